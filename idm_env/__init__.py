@@ -1,0 +1,47 @@
+"""Differentiable, vectorised lanes of Intelligent-Driver-Model vehicles, and a closed loop with measured traffic.
+
+Public names are loaded when first used, so ``import idm_env`` is quick and imports no torch; it registers the
+Gymnasium id ``DiffIDM-v0``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_LAZY = {
+    "Simulator": "idm_env.simulator",
+    "Trajectory": "idm_env.simulator",
+    "Lane": "idm_env.roads",
+    "Ring": "idm_env.roads",
+    "State": "idm_env.types",
+    "Command": "idm_env.types",
+    "Record": "idm_env.types",
+    "Parameter": "idm_env.parameters",
+    "Effect": "idm_env.effects",
+    "IDM": "idm_env.effects",
+    "Brakes": "idm_env.effects",
+    "Control": "idm_env.effects",
+    "Replay": "idm_env.effects",
+}
+
+__all__ = ["__version__", *_LAZY]
+
+if TYPE_CHECKING:
+    from idm_env.effects import IDM, Brakes, Control, Effect, Replay
+    from idm_env.parameters import Parameter
+    from idm_env.roads import Lane, Ring
+    from idm_env.simulator import Simulator, Trajectory
+    from idm_env.types import Command, Record, State
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'idm_env' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

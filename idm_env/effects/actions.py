@@ -1,0 +1,49 @@
+"""Vehicles that somebody else moves: an agent's command, and a replayed record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects.base import Effect, P
+from idm_env.types import Command, Driver, Motion, Record, Scene
+
+
+@dataclass(frozen=True)
+class Control(Effect):
+    """An agent's acceleration in place of the driver's, wherever its command is active.
+
+    Input ``control``: a ``Command(accel, active)``. Power, lag and brakes still act on it.
+    """
+
+    kind: ClassVar[str] = "control"
+    rank: ClassVar[int] = 35
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the command where active."""
+        command: Command = scene.input(self.name)
+        return torch.where(command.active, command.accel, accel)
+
+
+@dataclass(frozen=True)
+class Replay(Effect):
+    """A recorded vehicle is not accelerated but placed, so nothing drifts, and no gradient flows into it.
+
+    Input ``replay``: a ``Record``, holding the record at the end of the step.
+    """
+
+    kind: ClassVar[str] = "replay"
+
+    def place(self, motion: Motion, scene: Scene, p: P) -> Motion:
+        """Return the record where active."""
+        record: Record = scene.input(self.name)
+        return Motion(
+            torch.where(record.active, record.position - scene.position, motion.displacement),
+            torch.where(record.active, record.position, motion.position),
+            torch.where(record.active, record.speed, motion.speed),
+            torch.where(record.active, record.accel, motion.accel),
+            motion.present if record.present is None else record.present,
+        )

@@ -1,0 +1,95 @@
+"""How the driver's own parameters change: with speed, memory, place and time (hook ``adapt``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects.base import Effect, P
+from idm_env.effects.places import along, smooth_step, window
+from idm_env.parameters import Parameter
+from idm_env.types import Driver, Scene
+
+
+@dataclass(frozen=True)
+class SpeedDependentGap(Effect):
+    """``s* += s1 √(v/v0)`` (Treiber, Hennecke, Helbing 2000), with √ continued linearly below v/v0 = 10⁻³."""
+
+    kind: ClassVar[str] = "speed_dependent_gap"
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("extra_gap", "s1", "m", 3.0, -10.0, 15.0, null=0.0),)
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the longer desired gap."""
+        ratio = scene.speed / driver.desired_speed
+        root = torch.sqrt(ratio.clamp_min(1e-3)) - torch.relu(1e-3 - ratio) * (1e-3**-0.5)
+        return driver._replace(extra_gap=driver.extra_gap + p["extra_gap"] * root)
+
+
+@dataclass(frozen=True)
+class LongMemory(Effect):
+    """Drivers in long congestion keep larger gaps: ``T (1 + β (1 − λ))``, ``τ dλ/dt = v/v0 − λ``.
+
+    Source: Treiber and Helbing 2003, Phys. Rev. E 68, 046119. λ starts at v/v0 and is integrated exactly over a step of
+    constant v/v0.
+    """
+
+    kind: ClassVar[str] = "memory"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("strength", "β", "1", 0.5, -0.9, 3.0, null=0.0),
+        Parameter("memory_time", "τ", "s", 60.0, 5.0, 900.0, role="shape", starts=(20.0, 120.0)),
+    )
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return λ = v/v0."""
+        return scene.speed / driver.desired_speed
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the time gap in force."""
+        return driver._replace(time_gap=driver.time_gap * (1.0 + p["strength"] * (1.0 - scene.memory[self.name])))
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Relax λ towards v/v0."""
+        level = scene.memory[self.name]
+        return level + (scene.speed / driver.desired_speed - level) * -torch.expm1(-scene.dt / p["memory_time"])
+
+
+@dataclass(frozen=True)
+class SpeedZone(Effect):
+    """``v0 → f v0`` between x1 and x2, as behind a speed sign; edges are smooth over ``width`` (m).
+
+    Places are in the position's coordinate, on a lap of ``period`` metres where given.
+    """
+
+    kind: ClassVar[str] = "speed_zone"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("factor", "f", "1", 0.7, 0.2, 2.0, null=1.0),
+        Parameter("begin", "x1", "m", 200.0, -1e6, 1e6, role="place"),
+        Parameter("end", "x2", "m", 500.0, -1e6, 1e6, role="place"),
+    )
+    width: float = 5.0
+    period: float | None = None
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the desired speed in force."""
+        inside = window(along(scene.position, self.period), p["begin"], p["end"], self.width)
+        return driver._replace(desired_speed=driver.desired_speed * (1.0 + (p["factor"] - 1.0) * inside))
+
+
+@dataclass(frozen=True)
+class RegimeShift(Effect):
+    """``T → T (1 + k)`` after time t* (rain, darkness); the step is smooth over ``width`` (s)."""
+
+    kind: ClassVar[str] = "regime_shift"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("strength", "k", "1", 0.3, -0.8, 3.0, null=0.0),
+        Parameter("time", "t*", "s", 60.0, -1e7, 1e7, role="place"),
+    )
+    width: float = 0.5
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the time gap in force."""
+        after = smooth_step(scene.time, p["time"], self.width)
+        return driver._replace(time_gap=driver.time_gap * (1.0 + p["strength"] * after))

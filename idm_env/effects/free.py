@@ -1,0 +1,110 @@
+"""Curves over a feature of the scene: what to add when nothing in the catalogue has a name for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from torch import Tensor
+
+from idm_env.effects.base import Effect, P
+from idm_env.effects.places import along, interpolate
+from idm_env.parameters import Parameter, nearest
+from idm_env.types import Driver, Scene
+
+FEATURES: dict[str, str] = {
+    "position": "m",
+    "time": "s",
+    "speed": "m/s",
+    "gap": "m",
+    "closing_speed": "m/s",
+    "lead_accel": "m/s²",
+}
+"""Features that a curve can run over, with their units."""
+
+Target = Literal["time_gap", "desired_speed", "max_accel", "comfort_decel", "min_gap"]
+
+
+def feature_of(scene: Scene, feature: str, period: float | None) -> Tensor:
+    """Return a feature of the scene, in the unit of ``FEATURES``."""
+    values = {
+        "position": scene.position,
+        "time": scene.time,
+        "speed": scene.speed,
+        "gap": scene.leader.gap,
+        "closing_speed": scene.speed - scene.leader.speed,
+        "lead_accel": scene.leader.accel,
+    }
+    return along(values[feature], period)
+
+
+def _check(name: str, feature: str, knots: tuple[float, ...]) -> None:
+    if feature not in FEATURES:
+        raise ValueError(f"{name}.feature = '{feature}' is not a feature of the scene.{nearest(feature, FEATURES)}")
+    if len(knots) < 2 or any(b <= a for a, b in zip(knots, knots[1:], strict=False)):
+        raise ValueError(f"{name}.knots = {knots} must be at least two rising values ({FEATURES[feature]}).")
+
+
+@dataclass(frozen=True)
+class Curve(Effect):
+    """An added acceleration ``+ Σ c_k hat_k(x)``, piecewise linear in one feature x of the scene, free at its knots."""
+
+    kind: ClassVar[str] = "curve"
+    feature: str = "speed"
+    knots: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0)
+    period: float | None = None
+
+    def __post_init__(self) -> None:
+        _check("curve", self.feature, self.knots)
+
+    @property
+    def name(self) -> str:
+        """``curve_`` and the feature, so that several curves fit into one simulator."""
+        return f"curve_{self.feature}"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """One acceleration per knot."""
+        return tuple(
+            Parameter(f"knot_{i}", f"c{i}", "m/s²", 0.1 * (-1) ** i, -5.0, 5.0, null=0.0)
+            for i in range(len(self.knots))
+        )
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the curve's acceleration (m/s²)."""
+        x = feature_of(scene, self.feature, self.period)
+        return interpolate(x, self.knots, [p[f"knot_{i}"] for i in range(len(self.knots))], self.period)
+
+
+@dataclass(frozen=True)
+class DriverCurve(Effect):
+    """One driver parameter times ``1 + Σ c_k hat_k(x)`` over one feature x: T(x), v0(t) and their kin."""
+
+    kind: ClassVar[str] = "driver_curve"
+    target: Target = "time_gap"
+    feature: str = "position"
+    knots: tuple[float, ...] = (0.0, 500.0, 1000.0)
+    period: float | None = None
+
+    def __post_init__(self) -> None:
+        _check("driver_curve", self.feature, self.knots)
+        if self.target not in Driver._fields:
+            raise ValueError(f"driver_curve.target = '{self.target}' is unknown.{nearest(self.target, Driver._fields)}")
+
+    @property
+    def name(self) -> str:
+        """The target, ``_over_`` and the feature."""
+        return f"{self.target}_over_{self.feature}"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """One relative change per knot."""
+        return tuple(
+            Parameter(f"knot_{i}", f"c{i}", "1", 0.1 * (-1) ** i, -0.9, 3.0, null=0.0) for i in range(len(self.knots))
+        )
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the target parameter changed."""
+        x = feature_of(scene, self.feature, self.period)
+        change = interpolate(x, self.knots, [p[f"knot_{i}"] for i in range(len(self.knots))], self.period)
+        return driver._replace(**{self.target: getattr(driver, self.target) * (1.0 + change)})

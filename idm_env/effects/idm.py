@@ -1,0 +1,95 @@
+"""The Intelligent Driver Model, with its bounds kept exactly, and in the published smooth form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from idm_env.effects.base import CarFollowing, P
+from idm_env.parameters import Parameter
+from idm_env.types import Driver, Scene
+
+SMALLEST_GAP = 0.1
+"""Below this gap (m) the inverse square is continued by its tangent, so overlaps push back, finitely."""
+
+
+def desired_gap(driver: Driver, speed: Tensor, closing_speed: Tensor) -> Tensor:
+    """``s* = s0 + max(0, v T + v Δv / (2 √(a b))) + extra_gap`` (m): the interaction is floored, not all of s*."""
+    brake = 2.0 * torch.sqrt(driver.max_accel * driver.comfort_decel)
+    dynamic = speed * (driver.time_gap + closing_speed / brake)
+    return driver.min_gap + torch.relu(dynamic) + driver.extra_gap
+
+
+def inverse_square(gap: Tensor) -> Tensor:
+    """``1 / s²`` for s ≥ SMALLEST_GAP, its tangent below: finite, C¹, and rising through 0 and into overlaps."""
+    safe = gap.clamp_min(SMALLEST_GAP)
+    below = torch.relu(SMALLEST_GAP - gap)
+    return 1.0 / (safe * safe) + below * (2.0 / SMALLEST_GAP**3)
+
+
+def interaction(driver: Driver, speed: Tensor, gap: Tensor, lead_speed: Tensor) -> Tensor:
+    """``(s* / s)²`` (dimensionless), the interaction term of IDM."""
+    wanted = desired_gap(driver, speed, speed - lead_speed)
+    return wanted * wanted * inverse_square(gap)
+
+
+def soft_floor(x: Tensor, floor: Tensor | float, sharpness: float) -> Tensor:
+    """``floor + softplus(sharpness (x − floor)) / sharpness``; with sharpness 1 the paper's soft_min_clamp."""
+    return floor + softplus(sharpness * (x - floor), threshold=20.0) / sharpness
+
+
+@dataclass(frozen=True)
+class IDM(CarFollowing):
+    """Intelligent Driver Model (Treiber, Hennecke, Helbing 2000, Phys. Rev. E 62, 1805).
+
+    ::
+
+        A = a [1 − (v/v0)^δ − (s*/s)²],   s* = s0 + max(0, v T + v Δv / (2 √(a b)))
+
+    The term never exceeds a. Static choices: ``exponent`` δ (None makes it a parameter; a power by ``pow`` costs far
+    more than the default's two multiplications), and ``sharpness``: None is the exact form above; a number gives the
+    published smooth form, in which all of s* is floored by softplus of that sharpness and 1/s² is taken as it stands
+    (so gap 0 is a division by zero there and an overlap looks like a gap: use it to reproduce, not to drive).
+    """
+
+    kind: ClassVar[str] = "idm"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("max_accel", "a", "m/s²", 1.4, 0.1, 10.0, role="shape"),
+        Parameter("comfort_decel", "b", "m/s²", 2.0, 0.1, 10.0, role="shape"),
+        Parameter("time_gap", "T", "s", 1.5, 0.1, 5.0, role="shape"),
+        Parameter("min_gap", "s0", "m", 2.0, 0.1, 10.0, role="shape"),
+        Parameter("desired_speed", "v0", "m/s", 33.0, 1.0, 70.0, role="shape"),
+    )
+    exponent: float | None = 4.0
+    sharpness: float | None = None
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The five of the literature, and δ where it is free."""
+        free = (Parameter("exponent", "δ", "1", 4.0, 1.0, 12.0, role="shape"),)
+        return self.declared + (free if self.exponent is None else ())
+
+    def driver(self, p: P) -> Driver:
+        """Return the five parameters as they stand."""
+        return Driver(p["max_accel"], p["comfort_decel"], p["time_gap"], p["min_gap"], p["desired_speed"])
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return A (m/s²)."""
+        ratio = scene.speed / driver.desired_speed
+        if self.exponent == 4.0:
+            square = ratio * ratio
+            free = square * square
+        else:
+            free = ratio ** (p["exponent"] if self.exponent is None else self.exponent)
+        if self.sharpness is None:
+            term = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed)
+        else:
+            brake = 2.0 * torch.sqrt(driver.max_accel * driver.comfort_decel)
+            closing = scene.speed - scene.leader.speed
+            wanted = driver.min_gap + scene.speed * driver.time_gap + scene.speed * closing / brake + driver.extra_gap
+            term = (soft_floor(wanted, 0.0, self.sharpness) / scene.leader.gap) ** 2
+        return driver.max_accel * (1.0 - free - term * scene.leader.present)

@@ -1,0 +1,112 @@
+"""What the vehicle can: asymmetry, action points, power, lag and brakes (hook ``limit``, chained by rank)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects.base import Effect, P
+from idm_env.effects.idm import soft_floor
+from idm_env.parameters import Parameter
+from idm_env.types import Driver, Scene
+
+
+@dataclass(frozen=True)
+class Asymmetry(Effect):
+    """Weaker acceleration than braking: ``a > 0: (1 − k) a``, ``a < 0: (1 + k) a`` (Newell; Laval and Leclercq)."""
+
+    kind: ClassVar[str] = "asymmetry"
+    rank: ClassVar[int] = 10
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("strength", "k", "1", 0.3, -0.9, 0.9, null=0.0),)
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return a − k |a|."""
+        return accel - p["strength"] * accel.abs()
+
+
+@dataclass(frozen=True)
+class ActionPoint(Effect):
+    """Acceleration is held until it differs from the wanted one by Δa (Treiber and Kesting 2017, Transp. Res. B 104).
+
+    Δa has no gradient: search from the ``starts``.
+    """
+
+    kind: ClassVar[str] = "action_point"
+    rank: ClassVar[int] = 30
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("threshold", "Δa", "m/s²", 0.3, 0.0, 2.0, null=0.0, role="threshold", starts=(0.15, 0.4)),
+    )
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the held acceleration, or the wanted one where it differs enough."""
+        return torch.where((accel - scene.accel).abs() >= p["threshold"], accel, scene.accel)
+
+
+@dataclass(frozen=True)
+class PowerLimit(Effect):
+    """``a ≤ (P/m) / v`` with specific power P/m (W/kg); absent at its null, a power that no car has."""
+
+    kind: ClassVar[str] = "power_limit"
+    rank: ClassVar[int] = 40
+    sees_truth: ClassVar[bool] = True
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("power", "P/m", "W/kg", 15.0, 2.0, 100.0, null=1e5, role="threshold", starts=(8.0, 16.0)),
+    )
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the smaller of the wanted acceleration and what the engine gives."""
+        return torch.minimum(accel, p["power"] / scene.speed.clamp_min(0.1))
+
+
+@dataclass(frozen=True)
+class Lag(Effect):
+    """Powertrain lag ``τ dA/dt = a − A``, implicit: ``A' = (τ A + Δt a)/(τ + Δt)``, with a derivative at τ = 0.
+
+    A is the acceleration of the step before.
+    """
+
+    kind: ClassVar[str] = "lag"
+    rank: ClassVar[int] = 50
+    sees_truth: ClassVar[bool] = True
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("lag", "τ", "s", 0.5, 0.0, 3.0, null=0.0, starts=(0.3, 0.8)),
+    )
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the lagged acceleration."""
+        # The same fraction, written so that τ = 0 returns `accel` to the last bit.
+        return accel + (scene.accel - accel) * (p["lag"] / (p["lag"] + scene.dt))
+
+
+@dataclass(frozen=True)
+class Brakes(Effect):
+    """No harder braking than b_max, and never a reverse: ``a* = lb + f(a − lb)``.
+
+    ``f(x) = 0`` for x ≤ 0, ``x² (2w − x)/w²`` up to w, then ``x``: exact beyond w = ``width`` (m/s²), C¹, and never
+    above x, so that nobody creeps. Below the floor its gradient is zero. With Euler steps the floor is
+    ``lb = max(−v/Δt, −b_max)``; a ballistic step stops the car inside the step, so lb = −b_max.
+
+    ``sharpness`` (s²/m) instead gives the published floor ``lb + softplus(sharpness (a − lb))/sharpness``, 1 being the
+    paper's; it lifts every acceleration and lets a vehicle creep towards a parked leader.
+    """
+
+    kind: ClassVar[str] = "brakes"
+    rank: ClassVar[int] = 60
+    sees_truth: ClassVar[bool] = True
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("max_decel", "b_max", "m/s²", 9.0, 1.0, 15.0, role="shape"),)
+    width: float = 0.1
+    sharpness: float | None = None
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the acceleration that the brakes allow."""
+        floor = -p["max_decel"]
+        if scene.euler:
+            floor = torch.maximum(-scene.speed / scene.dt, floor)
+        if self.sharpness is not None:
+            return soft_floor(accel, floor, self.sharpness)
+        above = torch.relu(accel - floor)
+        part = above.clamp_max(self.width)
+        return floor + part * part * (2.0 * self.width - part) * (1.0 / self.width**2) + (above - part)

@@ -1,0 +1,37 @@
+"""Shapes over a coordinate, shared by effects that act at a place or time: hats, steps and windows."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def along(position: Tensor, period: float | None) -> Tensor:
+    """Return the position on a lap of length ``period`` (m), or the position itself on an open road."""
+    return position if period is None else torch.remainder(position, period)
+
+
+def smooth_step(x: Tensor, where: Tensor | float, width: float) -> Tensor:
+    """Rise from 0 to 1 around ``where``; ``width`` is the logistic's scale, 12 % to 88 % over 4 widths."""
+    return torch.sigmoid((x - where) / width)
+
+
+def window(x: Tensor, begin: Tensor, end: Tensor, width: float) -> Tensor:
+    """1 between ``begin`` and ``end``, 0 outside, with smooth edges so that both can be found by gradients."""
+    return smooth_step(x, begin, width) * smooth_step(-x, -end, width)
+
+
+def interpolate(x: Tensor, knots: tuple[float, ...], values: list[Tensor], period: float | None = None) -> Tensor:
+    """Piecewise linear through (knot, value), constant beyond the ends, or periodic.
+
+    ``values`` broadcast against ``x``; knots must rise. The sum runs over hats, so it is linear in the values and has a
+    derivative with respect to x between knots.
+    """
+    if period is not None:
+        first, last = knots[0], knots[-1]
+        knots = (last - period, *knots, first + period)
+        values = [values[-1], *values, values[0]]
+    total = values[0] + torch.zeros_like(x)
+    for left, right, before, after in zip(knots[:-1], knots[1:], values[:-1], values[1:], strict=True):
+        total = total + ((x - left) / (right - left)).clamp(0.0, 1.0) * (after - before)
+    return total

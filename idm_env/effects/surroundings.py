@@ -1,0 +1,73 @@
+"""Physics of the road and the air: slopes and drag (hook ``accelerate``, seeing the true scene)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects.base import Effect, P
+from idm_env.effects.places import along, interpolate
+from idm_env.parameters import Parameter
+from idm_env.types import Driver, Scene
+
+GRAVITY = 9.81
+"""Standard gravity, rounded (m/s²)."""
+
+
+@dataclass(frozen=True)
+class Grade(Effect):
+    """Gravity on a slope: ``− share · g sin(arctan(slope(x)))``, slope piecewise linear over ``knots``.
+
+    Slope is rise over run. With ``profile`` (one slope per knot) the road is known, and ``share`` is the parameter: 1 is gravity uncompensated,
+    0 a driver or controller who compensates it all. Without it every knot's slope is a parameter and the profile is
+    found from the traffic. ``knots`` are positions (m), on a lap of ``period`` metres where given.
+    """
+
+    kind: ClassVar[str] = "grade"
+    sees_truth: ClassVar[bool] = True
+    knots: tuple[float, ...] = (0.0, 250.0, 500.0, 750.0, 1000.0)
+    profile: tuple[float, ...] | None = None
+    period: float | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.knots) < 2 or any(b <= a for a, b in zip(self.knots, self.knots[1:], strict=False)):
+            raise ValueError(f"grade.knots = {self.knots} must be at least two rising positions (m).")
+        if self.profile is not None and len(self.profile) != len(self.knots):
+            raise ValueError(
+                f"grade.profile has {len(self.profile)} slopes for {len(self.knots)} knots: give one each."
+            )
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The share of a known profile, or the slope at every knot."""
+        if self.profile is not None:
+            return (Parameter("share", "", "1", 1.0, -2.0, 3.0, null=0.0),)
+        return tuple(
+            Parameter(f"slope_{i}", f"θ{i}", "1", 0.02 * (-1) ** i, -0.2, 0.2, null=0.0) for i in range(len(self.knots))
+        )
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return gravity's part (m/s²)."""
+        if self.profile is None:
+            slopes = [p[f"slope_{i}"] for i in range(len(self.knots))]
+        else:
+            slopes = [scene.position.new_tensor(slope) for slope in self.profile]
+        slope = interpolate(along(scene.position, self.period), self.knots, slopes, self.period)
+        pull = -GRAVITY * slope / torch.sqrt(1.0 + slope * slope)
+        return pull if self.profile is None else p["share"] * pull
+
+
+@dataclass(frozen=True)
+class Drag(Effect):
+    """Air drag ``− c v²`` beyond what the driver compensates; c = ρ c_w A / (2 m), 2e-4 to 8e-4 1/m for cars."""
+
+    kind: ClassVar[str] = "drag"
+    sees_truth: ClassVar[bool] = True
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("coefficient", "c", "1/m", 4e-4, -2e-3, 5e-3, null=0.0),)
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the drag (m/s²)."""
+        return -p["coefficient"] * scene.speed * scene.speed

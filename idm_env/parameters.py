@@ -1,0 +1,177 @@
+"""Parameters: declared once beside the equation, used by defaults, sampling, bounds, checks and tables.
+
+A ``Parameter`` says what a number means and where it may lie. Everything else here turns a tuple of effects into
+tensors (``defaults``, ``sample``, ``null``), moves tensors in and out of their bounds (``constrain``,
+``unconstrain``) or says in one line what is wrong with them (``check``).
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor
+from torch.distributions import biject_to, constraints
+from torch.distributions.transforms import Transform
+
+from idm_env.types import Params
+
+Role = Literal["strength", "shape", "threshold", "place"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    ``null`` is the value at which the effect is absent (None where the effect is never absent). ``role`` says how it
+    is found: a *strength* has a gradient at its null; a *shape* matters only once the strength does; a *threshold* or
+    a *place* has to be searched, from ``starts`` where given.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    default: float
+    low: float
+    high: float
+    null: float | None = None
+    role: Role = "strength"
+    starts: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high or not self.low <= self.default <= self.high:
+            raise ValueError(f"parameter '{self.name}': default {self.default} is outside [{self.low}, {self.high}].")
+
+    def transform(self) -> Transform:
+        """Bijection from the real line onto the open interval (low, high)."""
+        return biject_to(constraints.interval(self.low, self.high))
+
+
+class HasParameters(Protocol):
+    """Anything with a name and parameters: an effect."""
+
+    @property
+    def name(self) -> str:
+        """Key of the effect in ``Params``."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Declared parameters."""
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return ' Did you mean …?' for the nearest known word, or the list of all when none is near."""
+    known = list(known)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    if not close and "." in word:
+        close = difflib.get_close_matches(word.split(".")[-1], [k.split(".")[-1] for k in known], n=1, cutoff=0.4)
+        close = [k for k in known if close and k.split(".")[-1] == close[0]][:1]
+    return f" Did you mean '{close[0]}'?" if close else f" Known: {', '.join(sorted(known)) or 'none'}."
+
+
+def catalogue(effects: Iterable[HasParameters]) -> dict[str, Parameter]:
+    """Return every parameter of ``effects`` by its full name, ``effect.parameter``."""
+    return {f"{effect.name}.{p.name}": p for effect in effects for p in effect.parameters}
+
+
+def defaults(
+    effects: Iterable[HasParameters], *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+) -> dict[str, dict[str, Tensor]]:
+    """Return the default of every parameter as a scalar tensor."""
+    return {
+        e.name: {p.name: torch.tensor(p.default, dtype=dtype, device=device) for p in e.parameters} for e in effects
+    }
+
+
+def null(
+    effects: Iterable[HasParameters], *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+) -> dict[str, dict[str, Tensor]]:
+    """Return defaults with every parameter that has a null set to it: each such effect is absent."""
+    return {
+        e.name: {
+            p.name: torch.tensor(p.default if p.null is None else p.null, dtype=dtype, device=device)
+            for p in e.parameters
+        }
+        for e in effects
+    }
+
+
+def sample(
+    effects: Iterable[HasParameters],
+    shape: tuple[int, ...],
+    generator: torch.Generator,
+    *,
+    spread: float = 1.0,
+    dtype: torch.dtype | None = None,
+) -> dict[str, dict[str, Tensor]]:
+    """Draw every parameter uniformly from ``default ± spread · (bound − default)``, so never outside its bounds."""
+
+    def draw(p: Parameter) -> Tensor:
+        low = p.default + spread * (p.low - p.default)
+        high = p.default + spread * (p.high - p.default)
+        return low + (high - low) * torch.rand(shape, generator=generator, dtype=dtype)
+
+    return {e.name: {p.name: draw(p) for p in e.parameters} for e in effects}
+
+
+def constrain(parameter: Parameter, free: Tensor) -> Tensor:
+    """Map the real line onto the parameter's bounds."""
+    return parameter.transform()(free)
+
+
+def unconstrain(parameter: Parameter, value: Tensor, margin: float = 1e-4) -> Tensor:
+    """Map a value within bounds to the real line; a value at a bound is first moved inside by ``margin`` of the range."""
+    inside = margin * (parameter.high - parameter.low)
+    return parameter.transform().inv(value.clamp(parameter.low + inside, parameter.high - inside))
+
+
+def check(effects: Iterable[HasParameters], params: Params) -> None:
+    """Raise ValueError, in one line, for unknown, missing, non-finite or out-of-range parameters.
+
+    A parameter's null is always accepted, also where it lies outside the bounds of the search.
+    """
+    effects = tuple(effects)
+    known = catalogue(effects)
+    names = {e.name for e in effects}
+    for effect, values in params.items():
+        if effect not in names:
+            raise ValueError(f"unknown effect '{effect}' in parameters.{nearest(effect, names)}")
+        for name in values:
+            if f"{effect}.{name}" not in known:
+                raise ValueError(f"unknown parameter '{effect}.{name}'.{nearest(f'{effect}.{name}', known)}")
+    for full, p in known.items():
+        effect, name = full.split(".")
+        if effect not in params or name not in params[effect]:
+            raise ValueError(
+                f"parameter '{full}' is missing. Start from simulator.defaults() and change what you need."
+            )
+        value = torch.as_tensor(params[effect][name]).detach()
+        # Bounds are compared in float32 too, where 0.1 is not 0.1: a relative tolerance keeps a bound itself legal.
+        slack = 1e-6 * max(abs(p.low), abs(p.high))
+        bad = ~((value >= p.low - slack) & (value <= p.high + slack))
+        if p.null is not None:
+            bad &= value != p.null
+        if bool(bad.any()):
+            worst = float(value[bad].reshape(-1)[0])
+            unit = "" if p.unit == "1" else f" {p.unit}"
+            raise ValueError(f"{full} = {worst:g}{unit} is outside [{p.low:g}, {p.high:g}]{unit}.")
+
+
+def table(effects: Iterable[HasParameters]) -> list[dict[str, object]]:
+    """Return one row per parameter for docs and reports."""
+    return [
+        {
+            "parameter": full,
+            "symbol": p.symbol,
+            "unit": p.unit,
+            "default": p.default,
+            "low": p.low,
+            "high": p.high,
+            "null": p.null,
+            "role": p.role,
+        }
+        for full, p in catalogue(effects).items()
+    ]

@@ -1,0 +1,7 @@
+"""Roads turn positions into gaps and neighbours; they know no drivers."""
+
+from idm_env.roads.base import Road
+from idm_env.roads.lane import Lane
+from idm_env.roads.ring import Ring
+
+__all__ = ["Lane", "Ring", "Road"]

@@ -1,0 +1,77 @@
+"""What a road is: who leads whom, and how gaps follow from displacements. Roads know no drivers."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from idm_env.types import FAR, Neighbour
+
+
+@dataclass(frozen=True)
+class Road(abc.ABC):
+    """A topology over the last tensor dimension, vehicles sorted front first.
+
+    Written with shifted views instead of index gathers, because compilers fuse those.
+    """
+
+    @abc.abstractmethod
+    def ahead(self, x: Tensor) -> Tensor:
+        """Return each vehicle's leader's ``x``; a vehicle without a leader gets its own."""
+
+    @abc.abstractmethod
+    def back(self, x: Tensor) -> Tensor:
+        """Return each vehicle's follower's ``x``; a vehicle without a follower gets its own."""
+
+    @abc.abstractmethod
+    def led(self, x: Tensor) -> Tensor:
+        """Return 1 for every vehicle that the topology gives a leader, 0 otherwise, shape ``(vehicles,)``."""
+
+    @abc.abstractmethod
+    def gaps(self, position: Tensor, length: Tensor, circumference: Tensor | float | None = None) -> Tensor:
+        """Return the bumper-to-bumper gap to the leader (m), ``FAR`` where there is none."""
+
+    def leads(self, x: Tensor) -> Tensor:
+        """Return 1 for every vehicle that has a follower, 0 otherwise, shape ``(vehicles,)``."""
+        return self.led(x).flip(-1)
+
+    def leader_present(self, present: Tensor | None, like: Tensor) -> Tensor:
+        """Return 1 where there is a leader: by the topology, and by ``present`` where vehicles come and go."""
+        led = self.led(like)
+        return led if present is None else led * self.ahead(present) * present
+
+    def advance(self, gap: Tensor, displacement: Tensor) -> Tensor:
+        """Return the gaps after a step: ``gap + displacement[leader] − displacement`` (m)."""
+        return gap + torch.where(self.led(gap) > 0, self.ahead(displacement) - displacement, 0.0)
+
+    def leader(self, gap: Tensor, speed: Tensor, accel: Tensor, present: Tensor) -> Neighbour:
+        """Return the leader as seen by every vehicle; ``present`` is ``leader_present``'s."""
+        there = present > 0
+        return Neighbour(
+            gap, torch.where(there, self.ahead(speed), speed), torch.where(there, self.ahead(accel), 0.0), present
+        )
+
+    def second_leader(self, leader: Neighbour, length: Tensor, speed: Tensor) -> Neighbour:
+        """Return the leader's leader, with the gap between bumpers: ``s1 + length[leader] + s[leader]`` (m)."""
+        present = leader.present * self.ahead(leader.present.expand_as(speed))
+        there = present > 0
+        return Neighbour(
+            torch.where(there, leader.gap + self.ahead(length) + self.ahead(leader.gap), FAR),
+            torch.where(there, self.ahead(leader.speed), speed),
+            torch.where(there, self.ahead(leader.accel), 0.0),
+            present,
+        )
+
+    def behind(self, leader: Neighbour, speed: Tensor, accel: Tensor) -> Neighbour:
+        """Return the vehicle whose leader is this one, with *its* gap (m)."""
+        present = self.leads(speed) * self.back(leader.present.expand_as(speed))
+        there = present > 0
+        return Neighbour(
+            torch.where(there, self.back(leader.gap), FAR),
+            torch.where(there, self.back(speed), speed),
+            torch.where(there, self.back(accel), 0.0),
+            present,
+        )

@@ -1,0 +1,153 @@
+"""The nouns of the simulator: the one statement of shapes, signs and units.
+
+Shapes
+    The last dimension is vehicles, front first: the leader of vehicle ``i`` of a lane is vehicle ``i - 1``.
+    Leading dimensions are batch. Anything that broadcasts against ``(..., vehicles)`` is accepted.
+Signs and units
+    SI. Position is the front bumper along the lane (m); a gap is bumper to bumper,
+    ``position[leader] - length[leader] - position`` (m); closing speed is ``speed - lead_speed``, positive when
+    approaching (m/s).
+Nobody there
+    A missing neighbour has ``present == 0``, a gap of ``FAR`` and the driver's own speed: no infinities, no
+    NaN, and with the mask no interaction at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+FAR = 1e4
+"""Gap to a neighbour that is not there (m): finite, so that nothing downstream meets an infinity."""
+
+Params = Mapping[str, Mapping[str, Tensor]]
+"""Effect name → parameter name → tensor that broadcasts against ``(..., vehicles)``."""
+
+Inputs = Mapping[str, Any]
+"""Effect name → what that effect takes from outside at this step (a tensor or a tuple of tensors)."""
+
+Memory = Mapping[str, Tensor]
+"""Effect name → state of its own that the effect carries from step to step."""
+
+
+class State(NamedTuple):
+    """Everything that a step carries over.
+
+    ``gap`` is state although positions imply it: in float32 the difference of two positions cancels, and the
+    gradients with it. A step adds ``displacement[leader] - displacement`` instead. ``step`` is an integer
+    tensor (scalar or one per batch row), so that time never forces a device to synchronise.
+    """
+
+    position: Tensor
+    speed: Tensor
+    accel: Tensor
+    gap: Tensor
+    length: Tensor
+    step: Tensor
+    present: Tensor | None
+    memory: Memory
+
+
+class Motion(NamedTuple):
+    """What integration yields and replay overrides.
+
+    Displacement in this step (m), then position (m), speed (m/s), acceleration (m/s²) and validity at its end.
+    """
+
+    displacement: Tensor
+    position: Tensor
+    speed: Tensor
+    accel: Tensor
+    present: Tensor | None
+
+
+class Neighbour(NamedTuple):
+    """Another vehicle as seen by the driver: gap (m), its speed (m/s), its acceleration (m/s²), 1 if it is there.
+
+    For an adjacent vehicle ``gap`` is the signed distance of the front bumpers, positive when it is ahead.
+    """
+
+    gap: Tensor
+    speed: Tensor
+    accel: Tensor
+    present: Tensor
+
+
+class Scene(NamedTuple):
+    """What one step looks like to every vehicle; effects read this and know no topology.
+
+    ``second_leader`` and ``behind`` are filled only where an effect of the simulator needs them, ``inputs``
+    and ``memory`` are keyed by effect name, ``time`` is in seconds, ``euler`` tells how speeds will be integrated.
+    """
+
+    position: Tensor
+    speed: Tensor
+    accel: Tensor
+    leader: Neighbour
+    second_leader: Neighbour | None
+    behind: Neighbour | None
+    time: Tensor
+    dt: float
+    euler: bool
+    inputs: Inputs
+    memory: Memory
+
+    def input(self, name: str) -> Any:
+        """Return the input of effect ``name``; ValueError tells which input is missing."""
+        if name not in self.inputs:
+            raise ValueError(
+                f"effect '{name}' takes an input, and none was given. Pass inputs={{'{name}': …}} to step or rollout."
+            )
+        return self.inputs[name]
+
+
+class Driver(NamedTuple):
+    """Car-following parameters in force at this step, after every adaptation.
+
+    ``max_accel`` a (m/s²), ``comfort_decel`` b (m/s²), ``time_gap`` T (s), ``min_gap`` s0 (m), ``desired_speed``
+    v0 (m/s); ``extra_gap`` (m) is added to the desired gap s*.
+    """
+
+    max_accel: Tensor
+    comfort_decel: Tensor
+    time_gap: Tensor
+    min_gap: Tensor
+    desired_speed: Tensor
+    extra_gap: Tensor | float = 0.0
+
+
+class Command(NamedTuple):
+    """Input of the effect ``control``: commanded acceleration (m/s²) and where it is in force (bool)."""
+
+    accel: Tensor
+    active: Tensor
+
+
+class Record(NamedTuple):
+    """Input of the effect ``replay``: the record at the *end* of the step and which vehicles follow it.
+
+    ``active`` (bool) marks replayed vehicles; ``present`` (0 or 1, or None for all there) which vehicles exist.
+    """
+
+    position: Tensor
+    speed: Tensor
+    accel: Tensor
+    active: Tensor
+    present: Tensor | None = None
+
+
+class Imagined(NamedTuple):
+    """Input of the effect ``imagined``: a free gap Δp (m) and closing speed Δv (m/s), both per vehicle."""
+
+    gap: Tensor
+    closing_speed: Tensor
+
+
+class Adjacent(NamedTuple):
+    """Input of the effect ``lateral``: signed distance (m), speed (m/s) and presence of the adjacent-lane vehicle."""
+
+    distance: Tensor
+    speed: Tensor
+    present: Tensor
