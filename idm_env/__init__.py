@@ -27,7 +27,22 @@ _LAZY = {
     "Replay": "idm_env.effects",
 }
 
-__all__ = ["__version__", *_LAZY]
+__all__ = [
+    "IDM",
+    "Brakes",
+    "Command",
+    "Control",
+    "Effect",
+    "Lane",
+    "Parameter",
+    "Record",
+    "Replay",
+    "Ring",
+    "Simulator",
+    "State",
+    "Trajectory",
+    "__version__",
+]
 
 if TYPE_CHECKING:
     from idm_env.effects import IDM, Brakes, Control, Effect, Replay

@@ -123,7 +123,7 @@ def constrain(parameter: Parameter, free: Tensor) -> Tensor:
 
 
 def unconstrain(parameter: Parameter, value: Tensor, margin: float = 1e-4) -> Tensor:
-    """Map a value within bounds to the real line; a value at a bound is first moved inside by ``margin`` of the range."""
+    """Map a value within bounds to the real line; one at a bound is first moved inside by ``margin`` of the range."""
     inside = margin * (parameter.high - parameter.low)
     return parameter.transform().inv(value.clamp(parameter.low + inside, parameter.high - inside))
 
@@ -145,9 +145,7 @@ def check(effects: Iterable[HasParameters], params: Params) -> None:
     for full, p in known.items():
         effect, name = full.split(".")
         if effect not in params or name not in params[effect]:
-            raise ValueError(
-                f"parameter '{full}' is missing. Start from simulator.defaults() and change what you need."
-            )
+            raise ValueError(f"parameter '{full}' is missing. Start from simulator.defaults() and change what differs.")
         value = torch.as_tensor(params[effect][name]).detach()
         # Bounds are compared in float32 too, where 0.1 is not 0.1: a relative tolerance keeps a bound itself legal.
         slack = 1e-6 * max(abs(p.low), abs(p.high))

@@ -65,10 +65,9 @@ class Simulator:
             raise ValueError(
                 f"a simulator needs exactly one car-following effect, got {following or 'none'}. Add IDM() or drop one."
             )
-        if self.integration not in ("ballistic", "euler"):
-            raise ValueError(
-                f"integration = '{self.integration}' is unknown.{parameters.nearest(self.integration, ('ballistic', 'euler'))}"
-            )
+        if self.integration not in INTEGRATORS:
+            hint = parameters.nearest(self.integration, INTEGRATORS)
+            raise ValueError(f"integration = '{self.integration}' is unknown.{hint}")
         if not self.dt > 0:
             raise ValueError(f"dt = {self.dt} s must be positive.")
 
@@ -217,8 +216,8 @@ class Simulator:
     def step(self, state: State, inputs: Inputs, params: Params) -> State:
         """Return the state Δt later. Pure: the same arguments give the same result, with or without a graph.
 
-        ``inputs`` maps effect names to what they take at this step; ``params`` maps effect and parameter names to tensors
-        that broadcast against ``(..., vehicles)``.
+        ``inputs`` maps effect names to what they take at this step; ``params`` maps effect and parameter names to
+        tensors that broadcast against ``(..., vehicles)``.
         """
         accel, scene, driver = self._respond(state, inputs, params)
         displacement, speed, accel = INTEGRATORS[self.integration](state.speed, accel, self.dt)
@@ -263,8 +262,8 @@ class Simulator:
         """Repeat ``step``; return the last state and what ``keep`` takes of every state after a step, time first.
 
         ``inputs`` carry a leading time dimension of at least ``steps``. ``checkpoint_every`` k > 0 saves the graph's
-        tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps instead
-        of ``steps``, for about one more forward pass. ValueError for inputs that are too short or of no effect.
+        tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps
+        instead of ``steps``, for about one more forward pass. ValueError for inputs that are too short or of no effect.
         """
         for name, value in inputs.items():
             if name not in self.by_name:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar, Literal
 
 from torch import Tensor
@@ -41,7 +42,7 @@ def feature_of(scene: Scene, feature: str, period: float | None) -> Tensor:
 def _check(name: str, feature: str, knots: tuple[float, ...]) -> None:
     if feature not in FEATURES:
         raise ValueError(f"{name}.feature = '{feature}' is not a feature of the scene.{nearest(feature, FEATURES)}")
-    if len(knots) < 2 or any(b <= a for a, b in zip(knots, knots[1:], strict=False)):
+    if len(knots) < 2 or any(b <= a for a, b in pairwise(knots)):
         raise ValueError(f"{name}.knots = {knots} must be at least two rising values ({FEATURES[feature]}).")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
@@ -19,11 +20,11 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Grade(Effect):
-    """Gravity on a slope: ``− share · g sin(arctan(slope(x)))``, slope piecewise linear over ``knots``.
+    """Gravity on a slope: ``− share · g sin(arctan(slope(x)))``, slope (rise over run) piecewise linear over ``knots``.
 
-    Slope is rise over run. With ``profile`` (one slope per knot) the road is known, and ``share`` is the parameter: 1 is gravity uncompensated,
-    0 a driver or controller who compensates it all. Without it every knot's slope is a parameter and the profile is
-    found from the traffic. ``knots`` are positions (m), on a lap of ``period`` metres where given.
+    With ``profile`` (one slope per knot) the road is known, and ``share`` is the parameter: 1 is gravity
+    uncompensated, 0 a driver or controller who compensates it all. Without it every knot's slope is a parameter and
+    the profile is found from the traffic. ``knots`` are positions (m), on a lap of ``period`` metres where given.
     """
 
     kind: ClassVar[str] = "grade"
@@ -33,7 +34,7 @@ class Grade(Effect):
     period: float | None = None
 
     def __post_init__(self) -> None:
-        if len(self.knots) < 2 or any(b <= a for a, b in zip(self.knots, self.knots[1:], strict=False)):
+        if len(self.knots) < 2 or any(b <= a for a, b in pairwise(self.knots)):
             raise ValueError(f"grade.knots = {self.knots} must be at least two rising positions (m).")
         if self.profile is not None and len(self.profile) != len(self.knots):
             raise ValueError(
