@@ -1,0 +1,78 @@
+"""The members that every law runs over: one of each effect, and the variants that its static choices make."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from idm_env.effects import ALL, IDM, Brakes, Curve, DriverCurve, Effect, Grade, Noise
+from idm_env.effects.free import FEATURES
+from idm_env.roads import Lane, Ring
+from idm_env.simulator import Simulator
+from idm_env.types import Adjacent, Command, Imagined, Params, Record, State
+
+N = 5
+DTYPE = torch.float64
+
+MEMBERS: list[Effect] = [
+    *(cls() for cls in ALL.values()),
+    IDM(exponent=None),
+    IDM(sharpness=1.0),
+    Brakes(sharpness=1.0),
+    Grade(profile=(0.0, 0.02, -0.03, 0.01, 0.0)),
+    Grade(period=1200.0),
+    Noise(correlated=True),
+    *(Curve(feature=f, knots=(-1.0, 3.0, 8.0, 15.0)) for f in FEATURES),
+    *(DriverCurve(target=t) for t in ("desired_speed", "max_accel", "comfort_decel", "min_gap")),
+]
+
+
+def label(effect: Effect) -> str:
+    """Return a readable test id."""
+    return repr(effect).replace(" ", "")
+
+
+def around(effect: Effect, road: Lane | Ring | None = None, **options: object) -> Simulator:
+    """Return a simulator of IDM and Brakes with ``effect`` in it."""
+    base = [e for e in (IDM(), Brakes()) if e.name != effect.name]
+    return Simulator(road or Lane(), (*base, effect), **options)  # type: ignore[arg-type]
+
+
+def start(simulator: Simulator, params: Params, dtype: torch.dtype = DTYPE, batch: tuple[int, ...] = ()) -> State:
+    """Return a lively platoon: uneven gaps, speeds and accelerations, at 120 m and 3 s, so that places matter."""
+    generator = torch.Generator().manual_seed(7)
+    wiggle = torch.rand((*batch, N), generator=generator, dtype=DTYPE)
+    position = 320.0 - 22.0 * torch.arange(N, dtype=DTYPE) + 4.0 * wiggle
+    speed = 9.0 + 4.0 * torch.rand((*batch, N), generator=generator, dtype=DTYPE)
+    accel = torch.rand((*batch, N), generator=generator, dtype=DTYPE) - 0.6
+    around = 400.0 if isinstance(simulator.road, Ring) else None
+    return simulator.state(
+        position.to(dtype), speed.to(dtype), params, accel=accel.to(dtype), step=590, circumference=around
+    )
+
+
+def inputs_for(simulator: Simulator, steps: int, like: Tensor) -> dict[str, object]:
+    """Return lively inputs for every effect of the simulator that takes one, time first."""
+    generator = torch.Generator().manual_seed(11)
+
+    def draw() -> Tensor:
+        return torch.rand((steps, *like.shape), generator=generator, dtype=DTYPE).to(like.dtype)
+
+    first = (torch.arange(like.shape[-1]) == 0).expand(steps, *like.shape)
+    time = torch.arange(1, steps + 1, dtype=DTYPE).reshape(-1, *([1] * like.dim()))
+    every = {
+        "control": lambda: Command(draw() - 0.5, first),
+        "replay": lambda: Record(
+            (320.0 + 8.0 * simulator.dt * time + 0 * draw()).to(like.dtype), 8.0 + 0 * draw(), 0 * draw(), first
+        ),
+        "noise": lambda: torch.randn((steps, *like.shape), generator=generator, dtype=DTYPE).to(like.dtype),
+        "imagined": lambda: Imagined(10.0 + 5.0 * draw(), draw() - 0.5),
+        "lateral": lambda: Adjacent(20.0 * (draw() - 0.5), 6.0 + draw(), torch.ones_like(draw())),
+    }
+    return {name: make() for name, make in every.items() if name in simulator.by_name}
+
+
+def with_leaves(params: Params, effect: str) -> tuple[dict[str, dict[str, Tensor]], dict[str, Tensor]]:
+    """Return params whose ``effect`` has leaf tensors, and those leaves."""
+    leaves = {name: value.clone().requires_grad_() for name, value in params[effect].items()}
+    return {**params, effect: leaves}, leaves  # type: ignore[dict-item]
