@@ -52,6 +52,24 @@ if TYPE_CHECKING:
     from idm_env.types import Command, Record, State
 
 
+def _register() -> None:
+    """Register the environment ids; entry points are text, so that nothing heavy is imported here."""
+    from gymnasium.envs.registration import register, registry
+
+    if "DiffIDM-v0" not in registry:
+        register(
+            id="DiffIDM-v0",
+            entry_point="idm_env.envs.gym:DiffIDMEnv",
+            vector_entry_point="idm_env.envs.vector:DiffIDMVectorEnv",
+            max_episode_steps=3000,
+            # The checker's wrapper costs more than a step; tests run the full checker instead.
+            disable_env_checker=True,
+        )
+
+
+_register()
+
+
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return getattr(importlib.import_module(_LAZY[name]), name)

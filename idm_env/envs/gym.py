@@ -1,0 +1,141 @@
+"""``DiffIDM-v0`` for Gymnasium: one environment, a batch of one of the same code as the vector."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env.envs.batch import Batch, Outcome
+from idm_env.envs.settings import RENDER_MODES, settings
+from idm_env.envs.spaces import action_box, action_tensor, observation_box
+from idm_env.types import Params, State
+
+
+class DiffIDMEnv(gymnasium.Env):
+    """One environment: ``gym.make("DiffIDM-v0", task="ring", …)``.
+
+    ``task`` is one of ``idm_env.tasks.TASKS``; its docstring defines the task, and its fields are further keywords,
+    as are those of ``idm_env.envs.settings.settings``. All controlled vehicles are one agent here: their observations
+    one after the other, the mean of their rewards, terminated with the first and truncated with the last of them.
+
+    With ``output="numpy"`` observations are arrays and rewards floats. With ``output="torch"`` they are tensors that
+    carry the graph from actions, parameters and the initial state; ``detach()`` cuts it. Actions are a float32 box of
+    [−1, 1], scaled by ``max_command``; values beyond are clipped and have no gradient; ``None`` as an action leaves
+    all vehicles to their drivers.
+
+    ``reset(seed=s)`` begins the first episode of seed s, ``reset()`` the next one. ``reset(options={"state":
+    state})`` starts from a given ``State`` of shape ``(1, vehicles)``, with its graph.
+
+    Raises:
+        ValueError: In one line, with value, rule and cure.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  (Gymnasium declares it so)
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+    }
+
+    def __init__(self, render_mode: str | None = None, **keywords: Any) -> None:
+        made = settings(render_mode=render_mode, **keywords)
+        self.settings = made
+        self.render_mode = made.render_mode
+        self.batch = Batch(made, 1)
+        self.task = made.task
+        agents = len(self.task.agents)
+        self.metadata = {**type(self).metadata, "render_fps": round(1.0 / self.task.simulator.dt)}
+        self.observation_space = observation_box(self.task, made.dtype, agents)
+        self.action_space = action_box(agents)
+        self._shape = (agents,)
+        self._numpy = made.output == "numpy"
+        self._viewer: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; see the class for ``seed`` and ``options``."""
+        super().reset(seed=seed)
+        if seed is not None or self.batch.world is None:
+            # Without any seed the one that Gymnasium draws from the operating system is used.
+            self.batch.seed([0], [self.np_random_seed if seed is None else seed])
+        observation = self.batch.reset(state=(options or {}).get("state"))
+        if self.render_mode == "human":
+            self.render()
+        return self._out(observation), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Advance by Δt; return observation, reward, terminated, truncated and an empty info."""
+        if self.batch.world is None:
+            raise RuntimeError("step was called before reset. Call reset() first.")
+        tensor = None if action is None else action_tensor(action, self._shape, self.settings).unsqueeze(0)
+        with torch.no_grad() if self._numpy else contextlib.nullcontext():
+            outcome = self.batch.step(tensor)
+            reward = outcome.reward.mean() if len(self._shape) else outcome.reward
+        if self.render_mode == "human":
+            self.render()
+        terminated, truncated = single_ends(outcome)
+        return (
+            self._out(outcome.observation),
+            reward.item() if self._numpy else reward,
+            bool(terminated),
+            bool(truncated),
+            {},
+        )
+
+    def _out(self, observation: Tensor) -> Any:
+        flat = observation.reshape(-1)
+        return flat.detach().cpu().numpy() if self._numpy else flat
+
+    # -- gradients -----------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        """The state of the traffic, a batch of one."""
+        if self.batch.world is None:
+            raise RuntimeError("there is no state before reset. Call reset() first.")
+        return self.batch.world.state
+
+    @property
+    def params(self) -> Params:
+        """The parameters in force; assign tensors that require grad to differentiate with respect to them."""
+        return self.batch.params
+
+    @params.setter
+    def params(self, params: Params) -> None:
+        self.batch.set_params(params)
+
+    def detach(self) -> None:
+        """Cut the graph behind the present state, for truncated back-propagation."""
+        self.batch.detach()
+
+    # -- pictures ------------------------------------------------------------------------------------------------
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Return a picture (``rgb_array``), or show it (``human``)."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array' to make.")
+            return None
+        from idm_env.render import Viewer
+
+        if self._viewer is None:
+            self._viewer = Viewer(self.render_mode, self.metadata["render_fps"])
+        picture: np.ndarray | None = self._viewer.show(self.task, self.state)
+        return picture
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the window: everything else can be pickled."""
+        return {**self.__dict__, "_viewer": None}
+
+
+def single_ends(outcome: Outcome) -> tuple[Tensor, Tensor]:
+    """Return terminated (with the first agent) and truncated (with the last) of whole environments, shape ``(n,)``."""
+    terminated = outcome.terminated.any(-1)
+    return terminated, (outcome.truncated | outcome.terminated).all(-1) & outcome.truncated.any(-1)

@@ -1,0 +1,126 @@
+"""Keyword arguments of every face: what is the environment's own, what is the task's, and what a YAML file says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import torch
+from gymnasium.vector import AutoresetMode
+
+from idm_env.config import load_environment
+from idm_env.parameters import nearest
+from idm_env.tasks import Task, make_task
+
+OUTPUTS = ("numpy", "torch")
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+RENDER_MODES = ("rgb_array", "human")
+KEYWORDS = (
+    "task",
+    "config",
+    "output",
+    "device",
+    "dtype",
+    "autoreset_mode",
+    "render_mode",
+    "max_episode_steps",
+    "num_envs",
+)
+_MODES = {"NextStep": AutoresetMode.NEXT_STEP, "SameStep": AutoresetMode.SAME_STEP, "Disabled": AutoresetMode.DISABLED}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an environment is made of, checked.
+
+    ``output`` decides between numpy arrays and torch tensors, ``dtype`` and ``device`` are those of the simulation
+    and of the observations; ``autoreset_mode`` belongs to vectors; ``limit`` is the number of steps of an episode, or
+    None.
+    """
+
+    task: Task
+    output: Literal["numpy", "torch"]
+    device: torch.device
+    dtype: torch.dtype
+    autoreset_mode: AutoresetMode
+    render_mode: str | None
+    limit: int | None
+
+
+def settings(
+    *,
+    task: str | Task | None = None,
+    config: str | None = None,
+    output: str | None = None,
+    device: str | None = None,
+    dtype: str | None = None,
+    autoreset_mode: str | AutoresetMode | None = None,
+    render_mode: str | None = None,
+    max_episode_steps: int | None = None,
+    **choices: Any,
+) -> Settings:
+    """Return checked settings; ValueError in one line, with a suggestion, for a misspelled keyword or value.
+
+    ``config`` is a YAML file that says ``configures: environment`` and gives any of these keywords; a keyword that is
+    given here as well wins. ``max_episode_steps`` of None or −1 leaves the limit to the task.
+    """
+    own = {
+        "task": task,
+        "output": output,
+        "device": device,
+        "dtype": dtype,
+        "autoreset_mode": autoreset_mode,
+        "render_mode": render_mode,
+        "max_episode_steps": max_episode_steps,
+    }
+    if config is not None:
+        read = load_environment(config)
+        own = {key: read.pop(key, None) if value is None else value for key, value in own.items()}
+        choices = {**read, **choices}
+    chosen = own["task"] or "ring"
+    if isinstance(chosen, Task) and choices:
+        raise ValueError(
+            f"keyword '{next(iter(choices))}' was given beside a task that is already made. Give it to the task."
+        )
+    return Settings(
+        task=chosen if isinstance(chosen, Task) else make_task(cast(str, chosen), others=KEYWORDS, **choices),
+        output=cast(Any, _one_of("output", own["output"] or "numpy", OUTPUTS)),
+        device=_device(own["device"] or "cpu"),
+        dtype=DTYPES[_one_of("dtype", own["dtype"] or "float32", DTYPES)],
+        autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.NEXT_STEP),
+        render_mode=None if own["render_mode"] is None else _one_of("render_mode", own["render_mode"], RENDER_MODES),
+        limit=_limit(own["max_episode_steps"]),
+    )
+
+
+def _one_of(name: str, value: Any, known: Any) -> str:
+    if value not in known:
+        raise ValueError(f"{name} = {value!r} is unknown.{nearest(str(value), known)}")
+    return str(value)
+
+
+def _mode(value: Any) -> AutoresetMode:
+    if isinstance(value, AutoresetMode):
+        return value
+    spelled = {**_MODES, **{mode.value: mode for mode in AutoresetMode}, **{mode.name: mode for mode in AutoresetMode}}
+    if value not in spelled:
+        raise ValueError(f"autoreset_mode = {value!r} is unknown.{nearest(str(value), _MODES)}")
+    return spelled[value]
+
+
+def _device(value: Any) -> torch.device:
+    try:
+        device = torch.device(value)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, TypeError):
+        known = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+        raise ValueError(f"device = {value!r} is unknown or not there. Available: {', '.join(known)}.") from None
+    return device
+
+
+def _limit(value: Any) -> int | None:
+    if value is None or value == -1:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"max_episode_steps = {value!r} must be a whole number of at least 1, or -1 for no limit.")
+    return value

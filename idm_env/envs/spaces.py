@@ -1,0 +1,53 @@
+"""Spaces of a task, and actions on their way in: checked, and converted to the tensors of the simulation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor
+
+from idm_env.envs.settings import Settings
+from idm_env.tasks import Task
+
+
+def numpy_dtype(dtype: torch.dtype) -> type[np.floating]:
+    """Return numpy's name of a float dtype."""
+    return np.float64 if dtype == torch.float64 else np.float32
+
+
+def observation_box(task: Task, dtype: torch.dtype, agents: int) -> Box:
+    """Return the space of what ``agents`` agents observe, one after the other."""
+    kind = numpy_dtype(dtype)
+    low, high = np.asarray(task.bounds.low, kind), np.asarray(task.bounds.high, kind)
+    return Box(np.tile(low, agents), np.tile(high, agents), dtype=kind)
+
+
+def action_box(agents: int) -> Box:
+    """Return the space of the actions of ``agents`` agents: float32, exactly [−1, 1]."""
+    return Box(-1.0, 1.0, (agents,), np.float32)
+
+
+def action_tensor(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor:
+    """Return an action as a tensor of the simulation, with its graph.
+
+    ValueError for a wrong shape, or values that are not finite; float32 and float64, numpy and torch are all accepted.
+    """
+    if isinstance(action, Tensor):
+        tensor = action
+    else:
+        array = np.asarray(action)
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"an action of type {array.dtype} is not a number. Give floats in [-1, 1].")
+        tensor = torch.from_numpy(array) if array.flags.writeable and array.flags.c_contiguous else torch.tensor(array)
+    if tensor.shape != shape:
+        raise ValueError(
+            f"action has shape {tuple(tensor.shape)}, and {shape} is needed: one number per controlled vehicle."
+        )
+    tensor = tensor.to(device=made.device, dtype=made.dtype)
+    # The sum is finite only if every part is, and is one number; only a doubtful sum is looked at more closely.
+    if not np.isfinite(tensor.detach().sum().item()) and not bool(torch.isfinite(tensor.detach()).all()):
+        raise ValueError("action holds NaN or infinite values. Give finite numbers; those outside [-1, 1] are clipped.")
+    return tensor

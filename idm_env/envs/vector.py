@@ -1,0 +1,222 @@
+"""``gym.make_vec("DiffIDM-v0", num_envs=4096)``: a native batch, with all three modes of automatic reset."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from idm_env.envs.batch import Batch
+from idm_env.envs.gym import single_ends
+from idm_env.envs.settings import RENDER_MODES, settings
+from idm_env.envs.spaces import action_box, action_tensor, observation_box
+from idm_env.tasks.checks import whole
+from idm_env.types import Params, State
+
+LIMIT = 3000
+"""Steps of an episode where nothing else is said, as for the registered id."""
+
+
+class DiffIDMVectorEnv(VectorEnv):
+    """``num_envs`` environments in one batch; keywords as for ``DiffIDMEnv``.
+
+    Environment i equals a single environment seeded with ``seed + i``. ``autoreset_mode`` is ``"NextStep"`` (the step
+    after an end resets, with reward 0), ``"SameStep"`` (the returned observation is the new episode's, the last one
+    is in ``info["final_obs"]``) or ``"Disabled"`` (the caller resets with ``options={"reset_mask": mask}``).
+
+    With ``output="torch"`` observations and rewards carry their graph; the observation of a fresh episode has none, and
+    ``info["final_obs"]`` is a dense tensor with the graph of the ended episodes (rows of ``_final_obs`` hold; the
+    others are 0).
+
+    Raises:
+        ValueError: In one line, with value, rule and cure.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  (Gymnasium declares it so)
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 10,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self, num_envs: int = 1, render_mode: str | None = None, max_episode_steps: int | None = LIMIT, **keywords: Any
+    ) -> None:
+        made = settings(render_mode=render_mode, max_episode_steps=max_episode_steps, **keywords)
+        self.settings = made
+        self.task = made.task
+        self.num_envs = whole("num_envs", num_envs, 1)
+        self.render_mode = made.render_mode
+        self.metadata = {
+            **type(self).metadata,
+            "render_fps": round(1.0 / self.task.simulator.dt),
+            "autoreset_mode": made.autoreset_mode,
+        }
+        agents = len(self.task.agents)
+        self.single_observation_space = observation_box(self.task, made.dtype, agents)
+        self.single_action_space = action_box(agents)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.batch = Batch(made, num_envs)
+        self._shape = (num_envs, agents)
+        self._numpy = made.output == "numpy"
+        self._ended = np.zeros(num_envs, dtype=bool)
+        self._viewers: list[Any] = []
+
+    # -- reset and step ------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes: in all environments, or in those of ``options["reset_mask"]``.
+
+        A number seeds environment i with ``seed + i``; a sequence gives every one its own. ``options["state"]`` is a
+        ``State`` to start from, one row per environment that is reset.
+        """
+        rows = self._masked((options or {}).get("reset_mask"))
+        self._seed(seed, rows)
+        observation = self.batch.reset(rows, (options or {}).get("state"))
+        self._ended[rows] = False
+        if self.render_mode == "human":
+            self.render()
+        return self._out(observation), {}
+
+    def _masked(self, mask: Any) -> np.ndarray:
+        if mask is None:
+            return np.arange(self.num_envs)
+        mask = mask.cpu().numpy() if isinstance(mask, Tensor) else mask
+        if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(
+                f"options['reset_mask'] = {mask!r} must be a bool array of shape ({self.num_envs},) with at "
+                f"least one True."
+            )
+        if self.batch.world is None and not mask.all():
+            raise ValueError(
+                "options['reset_mask'] leaves environments out before the first reset. Reset all of them once."
+            )
+        return np.flatnonzero(mask)
+
+    def _seed(self, seed: int | Sequence[int | None] | None, rows: np.ndarray) -> None:
+        if seed is None:
+            if self.batch.world is None:
+                self.batch.seed(np.arange(self.num_envs), self._entropy())
+            return
+        if isinstance(seed, (int, np.integer)):
+            super().reset(seed=int(seed))
+            seeds: Sequence[int | None] = [int(seed) + i for i in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise ValueError(
+                    f"seed has {len(seeds)} values for {self.num_envs} environments: give one number or one each."
+                )
+            if self.batch.world is None and None in seeds:
+                self.batch.seed(np.arange(self.num_envs), self._entropy())
+        given = [row for row in rows if seeds[row] is not None]
+        self.batch.seed(given, [int(seeds[row] or 0) for row in given])
+
+    def _entropy(self) -> list[int]:
+        """Return the seeds that follow the one that Gymnasium draws from the operating system."""
+        first = int(self.np_random_seed or 0)
+        return [first + i for i in range(self.num_envs)]
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Advance all environments by Δt; ``None`` as actions leaves all vehicles to their drivers."""
+        if self.batch.world is None:
+            raise RuntimeError("step was called before reset. Call reset() first.")
+        mode = self.settings.autoreset_mode
+        over = np.flatnonzero(self._ended)
+        if len(over) and mode is AutoresetMode.DISABLED:
+            raise RuntimeError(
+                f"environments {over[:5].tolist()} have ended. Reset them with options={{'reset_mask': mask}}."
+            )
+        tensor = None if actions is None else action_tensor(actions, self._shape, self.settings)
+        with torch.no_grad() if self._numpy else contextlib.nullcontext():
+            outcome = self.batch.step(tensor)
+            observation, reward = outcome.observation, outcome.reward.mean(-1)
+            terminated, truncated = single_ends(outcome)
+            if len(over):
+                observation = self.batch.reset(over)
+                begun = torch.as_tensor(self._ended, device=reward.device)
+                reward = torch.where(begun, 0.0, reward)
+                terminated, truncated = terminated & ~begun, truncated & ~begun
+            self._ended = (terminated | truncated).cpu().numpy()
+            info: dict[str, Any] = {}
+            if mode is AutoresetMode.SAME_STEP and self._ended.any():
+                info = self._final(observation)
+                observation = self.batch.reset(np.flatnonzero(self._ended))
+                self._ended = np.zeros(self.num_envs, dtype=bool)
+        if self.render_mode == "human":
+            self.render()
+        if not self._numpy:
+            return self._out(observation), reward, terminated, truncated, info
+        ends = terminated.cpu().numpy(), truncated.cpu().numpy()
+        return self._out(observation), reward.cpu().numpy().astype(np.float64), *ends, info
+
+    def _final(self, observation: Tensor) -> dict[str, Any]:
+        """Return the last observations of the episodes that ended, as Gymnasium lays them out, or dense for torch."""
+        ended, flat = self._ended.copy(), self._out(observation)
+        if not self._numpy:
+            mask = torch.as_tensor(ended, device=flat.device)
+            return {"final_obs": torch.where(mask.unsqueeze(-1), flat, 0.0), "_final_obs": mask}
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(ended):
+            final[i] = flat[i]
+        return {"final_obs": final, "_final_obs": ended, "final_info": {}, "_final_info": ended.copy()}
+
+    def _out(self, observation: Tensor) -> Any:
+        flat = observation.reshape(self.num_envs, -1)
+        return flat.detach().cpu().numpy() if self._numpy else flat
+
+    # -- gradients -----------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        """The state of the traffic, one row per environment."""
+        if self.batch.world is None:
+            raise RuntimeError("there is no state before reset. Call reset() first.")
+        return self.batch.world.state
+
+    @property
+    def params(self) -> Params:
+        """The parameters in force; assign tensors that require grad to differentiate with respect to them."""
+        return self.batch.params
+
+    @params.setter
+    def params(self, params: Params) -> None:
+        self.batch.set_params(params)
+
+    def detach(self) -> None:
+        """Cut the graph behind the present states, for truncated back-propagation."""
+        self.batch.detach()
+
+    # -- pictures ------------------------------------------------------------------------------------------------
+
+    def render(self) -> Any:
+        """Return a picture of every environment (``rgb_array``), or show the first one (``human``)."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array' to make_vec.")
+            return None
+        from idm_env.render import Viewer
+
+        shown = self.num_envs if self.render_mode == "rgb_array" else 1
+        while len(self._viewers) < shown:
+            self._viewers.append(Viewer(self.render_mode, self.metadata["render_fps"]))
+        pictures = [viewer.show(self.task, self.state, row) for row, viewer in enumerate(self._viewers[:shown])]
+        return tuple(pictures) if self.render_mode == "rgb_array" else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the windows, if there are any."""
+        for viewer in self._viewers:
+            viewer.close()
+        self._viewers = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the windows: everything else can be pickled."""
+        return {**self.__dict__, "_viewers": []}

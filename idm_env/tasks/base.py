@@ -1,0 +1,250 @@
+"""What a task is: pure functions reset, step, observe, reward and ended over frozen static choices, batched.
+
+A task knows nothing of Gymnasium, of automatic resets or of where gradients are cut; agents that differentiate
+through a rollout call it directly. Everything random comes in: as keys (``Draw``) at reset and as normals at every
+step.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from idm_env.effects import Control, Effect, Noise
+from idm_env.roads import Road
+from idm_env.simulator import Simulator
+from idm_env.tasks.behaviour import Behaviour, behaviour
+from idm_env.tasks.checks import agents_of, at_least, finite, whole
+from idm_env.tasks.random import Draw
+from idm_env.types import Command, Inputs, Params, State
+
+Advance = Callable[[State, Inputs, Params], State]
+"""One step of a simulator: ``Simulator.step``, or a fused kernel that gives the same."""
+
+_NORMALS_AT_ONCE = 1 << 16
+
+
+class World(NamedTuple):
+    """Everything that a step carries over: the state of the traffic, and what is constant in an episode.
+
+    Every tensor has the environments as its first dimension.
+    """
+
+    state: State
+    episode: Mapping[str, Tensor]
+
+
+class Ended(NamedTuple):
+    """Which agents have come to an end of their own, and which are cut off; bool, shape ``(…, agents)``."""
+
+    terminated: Tensor
+    truncated: Tensor
+
+
+class Bounds(NamedTuple):
+    """Names of what one agent observes, with the lowest and the highest value of each."""
+
+    names: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Task(abc.ABC):
+    """Static choices that every task has; all are plain values that JSON can hold.
+
+    Args:
+        vehicles: Number of vehicles, recorded ones included.
+        controlled: How many vehicles agents control, spread evenly, or which ones (indices, front first).
+        vehicle_length: Length of every vehicle (m).
+        dt: Time step (s); None is the one of ``effects`` if that is a model file, else 0.1.
+        integration: ``"ballistic"`` or ``"euler"``; None as for ``dt``.
+        effects: Effects to add to the task's own or to replace those of the same name: names or
+            ``{"effect": name, choice: value}``; or the path of a ``model.yaml``, whose effects then are all of the
+            drivers'.
+        parameters: What differs from the task's parameters: ``{"idm": {"time_gap": 1.2}}`` or ``{"idm.time_gap":
+            1.2}``; a number, one number per vehicle, or a tensor (which may require grad).
+        noise: Standard deviation of the drivers' noise N, added as ``accel += √Δt N(0, noise²)`` (m/s² per √s); 0 is
+            none.
+        warmup: Steps before an episode begins, in which nobody is controlled.
+        warmup_pool: If above 0, episodes begin in one of that many warmed-up worlds, which are made once.
+        max_command: Acceleration that an action of 1 commands (m/s²).
+
+    Raises:
+        ValueError: In one line, with value, rule and cure.
+    """
+
+    vehicles: int = 22
+    controlled: int | Sequence[int] = 1
+    vehicle_length: float = 5.0
+    dt: float | None = None
+    integration: str | None = None
+    effects: str | Sequence[str | Mapping[str, Any] | Effect] = ()
+    parameters: Mapping[str, Any] | None = None
+    noise: float = 0.0
+    warmup: int = 0
+    warmup_pool: int = 0
+    max_command: float = 1.0
+
+    name: ClassVar[str]
+    road: ClassVar[Road]
+    own_effects: ClassVar[tuple[Effect, ...]]
+    own_parameters: ClassVar[Mapping[str, Mapping[str, float]]]
+    first_free: ClassVar[int] = 0
+    """Vehicles before this one cannot be controlled: they are recorded."""
+
+    def __post_init__(self) -> None:
+        whole("vehicles", self.vehicles, self.first_free + 1)
+        agents_of(self.controlled, self.vehicles, self.first_free)
+        at_least("vehicle_length", self.vehicle_length, 0.1, "m")
+        at_least("noise", self.noise, 0.0, "m/s²")
+        whole("warmup", self.warmup, 0)
+        whole("warmup_pool", self.warmup_pool, 0)
+        if self.warmup_pool and not self.warmup:
+            raise ValueError(f"warmup_pool = {self.warmup_pool} has no use without warm-up. Give warmup=750 as well.")
+        at_least("max_command", self.max_command, 1e-3, "m/s²")
+        self.params(torch.float64, "cpu")
+
+    # -- static facts --------------------------------------------------------------------------------------------
+
+    @cached_property
+    def agents(self) -> tuple[int, ...]:
+        """Indices of the controlled vehicles, front first."""
+        return agents_of(self.controlled, self.vehicles, self.first_free)
+
+    @property
+    def horizon(self) -> int | None:
+        """Steps after which the task itself cuts an episode; None leaves that to ``max_episode_steps``."""
+        return None
+
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> Bounds:
+        """What one agent observes; observations are clipped to it, and what is clipped has no gradient."""
+
+    @cached_property
+    def _behaviour(self) -> Behaviour:
+        extra: tuple[Effect, ...] = (Control(),)
+        own = {effect: dict(values) for effect, values in self.own_parameters.items()}
+        if self.noise:
+            extra += (Noise(),)
+        made = behaviour(self.own_effects, extra, own, self.effects, self.parameters, self.dt, self.integration)
+        if self.noise:
+            made.parameters.setdefault("noise", {}).setdefault("sigma", self.noise * math.sqrt(made.dt))
+        return made
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """The simulator of this task."""
+        made = self._behaviour
+        return Simulator(self.road, made.effects, made.dt, made.integration)
+
+    @cached_property
+    def noisy(self) -> bool:
+        """Whether the drivers' noise is drawn."""
+        return "noise" in self.simulator.by_name
+
+    @cached_property
+    def _tensors(self) -> dict[tuple[str, torch.device, torch.dtype], Tensor]:
+        return {}
+
+    def constant(self, name: str, values: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
+        """Return a static tensor, made once per device and dtype; ``values`` may be a function that gives them."""
+        key = (name, device, dtype)
+        if key not in self._tensors:
+            made = values() if callable(values) else values
+            self._tensors[key] = torch.as_tensor(made, device=device).to(dtype)
+        return self._tensors[key]
+
+    def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
+        """Return the parameters as tensors (a number: scalar; a list: one per vehicle; a tensor: as it is)."""
+        return self._behaviour.params(self.vehicles, dtype, device)
+
+    def pick(self, x: Tensor) -> Tensor:
+        """Return what belongs to the controlled vehicles, shape ``(…, agents)``."""
+        if len(self.agents) == 1:
+            return x[..., self.agents[0] : self.agents[0] + 1]
+        return x.index_select(-1, self.constant("agents", self.agents, x.device, torch.int64))
+
+    # -- pure functions ------------------------------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def begin(self, draw: Draw, params: Params) -> World:
+        """Return the worlds before the warm-up, with ``state.step = −warmup``."""
+
+    def reset(self, draw: Draw, params: Params, advance: Advance | None = None) -> World:
+        """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control."""
+        world = self.begin(draw, params)
+        for normals in self.warmup_normals(draw, world.state):
+            state = (advance or self.simulator.step)(world.state, self.inputs(world, None, normals), params)
+            world = world._replace(state=state)
+        return world
+
+    def warmup_normals(self, draw: Draw, state: State) -> Iterator[Tensor | None]:
+        """Yield the normals of every step of the warm-up, drawn in blocks; None where there is no noise."""
+        rows, width = state.speed.shape
+        block = max(1, _NORMALS_AT_ONCE // max(rows * width, 1))
+        for begin in range(0, self.warmup, block):
+            steps = min(block, self.warmup - begin)
+            if self.noisy:
+                yield from draw.normals(state.step + begin, steps, width, state.speed.dtype)
+            else:
+                yield from [None] * steps
+
+    def command(self, action: Tensor) -> Tensor:
+        """Return the commanded accelerations (m/s²) of actions, which are clipped to [−1, 1] (no gradient beyond)."""
+        return action.clamp(-1.0, 1.0) * self.max_command
+
+    def inputs(self, world: World, command: Tensor | None, normals: Tensor | None) -> Inputs:
+        """Return the inputs of one step: the command (m/s², None for nobody), and the normals of the noise."""
+        speed = world.state.speed
+        if command is None:
+            idle = self.constant("idle", [False] * self.vehicles, speed.device, torch.bool)
+            inputs: dict[str, Any] = {"control": Command(speed.new_zeros(()), idle)}
+        else:
+            mine = [i in self.agents for i in range(self.vehicles)]
+            active = self.constant("active", mine, speed.device, torch.bool)
+            if len(self.agents) > 1:
+                slots = [self.agents.index(i) if i in self.agents else 0 for i in range(self.vehicles)]
+                command = command.index_select(-1, self.constant("slots", slots, speed.device, torch.int64))
+            inputs = {"control": Command(command, active)}
+        if normals is not None:
+            inputs["noise"] = normals
+        return inputs
+
+    def step(
+        self, world: World, command: Tensor, normals: Tensor | None, params: Params, advance: Advance | None = None
+    ) -> World:
+        """Return the world Δt later. ``command`` (m/s²) has shape ``(…, agents)``, ``normals`` ``(…, vehicles)``."""
+        state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals), params)
+        return world._replace(state=state)
+
+    @abc.abstractmethod
+    def observe(self, world: World) -> Tensor:
+        """Return what the agents observe, shape ``(…, agents, features)``, within ``bounds``."""
+
+    @abc.abstractmethod
+    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return the rewards of a step, shape ``(…, agents)``; ``command`` in m/s²."""
+
+    def ended(self, world: World) -> Ended:
+        """Return whether it is over: terminated for all agents where any two vehicles have touched (a gap ≤ 0)."""
+        crashed = (world.state.gap <= 0.0).any(-1, keepdim=True).expand(-1, len(self.agents))
+        return Ended(crashed, torch.zeros_like(crashed))
+
+    def clip(self, features: list[Tensor]) -> Tensor:
+        """Stack features of shape ``(…, agents)`` and clip them to ``bounds``."""
+        seen = torch.stack(features, dim=-1)
+        low = self.constant("low", self.bounds.low, seen.device, seen.dtype)
+        high = self.constant("high", self.bounds.high, seen.device, seen.dtype)
+        return torch.maximum(torch.minimum(seen, high), low)
+
+
+__all__ = ["Advance", "Bounds", "Draw", "Ended", "Task", "World", "finite"]

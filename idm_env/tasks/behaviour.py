@@ -1,0 +1,85 @@
+"""How drivers behave in a task: its own effects and parameters, changed by keyword or replaced by a saved model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from idm_env import parameters
+from idm_env.config import load_model, make_effects, nested, number
+from idm_env.effects import CarFollowing, Effect
+from idm_env.simulator import Integration
+from idm_env.types import Params
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """Effects, the values that differ from their defaults, and how they are integrated."""
+
+    effects: tuple[Effect, ...]
+    parameters: dict[str, dict[str, Any]]
+    dt: float
+    integration: Integration
+
+    def params(self, vehicles: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
+        """Return checked tensors; a list must have one value per vehicle."""
+        values = parameters.defaults(self.effects, dtype=dtype, device=device)
+        for effect, part in self.parameters.items():
+            for name, value in part.items():
+                values.setdefault(effect, {})[name] = _tensor(f"{effect}.{name}", value, vehicles, dtype, device)
+        parameters.check(self.effects, cast(Params, values))
+        return values
+
+
+def _tensor(name: str, value: Any, vehicles: int, dtype: torch.dtype, device: torch.device | str) -> Tensor:
+    if isinstance(value, Tensor):
+        return value.to(device=device, dtype=dtype)
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        if len(value) != vehicles:
+            raise ValueError(
+                f"{name} has {len(value)} values for {vehicles} vehicles: give one number or one per vehicle."
+            )
+        return torch.tensor([number(name, x) for x in value], dtype=dtype, device=device)
+    return torch.tensor(number(name, value), dtype=dtype, device=device)
+
+
+def behaviour(
+    own: tuple[Effect, ...],
+    required: tuple[Effect, ...],
+    own_parameters: dict[str, dict[str, Any]],
+    effects: str | Sequence[str | Mapping[str, Any] | Effect],
+    changes: Mapping[str, Any] | None,
+    dt: float | None,
+    integration: str | None,
+) -> Behaviour:
+    """Return the behaviour of a task with keyword changes.
+
+    ``required`` effects are the task's machinery (control, replay, noise). ``effects`` is a list to add to ``own``,
+    or the path of a model file, which replaces ``own`` and its parameters and gives dt and integration unless they
+    are given.
+    """
+    values = own_parameters
+    if isinstance(effects, (str, Path)):
+        model = load_model(effects)
+        chosen, values = list(model.effects), {e: dict(v) for e, v in model.parameters.items()}
+        dt = model.dt if dt is None else dt
+        integration = integration or model.integration
+    else:
+        chosen = list(own)
+        for effect in make_effects(effects):
+            following = isinstance(effect, CarFollowing)
+            chosen = [e for e in chosen if e.name != effect.name and not (following and isinstance(e, CarFollowing))]
+            chosen.append(effect)
+    names = {e.name for e in chosen}
+    chosen += [e for e in required if e.name not in names]
+    known = {e.name for e in chosen}
+    values = {effect: dict(part) for effect, part in values.items() if effect in known}
+    for key, change in nested(changes or {}).items():
+        values.setdefault(key, {}).update(change)
+    step = number("dt", 0.1 if dt is None else dt)
+    return Behaviour(tuple(chosen), values, step, cast(Integration, integration or "ballistic"))

@@ -1,0 +1,131 @@
+"""Task ``ring``: dissolve the stop-and-go wave on a ring road (Flow's wave attenuation)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env import metrics
+from idm_env.effects import IDM, Brakes, Effect
+from idm_env.parameters import nearest
+from idm_env.roads import Ring, Road
+from idm_env.tasks.base import Bounds, Task, World
+from idm_env.tasks.checks import at_least, span
+from idm_env.tasks.random import Draw
+from idm_env.types import Params
+
+STARTS = ("uniform", "wave")
+_LENGTH_STREAM = 1
+_TIME_GAP = 0.8
+"""Below this time gap a vehicle tailgates (s)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RingTask(Task):
+    """21 human drivers and one controlled vehicle (or k of N) on a ring, after Sugiyama et al. 2008, New J. Phys. 10.
+
+    The benchmark is WaveAttenuationPOEnv of Flow (Wu, Kreidieh, Parvate, Vinitsky, Bayen 2017, arXiv 1710.05465),
+    with its figures: length from 220–270 m, Δt 0.1 s, warm-up 750 steps, horizon 3000, IDM v0 = 30, T = 1, a = 1, b =
+    1.5, δ = 4, s0 = 2, noise 0.2, command ±1 m/s². In the warm-up everybody is a human driver.
+
+    Observation, per agent: ``v/15, (v_lead − v)/15, headway/270``, headway from front bumper to front bumper.
+    Reward, the same for all agents: ``4 mean(v)/20 − 4 mean|u|``, v of all vehicles after the step, u the commands
+    (m/s²); less ``tailgating · max(0, 1 − time gap / 0.8 s)``, each agent's own, and ``fuel · mean fuel rate (mL/s)``.
+    Terminated where vehicles touch.
+
+    Args:
+        length: Circumference (m), or ``[lowest, highest]`` to be drawn for every episode.
+        start: ``"uniform"``: equal gaps, standing. ``"wave"``: gaps and speeds in a wave, for a developed one with less
+            warm-up.
+        tailgating: Weight of the tailgating term; 0 leaves it out.
+        fuel: Weight of the fuel term (s/mL); 0 leaves it out.
+    """
+
+    name: ClassVar[str] = "ring"
+    road: ClassVar[Road] = Ring()
+    own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Brakes())
+    own_parameters: ClassVar = {
+        "idm": {"max_accel": 1.0, "comfort_decel": 1.5, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 30.0}
+    }
+
+    length: float | Sequence[float] = (220.0, 270.0)
+    noise: float = 0.2
+    warmup: int = 750
+    start: str = "uniform"
+    tailgating: float = 0.0
+    fuel: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shortest, _ = span("length", self.length, 1.0, "m")
+        if self.vehicles * (self.vehicle_length + 0.5) > shortest:
+            raise ValueError(
+                f"{self.vehicles} vehicles of {self.vehicle_length:g} m and half a metre each do not fit a ring of "
+                f"{shortest:g} m. Take fewer vehicles or a longer ring."
+            )
+        if self.start not in STARTS:
+            raise ValueError(f"start = {self.start!r} is unknown.{nearest(str(self.start), STARTS)}")
+        at_least("tailgating", self.tailgating, 0.0)
+        at_least("fuel", self.fuel, 0.0)
+
+    @property
+    def bounds(self) -> Bounds:
+        """Speeds up to 100 m/s, headways from an overlap to the longest ring."""
+        longest = span("length", self.length, 1.0, "m")[1] / 270.0
+        return Bounds(("speed", "relative_speed", "headway"), (0.0, -7.0, -0.1), (7.0, 7.0, longest + 0.1))
+
+    def begin(self, draw: Draw, params: Params) -> World:
+        """Return rings of drawn lengths: standing at equal gaps, or in a wave."""
+        like = params["idm"]["max_accel"] if "idm" in params else next(iter(next(iter(params.values())).values()))
+        low, high = span("length", self.length, 1.0, "m")
+        length = low + (high - low) * draw.uniforms(_LENGTH_STREAM, 1, like.dtype)
+        place = torch.arange(self.vehicles, dtype=like.dtype, device=length.device) / self.vehicles
+        free = length / self.vehicles - self.vehicle_length
+        shift, speed = torch.zeros_like(length), torch.zeros_like(length)
+        if self.start == "wave":
+            # Gaps free · (1 + A cos 2πi/N): their sum is the ring's, and positions are its running sum.
+            amplitude = 0.75
+            ripple = torch.cos(2.0 * math.pi * place)
+            shift = amplitude * free * (ripple.cumsum(-1) - ripple)
+            speed = (free * (1.0 + amplitude * ripple.roll(1, -1)) - 2.0).clamp_min(0.0)
+        position = -place * length - shift
+        state = self.simulator.state(
+            position,
+            speed.expand_as(position).contiguous(),
+            params,
+            length=self.vehicle_length,
+            circumference=length.squeeze(-1),
+            step=torch.full((len(length),), -self.warmup, device=length.device),
+        )
+        return World(state, {})
+
+    def observe(self, world: World) -> Tensor:
+        """Return ``v/15, (v_lead − v)/15, headway/270`` of every agent."""
+        state = world.state
+        speed = self.pick(state.speed)
+        lead_speed = self._pick_lead(state.speed)
+        headway = self.pick(state.gap) + self._pick_lead(state.length)
+        return self.clip([speed / 15.0, (lead_speed - speed) / 15.0, headway / 270.0])
+
+    def _pick_lead(self, x: Tensor) -> Tensor:
+        leaders = [(i - 1) % self.vehicles for i in self.agents]
+        if len(leaders) == 1:
+            return x[..., leaders[0] : leaders[0] + 1]
+        return x.index_select(-1, self.constant("leaders", leaders, x.device, torch.int64))
+
+    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return ``4 mean(v)/20 − 4 mean|u|``, less the terms that have a weight."""
+        state = after.state
+        reward = 0.2 * state.speed.mean(-1, keepdim=True) - 4.0 * command.abs().mean(-1, keepdim=True)
+        if self.fuel:
+            reward = reward - self.fuel * metrics.fuel(state.speed, state.accel).mean(-1, keepdim=True)
+        reward = reward.expand(-1, len(self.agents))
+        if self.tailgating:
+            time_gap = metrics.time_gap(self.pick(state.gap), self.pick(state.speed))
+            reward = reward - self.tailgating * torch.relu(1.0 - time_gap / _TIME_GAP)
+        return reward
