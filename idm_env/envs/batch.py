@@ -123,18 +123,20 @@ class Batch:
         self._used += 1
         return self._block[self._used - 1]
 
-    def step(self, action: Tensor | None) -> Outcome:
-        """Advance every row; ``action`` has shape ``(n, agents)``, None leaves everybody to the drivers."""
+    def step(self, action: Tensor | None, live: Tensor | None = None) -> Outcome:
+        """Advance every row; ``action`` has shape ``(n, agents)``, None leaves everybody to the drivers.
+
+        ``live`` (bool, ``(n, agents)``) leaves only single agents' vehicles to their drivers, and drops their commands.
+        """
         before, task = self.world, self.task
         assert before is not None
         normals = self._normals(before.state)
-        if action is None:
-            state = self.advance(before.state, task.inputs(before, None, normals), self.params)
-            after = before._replace(state=state)
-            command = state.speed.new_zeros(self.count, len(task.agents))
-        else:
-            command = task.command(action)
-            after = task.step(before, command, normals, self.params, self.advance)
+        command = None if action is None else task.command(action)
+        after = task.step(before, command, normals, self.params, live=live, advance=self.advance)
+        if command is None:
+            command = after.state.speed.new_zeros(self.count, len(task.agents))
+        elif live is not None:
+            command = torch.where(live, command, 0.0)
         self.world = after
         terminated, truncated = task.ended(after)
         if self.limit is not None:

@@ -183,8 +183,7 @@ class Task(abc.ABC):
         """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control."""
         world = self.begin(draw, params)
         for normals in self.warmup_normals(draw, world.state):
-            state = (advance or self.simulator.step)(world.state, self.inputs(world, None, normals), params)
-            world = world._replace(state=state)
+            world = self.step(world, None, normals, params, advance=advance)
         return world
 
     def warmup_normals(self, draw: Draw, state: State) -> Iterator[Tensor | None]:
@@ -202,8 +201,13 @@ class Task(abc.ABC):
         """Return the commanded accelerations (m/s²) of actions, which are clipped to [−1, 1] (no gradient beyond)."""
         return action.clamp(-1.0, 1.0) * self.max_command
 
-    def inputs(self, world: World, command: Tensor | None, normals: Tensor | None) -> Inputs:
-        """Return the inputs of one step: the command (m/s², None for nobody), and the normals of the noise."""
+    def inputs(
+        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+    ) -> Inputs:
+        """Return the inputs of one step: the command (m/s², None for nobody), and the normals of the noise.
+
+        ``live`` (bool, ``(…, agents)``) says which agents still command; the others' vehicles go back to their drivers.
+        """
         speed = world.state.speed
         if command is None:
             idle = self.constant("idle", [False] * self.vehicles, speed.device, torch.bool)
@@ -213,17 +217,27 @@ class Task(abc.ABC):
             active = self.constant("active", mine, speed.device, torch.bool)
             if len(self.agents) > 1:
                 slots = [self.agents.index(i) if i in self.agents else 0 for i in range(self.vehicles)]
-                command = command.index_select(-1, self.constant("slots", slots, speed.device, torch.int64))
+                slot = self.constant("slots", slots, speed.device, torch.int64)
+                command = command.index_select(-1, slot)
+                live = None if live is None else live.index_select(-1, slot)
+            active = active if live is None else active & live
             inputs = {"control": Command(command, active)}
         if normals is not None:
             inputs["noise"] = normals
         return inputs
 
     def step(
-        self, world: World, command: Tensor, normals: Tensor | None, params: Params, advance: Advance | None = None
+        self,
+        world: World,
+        command: Tensor | None,
+        normals: Tensor | None,
+        params: Params,
+        *,
+        live: Tensor | None = None,
+        advance: Advance | None = None,
     ) -> World:
         """Return the world Δt later. ``command`` (m/s²) has shape ``(…, agents)``, ``normals`` ``(…, vehicles)``."""
-        state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals), params)
+        state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals, live), params)
         return world._replace(state=state)
 
     @abc.abstractmethod

@@ -1,1 +1,17 @@
-"""Wrappers around the environments."""
+"""Wrappers around the environments: statistics that keep gradients, and parameters to be fitted."""
+
+from __future__ import annotations
+
+from idm_env.wrappers.statistics import (
+    NormalizeObservation,
+    RecordEpisodeStatistics,
+    VectorNormalizeObservation,
+    VectorRecordEpisodeStatistics,
+)
+
+__all__ = [
+    "NormalizeObservation",
+    "RecordEpisodeStatistics",
+    "VectorNormalizeObservation",
+    "VectorRecordEpisodeStatistics",
+]

@@ -1,0 +1,167 @@
+"""PettingZoo: every controlled vehicle is an agent of its own, in any of the tasks.
+
+``parallel_env(**keywords)`` steps all agents at once; ``env(**keywords)`` and ``raw_env(**keywords)`` are the same
+turn by turn. Keywords are those of ``gym.make("DiffIDM-v0", …)``, with ``max_cycles`` for the number of steps.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.utils import seeding
+from pettingzoo import ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+
+from idm_env.envs.batch import Batch
+from idm_env.envs.settings import RENDER_MODES, settings
+from idm_env.envs.spaces import action_box, numpy_dtype, observation_box
+
+CYCLES = 3000
+_SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
+
+
+class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (PettingZoo's name)
+    """All agents step at once: agent ``vehicle_i`` commands vehicle i.
+
+    An agent that has terminated or been truncated leaves ``agents``, and its vehicle goes back to its driver.
+    ``state()`` is the whole traffic: speed/30 of every vehicle, then gap/100 (capped at 1000 m). Numpy only:
+    gradients are the business of the Gymnasium faces.
+
+    Raises:
+        ValueError: In one line, for keywords that do not exist, and for actions that are missing or not finite.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo declares it so)
+        "name": "diffidm_v0",
+        "render_modes": list(RENDER_MODES),
+        "is_parallelizable": True,
+        "render_fps": 10,
+    }
+
+    def __init__(self, *, max_cycles: int = CYCLES, render_mode: str | None = None, **keywords: Any) -> None:
+        made = settings(max_episode_steps=max_cycles, render_mode=render_mode, **keywords)
+        if made.output != "numpy":
+            raise ValueError("output = 'torch' has no meaning for PettingZoo. Use gym.make_vec for gradients.")
+        self.settings = made
+        self.task = made.task
+        self.max_cycles = max_cycles
+        self.render_mode = made.render_mode
+        self.batch = Batch(made, 1)
+        self.possible_agents = [f"vehicle_{i}" for i in self.task.agents]
+        self.agents: list[str] = []
+        self.observation_spaces = {a: observation_box(self.task, made.dtype, 1) for a in self.possible_agents}
+        self.action_spaces = {a: action_box(1) for a in self.possible_agents}
+        kind, n = numpy_dtype(made.dtype), self.task.vehicles
+        low = np.repeat(np.array([0.0, -1.0], kind), n)
+        high = np.repeat(np.array([10.0, _FARTHEST / _GAP_SCALE], kind), n)
+        self.state_space = Box(low, high, dtype=kind)
+        self._viewer: Any = None
+
+    def observation_space(self, agent: str) -> gymnasium.Space[Any]:
+        """Return the space of an agent's observations: the same object at every call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gymnasium.Space[Any]:
+        """Return the space of an agent's actions: the same object at every call."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise."""
+        if seed is not None or self.batch.world is None:
+            self.batch.seed([0], [seeding.np_random(seed)[1]])
+        self.batch.limit = min(x for x in (self.max_cycles, self.task.horizon) if x is not None)
+        self.agents = list(self.possible_agents)
+        seen = self.batch.reset()[0].cpu().numpy()
+        if self.render_mode == "human":
+            self.render()
+        return self._by_agent(seen), {agent: {} for agent in self.agents}
+
+    def step(
+        self, actions: dict[str, np.ndarray]
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Advance by Δt with one action for every agent that is still there."""
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        live = [agent in self.agents for agent in self.possible_agents]
+        commands = np.zeros((1, len(live)))
+        for i, agent in enumerate(self.possible_agents):
+            if live[i]:
+                commands[0, i] = self._action(agent, actions)
+        made = self.settings
+        with torch.no_grad():
+            everybody = all(live)
+            outcome = self.batch.step(
+                torch.as_tensor(commands, dtype=made.dtype, device=made.device),
+                None if everybody else torch.tensor([live], device=made.device),
+            )
+        seen = self._by_agent(outcome.observation[0].cpu().numpy())
+        rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:])
+        infos: dict[str, dict[str, Any]] = {agent: {} for agent in self.agents}
+        self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
+        if self.render_mode == "human":
+            self.render()
+        return seen, rewards, terminated, truncated, infos
+
+    def _action(self, agent: str, actions: dict[str, np.ndarray]) -> float:
+        if agent not in actions:
+            raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
+        action = np.asarray(actions[agent], dtype=float)
+        if action.shape != (1,) or not np.isfinite(action).all():
+            raise ValueError(
+                f"action of '{agent}' = {actions[agent]!r} must be one finite number, as an array of shape (1,)."
+            )
+        return float(action[0])
+
+    def _by_agent(self, values: Any) -> dict[str, Any]:
+        return {agent: values[i] for i, agent in enumerate(self.possible_agents) if agent in self.agents}
+
+    def state(self) -> np.ndarray:
+        """Return the whole traffic, within ``state_space``."""
+        if self.batch.world is None:
+            raise RuntimeError("there is no state before reset. Call reset() first.")
+        traffic = self.batch.world.state
+        gap = traffic.gap.clamp_max(_FARTHEST) / _GAP_SCALE
+        seen = torch.cat((traffic.speed / _SPEED_SCALE, gap), dim=-1)[0].cpu().numpy()
+        return np.clip(seen, self.state_space.low, self.state_space.high)
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture (``rgb_array``), or show it (``human``)."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array'.")
+            return None
+        from idm_env.render import Viewer
+
+        if self._viewer is None:
+            self._viewer = Viewer(self.render_mode, round(1.0 / self.task.simulator.dt))
+        if self.batch.world is None:
+            raise RuntimeError("there is nothing to see before reset. Call reset() first.")
+        picture: np.ndarray | None = self._viewer.show(self.task, self.batch.world.state)
+        return picture
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the window: everything else can be pickled."""
+        return {**self.__dict__, "_viewer": None}
+
+
+def raw_env(**keywords: Any) -> Any:
+    """Return the environment turn by turn (AEC)."""
+    return parallel_to_aec(parallel_env(**keywords))
+
+
+def env(**keywords: Any) -> Any:
+    """Return the environment turn by turn, with PettingZoo's check of the order of calls."""
+    turns = raw_env(**keywords)
+    return turns if isinstance(turns, OrderEnforcingWrapper) else OrderEnforcingWrapper(turns)

@@ -1,0 +1,79 @@
+"""PettingZoo's own tests on the face, and agents that come to their ends one by one."""
+
+import pickle
+
+import numpy as np
+import pytest
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test, seed_test
+from pettingzoo.test.state_test import state_test
+
+from idm_env.envs.pettingzoo import env, parallel_env, raw_env
+
+QUICK = {"controlled": 3, "warmup": 5}
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_parallel_api():
+    parallel_api_test(parallel_env(**QUICK, max_cycles=40), num_cycles=60)
+
+
+def test_api():
+    api_test(env(**QUICK, max_cycles=30), num_cycles=60)
+
+
+def test_seeds():
+    parallel_seed_test(lambda: parallel_env(**QUICK), num_cycles=20)
+    seed_test(lambda: env(**QUICK), num_cycles=20)
+
+
+def test_state():
+    state_test(env(**QUICK), parallel_env(**QUICK), num_cycles=5)
+
+
+def test_render():
+    render_test(lambda **keywords: env(**QUICK, **keywords))
+
+
+def test_spaces_are_the_same_object_and_metadata_is_whole():
+    made = parallel_env(**QUICK)
+    agent = made.possible_agents[0]
+    assert made.observation_space(agent) is made.observation_space(agent)
+    assert made.action_space(agent) is made.action_space(agent)
+    assert made.metadata["name"] == "diffidm_v0"
+    assert made.metadata["is_parallelizable"]
+    assert str(raw_env(**QUICK)) == "diffidm_v0"
+
+
+def test_it_agrees_with_the_single_environment():
+    import gymnasium as gym
+
+    single = gym.make("DiffIDM-v0", **QUICK)
+    many = parallel_env(**QUICK)
+    seen, _ = many.reset(seed=2)
+    np.testing.assert_array_equal(np.concatenate(list(seen.values())), single.reset(seed=2)[0])
+    for _ in range(5):
+        seen, rewards, *_ = many.step({a: np.array([0.3], np.float32) for a in many.agents})
+        observation, reward, *_ = single.step(np.full(3, 0.3, np.float32))
+        np.testing.assert_allclose(np.concatenate(list(seen.values())), observation, atol=1e-6)
+        assert np.mean(list(rewards.values())) == pytest.approx(reward)
+
+
+def test_pickles():
+    made = parallel_env(**QUICK)
+    made.reset(seed=0)
+    copy = pickle.loads(pickle.dumps(made))
+    actions = {a: np.zeros(1, np.float32) for a in made.agents}
+    np.testing.assert_array_equal(list(made.step(actions)[0].values()), list(copy.step(actions)[0].values()))
+
+
+@pytest.mark.parametrize("bad", [{}, {"vehicle_0": np.array([np.nan])}, {"vehicle_0": np.zeros(2)}])
+def test_bad_actions_are_errors(bad):
+    made = parallel_env(vehicles=5, length=80.0, warmup=1)
+    made.reset(seed=0)
+    with pytest.raises(ValueError, match="action"):
+        made.step(bad)
+
+
+def test_a_misspelled_keyword_has_a_suggestion():
+    with pytest.raises(ValueError, match="Did you mean 'vehicles'"):
+        parallel_env(vehicels=3)

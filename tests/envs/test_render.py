@@ -1,0 +1,106 @@
+"""Pictures: what is drawn where, headless windows, videos, and space-time diagrams."""
+
+import gymnasium as gym
+import numpy as np
+import polars as pl
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+import idm_env  # noqa: F401
+from idm_env.render import colour, space_time
+from idm_env.simulator import Trajectory
+
+QUICK = {"warmup": 5}
+BLUE = np.array([30, 90, 220])
+
+
+def test_check_env_with_rendering(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    check_env(gym.make("DiffIDM-v0", **QUICK).unwrapped)
+
+
+def blue(picture):
+    return int((np.abs(picture.astype(int) - BLUE).sum(-1) < 10).sum())
+
+
+def test_the_picture_shows_vehicles_speeds_and_controlled_ones():
+    def picture(**keywords):
+        env = gym.make("DiffIDM-v0", render_mode="rgb_array", **{**QUICK, **keywords})
+        env.reset(seed=0)
+        return env.render()
+
+    one, three = picture(), picture(controlled=3)
+    assert one.shape == (600, 600, 3)
+    assert one.dtype == np.uint8
+    assert blue(three) > 2 * blue(one) > 0
+    moving = picture(start="wave")
+    assert (moving != one).any()
+
+
+def test_colours_run_from_red_to_green():
+    slow, fast = colour(0.0, 10.0), colour(10.0, 10.0)
+    assert slow[0] > slow[1] + 100
+    assert fast[1] > fast[0] + 50
+    assert colour(99.0, 10.0) == fast
+
+
+def test_a_vector_renders_one_picture_each():
+    env = gym.make_vec("DiffIDM-v0", num_envs=2, render_mode="rgb_array", **QUICK)
+    env.reset(seed=0)
+    pictures = env.render()
+    assert len(pictures) == 2
+    env.close()
+
+
+def test_a_window_without_a_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gym.make("DiffIDM-v0", render_mode="human", **QUICK)
+    env.reset(seed=0)
+    env.step(np.zeros(1, np.float32))
+    assert env.render() is None
+    env.close()
+    env.close()
+
+
+def test_record_video(tmp_path):
+    env = gym.make("DiffIDM-v0", render_mode="rgb_array", max_episode_steps=8, **QUICK)
+    env = gym.wrappers.RecordVideo(env, str(tmp_path), episode_trigger=lambda _: True)
+    env.reset(seed=0)
+    for _ in range(8):
+        env.step(np.zeros(1, np.float32))
+    env.close()
+    assert [path.stat().st_size > 1000 for path in tmp_path.glob("*.mp4")] == [True]
+
+
+def lines(figure):
+    return [c for c in figure.axes[0].collections if c.get_array() is not None]
+
+
+def test_space_time_of_a_rollout_and_of_a_table():
+    time = 0.1 * torch.arange(1, 21, dtype=torch.float64)
+    speed = torch.tensor([2.0, 3.0], dtype=torch.float64).expand(20, 2)
+    position = torch.stack((50.0 + 2.0 * time, 3.0 * time), -1)
+    drawn = lines(space_time(Trajectory(position, speed, speed, speed)))
+    assert len(drawn) == 2
+    np.testing.assert_allclose(drawn[0].get_segments()[0], [[0.1, 50.2], [0.2, 50.4]])
+    rows = [
+        {"run_id": "r", "vehicle_id": str(i), "time_s": float(t), "position_m": float(x), "speed_mps": 2.0}
+        for i in range(2)
+        for t, x in zip(time, position[:, i], strict=True)
+    ]
+    table = lines(space_time(pl.DataFrame(rows)))
+    np.testing.assert_allclose(table[1].get_segments()[0], drawn[1].get_segments()[0])
+
+
+def test_space_time_on_a_ring_draws_no_line_across_the_lap():
+    position = torch.linspace(0.0, 25.0, 26).unsqueeze(-1)
+    drawn = lines(space_time(Trajectory(position, position, position, position), ring_length=10.0))
+    assert all(abs(segment[1, 1] - segment[0, 1]) < 2.0 for segment in drawn[0].get_segments())
+    assert len(drawn[0].get_segments()) == 23
+
+
+def test_a_table_without_speed_is_an_error():
+    with pytest.raises(ValueError, match="no column 'speed_mps'"):
+        space_time(pl.DataFrame({"vehicle_id": [1], "time_s": [0.0], "position_m": [0.0]}))
