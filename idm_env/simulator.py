@@ -249,6 +249,20 @@ class Simulator:
             gap = torch.where(now & ~before, self.road.gaps(motion.position, state.length), gap)
         return torch.where(now, gap, FAR)
 
+    def slices(self, inputs: Inputs, steps: int) -> list[dict[str, Any]]:
+        """Return the inputs of each step, from inputs with a leading time dimension.
+
+        ValueError for inputs that are too short or belong to no effect.
+        """
+        for name, value in inputs.items():
+            if name not in self.by_name:
+                raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
+            have = min(len(x) for x in _leaves(value) if x is not None)
+            if have < steps:
+                raise ValueError(f"input '{name}' covers {have} steps of {steps}. Its first dimension is time.")
+        unbound = {name: _unbind(value) for name, value in inputs.items()}
+        return [{name: value[t] for name, value in unbound.items()} for t in range(steps)]
+
     def rollout(
         self,
         state: State,
@@ -265,18 +279,12 @@ class Simulator:
         tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps
         instead of ``steps``, for about one more forward pass. ValueError for inputs that are too short or of no effect.
         """
-        for name, value in inputs.items():
-            if name not in self.by_name:
-                raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
-            have = min(len(x) for x in _leaves(value) if x is not None)
-            if have < steps:
-                raise ValueError(f"input '{name}' covers {have} steps of {steps}. Its first dimension is time.")
-        unbound = {name: _unbind(value) for name, value in inputs.items()}
+        slices = self.slices(inputs, steps)
 
         def run(state: State, begin: int, end: int) -> tuple[State, list[tuple[Tensor, ...]]]:
             kept = []
             for t in range(begin, end):
-                state = self.step(state, {name: value[t] for name, value in unbound.items()}, params)
+                state = self.step(state, slices[t], params)
                 kept.append(keep(state))
             return state, kept
 
