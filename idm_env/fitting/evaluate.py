@@ -1,0 +1,71 @@
+"""How well a model reproduces drivers: errors per episode, and parameters for drivers that no fit has seen."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from idm_env.fitting.fit import Fit
+from idm_env.fitting.problem import Problem, Simulated
+
+
+class Errors(NamedTuple):
+    """Per episode [rows]: root mean square and mean absolute gap error (m), speed RMSE (m/s), smallest gap (m)."""
+
+    gap_rmse: Tensor
+    gap_mae: Tensor
+    speed_rmse: Tensor
+    smallest_gap: Tensor
+
+    def summary(self) -> dict[str, float]:
+        """Return means over episodes, the median gap RMSE, and how many episodes end in a collision."""
+        return {
+            "gap_rmse_m": float(self.gap_rmse.mean()),
+            "gap_rmse_median_m": float(self.gap_rmse.median()),
+            "gap_mae_m": float(self.gap_mae.mean()),
+            "speed_rmse_mps": float(self.speed_rmse.mean()),
+            "collisions": int((self.smallest_gap <= 0).sum()),
+            "episodes": len(self.gap_rmse),
+        }
+
+
+def errors(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Errors, Simulated]:
+    """Simulate every driver behind its measured leader and compare; own [G, P], shared [Q].
+
+    The first sample, where simulation starts on the measured state, counts as an error of 0, as in the published benchmark.
+    """
+    with torch.no_grad():
+        simulated = problem.simulate(problem.rows(own, shared))
+    weight = problem.weight
+    count = weight.sum(0) + 1.0
+    gap = (simulated.gap - problem.batch.gap[1:]) * weight
+    speed = (simulated.speed - problem.batch.speed[1:]) * weight
+    smallest = torch.where(weight > 0, simulated.gap, torch.inf).amin(0)
+    return (
+        Errors(
+            (gap.square().sum(0) / count).sqrt(),
+            gap.abs().sum(0) / count,
+            (speed.square().sum(0) / count).sqrt(),
+            smallest,
+        ),
+        simulated,
+    )
+
+
+def own_for(found: Fit, problem: Problem, pooled: Tensor) -> tuple[Tensor, list[str]]:
+    """Return own values for the groups of another problem, and the groups that the fit has not seen.
+
+    A group that was fitted keeps its values; any other gets the ``pooled`` ones [P].
+    """
+    index = {name: i for i, name in enumerate(found.problem.groups)}
+    unseen = [name for name in problem.groups if name not in index]
+    rows = [pooled if name in unseen else found.own[index[name]] for name in problem.groups]
+    return torch.stack(rows), unseen
+
+
+def like(problem: Problem, other: Problem) -> Problem:
+    """Return ``problem`` with the batch and groups of ``other``."""
+    return dataclasses.replace(problem, batch=other.batch, group=other.group, groups=other.groups)

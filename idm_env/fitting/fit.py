@@ -1,0 +1,253 @@
+"""Calibration: from episodes to fitted parameters with standard errors, interruptible and resumable."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from scipy.stats import qmc
+from torch import Tensor
+
+from idm_env.data import Episode
+from idm_env.effects import IDM, Brakes, Replay
+from idm_env.fitting.adam import adam
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.levenberg import Normal, Progress, minimise, normal
+from idm_env.fitting.problem import IDM_NAMES, Loss, Objective, Problem, group_of
+from idm_env.fitting.uncertainty import Uncertainty, uncertainty
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
+
+Method = Literal["lm", "adam"]
+OnProgress = Callable[[str, int, int, float], None]
+"""Called with the phase, steps done, steps at most, and the root mean square residual (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Fitted parameters: own [G, P], shared [Q], their uncertainty, and how the search ended."""
+
+    problem: Problem
+    own: Tensor
+    shared: Tensor
+    uncertainty: Uncertainty
+    converged: Tensor
+    iterations: int
+    method: Method
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Full names of the free parameters, own first."""
+        return self.problem.own + self.problem.shared
+
+    def values(self) -> Tensor:
+        """Return own and shared values side by side, [G, P+Q]."""
+        return torch.cat((self.own, self.shared.expand(len(self.own), -1)), dim=-1)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return one row per group and parameter: estimate, standard error, 95 % interval, and what is doubtful."""
+        rows = []
+        for g, group in enumerate(self.problem.groups):
+            for i, (name, p) in enumerate(zip(self.names, self.problem.parameters, strict=True)):
+                estimate = float(self.values()[g, i])
+                error = float(self.uncertainty.standard_error[g, i])
+                rows.append(
+                    {
+                        "group": group,
+                        "parameter": name,
+                        "symbol": p.symbol,
+                        "unit": p.unit,
+                        "estimate": estimate,
+                        "standard_error": error,
+                        "low": max(estimate - 1.96 * error, p.low),
+                        "high": min(estimate + 1.96 * error, p.high),
+                        "at_bound": bool(self.uncertainty.at_bound[g, i]),
+                        "identified": bool(self.uncertainty.identified[g, i]),
+                        "converged": bool(self.converged[g]),
+                    }
+                )
+        return rows
+
+
+def base_simulator(dt: float = 0.1, **choices: Any) -> Simulator:
+    """Return what is calibrated: IDM and brakes in a lane behind replayed neighbours."""
+    return Simulator(Lane(), (IDM(), Replay(), Brakes()), dt=dt, **choices)
+
+
+class Checkpoint:
+    """Finished phases and the running one of a fit in one file, replaced atomically after every iteration.
+
+    A file that belongs to other data or options is refused with ValueError; without ``resume`` it is overwritten.
+    """
+
+    def __init__(self, path: Path | None, fingerprint: str, resume: bool) -> None:
+        self.path = path
+        self.content: dict[str, Any] = {"fingerprint": fingerprint, "phases": {}}
+        if path is None or not resume or not path.exists():
+            return
+        saved = torch.load(path, weights_only=True)
+        if saved["fingerprint"] != fingerprint:
+            raise ValueError(f"{path} was left by a run on other data or options. Leave out --resume to start afresh.")
+        self.content = saved
+
+    def get(self, phase: str) -> dict[str, Any] | None:
+        """Return what was last saved of a phase."""
+        found: dict[str, Any] | None = self.content["phases"].get(phase)
+        return found
+
+    def put(self, phase: str, content: dict[str, Any]) -> None:
+        """Save a phase."""
+        self.content["phases"][phase] = content
+        if self.path is not None:
+            beside = self.path.with_suffix(".part")
+            torch.save(self.content, beside)
+            os.replace(beside, self.path)
+
+    def done(self) -> None:
+        """Remove the file: the fit has ended."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
+
+
+def fingerprint(problem: Problem, *options: object) -> str:
+    """Return a digest of everything that determines a fit."""
+    digest = hashlib.sha256(repr((problem.simulator, problem.own, problem.shared, problem.groups, options)).encode())
+    digest.update(repr((problem.objective, problem.relative, problem.loss, problem.skip)).encode())
+    digest.update(problem.batch.gap.numpy().tobytes() + problem.batch.position.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def fit(
+    episodes: Sequence[Episode],
+    *,
+    by: str = "driver",
+    simulator: Simulator | None = None,
+    free: Sequence[str] = IDM_NAMES,
+    shared: Sequence[str] = (),
+    objective: Objective = "spacing",
+    relative: bool = False,
+    loss: Loss = "rmse",
+    skip: float = 0.0,
+    method: Method = "lm",
+    starts: int = 4,
+    iterations: int = 60,
+    seed: int = 0,
+    start: tuple[Tensor, Tensor] | None = None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Fit:
+    """Calibrate ``free`` parameters per group of drivers, and ``shared`` ones for all, behind the measured leaders.
+
+    ``by`` is ``driver``, ``all`` or a column. ``method`` is ``lm`` (Levenberg–Marquardt with exact forward-mode Jacobians, from
+    ``starts`` starts per group, the pooled optimum among them) or ``adam`` (500 steps of reverse mode, learning rate
+    0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead. ``checkpoint`` names the file
+    that makes an interrupted fit resumable with the same result. ValueError and DataError for what cannot be fitted.
+    """
+    if method not in ("lm", "adam"):
+        raise ValueError(f"method = '{method}' is unknown. Use 'lm' or 'adam'.")
+    batch = Batch.of(episodes)
+    group, names = group_of(batch.episodes, by)
+    simulator = simulator or base_simulator(batch.dt)
+    if abs(simulator.dt - batch.dt) > 1e-6:
+        simulator = dataclasses.replace(simulator, dt=batch.dt)
+    problem = Problem(
+        simulator, batch, tuple(free), tuple(shared), group, names,
+        objective=objective, relative=relative, loss=loss, skip=skip,
+    )  # fmt: skip
+    saved = Checkpoint(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)
+    begin = start or (_defaults(problem, problem.own).expand(len(names), -1), _defaults(problem, problem.shared))
+    if method == "adam":
+        own, common, converged, count = _adam(problem, *begin, saved, on_progress)
+    else:
+        own, common, converged, count = _levenberg(
+            problem, begin, starts if start is None else 1, iterations, seed, saved, on_progress
+        )
+    result = Fit(problem, own, common, uncertainty(problem, own, common), converged, count, method)
+    saved.done()
+    return result
+
+
+def _defaults(problem: Problem, names: Sequence[str]) -> Tensor:
+    declared = dict(zip(problem.own + problem.shared, problem.parameters, strict=True))
+    # A strength starts at its null where it has a gradient there, at its first start otherwise.
+    values = [
+        p.default if p.null is None else (p.null if p.role == "strength" and not p.starts else (*p.starts, p.default)[0])
+        for p in (declared[name] for name in names)
+    ]
+    return torch.tensor(values, dtype=problem.batch.gap.dtype)
+
+
+def _adam(
+    problem: Problem, own: Tensor, shared: Tensor, saved: Checkpoint, on_progress: OnProgress | None
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    steps = 500
+
+    def on_step(step: int, value: float, state: dict[str, Any]) -> None:
+        if step % 10 == 0 or step == steps:
+            saved.put("adam", state)
+        if on_progress is not None:
+            on_progress("adam", step, steps, value**0.5)
+
+    own, shared, _ = adam(problem, own, shared, steps=steps, state=saved.get("adam"), on_step=on_step)
+    # Adam has no test of its own: a Gauss–Newton step that would gain more than 1 % says that it has not arrived.
+    now = normal(problem, own[None], shared[None])
+    gain = torch.einsum("gp,gpq,gq->g", now.gradient[0], torch.linalg.pinv(now.hessian[0]), now.gradient[0])
+    return own, shared, gain <= 0.01 * now.cost[0], steps
+
+
+def _levenberg(
+    problem: Problem, begin: tuple[Tensor, Tensor], starts: int, iterations: int, seed: int, saved: Checkpoint,
+    on_progress: OnProgress | None,
+) -> tuple[Tensor, Tensor, Tensor, int]:  # fmt: skip
+    own, shared = begin
+    if starts > 1 and len(problem.groups) > 1:
+        pooled = dataclasses.replace(problem, group=torch.zeros_like(problem.group), groups=("all",))
+        fleet = _phase("pooled", pooled, own[:1][None], shared[None], iterations, saved, on_progress)[0]
+        own, shared = fleet.own[0].expand(len(problem.groups), -1), fleet.shared[0]
+    if starts > 1 and not problem.shared:
+        several = _spread(problem, own, starts, seed)
+        first = _phase(
+            "starts", problem, several, shared.expand(starts, -1), min(10, iterations), saved, on_progress
+        )  # fmt: skip
+        best = first[1].cost.argmin(0)
+        own = first[0].own[best, torch.arange(len(best))]
+    progress, _ = _phase("final", problem, own[None], shared[None], iterations, saved, on_progress)
+    converged = progress.done[0] if not problem.shared else torch.full((len(problem.groups),), progress.finished)
+    return progress.own[0], progress.shared[0], converged, progress.iteration
+
+
+def _spread(problem: Problem, own: Tensor, starts: int, seed: int) -> Tensor:
+    """Return [starts, G, P]: the given values, then factors of ½ to 2 on them by a scrambled Sobol sequence."""
+    sampler = qmc.Sobol(len(problem.own), seed=seed)
+    points = torch.as_tensor(sampler.random(max(1, 2 ** (starts - 1).bit_length())), dtype=own.dtype)[: starts - 1]
+    low, high = (bound[: len(problem.own)] for bound in problem.bounds)
+    around = own[None] * (4.0 ** (points - 0.5))[:, None, :]
+    return torch.cat((own[None], torch.minimum(torch.maximum(around, low), high)))
+
+
+def _phase(
+    name: str, problem: Problem, own: Tensor, shared: Tensor, iterations: int, saved: Checkpoint,
+    on_progress: OnProgress | None,
+) -> tuple[Progress, Normal]:  # fmt: skip
+    found = saved.get(name)
+    if found is not None:
+        progress = Progress(**found)
+    else:
+        size = (own.shape[0], len(problem.groups))
+        progress = Progress(own, shared, torch.full(size, 1e-2, dtype=own.dtype), torch.zeros(size, dtype=torch.bool))
+
+    def on_step(now: Progress, equations: Normal) -> None:
+        saved.put(name, dataclasses.asdict(now))
+        if on_progress is not None:
+            cost = equations.cost.amin(0).sum()
+            mean = cost / len(problem.batch) if problem.loss == "rmse" else (cost / problem.samples.sum()).sqrt()
+            on_progress(name, now.iteration, iterations, float(mean))
+
+    return minimise(problem, progress, iterations, on_step=on_step)

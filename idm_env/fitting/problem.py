@@ -1,0 +1,197 @@
+"""A fitting problem: which parameters are free, who shares them, and what the residual is.
+
+Free parameters are *own* (one value per group of drivers) or *shared* (one value for all). Values travel as two tensors:
+``own`` [..., groups, P] and ``shared`` [..., Q], in the order of the names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from idm_env.data import DataError, Episode
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.tangent import TangentStep, linearised_rollout
+from idm_env.parameters import Parameter, catalogue, nearest
+from idm_env.simulator import Simulator
+from idm_env.types import Inputs, State
+
+Objective = Literal["spacing", "speed", "both"]
+Loss = Literal["mse", "rmse"]
+IDM_NAMES = ("idm.max_accel", "idm.comfort_decel", "idm.time_gap", "idm.min_gap", "idm.desired_speed")
+
+
+class Simulated(NamedTuple):
+    """The driver's gap (m) and speed (m/s) at every sample after the first, [T−1, ..., rows]."""
+
+    gap: Tensor
+    speed: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A simulator, measured episodes, and the parameters to find.
+
+    ``group`` gives every row's group. ``objective`` is the residual: ``spacing`` (simulated − measured gap, m), ``speed``
+    (m/s) or ``both`` (gap/``scales[0]`` and speed/``scales[1]``); ``relative`` divides by the row's mean measured value.
+    Samples of the first ``skip`` seconds do not count. ``loss`` says how episodes of a group add up: ``mse`` sums squared
+    residuals, ``rmse`` sums every episode's root mean square, so that a few bad episodes do not decide for all.
+    """
+
+    simulator: Simulator
+    batch: Batch
+    own: tuple[str, ...]
+    shared: tuple[str, ...]
+    group: Tensor
+    groups: tuple[str, ...]
+    objective: Objective = "spacing"
+    relative: bool = False
+    loss: Loss = "mse"
+    skip: float = 0.0
+    scales: tuple[float, float] = (1.0, 0.3)
+
+    def __post_init__(self) -> None:
+        known = catalogue(self.simulator.effects)
+        for name in self.own + self.shared:
+            if name not in known:
+                raise ValueError(f"unknown parameter '{name}'.{nearest(name, known)}")
+        for what, value, known_values in (
+            ("objective", self.objective, ("spacing", "speed", "both")),
+            ("loss", self.loss, ("mse", "rmse")),
+        ):
+            if value not in known_values:
+                raise ValueError(f"{what} '{value}' is unknown.{nearest(value, known_values)}")
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Declarations of the free parameters, own first."""
+        known = catalogue(self.simulator.effects)
+        return tuple(known[name] for name in self.own + self.shared)
+
+    @cached_property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bounds of the free parameters, own first."""
+        low = torch.tensor([p.low for p in self.parameters], dtype=torch.float64)
+        return low, torch.tensor([p.high for p in self.parameters], dtype=torch.float64)
+
+    @cached_property
+    def _inputs(self) -> Inputs:
+        return self.batch.inputs(self.simulator)
+
+    @cached_property
+    def weight(self) -> Tensor:
+        """1 for every sample that counts, [T−1, rows]."""
+        weight = self.batch.valid[1:].clone()
+        weight[: round(self.skip / self.batch.dt)] = 0
+        return weight
+
+    @property
+    def samples(self) -> Tensor:
+        """Residuals that count, per row."""
+        return self.weight.sum(0) * (2.0 if self.objective == "both" else 1.0)
+
+    def params(self, values: dict[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+        """Return defaults with some parameters replaced, each by a tensor that broadcasts against rows × vehicles."""
+        params = self.simulator.defaults(dtype=self.batch.gap.dtype)
+        for name, value in values.items():
+            effect, parameter = name.split(".")
+            params[effect][parameter] = value
+        return params
+
+    def simulate(self, values: dict[str, Tensor]) -> Simulated:
+        """Roll the drivers out behind their measured leaders; ``values`` are [..., rows] by parameter name."""
+        _, driver = self.batch.columns(self.simulator)
+        params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
+        state = self.batch.start(self.simulator, params)
+
+        def keep(now: State) -> tuple[Tensor, Tensor]:
+            return now.gap[..., driver], now.speed[..., driver]
+
+        _, kept = self.simulator.rollout(state, self._inputs, params, self.batch.steps, keep=keep)  
+        return Simulated(*kept)
+
+    def rows(self, own: Tensor, shared: Tensor) -> dict[str, Tensor]:
+        """Return the value of every free parameter for every row, from values per group."""
+        per_row = own.index_select(-2, self.group)
+        values = {name: per_row[..., i] for i, name in enumerate(self.own)}
+        for i, name in enumerate(self.shared):
+            values[name] = shared[..., i, None].expand(per_row.shape[:-1])
+        return values
+
+    def residual(self, simulated: Simulated) -> Tensor:
+        """Return the weighted residual [T−1 (twice for both), ..., rows], 0 where a sample does not count."""
+        shape = (-1, *(1,) * (simulated.gap.dim() - 2), len(self.batch))
+        return self._weigh(
+            simulated.gap - self.batch.gap[1:].reshape(shape), simulated.speed - self.batch.speed[1:].reshape(shape)
+        )
+
+    def _weigh(self, gap: Tensor, speed: Tensor) -> Tensor:
+        """Stack differences (or derivatives) of gap and speed, each over its scale: linear in both."""
+        parts = []
+        for name, difference, measured, scale in (
+            ("spacing", gap, self.batch.gap[1:], self.scales[0]),
+            ("speed", speed, self.batch.speed[1:], self.scales[1]),
+        ):
+            if self.objective not in (name, "both"):
+                continue
+            weight = self.weight / (scale if self.objective == "both" else 1.0)
+            if self.relative:
+                mean = (measured.abs() * self.weight).sum(0) / self.weight.sum(0).clamp_min(1.0)
+                weight = weight / mean.clamp_min(0.1)
+            parts.append(difference * weight.reshape(-1, *(1,) * (gap.dim() - 2), gap.shape[-1]))
+        return torch.cat(parts)
+
+    @cached_property
+    def _tangent(self) -> TangentStep:
+        return TangentStep(self.simulator)
+
+    def linearise(self, own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the residual [T, ..., rows] and its Jacobian [T, P+Q, ..., rows], by forward-mode differentiation.
+
+        All directions share one rollout: values once, tangents as a further batch dimension.
+        """
+        _, driver = self.batch.columns(self.simulator)
+        values = self.rows(own, shared)
+        params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
+        directions = {
+            name: torch.zeros(len(values), *value.shape, 1, dtype=value.dtype) for name, value in values.items()
+        }
+        for i, direction in enumerate(directions.values()):
+            direction[i] = 1.0
+        kept, along = linearised_rollout(
+            self._tangent,
+            lambda p: self.batch.start(self.simulator, p),
+            self._inputs,
+            params,
+            directions,
+            self.batch.steps,
+            lambda state: (state.gap[..., driver], state.speed[..., driver]),
+        )
+        return self.residual(Simulated(*kept)), self._weigh(*along)
+
+
+def group_of(episodes: Sequence[Episode], by: str) -> tuple[Tensor, tuple[str, ...]]:
+    """Return each episode's group and the names of the groups.
+
+    ``by`` is ``driver`` (one vehicle of one run), ``all``, or a column that is constant over an episode, such as
+    vehicle_name. DataError names the nearest column for an unknown one.
+    """
+    if by == "driver":
+        labels = [f"{e.run_id}/{e.vehicle_id}" for e in episodes]
+    elif by == "all":
+        labels = ["all"] * len(episodes)
+    elif by in ("run_id", "vehicle_id", "leader_id"):
+        labels = [str(getattr(e, by)) for e in episodes]
+    else:
+        known = set.intersection(*(set(e.labels) for e in episodes)) | {"driver", "all", "run_id", "vehicle_id"}
+        if by not in known:
+            raise DataError(f"cannot group by '{by}': no such column that is constant for a driver.{nearest(by, known)}")
+        labels = [e.labels[by] for e in episodes]
+    names = tuple(dict.fromkeys(labels))
+    index = {name: i for i, name in enumerate(names)}
+    return torch.tensor([index[label] for label in labels]), names

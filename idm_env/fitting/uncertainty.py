@@ -1,0 +1,94 @@
+"""Standard errors of fitted parameters, and which of them the data do not tell."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from idm_env.fitting.levenberg import row_equations, sum_groups
+from idm_env.fitting.problem import Problem
+
+ENOUGH_ROWS = 10
+"""From this many episodes in a group on, their spread itself gives the variance of the group's gradient."""
+
+
+class Uncertainty(NamedTuple):
+    """Per group: covariance [G, N, N], standard errors [G, N], effective samples [G], and flags [G, N]."""
+
+    covariance: Tensor
+    standard_error: Tensor
+    effective_samples: Tensor
+    at_bound: Tensor
+    identified: Tensor
+
+
+def effective_samples(residual: Tensor, weight: Tensor) -> Tensor:
+    """Return how many independent samples a correlated residual is worth, per row: ``n (1 − ρ)/(1 + ρ)``.
+
+    ρ is the lag-1 autocorrelation of the residual about 0, [T, rows]; residuals of free simulation are strongly
+    correlated, and standard errors that ignore it are several times too small.
+    """
+    count = weight.sum(0)
+    both = weight[1:] * weight[:-1]
+    rho = (residual[1:] * residual[:-1] * both).sum(0) / residual.square().sum(0).clamp_min(1e-300)
+    rho = (rho * count / both.sum(0).clamp_min(1.0)).clamp(0.0, 0.9999)
+    return count * (1.0 - rho) / (1.0 + rho)
+
+
+def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
+    """Return standard errors by the sandwich ``H⁻¹ M H⁻¹``; own [G, P], shared [Q].
+
+    H is the Gauss–Newton matrix of the loss, M the variance of its gradient. In a group of fewer than ``ENOUGH_ROWS``
+    episodes, M adds each row's JᵀJ times its residual variance times n/n_eff, for correlated residuals; in a larger one it is
+    the spread of the rows' own gradients, which holds also where drivers differ (cluster-robust, Liang and Zeger 1986).
+    Shared parameters add up the information of all groups.
+
+    A parameter is *not identified* when its standard error exceeds half of its value (a quarter of the width of its
+    bounds for a strength, whose value may be near 0); it is *at a bound* within 0.1 % of the width. Standard errors are of
+    the interior: at a bound they say how flat the loss is, not how far the truth may lie.
+    """
+    rows, row_weight, residual = row_equations(problem, own[None], shared[None])
+    sample_weight = problem.weight.repeat(2, 1) if problem.objective == "both" else problem.weight
+    independent = effective_samples(residual[:, 0], sample_weight)
+    size = len(problem.own) + len(problem.shared)
+    groups = len(problem.groups)
+    per_group = own.new_zeros(groups).index_add(0, problem.group, torch.ones_like(problem.samples))
+    # Degrees of freedom are spent by the group; every row bears its share.
+    spent = size / per_group[problem.group]
+    variance = residual[:, 0].square().sum(0) / (problem.samples - spent).clamp_min(1.0)
+    inflation = problem.samples / independent.clamp_min(1.0)
+    by_row = rows.hessian[0] * (row_weight[0] * variance * inflation)[:, None, None]
+    spread = rows.gradient[0][:, :, None] * rows.gradient[0][:, None, :]
+    many = per_group >= ENOUGH_ROWS
+    meat = torch.where(many[:, None, None], sum_groups(problem, spread[None])[0], sum_groups(problem, by_row[None])[0])
+    bread = _inverse(sum_groups(problem, rows.hessian)[0])
+    covariance = bread @ meat @ bread
+    if problem.shared and groups > 1:
+        covariance = _share(covariance, len(problem.own))
+    error = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+    value = torch.cat((own, shared.expand(groups, -1)), dim=-1)
+    low, high = problem.bounds
+    at_bound = ((value - low).abs() <= 1e-3 * (high - low)) | ((value - high).abs() <= 1e-3 * (high - low))
+    strength = torch.tensor([p.null is not None for p in problem.parameters])
+    limit = torch.where(strength, 0.25 * (high - low), 0.5 * value.abs())
+    total = own.new_zeros(groups).index_add(0, problem.group, independent)
+    return Uncertainty(covariance, error, total, at_bound, error < limit)
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """Invert; a direction without information gets a huge variance instead of a failed inverse."""
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    scale = torch.sqrt(diagonal.clamp_min(1e-12 * diagonal.amax(-1, keepdim=True) + 1e-300))
+    eigenvalue, vector = torch.linalg.eigh(matrix / (scale[..., None] * scale[..., None, :]))
+    inverse = (vector / eigenvalue.clamp_min(1e-10)[..., None, :]) @ vector.mT
+    return inverse / (scale[..., None] * scale[..., None, :])
+
+
+def _share(covariance: Tensor, own: int) -> Tensor:
+    """Combine each group's information on the shared parameters: the inverse variances add up."""
+    block = covariance[:, own:, own:]
+    result = covariance.clone()
+    result[:, own:, own:] = _inverse(_inverse(block).sum(0))
+    return result
