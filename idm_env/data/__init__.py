@@ -1,0 +1,29 @@
+"""Measured traffic: files to checked trajectories, trajectories to episodes of one driver behind one leader."""
+
+from __future__ import annotations
+
+from idm_env.data import synthetic
+from idm_env.data.episode import Episode, Episodes
+from idm_env.data.episodes import episodes
+from idm_env.data.errors import DataError, Repair
+from idm_env.data.load import load
+from idm_env.data.records import Record
+from idm_env.data.schema import LEADER_LOST_GAP_M
+from idm_env.data.smooth import Motion, noise_sigma, smooth
+from idm_env.data.trajectories import Trajectories
+
+__all__ = [
+    "LEADER_LOST_GAP_M",
+    "DataError",
+    "Episode",
+    "Episodes",
+    "Motion",
+    "Record",
+    "Repair",
+    "Trajectories",
+    "episodes",
+    "load",
+    "noise_sigma",
+    "smooth",
+    "synthetic",
+]

@@ -1,0 +1,116 @@
+"""Put every vehicle of a run on one regular clock; short holes are filled, long ones split the track later."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from idm_env.data.errors import DataError, Repair
+from idm_env.data.schema import TRACK
+
+LONGEST_BRIDGE = 2.5
+"""Two samples at most this many steps apart are joined: jitter and one missing row, never more."""
+CLOCK_ROUNDING_S = 1e-3
+"""Times this close to the clock are on it: files round to milliseconds."""
+SHORTEST_STEP_S = 1e-3
+"""No traffic is measured more often than 1000 times a second (s)."""
+LINEAR = ("position_m", "speed_mps", "gap_m", "length_m")
+
+
+def steps_of(frame: pl.DataFrame, source: str) -> dict[str, float]:
+    """Return each run's time step in s: the mean of the differences of time that are not holes.
+
+    Raises:
+        DataError: If no vehicle has two times, or a step is too short to be one.
+    """
+    change = frame.select("run_id", pl.col("time_s").diff().over(TRACK).alias("change")).drop_nulls()
+    change = change.with_columns(pl.col("change").median().over("run_id").alias("middle"))
+    near = change.filter(pl.col("change") < 1.5 * pl.col("middle")).group_by("run_id").agg(pl.col("change").mean())
+    if near.height == 0:
+        raise DataError(f"{source}: no vehicle has two different times; a track needs at least 5 s of rows.")
+    overall = float(near["change"].median())  # type: ignore[arg-type]
+    steps = dict.fromkeys(frame["run_id"].unique(), overall)
+    for run, step in near.rows():
+        if step < SHORTEST_STEP_S:
+            raise DataError(f"{source}: time_s rises by {step:g} s from row to row in run {run}; is it in seconds?")
+        # 0.1000004 is a clock of 0.1 s; 0.0333 is not one of 0.033 s.
+        steps[run] = round(step, 3) if abs(step - round(step, 3)) < 0.002 * step else step
+    return steps
+
+
+def regularise(frame: pl.DataFrame, steps: dict[str, float]) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the frame (sorted, times unique) on its runs' clocks, with the integer column ``step``.
+
+    Position, speed, gap and length are interpolated linearly in time; all other columns are taken from the sample
+    nearest in time, as a place on a lap must not be averaged over its wrap.
+    """
+    step = frame["run_id"].replace_strict(steps, return_dtype=pl.Float64).to_numpy()
+    start = frame.select(pl.col("time_s").min().over("run_id"))["time_s"].to_numpy()
+    exact = (frame["time_s"].to_numpy() - start) / step
+    whole = np.round(exact)
+    on_clock = np.abs(exact - whole) * step <= np.minimum(CLOCK_ROUNDING_S, 0.05 * step)
+    exact = np.where(on_clock, whole, exact)
+    track = frame.select(pl.struct(TRACK).rle_id())[TRACK[0]].to_numpy()
+    left, weight, ticks = _grid(exact, track)
+    times = start[left] + ticks * step[left]
+    changed = weight > 0
+    if changed.any() or len(left) != frame.height:
+        same_leader = _same_leader(frame)[left]
+        columns = {
+            name: _interpolated(frame[name], left, weight, same_leader if name == "gap_m" else None)
+            for name in frame.columns
+        }
+        result = pl.DataFrame(columns)
+    else:
+        result = frame
+    result = result.with_columns(pl.Series("time_s", times), pl.Series("step", ticks.astype(np.int64)))
+    result = result.filter((pl.col("step").diff() != 0).fill_null(True) | (pl.struct(TRACK).rle_id().diff() != 0))
+    return result, _repairs(frame, on_clock, track[left[changed]])
+
+
+def _grid(exact: np.ndarray, track: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return, per tick of the clock, the sample to its left, the weight of the one to its right, and the tick."""
+    first = np.ceil(exact)
+    joined = np.zeros(len(exact), bool)
+    joined[:-1] = (track[1:] == track[:-1]) & (np.diff(exact) <= LONGEST_BRIDGE)
+    following = np.append(first[1:], 0.0)
+    count = np.where(joined, following - first, first == exact).astype(int)
+    left = np.repeat(np.arange(len(exact)), count)
+    within = np.arange(len(left)) - np.repeat(np.cumsum(count) - count, count)
+    ticks = first[left] + within
+    span = np.where(joined, np.append(np.diff(exact), 1.0), 1.0)
+    return left, (ticks - exact[left]) / span[left], ticks
+
+
+def _same_leader(frame: pl.DataFrame) -> np.ndarray:
+    """Say for every row whether the next one has the same leader: only then a gap can be interpolated."""
+    if "leader_id" not in frame.columns:
+        return np.ones(frame.height, bool)
+    return frame["leader_id"].eq_missing(frame["leader_id"].shift(-1)).to_numpy()
+
+
+def _interpolated(column: pl.Series, left: np.ndarray, weight: np.ndarray, same: np.ndarray | None) -> pl.Series:
+    right = left + (weight > 0)
+    if same is not None:
+        weight = np.where(same, weight, np.round(weight))
+    if column.name in LINEAR:
+        values = column.to_numpy()
+        before, after = values[left], values[right]
+        mixed = np.where(weight > 0, before * (1 - weight) + after * weight, before)
+        return pl.Series(column.name, mixed, nan_to_null=True)
+    return column.gather(np.where(weight > 0.5, right, left))
+
+
+def _repairs(frame: pl.DataFrame, on_clock: np.ndarray, changed_tracks: np.ndarray) -> list[Repair]:
+    track = frame.select(pl.struct(TRACK).rle_id())[TRACK[0]].to_numpy()
+    jittered = np.unique(track[~on_clock])
+    filled = int((~np.isin(changed_tracks, jittered)).sum())
+    repairs = []
+    if len(jittered):
+        rows = int((~on_clock).sum())
+        text = f"{len(jittered)} tracks had irregular times ({rows} rows) and were resampled onto a regular clock."
+        repairs.append(Repair("irregular time", len(jittered), text))
+    if filled:
+        text = f"{filled} single missing rows were filled by interpolation; longer holes split the track."
+        repairs.append(Repair("missing row", filled, text))
+    return repairs

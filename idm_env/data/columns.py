@@ -1,0 +1,55 @@
+"""The columns of a table that no model knows: numbers on the episode's clock, and labels that groups can be made by."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from idm_env.data.schema import TIDY
+from idm_env.data.trajectories import Trajectories
+
+_KNOWN = {*TIDY, "gap_measured", "step"}
+
+
+def with_step(trajectories: Trajectories) -> pl.DataFrame:
+    """Return the table with the integer column ``step``: equal for all vehicles of a run at the same time."""
+    step = pl.col("run_id").replace_strict(trajectories.steps, return_dtype=pl.Float64)
+    since = pl.col("time_s") - pl.col("time_s").min().over("run_id")
+    return trajectories.table.with_columns((since / step).round().cast(pl.Int64).alias("step"))
+
+
+def extra(table: pl.DataFrame) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return the further numeric columns as arrays (NaN where empty), and the names of those that can be labels."""
+    others = [name for name in table.columns if name not in _KNOWN]
+    numbers = {name: table[name].cast(pl.Float64).to_numpy() for name in others if table[name].dtype.is_numeric()}
+    texts = [name for name in others if not table[name].dtype.is_float()]
+    return numbers, [*texts, "lane"]
+
+
+def of_span(numbers: dict[str, np.ndarray], span: slice) -> dict[str, np.ndarray]:
+    """Return the numeric columns of an episode; empty cells take the nearest values, an empty column is absent."""
+    parts = {name: filled(values[span]) for name, values in numbers.items()}
+    return {name: part for name, part in parts.items() if part is not None}
+
+
+def filled(values: np.ndarray) -> np.ndarray | None:
+    """Return a copy in which NaN takes the nearest finite value, or None if there is none."""
+    good = np.flatnonzero(np.isfinite(values))
+    if len(good) == 0:
+        return None
+    ticks = np.arange(len(values))
+    after = np.clip(np.searchsorted(good, ticks), 0, len(good) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.where(np.abs(good[before] - ticks) <= np.abs(good[after] - ticks), before, after)
+    return values[good[nearer]]
+
+
+def labels(table: pl.DataFrame, names: list[str], begin: int, end: int) -> dict[str, str]:
+    """Return, as text, the columns that hold one value, and no empty cell, from row `begin` to `end`."""
+    found = {}
+    part = table.select(names).slice(begin, end - begin)
+    for name in names:
+        first = part[name][0]
+        if first is not None and part[name].n_unique() == 1:
+            found[name] = str(first)
+    return found

@@ -1,0 +1,81 @@
+"""One driver behind one leader over one unbroken stretch of time, with everybody around them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+
+from idm_env.data.errors import Repair
+from idm_env.data.records import Record
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One follower behind one leader; arrays are [T] in SI units, finite everywhere.
+
+    Attributes:
+        run_id, vehicle_id, leader_id: Identifiers, as text.
+        key: ``"run/vehicle/k"`` with k counting the stretches of this vehicle.
+        dt: Time step in s.
+        time_s: The file's clock.
+        position_m, speed_mps, gap_m: The driver's front bumper, speed and measured bumper-to-bumper gap.
+        length_m: The driver's length.
+        leader: Its record; leader.position_m − leader.length_m − position_m equals gap_m.
+        second_leader, behind, adjacent: Records on the same clock, ``present`` where they were there: the leader's
+            leader, the vehicle that follows this driver, and the nearest one in a lane beside.
+        place_m: Coordinate of places, such as the position on a lap.
+        columns: Further numeric columns of the file.
+        labels: Further columns that are constant here, such as ``vehicle_name`` or ``split``.
+    """
+
+    run_id: str
+    vehicle_id: str
+    leader_id: str
+    key: str
+    dt: float
+    time_s: np.ndarray
+    position_m: np.ndarray
+    speed_mps: np.ndarray
+    gap_m: np.ndarray
+    length_m: float
+    leader: Record
+    second_leader: Record
+    behind: Record
+    adjacent: Record
+    place_m: np.ndarray
+    columns: dict[str, np.ndarray]
+    labels: dict[str, str]
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def seconds(self) -> float:
+        """Duration in s."""
+        return len(self) * self.dt
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes(Sequence[Episode]):
+    """Episodes in the order of the table, and what was left out and why, each counted."""
+
+    items: tuple[Episode, ...]
+    left_out: tuple[Repair, ...]
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __iter__(self) -> Iterator[Episode]:
+        return iter(self.items)
+
+    @overload
+    def __getitem__(self, index: int) -> Episode: ...
+    @overload
+    def __getitem__(self, index: slice) -> Episodes: ...
+    def __getitem__(self, index: int | slice) -> Episode | Episodes:
+        if isinstance(index, slice):
+            return Episodes(self.items[index], self.left_out)
+        return self.items[index]

@@ -1,0 +1,54 @@
+"""What the data package says when it cannot go on, and what it counts when it can."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+class DataError(ValueError):
+    """A file that cannot be used: one line that names the value, the rule and the cure."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
+
+
+@dataclass(frozen=True)
+class Repair:
+    """One thing that was changed or left out, with how often.
+
+    Attributes:
+        kind: A short name, the same in every report, such as ``"duplicated time"``.
+        count: How many rows, tracks or vehicles (`text` says which).
+        text: One sentence for a reader.
+    """
+
+    kind: str
+    count: int
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def nearest(name: str, names: Iterable[str], cutoff: float = 0.5) -> str | None:
+    """Return the most similar of `names`, ignoring case, or None if none is similar."""
+    by_lower = {other.lower(): other for other in names}
+    found = difflib.get_close_matches(name.lower(), list(by_lower), n=1, cutoff=cutoff)
+    return by_lower[found[0]] if found else None
+
+
+def listed(names: Iterable[str], most: int = 12) -> str:
+    """Return names as one comma-separated phrase, cut after `most` of them."""
+    all_names = [str(name) for name in names]
+    shown = ", ".join(all_names[:most])
+    return shown if len(all_names) <= most else f"{shown} and {len(all_names) - most} more"
+
+
+def missing_column(name: str, columns: Iterable[str], source: str, known: Iterable[str] = ()) -> DataError:
+    """Return the error for a column that a file lacks, suggesting the nearest name that is not itself `known`."""
+    names = list(columns)
+    guess = nearest(name, set(names) - set(known))
+    cure = f"did you mean {guess!r}? Rename it." if guess else f"the file has: {listed(names)}."
+    return DataError(f"{source}: column {name!r} is missing; {cure}")

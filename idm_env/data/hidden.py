@@ -1,0 +1,161 @@
+"""The hidden effects of the synthetic data: equations of acceleration, in numpy, independent of the simulator's code.
+
+Base: a [1 − (v/v0)⁴ − (s*/s)²] with s* = s0 + max(0, v T + v Δv / (2 √(ab))) (Treiber, Hennecke, Helbing 2000). Every
+effect below changes one thing in it; sources are named in `idm_env.effects`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+GRAVITY = 9.81
+HARDEST_BRAKING = 9.0
+MEMORY_TIME_S = 120.0
+ZONE_M = (800.0, 1500.0)
+SHIFT_TIME_S = 100.0
+PRESSURE_CAP = 4.0
+REACH_M = 25.0
+
+
+@dataclass(frozen=True)
+class Strength:
+    """An effect's strength: its symbol, and the values that count as middle and as half of it."""
+
+    symbol: str
+    middle: float
+    half: float
+
+
+EFFECTS: dict[str, Strength] = {
+    "delay": Strength("tau_s", 0.5, 0.25),
+    "lag": Strength("tau_s", 0.5, 0.25),
+    "second_leader": Strength("weight", 0.35, 0.175),
+    "leader_acceleration": Strength("gain", 0.4, 0.2),
+    "brake_light": Strength("gain", 0.6, 0.3),
+    "asymmetry": Strength("k", 0.3, 0.15),
+    "power_limit": Strength("watt_per_kg", 12.0, 18.0),
+    "drag": Strength("per_m", 5e-4, 2.5e-4),
+    "speed_dependent_gap": Strength("s1_m", 5.0, 2.5),
+    "memory": Strength("beta", 0.8, 0.4),
+    "follower": Strength("gain", 0.15, 0.075),
+    "dead_zone": Strength("rad_per_s", 0.002, 0.001),
+    "action_point": Strength("mps2", 0.3, 0.15),
+    "grade": Strength("steepest_slope", 0.04, 0.02),
+    "speed_zone": Strength("factor", 0.6, 0.8),
+    "regime_shift": Strength("k", 0.35, 0.175),
+    "lateral": Strength("per_s", 0.1, 0.05),
+    "gap_bias": Strength("bias_m", 1.5, 0.75),
+}
+"""Every effect of the catalogue. ``gap_bias`` changes the measured gap, not the motion."""
+
+
+@dataclass(frozen=True)
+class Drivers:
+    """Parameters of the followers, arrays [runs, followers], SI units."""
+
+    time_gap: np.ndarray
+    min_gap: np.ndarray
+    max_accel: np.ndarray
+    comfort_decel: np.ndarray
+    desired_speed: np.ndarray
+
+
+@dataclass(frozen=True)
+class View:
+    """What is around the followers at one moment, arrays [runs, followers]; NaN where there is no such vehicle."""
+
+    time: np.ndarray
+    position: np.ndarray
+    speed: np.ndarray
+    gap: np.ndarray
+    lead_speed: np.ndarray
+    second_gap: np.ndarray
+    second_speed: np.ndarray
+    gap_behind: np.ndarray
+    beside_distance: np.ndarray
+    beside_speed: np.ndarray
+    memory: np.ndarray
+
+
+def slope(position: np.ndarray, steepest: float) -> np.ndarray:
+    """Return the road's slope (rise over run) at positions in m: two waves, together at most `steepest`."""
+    return steepest * (0.6 * np.sin(2 * np.pi * position / 730.0) + 0.4 * np.sin(2 * np.pi * position / 1170.0 + 1.0))
+
+
+def wanted(
+    view: View, seen: tuple[np.ndarray, np.ndarray, np.ndarray], drivers: Drivers, on: dict[str, float]
+) -> np.ndarray:
+    """Return what the followers want (m/s²), but for the leader's acceleration and the vehicle's limits.
+
+    Args:
+        view: The true scene.
+        seen: Gap, speed and leader's speed as the driver sees them: those of a delay ago.
+        drivers: Parameters.
+        on: Strength by name of every effect at work.
+    """
+    gap, speed, lead_speed = seen
+    closing = speed - lead_speed
+    if "dead_zone" in on:
+        closing = np.where(1.8 * np.abs(closing) / np.maximum(gap, 0.1) ** 2 < on["dead_zone"], 0.0, closing)
+    time_gap, top = _adapted(view, drivers, on)
+    desired = _desired_gap(speed, closing, time_gap, drivers)
+    if "speed_dependent_gap" in on:
+        desired = desired + on["speed_dependent_gap"] * np.sqrt(np.maximum(speed, 0.0) / top)
+    interaction = (desired / np.maximum(gap, 0.1)) ** 2
+    if "second_leader" in on:
+        behind_two = _desired_gap(speed, speed - view.second_speed, time_gap, drivers)
+        other = (behind_two / np.maximum(view.second_gap / 2, 0.1)) ** 2
+        weight = on["second_leader"]
+        interaction = np.where(np.isnan(other), interaction, (1 - weight) * interaction + weight * other)
+    accel = drivers.max_accel * (1 - (speed / top) ** 4 - interaction)
+    if "follower" in on:
+        pressure = ((drivers.min_gap + speed * time_gap) / np.maximum(view.gap_behind, 0.1)) ** 2
+        push = on["follower"] * drivers.max_accel * np.minimum(pressure, PRESSURE_CAP)
+        accel = accel + np.nan_to_num(push)
+    if "lateral" in on:
+        friction = np.maximum(speed - view.beside_speed, 0.0) * np.exp(-np.abs(view.beside_distance) / REACH_M)
+        accel = accel - on["lateral"] * np.nan_to_num(friction)
+    if "drag" in on:
+        accel = accel - on["drag"] * view.speed**2
+    if "grade" in on:
+        accel = accel - GRAVITY * np.sin(np.arctan(slope(view.position, on["grade"])))
+    return accel
+
+
+def led(accel: np.ndarray, lead_accel: np.ndarray, on: dict[str, float]) -> np.ndarray:
+    """Return the acceleration with the reaction to the leader's own acceleration."""
+    if "leader_acceleration" in on:
+        accel = accel + on["leader_acceleration"] * lead_accel
+    if "brake_light" in on:
+        accel = accel + on["brake_light"] * np.minimum(lead_accel, 0.0)
+    return accel
+
+
+def limited(accel: np.ndarray, speed: np.ndarray, held: np.ndarray, on: dict[str, float]) -> np.ndarray:
+    """Return what the vehicles do of what is wanted: asymmetry, action points, power, brakes."""
+    if "asymmetry" in on:
+        accel = accel - on["asymmetry"] * np.abs(accel)
+    if "action_point" in on:
+        accel = np.where(np.abs(accel - held) >= on["action_point"], accel, held)
+    if "power_limit" in on:
+        accel = np.minimum(accel, on["power_limit"] / np.maximum(speed, 0.1))
+    return np.maximum(accel, -HARDEST_BRAKING)
+
+
+def _adapted(view: View, drivers: Drivers, on: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    time_gap, top = drivers.time_gap, drivers.desired_speed
+    if "memory" in on:
+        time_gap = time_gap * (1 + on["memory"] * (1 - view.memory))
+    if "regime_shift" in on:
+        time_gap = time_gap * (1 + on["regime_shift"] * (view.time > SHIFT_TIME_S))
+    if "speed_zone" in on:
+        inside = (view.position > ZONE_M[0]) & (view.position < ZONE_M[1])
+        top = np.where(inside, on["speed_zone"] * top, top)
+    return time_gap, top
+
+
+def _desired_gap(speed: np.ndarray, closing: np.ndarray, time_gap: np.ndarray, drivers: Drivers) -> np.ndarray:
+    braking = 2.0 * np.sqrt(drivers.max_accel * drivers.comfort_decel)
+    return drivers.min_gap + np.maximum(speed * time_gap + speed * closing / braking, 0.0)

@@ -1,0 +1,100 @@
+"""Read a file of measured vehicles, whatever its layout, into checked trajectories."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import polars as pl
+
+from idm_env.data import ngsim, openacc, tidy
+from idm_env.data.errors import DataError, Repair, listed
+from idm_env.data.trajectories import Trajectories
+
+LAYOUTS = ("auto", "tidy", "ngsim", "openacc")
+EXTENSIONS = (".csv", ".csv.gz", ".parquet")
+_UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, EOFError, UnicodeError, ValueError)
+
+
+def load(
+    path: str | Path, *, ring_length: float | None = None, place: str | None = None, layout: str = "auto"
+) -> Trajectories:
+    """Return the trajectories of a file; the file itself is only read.
+
+    Args:
+        path: A csv, csv.gz or parquet file: a tidy table, an NGSIM file or an OpenACC file.
+        ring_length: Length in m of a closed road, on which a leader may be behind.
+        place: Column with the coordinate of places (hills, zones), such as ``"track_s_m"``; position_m if None.
+        layout: ``"tidy"``, ``"ngsim"``, ``"openacc"``, or ``"auto"`` to tell by the columns.
+
+    Raises:
+        DataError: If the file cannot be read or used; one line that names the value, the rule and the cure.
+    """
+    path = Path(path)
+    if layout not in LAYOUTS:
+        raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
+    extension = _checked(path)
+    lines = [] if extension == ".parquet" else _first_lines(path, openacc.SEARCHED_LINES)
+    above = openacc.header_line(lines)
+    try:
+        if layout == "openacc" or (layout == "auto" and above is not None):
+            above = openacc.HEADER_LINES if above is None else above
+            table = _table(path, extension, skip=above)
+            frame, repairs = openacc.read(table, lines[:above], path.name.split(".")[0], path.name)
+        else:
+            frame, repairs = _plain_layout(_table(path, extension), layout, path.name)
+        return Trajectories.from_frame(frame, source=path.name, ring_length=ring_length, place=place, repairs=repairs)
+    except pl.exceptions.PolarsError as error:
+        # Types that no rule foresaw, such as lists in a parquet column, or one name twice.
+        raise _unreadable(path, error) from error
+
+
+def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+    table = table.rename({name: name.strip() for name in table.columns})
+    if layout == "ngsim" or (layout == "auto" and ngsim.matches(table.columns)):
+        return ngsim.read(table, source)
+    if layout == "auto" and not tidy.matches(table.columns):
+        raise DataError(
+            f"{source}: no known layout has the columns {listed(table.columns, 8)}; a tidy table, separated by commas, "
+            "needs vehicle_id, time_s and position_m."
+        )
+    return tidy.read(table)
+
+
+def _checked(path: Path) -> str:
+    """Return the file's extension, or raise DataError for what is no readable file of a known kind."""
+    if path.is_dir():
+        raise DataError(f"{path} is a directory; name one file in it ({', '.join(EXTENSIONS)}).")
+    if not path.exists():
+        raise DataError(f"{path} does not exist; check the path.")
+    extension = next((known for known in EXTENSIONS if path.name.lower().endswith(known)), None)
+    if extension is None:
+        raise DataError(f"{path.name} has an unknown extension; use one of {', '.join(EXTENSIONS)}.")
+    if path.stat().st_size == 0:
+        raise DataError(f"{path.name} is empty (0 bytes); it needs a header and rows.")
+    return extension
+
+
+def _first_lines(path: Path, count: int) -> list[str]:
+    opener = gzip.open if path.name.lower().endswith(".gz") else open
+    try:
+        with opener(path, "rt", encoding="utf-8", errors="replace") as file:
+            return [str(file.readline()) for _ in range(count)]
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def _table(path: Path, extension: str, skip: int = 0) -> pl.DataFrame:
+    try:
+        if extension == ".parquet":
+            return pl.read_parquet(path)
+        return pl.read_csv(
+            path, skip_rows=skip, infer_schema_length=None, null_values=["", "NA", "N/A", "NaN", "nan", "null", "None"]
+        )
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: BaseException) -> DataError:
+    reason = str(error).strip().splitlines()[0][:150] if str(error).strip() else type(error).__name__
+    return DataError(f"{path.name} cannot be read ({reason}); is it complete and what its extension says?")

@@ -1,0 +1,102 @@
+"""Does the table mean metres, seconds and m/s? Feet, km/h, milliseconds and frames are named, never guessed away."""
+
+from __future__ import annotations
+
+import math
+
+import polars as pl
+
+from idm_env.data.errors import DataError, Repair
+from idm_env.data.schema import HIGHEST_SPEED_MPS, LONGEST_LENGTH_M, LOWEST_SPEED_MPS, TRACK
+
+LONGEST_MEDIAN_LENGTH_M = 12.0
+LONGEST_STEP_S = 2.0
+# speed_mps divided by the change of position_m over the change of time_s, if one of the three is in another unit
+_MISTAKES = (
+    (3.6, "speed_mps looks like km/h; divide it by 3.6"),
+    (3.281, "speed_mps looks like feet per second; multiply it by 0.3048"),
+    (2.237, "speed_mps looks like miles per hour; multiply it by 0.44704"),
+    (1 / 3.281, "position_m looks like feet; multiply it by 0.3048"),
+    (10.0, "time_s looks like frames of 0.1 s; divide it by 10"),
+    (1000.0, "time_s looks like milliseconds; divide it by 1000"),
+)
+
+
+def check(frame: pl.DataFrame, source: str) -> None:
+    """Raise DataError if lengths, speeds, steps of time or their ratio are not those of SI units.
+
+    Speeds are checked where the file gives them; a speed that is a fixed multiple of the change of position is the
+    surest sign of a wrong unit, so that it is looked for first.
+    """
+    step = frame.select(pl.col("time_s").diff().over(TRACK).median()).item()
+    if "speed_mps" in frame.columns:
+        _check_ratio(frame, source, step)
+    if step is not None and step > LONGEST_STEP_S:
+        raise DataError(
+            f"{source}: time_s rises by {step:g} s from row to row; is it in milliseconds or frames? Use seconds."
+        )
+    if "length_m" in frame.columns:
+        lengths = frame["length_m"].drop_nulls()
+        median = lengths.median() if len(lengths) else None
+        if isinstance(median, float) and median > LONGEST_MEDIAN_LENGTH_M:
+            raise DataError(
+                f"{source}: the median length_m is {median:.1f}, above {LONGEST_MEDIAN_LENGTH_M:g} m; the file looks "
+                "like feet: multiply lengths, positions, gaps and speeds by 0.3048."
+            )
+    high = _high_speed(frame)
+    if high is not None and high > HIGHEST_SPEED_MPS:
+        raise DataError(
+            f"{source}: 1 % of speeds exceed {high:.1f}, above {HIGHEST_SPEED_MPS:g} m/s; the file looks like km/h or "
+            "feet per second: convert it to metres and m/s."
+        )
+
+
+def _high_speed(frame: pl.DataFrame) -> float | None:
+    if "speed_mps" in frame.columns and frame["speed_mps"].null_count() < frame.height:
+        return frame["speed_mps"].quantile(0.99)
+    moved = frame.select((pl.col("position_m").diff() / pl.col("time_s").diff()).over(TRACK).alias("speed"))["speed"]
+    return moved.filter(moved.is_finite().fill_null(False)).quantile(0.9)
+
+
+def _check_ratio(frame: pl.DataFrame, source: str, step: float | None) -> None:
+    if step is None:
+        return
+    change = pl.col("position_m").diff().over(TRACK) / pl.col("time_s").diff().over(TRACK)
+    speed = (pl.col("speed_mps") + pl.col("speed_mps").shift(1).over(TRACK)) / 2
+    moving = (pl.col("time_s").diff().over(TRACK) <= 2.5 * step) & (speed.abs() > 2.0)
+    pairs = frame.select(change.alias("change"), speed.alias("speed"), moving.alias("moving"))
+    pairs = pairs.filter(pl.col("moving") & pl.col("change").is_finite())
+    if pairs.height < 20:
+        return
+    if pairs.select((pl.col("change") < 0).mean()).item() > 0.5:
+        raise DataError(
+            f"{source}: position_m falls while vehicles drive; it must rise along the road: change its sign."
+        )
+    low, ratio, high = (pairs.select((pl.col("speed") / pl.col("change")).quantile(q)).item() for q in (0.4, 0.5, 0.6))
+    if 0.75 <= ratio <= 1.33:
+        return
+    if ratio <= 0:
+        raise DataError(f"{source}: speed_mps is negative while position_m rises; change its sign.")
+    factor, cure = min(_MISTAKES, key=lambda mistake: abs(math.log(ratio / mistake[0])))
+    if abs(ratio / factor - 1) < 0.1:
+        raise DataError(f"{source}: speed_mps is {ratio:.2f} times the change of position_m per second; {cure}.")
+    if low > 1.33 or high < 0.75:
+        raise DataError(
+            f"{source}: speed_mps is {ratio:.2f} times the change of position_m per second; check their units."
+        )
+
+
+def implausible(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
+    """Empty single speeds and lengths that no vehicle has (the unit itself having been checked), counted."""
+    repairs = []
+    bounds = {"speed_mps": (LOWEST_SPEED_MPS, HIGHEST_SPEED_MPS, "m/s"), "length_m": (0.1, LONGEST_LENGTH_M, "m")}
+    for name, (low, high, unit) in bounds.items():
+        if name not in frame.columns:
+            continue
+        good = frame[name].is_between(low, high).fill_null(True)
+        count = frame.height - int(good.sum())
+        if count:
+            frame = frame.with_columns(pl.when(good).then(pl.col(name)).alias(name))
+            text = f"{count} values of {name} outside [{low:g}, {high:g}] {unit} are taken as missing."
+            repairs.append(Repair("implausible value", count, text))
+    return frame, repairs

@@ -1,0 +1,31 @@
+"""Fixtures for all tests: the measured files, which are not part of the project and may be absent."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+
+def measured_folder() -> Path:
+    """The folder named by IDM_ENV_DATA, or shared/data beside the checkout."""
+    named = os.environ.get("IDM_ENV_DATA")
+    return Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def measured() -> Callable[[str], Path]:
+    """Return the path of a measured file by name; the test is skipped, with a warning, where it is absent."""
+
+    def find(name: str) -> Path:
+        path = measured_folder() / name
+        if not path.exists():
+            message = f"measured file {name} is absent from {measured_folder()} (set IDM_ENV_DATA): test skipped"
+            warnings.warn(message, stacklevel=2)
+            pytest.skip(message)
+        return path
+
+    return find
