@@ -1,4 +1,4 @@
-"""Adam through the simulator, as in the paper: reverse-mode gradients of a whole rollout, parameters behind bijections."""
+"""Adam through the simulator, as in the paper: reverse-mode gradients, parameters behind bijections."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def adam(
     """Minimise the mean squared residual; return own [G, P] and shared [Q] values and the last loss.
 
     Every parameter lives on the real line behind ``biject_to`` of its bounds; the learning rate falls linearly from
-    ``rate[0]`` to ``rate[1]``. ``state`` is what ``on_step`` was given last: with it an interrupted run goes on as if nothing
-    had happened.
+    ``rate[0]`` to ``rate[1]``. ``state`` is what ``on_step`` was given last: with it an interrupted run goes on as
+    if nothing had happened.
     """
     free = [
         unconstrain(p, own[:, i]) if i < len(problem.own) else unconstrain(p, shared[i - len(problem.own)])

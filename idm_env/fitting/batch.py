@@ -26,9 +26,10 @@ COLUMNS = ("second_leader", "leader", "driver", "behind")
 class Batch:
     """Episodes on one time step, padded to one length.
 
-    Time is first: ``gap``, ``speed`` and ``valid`` are [T, rows]; ``position``, ``all_speed``, ``accel`` and ``present`` are
-    [T, rows, 4] in the order of ``COLUMNS``, positions in the coordinate of places; ``length`` is [rows, 4], ``first_step``
-    [rows]; ``beside`` is distance, speed and presence of the adjacent vehicle, each [T, rows].
+    Time is first: ``gap``, ``speed`` and ``valid`` are [T, rows]; ``position``, ``all_speed``, ``accel`` and
+    ``present`` are [T, rows, 4] in the order of ``COLUMNS``, positions in the coordinate of places; ``length`` is
+    [rows, 4], ``first_step`` [rows]; ``beside`` is distance, speed and presence of the adjacent vehicle, each [T,
+    rows].
     """
 
     episodes: tuple[Episode, ...]
@@ -53,7 +54,9 @@ class Batch:
         dt = items[0].dt
         odd = next((e for e in items if abs(e.dt - dt) > 1e-3 * dt), None)
         if odd is not None:
-            raise DataError(f"episodes {items[0].key} and {odd.key} have steps of {dt:g} and {odd.dt:g} s. Give one dt.")
+            raise DataError(
+                f"episodes {items[0].key} and {odd.key} have steps of {dt:g} and {odd.dt:g} s. Give one dt."
+            )
         steps = max(len(e) for e in items)
 
         def stack(columns: Sequence[np.ndarray]) -> Tensor:
@@ -98,12 +101,13 @@ class Batch:
             name: getattr(self, name)[:steps].index_select(1, at)
             for name in ("gap", "speed", "valid", "position", "all_speed", "accel", "present")
         }
+        beside = [x[:steps].index_select(1, at) for x in self.beside]
         return dataclasses.replace(
             self,
             episodes=tuple(self.episodes[i] for i in index),
             length=self.length[at],
             first_step=self.first_step[at],
-            beside=tuple(x[:steps].index_select(1, at) for x in self.beside),
+            beside=(beside[0], beside[1], beside[2]),
             **changes,
         )
 

@@ -35,7 +35,8 @@ class Errors(NamedTuple):
 def errors(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Errors, Simulated]:
     """Simulate every driver behind its measured leader and compare; own [G, P], shared [Q].
 
-    The first sample, where simulation starts on the measured state, counts as an error of 0, as in the published benchmark.
+    The first sample, where simulation starts on the measured state, counts as an error of 0, as in the published
+    benchmark.
     """
     with torch.no_grad():
         simulated = problem.simulate(problem.rows(own, shared))

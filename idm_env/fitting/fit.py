@@ -145,10 +145,11 @@ def fit(
 ) -> Fit:
     """Calibrate ``free`` parameters per group of drivers, and ``shared`` ones for all, behind the measured leaders.
 
-    ``by`` is ``driver``, ``all`` or a column. ``method`` is ``lm`` (Levenberg–Marquardt with exact forward-mode Jacobians, from
-    ``starts`` starts per group, the pooled optimum among them) or ``adam`` (500 steps of reverse mode, learning rate
-    0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead. ``checkpoint`` names the file
-    that makes an interrupted fit resumable with the same result. ValueError and DataError for what cannot be fitted.
+    ``by`` is ``driver``, ``all`` or a column. ``method`` is ``lm`` (Levenberg–Marquardt with exact forward-mode
+    Jacobians, from ``starts`` starts per group, the pooled optimum among them) or ``adam`` (500 steps of reverse
+    mode, learning rate 0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead.
+    ``checkpoint`` names the file that makes an interrupted fit resumable with the same result. ValueError and
+    DataError for what cannot be fitted.
     """
     if method not in ("lm", "adam"):
         raise ValueError(f"method = '{method}' is unknown. Use 'lm' or 'adam'.")
@@ -178,7 +179,9 @@ def _defaults(problem: Problem, names: Sequence[str]) -> Tensor:
     declared = dict(zip(problem.own + problem.shared, problem.parameters, strict=True))
     # A strength starts at its null where it has a gradient there, at its first start otherwise.
     values = [
-        p.default if p.null is None else (p.null if p.role == "strength" and not p.starts else (*p.starts, p.default)[0])
+        p.default
+        if p.null is None
+        else (p.null if p.role == "strength" and not p.starts else (*p.starts, p.default)[0])
         for p in (declared[name] for name in names)
     ]
     return torch.tensor(values, dtype=problem.batch.gap.dtype)

@@ -43,28 +43,25 @@ class Progress:
     finished: bool = False
 
 
-def row_equations(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Normal, Tensor, Tensor]:
-    """Linearise and return the equations of every row, its weight in the loss [S, rows], and the residual.
+def row_equations(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Normal, Tensor]:
+    """Linearise and return the equations of every row, and its weight in the loss [S, rows].
 
-    With ``loss="mse"`` a row costs ``Σ r²``; with ``"rmse"`` it costs ``√(Σ r²/n)``, whose gradient and majorising matrix are
-    those of Σ r² with weight ``1/(n · RMSE)``: iteratively reweighted least squares, which never raises the cost.
+    With ``loss="mse"`` a row costs ``Σ r²``; with ``"rmse"`` it costs ``√(Σ r²/n)``, whose gradient and majorising
+    matrix are those of Σ r² with weight ``1/(n · RMSE)``: iteratively reweighted least squares, which never raises
+    the cost.
     """
-    residual, jacobian = problem.linearise(own, shared)
-    square = residual.square().sum(0)
-    gradient = torch.einsum("tpsb,tsb->sbp", jacobian, residual)
-    hessian = torch.einsum("tpsb,tqsb->sbpq", jacobian, jacobian)
-    weight = torch.ones_like(square)
-    cost = square
-    if problem.loss == "rmse":
-        samples = problem.samples.clamp_min(1.0)
-        cost = torch.sqrt(square / samples + 1e-12)
-        weight = 1.0 / (samples * cost)
-    return Normal(cost, gradient * weight[..., None], hessian * weight[..., None, None]), weight, residual
+    square, gradient, hessian = problem.equations(own, shared)
+    if problem.loss == "mse":
+        return Normal(square, gradient, hessian), torch.ones_like(square)
+    samples = problem.samples.clamp_min(1.0)
+    cost = torch.sqrt(square / samples + 1e-12)
+    weight = 1.0 / (samples * cost)
+    return Normal(cost, gradient * weight[..., None], hessian * weight[..., None, None]), weight
 
 
 def normal(problem: Problem, own: Tensor, shared: Tensor) -> Normal:
     """Linearise at these values and sum the normal equations over the rows of every group."""
-    rows, _, _ = row_equations(problem, own, shared)
+    rows, _ = row_equations(problem, own, shared)
     return Normal(*(sum_groups(problem, x) for x in (rows.cost, rows.gradient, rows.hessian)))
 
 
@@ -110,7 +107,8 @@ def refine(
     """Improve the own parameters at fixed shared ones until every group has converged or ``iterations`` have passed.
 
     A group has converged when an accepted step lowers its cost by less than ``tolerance`` of it, when a refused step
-    promised no more than that, or when no damping up to 1e8 finds a lower one. ``on_step`` is called after every iteration.
+    promised no more than that, or when no damping up to 1e8 finds a lower one. ``on_step`` is called after every
+    iteration.
     """
     now = normal(problem, progress.own, progress.shared)
     while progress.iteration < iterations and not bool(progress.done.all()):
@@ -169,8 +167,8 @@ def minimise(
 ) -> tuple[Progress, Normal]:
     """Find own and shared parameters; without shared ones this is ``refine``.
 
-    Each iteration steps the shared parameters by their projected normal equations, lets the own ones follow, re-optimises
-    these for ``inner`` iterations, and keeps the result only if the total cost is lower.
+    Each iteration steps the shared parameters by their projected normal equations, lets the own ones follow,
+    re-optimises these for ``inner`` iterations, and keeps the result only if the total cost is lower.
     """
     if not problem.shared:
         progress, now = refine(problem, progress, iterations, on_step=on_step)

@@ -1,7 +1,7 @@
 """A fitting problem: which parameters are free, who shares them, and what the residual is.
 
-Free parameters are *own* (one value per group of drivers) or *shared* (one value for all). Values travel as two tensors:
-``own`` [..., groups, P] and ``shared`` [..., Q], in the order of the names.
+Free parameters are *own* (one value per group of drivers) or *shared* (one value for all). Values travel as two
+tensors: ``own`` [..., groups, P] and ``shared`` [..., Q], in the order of the names.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from idm_env.data import DataError, Episode
+from idm_env.fitting import fast
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.tangent import TangentStep, linearised_rollout
 from idm_env.parameters import Parameter, catalogue, nearest
@@ -37,10 +38,11 @@ class Simulated(NamedTuple):
 class Problem:
     """A simulator, measured episodes, and the parameters to find.
 
-    ``group`` gives every row's group. ``objective`` is the residual: ``spacing`` (simulated − measured gap, m), ``speed``
-    (m/s) or ``both`` (gap/``scales[0]`` and speed/``scales[1]``); ``relative`` divides by the row's mean measured value.
-    Samples of the first ``skip`` seconds do not count. ``loss`` says how episodes of a group add up: ``mse`` sums squared
-    residuals, ``rmse`` sums every episode's root mean square, so that a few bad episodes do not decide for all.
+    ``group`` gives every row's group. ``objective`` is the residual: ``spacing`` (simulated − measured gap, m),
+    ``speed`` (m/s) or ``both`` (gap/``scales[0]`` and speed/``scales[1]``); ``relative`` divides by the row's mean
+    measured value. Samples of the first ``skip`` seconds do not count. ``loss`` says how episodes of a group add up:
+    ``mse`` sums squared residuals, ``rmse`` sums every episode's root mean square, so that a few bad episodes do not
+    decide for all. ``kernels=False`` keeps to the torch path where fused kernels would fit.
     """
 
     simulator: Simulator
@@ -54,6 +56,7 @@ class Problem:
     loss: Loss = "mse"
     skip: float = 0.0
     scales: tuple[float, float] = (1.0, 0.3)
+    kernels: bool = True
 
     def __post_init__(self) -> None:
         known = catalogue(self.simulator.effects)
@@ -105,6 +108,8 @@ class Problem:
 
     def simulate(self, values: dict[str, Tensor]) -> Simulated:
         """Roll the drivers out behind their measured leaders; ``values`` are [..., rows] by parameter name."""
+        if self._fast:
+            return Simulated(*fast.simulate(self, values))
         _, driver = self.batch.columns(self.simulator)
         params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
         state = self.batch.start(self.simulator, params)
@@ -112,7 +117,7 @@ class Problem:
         def keep(now: State) -> tuple[Tensor, Tensor]:
             return now.gap[..., driver], now.speed[..., driver]
 
-        _, kept = self.simulator.rollout(state, self._inputs, params, self.batch.steps, keep=keep)  
+        _, kept = self.simulator.rollout(state, self._inputs, params, self.batch.steps, keep=keep)
         return Simulated(*kept)
 
     def rows(self, own: Tensor, shared: Tensor) -> dict[str, Tensor]:
@@ -130,21 +135,44 @@ class Problem:
             simulated.gap - self.batch.gap[1:].reshape(shape), simulated.speed - self.batch.speed[1:].reshape(shape)
         )
 
-    def _weigh(self, gap: Tensor, speed: Tensor) -> Tensor:
-        """Stack differences (or derivatives) of gap and speed, each over its scale: linear in both."""
-        parts = []
-        for name, difference, measured, scale in (
-            ("spacing", gap, self.batch.gap[1:], self.scales[0]),
-            ("speed", speed, self.batch.speed[1:], self.scales[1]),
+    @cached_property
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Weights of gap and speed residuals, each [T−1, rows]; 0 where the objective does not look."""
+        both = []
+        for name, measured, scale in (
+            ("spacing", self.batch.gap[1:], self.scales[0]),
+            ("speed", self.batch.speed[1:], self.scales[1]),
         ):
-            if self.objective not in (name, "both"):
-                continue
             weight = self.weight / (scale if self.objective == "both" else 1.0)
             if self.relative:
                 mean = (measured.abs() * self.weight).sum(0) / self.weight.sum(0).clamp_min(1.0)
                 weight = weight / mean.clamp_min(0.1)
-            parts.append(difference * weight.reshape(-1, *(1,) * (gap.dim() - 2), gap.shape[-1]))
-        return torch.cat(parts)
+            both.append(weight if self.objective in (name, "both") else torch.zeros_like(weight))
+        return both[0], both[1]
+
+    def _weigh(self, gap: Tensor, speed: Tensor) -> Tensor:
+        """Stack weighted differences (or derivatives) of gap and speed: linear in both."""
+        shape = (-1, *(1,) * (gap.dim() - 2), gap.shape[-1])
+        pair = {
+            "spacing": gap * self.weights[0].reshape(shape),
+            "speed": speed * self.weights[1].reshape(shape),
+        }
+        return torch.cat([x for name, x in pair.items() if self.objective in (name, "both")])
+
+    @cached_property
+    def _fast(self) -> bool:
+        return fast.matches(self)
+
+    def equations(self, own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return Σr² [S, rows], Jᵀr [S, rows, N] and JᵀJ [S, rows, N, N]; own [S, G, P], shared [S, Q]."""
+        if self._fast:
+            return fast.equations(self, self.rows(own, shared))
+        residual, jacobian = self.linearise(own, shared)
+        return (
+            residual.square().sum(0),
+            torch.einsum("tpsb,tsb->sbp", jacobian, residual),
+            torch.einsum("tpsb,tqsb->sbpq", jacobian, jacobian),
+        )
 
     @cached_property
     def _tangent(self) -> TangentStep:
@@ -190,7 +218,9 @@ def group_of(episodes: Sequence[Episode], by: str) -> tuple[Tensor, tuple[str, .
     else:
         known = set.intersection(*(set(e.labels) for e in episodes)) | {"driver", "all", "run_id", "vehicle_id"}
         if by not in known:
-            raise DataError(f"cannot group by '{by}': no such column that is constant for a driver.{nearest(by, known)}")
+            raise DataError(
+                f"cannot group by '{by}': no such column that is constant for a driver.{nearest(by, known)}"
+            )
         labels = [e.labels[by] for e in episodes]
     names = tuple(dict.fromkeys(labels))
     index = {name: i for i, name in enumerate(names)}

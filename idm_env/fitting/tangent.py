@@ -74,10 +74,10 @@ class TangentStep:
             values = [params[name.split(".")[0]][name.split(".")[1]] for name in names]
 
             def along(t: list[Tensor], d: list[Tensor]) -> Any:
-                out, tangent, rest = torch.func.jvp(function, (floats, values), (t, d), has_aux=True)
+                out, tangent, rest = torch.func.jvp(function, (floats, values), (t, d), has_aux=True)  # type: ignore[misc]
                 return out, tangent, rest
 
-            out, tangent, rest = torch.func.vmap(along, out_dims=(None, 0, None))(tangents, directions)
+            out, tangent, rest = torch.func.vmap(along, out_dims=(None, 0, None))(tangents, directions)  # type: ignore[arg-type]
             after: list[Tensor] = list(state_leaves)
             for i, x in (*zip(moving, out, strict=True), *zip(fixed, rest, strict=True)):
                 after[i] = x

@@ -25,39 +25,45 @@ class Uncertainty(NamedTuple):
 
 
 def effective_samples(residual: Tensor, weight: Tensor) -> Tensor:
-    """Return how many independent samples a correlated residual is worth, per row: ``n (1 − ρ)/(1 + ρ)``.
+    """Return how many independent samples a correlated residual is worth, per row: ``n / (1 + 2 Σ ρ_k)``.
 
-    ρ is the lag-1 autocorrelation of the residual about 0, [T, rows]; residuals of free simulation are strongly
-    correlated, and standard errors that ignore it are several times too small.
+    ρ_k is the autocorrelation of the residual about 0 at lag k, [T, rows], summed up to its first non-positive value
+    (the initial positive sequence, Geyer 1992). Residuals of free simulation are strongly correlated, and standard
+    errors that ignore it are several times too small.
     """
     count = weight.sum(0)
-    both = weight[1:] * weight[:-1]
-    rho = (residual[1:] * residual[:-1] * both).sum(0) / residual.square().sum(0).clamp_min(1e-300)
-    rho = (rho * count / both.sum(0).clamp_min(1.0)).clamp(0.0, 0.9999)
-    return count * (1.0 - rho) / (1.0 + rho)
+    size = 2 * len(residual)
+    spectrum = torch.fft.rfft(residual * weight, size, dim=0)
+    covariance = torch.fft.irfft(spectrum.abs().square(), size, dim=0)[: len(residual)]
+    rho = covariance / covariance[0].clamp_min(1e-300)
+    positive = torch.cumprod((rho > 0).to(rho.dtype), dim=0)
+    time = 2.0 * (rho * positive).sum(0) - 1.0
+    return count / time.clamp_min(1.0)
 
 
 def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
     """Return standard errors by the sandwich ``H⁻¹ M H⁻¹``; own [G, P], shared [Q].
 
     H is the Gauss–Newton matrix of the loss, M the variance of its gradient. In a group of fewer than ``ENOUGH_ROWS``
-    episodes, M adds each row's JᵀJ times its residual variance times n/n_eff, for correlated residuals; in a larger one it is
-    the spread of the rows' own gradients, which holds also where drivers differ (cluster-robust, Liang and Zeger 1986).
-    Shared parameters add up the information of all groups.
+    episodes, M adds each row's JᵀJ times its residual variance times n/n_eff, for correlated residuals; in a larger
+    one it is the spread of the rows' own gradients, which holds also where drivers differ (cluster-robust, Liang and
+    Zeger 1986). Shared parameters add up the information of all groups.
 
     A parameter is *not identified* when its standard error exceeds half of its value (a quarter of the width of its
-    bounds for a strength, whose value may be near 0); it is *at a bound* within 0.1 % of the width. Standard errors are of
-    the interior: at a bound they say how flat the loss is, not how far the truth may lie.
+    bounds for a strength, whose value may be near 0); it is *at a bound* within 0.1 % of the width. Standard errors
+    are of the interior: at a bound they say how flat the loss is, not how far the truth may lie.
     """
-    rows, row_weight, residual = row_equations(problem, own[None], shared[None])
+    rows, row_weight = row_equations(problem, own[None], shared[None])
+    with torch.no_grad():
+        residual = problem.residual(problem.simulate(problem.rows(own, shared)))
     sample_weight = problem.weight.repeat(2, 1) if problem.objective == "both" else problem.weight
-    independent = effective_samples(residual[:, 0], sample_weight)
+    independent = effective_samples(residual, sample_weight)
     size = len(problem.own) + len(problem.shared)
     groups = len(problem.groups)
     per_group = own.new_zeros(groups).index_add(0, problem.group, torch.ones_like(problem.samples))
     # Degrees of freedom are spent by the group; every row bears its share.
     spent = size / per_group[problem.group]
-    variance = residual[:, 0].square().sum(0) / (problem.samples - spent).clamp_min(1.0)
+    variance = residual.square().sum(0) / (problem.samples - spent).clamp_min(1.0)
     inflation = problem.samples / independent.clamp_min(1.0)
     by_row = rows.hessian[0] * (row_weight[0] * variance * inflation)[:, None, None]
     spread = rows.gradient[0][:, :, None] * rows.gradient[0][:, None, :]
