@@ -56,6 +56,8 @@ class Model:
     def __post_init__(self) -> None:
         if self.integration not in INTEGRATORS:
             raise ValueError(f"integration = '{self.integration}' is unknown.{nearest(self.integration, INTEGRATORS)}")
+        if not self.dt > 0.0:
+            raise ValueError(f"dt = {self.dt} s must be positive.")
         parameters.check(self.effects, self.params(dtype=torch.float64))
         for key in self.drivers:
             try:

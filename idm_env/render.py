@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 SIZE = 600
 """Width, and on a ring also height, of a picture (pixels)."""
 _LANE_HEIGHT = 200
+_MOST_LANES = 8
+"""Lanes beyond these are drawn over the first ones again."""
 _ASPHALT, _GROUND, _INK, _MARK = (70, 74, 82), (244, 243, 238), (30, 32, 36), (30, 90, 220)
 _COLOURS = np.array([(178, 24, 43), (239, 138, 98), (253, 219, 120), (120, 190, 110), (26, 120, 80)], float)
 
@@ -57,7 +59,8 @@ class Viewer:
     def show(self, task: Task, state: State, row: int = 0) -> np.ndarray | None:
         """Return the picture of one row of a state as ``(height, width, 3)`` uint8, or show it in the window."""
         ring = task.name == "ring"
-        canvas = self._pygame.Surface((SIZE, SIZE if ring else _LANE_HEIGHT))
+        lanes = min(max(task.lanes) + 1, _MOST_LANES)
+        canvas = self._pygame.Surface((SIZE, SIZE if ring else _LANE_HEIGHT + 40 * (lanes - 1)))
         canvas.fill(_GROUND)
         values = {
             name: getattr(state, name)[row].detach().cpu().double().numpy()
@@ -85,8 +88,11 @@ class Viewer:
 
     def _lane(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float) -> None:
         there = values["present"] > 0
-        height = 0.55 * _LANE_HEIGHT
-        self._pygame.draw.rect(canvas, _ASPHALT, (0, height - 13, SIZE, 26))
+        lanes = min(max(task.lanes) + 1, _MOST_LANES)
+        top = 0.55 * _LANE_HEIGHT
+        for lane in range(lanes):
+            self._pygame.draw.rect(canvas, _ASPHALT, (0, top + 40 * lane - 13, SIZE, 26))
+        height = top + 40 * (lanes - 1)
         if not there.any():
             return
         front = float(values["position"][there].max())
@@ -99,7 +105,8 @@ class Viewer:
         for i in np.flatnonzero(there):
             length = values["length"][i]
             x = 0.97 * SIZE - (front - values["position"][i] + 0.5 * length) * scale
-            self._vehicle(canvas, (x, height), 0.0, length * scale, values["speed"][i], fastest, i in task.agents)
+            y = top + 40 * (task.lanes[i] % _MOST_LANES)
+            self._vehicle(canvas, (x, y), 0.0, length * scale, values["speed"][i], fastest, i in task.agents)
 
     def _vehicle(
         self,

@@ -8,10 +8,13 @@ from typing import Any
 
 from idm_env.parameters import nearest
 from idm_env.tasks.base import Advance, Bounds, Ended, Task, World
+from idm_env.tasks.follow import FollowTask
+from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
+from idm_env.tasks.replay import ReplayTask
 from idm_env.tasks.ring import RingTask
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (RingTask,)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (RingTask, FollowTask, PlatoonTask, ReplayTask)}
 
 
 def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any) -> Task:
@@ -28,4 +31,17 @@ def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any)
     return TASKS[task](**choices)
 
 
-__all__ = ["TASKS", "Advance", "Bounds", "Draw", "Ended", "RingTask", "Task", "World", "make_task"]
+__all__ = [
+    "TASKS",
+    "Advance",
+    "Bounds",
+    "Draw",
+    "Ended",
+    "FollowTask",
+    "PlatoonTask",
+    "ReplayTask",
+    "RingTask",
+    "Task",
+    "World",
+    "make_task",
+]

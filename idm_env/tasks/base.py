@@ -29,6 +29,7 @@ Advance = Callable[[State, Inputs, Params], State]
 """One step of a simulator: ``Simulator.step``, or a fused kernel that gives the same."""
 
 _NORMALS_AT_ONCE = 1 << 16
+_TAKE_INPUTS = {"control", "replay", "imagined", "lateral"}
 
 
 class World(NamedTuple):
@@ -97,6 +98,8 @@ class Task(abc.ABC):
     road: ClassVar[Road]
     own_effects: ClassVar[tuple[Effect, ...]]
     own_parameters: ClassVar[Mapping[str, Mapping[str, float]]]
+    machinery: ClassVar[tuple[Effect, ...]] = (Control(),)
+    """Effects through which the task itself acts; they are always there, and take inputs that the task gives."""
     first_free: ClassVar[int] = 0
     """Vehicles before this one cannot be controlled: they are recorded."""
 
@@ -125,19 +128,30 @@ class Task(abc.ABC):
         return None
 
     @property
+    def lanes(self) -> tuple[int, ...]:
+        """The lane of each vehicle, counted from 0: for pictures."""
+        return (0,) * self.vehicles
+
+    @property
     @abc.abstractmethod
     def bounds(self) -> Bounds:
         """What one agent observes; observations are clipped to it, and what is clipped has no gradient."""
 
     @cached_property
     def _behaviour(self) -> Behaviour:
-        extra: tuple[Effect, ...] = (Control(),)
+        extra = self.machinery
         own = {effect: dict(values) for effect, values in self.own_parameters.items()}
         if self.noise:
             extra += (Noise(),)
         made = behaviour(self.own_effects, extra, own, self.effects, self.parameters, self.dt, self.integration)
         if self.noise:
             made.parameters.setdefault("noise", {}).setdefault("sigma", self.noise * math.sqrt(made.dt))
+        given = {"noise", *(effect.name for effect in self.machinery)}
+        for effect in made.effects:
+            if effect.name in _TAKE_INPUTS - given:
+                raise ValueError(
+                    f"effect '{effect.name}' takes an input that task '{self.name}' does not give. Leave it out here."
+                )
         return made
 
     @cached_property

@@ -20,7 +20,18 @@ def quick(**keywords):
     return gym.make("DiffIDM-v0", **{**QUICK, **keywords})
 
 
-@pytest.mark.parametrize("keywords", [{}, {"controlled": 3}, {"dtype": "float64"}, {"warmup_pool": 4}])
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {},
+        {"controlled": 3},
+        {"dtype": "float64"},
+        {"warmup_pool": 4},
+        {"task": "follow"},
+        {"task": "platoon", "controlled": 2},
+        {"task": "replay", "warmup": 0},
+    ],
+)
 @pytest.mark.filterwarnings("error")
 def test_check_env(keywords):
     check_env(quick(**keywords).unwrapped, skip_render_check=True)

@@ -32,6 +32,7 @@ def close(a, b):
 
 # Controlled vehicles that brake and accelerate at random crash on a short ring, so ends come at different steps.
 CASES = [{}, {"warmup_pool": 4}, {"vehicles": 4, "length": [26.0, 30.0], "start": "wave"}, {"controlled": 2}]
+CASES += [{"task": "follow", "warmup": 0}, {"task": "platoon", "controlled": 2}, {"task": "replay", "warmup": 0}]
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,0 +1,151 @@
+"""Task ``follow``: one controlled vehicle smooths the traffic behind a recorded leader (the I-24 work)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env import metrics
+from idm_env.effects import IDM, Brakes, Control, Effect, Replay
+from idm_env.roads import Lane, Road
+from idm_env.tasks.base import Bounds, Ended, Task, World
+from idm_env.tasks.checks import whole
+from idm_env.tasks.random import Draw
+from idm_env.tasks.recorded import Leaders, equilibrium_gap, head, made_up_leader, queue, recorded_leaders, starts
+from idm_env.types import Inputs, Params
+
+HORIZON = 1000
+_NEAREST, _FARTHEST, _SHORTEST = 7.0, 120.0, 1.0
+_GALLONS_PER_HOUR = 0.951
+"""1 mL/s in US gallons per hour."""
+
+
+def headway_penalty(gap: Tensor, speed: Tensor) -> Tensor:
+    """Return 0 … 1: how far a gap is below 7 m, above 120 m, or a time gap below 1 s.
+
+    The source takes 1 at any violation. Here it rises over 1 m, 10 m and 0.2 s, so that it has a gradient; a deeper
+    violation counts 1 as in the source.
+    """
+    near = _NEAREST - gap
+    far = (gap - _FARTHEST) / 10.0
+    short = (_SHORTEST - metrics.time_gap(gap, speed)) / 0.2
+    return torch.maximum(torch.maximum(near, far), short).clamp(0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FollowTask(Task):
+    """A controlled vehicle and five IDM followers behind a recorded leader (vehicle 0).
+
+    After Lichtlé, Vinitsky, Nice, Seibold, Work, Bayen 2022, "Deploying traffic smoothing cruise controllers learned
+    from trajectory data", ICRA, and its public code: Δt 0.1 s, horizon 1000, humans with a = 1.3, b = 2, v0 = 45, T =
+    1, s0 = 2, everybody in equilibrium at the start.
+
+    Observation, per agent: ``v/40, v_lead/40, gap/100``.
+    Reward, per agent: ``1 − fuel/10 − 0.002 u² − 2 p − 50 [crash]``; fuel is the mean rate of the agent and everybody
+    behind it (US gallons per hour; the source's own energy model is not public, ``metrics.fuel`` stands in), u its
+    command (m/s²), p in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap below 1 s.
+    Terminated where vehicles touch; truncated after 1000 steps or at the end of the record.
+
+    Args:
+        leader: A trajectory file; every leader that somebody follows in it may be drawn. None is the project's own
+            made-up trace.
+    """
+
+    name: ClassVar[str] = "follow"
+    road: ClassVar[Road] = Lane()
+    own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Brakes())
+    own_parameters: ClassVar = {
+        "idm": {"max_accel": 1.3, "comfort_decel": 2.0, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 45.0}
+    }
+    machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
+    first_free: ClassVar[int] = 1
+
+    vehicles: int = 7
+    max_command: float = 3.0
+    leader: str | None = None
+
+    def __post_init__(self) -> None:
+        whole("vehicles", self.vehicles, 2)
+        super().__post_init__()
+        _ = self.leaders
+
+    @property
+    def horizon(self) -> int:
+        """1000 steps."""
+        return HORIZON
+
+    @cached_property
+    def leaders(self) -> Leaders:
+        """The recorded leaders."""
+        dt = self.simulator.dt
+        return made_up_leader(dt) if self.leader is None else recorded_leaders(str(self.leader), dt)
+
+    @property
+    def bounds(self) -> Bounds:
+        """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
+        return Bounds(("speed", "lead_speed", "gap"), (0.0, 0.0, -0.1), (2.5, 2.5, 10.0))
+
+    def begin(self, draw: Draw, params: Params) -> World:
+        """Return a queue in equilibrium behind a drawn stretch of a drawn leader."""
+        like = params["idm"]["max_accel"]
+        device = draw.key.device
+        steps = self.constant("steps", self.leaders.steps, device, torch.int64)
+        trace, start = starts(draw, steps, self.horizon + self.warmup)
+        episode = {"trace": trace, "start": start + self.warmup}
+        first = self._motion(episode, torch.full_like(start, -self.warmup), like.dtype)
+        speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()
+        driver = IDM().driver(dict(params["idm"]))
+        gaps = equilibrium_gap(driver, speed).expand_as(speed)[:, 1:]
+        state = self.simulator.state(
+            queue(first[:, :1], gaps, self.vehicle_length),
+            speed,
+            params,
+            length=self.vehicle_length,
+            step=torch.full((len(start),), -self.warmup, device=device),
+        )
+        return World(state, episode)
+
+    def _motion(self, episode: dict[str, Tensor], step: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return position, speed and acceleration of the leaders at a step, shape ``(n, 3)``."""
+        motion = self.constant("motion", self.leaders.motion, step.device, dtype)
+        return motion[episode["trace"], (episode["start"] + step).clamp(0, motion.shape[1] - 1)]
+
+    def inputs(
+        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+    ) -> Inputs:
+        """Return the inputs of one step, with the leader's record at its end."""
+        inputs = dict(super().inputs(world, command, normals, live))
+        state = world.state
+        first = self.constant("first", [True] + [False] * (self.vehicles - 1), state.speed.device, torch.bool)
+        inputs["replay"] = head(self._motion(dict(world.episode), state.step + 1, state.speed.dtype), first)
+        return inputs
+
+    def observe(self, world: World) -> Tensor:
+        """Return ``v/40, v_lead/40, gap/100`` of every agent."""
+        state = world.state
+        lead_speed = self.pick(self.road.ahead(state.speed))
+        return self.clip([self.pick(state.speed) / 40.0, lead_speed / 40.0, self.pick(state.gap) / 100.0])
+
+    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return ``1 − fuel/10 − 0.002 u² − 2 p − 50 [crash]``."""
+        state = after.state
+        fuel = metrics.fuel(state.speed, state.accel) * _GALLONS_PER_HOUR
+        # Running means from the back: of every vehicle and those behind it.
+        count = self.constant("count", list(range(self.vehicles, 0, -1)), fuel.device, fuel.dtype)
+        behind = fuel.flip(-1).cumsum(-1).flip(-1) / count
+        gap, speed = self.pick(state.gap), self.pick(state.speed)
+        crash = (state.gap[..., 1:] <= 0.0).any(-1, keepdim=True).to(fuel.dtype)
+        return (
+            1.0 - 0.1 * self.pick(behind) - 0.002 * command * command - 2.0 * headway_penalty(gap, speed) - 50.0 * crash
+        )
+
+    def ended(self, world: World) -> Ended:
+        """Return whether vehicles have touched, or the record is at its end."""
+        ends = super().ended(world)
+        steps = self.constant("steps", self.leaders.steps, world.state.step.device, torch.int64)
+        over = world.episode["start"] + world.state.step + 1 >= steps[world.episode["trace"]]
+        return Ended(ends.terminated, ends.truncated | over.unsqueeze(-1))

@@ -1,0 +1,137 @@
+"""Task ``platoon``: controlled vehicles among N in an open lane, and disturbances at its head."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects import IDM, Brakes, Control, Effect, Replay
+from idm_env.roads import Lane, Road
+from idm_env.tasks.base import Bounds, Task, World
+from idm_env.tasks.checks import at_least, span, whole
+from idm_env.tasks.random import Draw
+from idm_env.tasks.recorded import equilibrium_gap, head, queue
+from idm_env.types import Inputs, Params
+
+_WAVE_STREAM = 21
+_WAVES = 3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlatoonTask(Task):
+    """k controlled vehicles of N behind a head (vehicle 0) whose speed oscillates; damp it, front to back.
+
+    The head drives ``v(t) = v̄ + Σ A_j [cos(ω_j t + φ_j) − cos φ_j e^{−t/10 s}]`` with three waves of drawn periods,
+    phases and amplitudes (which sum to ``disturbance``), and starts at v̄ exactly, as everybody does, in equilibrium.
+    String stability (Swaroop and Hedrick 1996, IEEE Trans. Autom. Control 41) is ``metrics.amplification`` of the
+    speeds.
+
+    Observation, per agent: ``v/30, (v_lead − v)/10, gap/100, (v − v̄)/10``.
+    Reward, per agent: ``−((v_i − v̄)² + (v_last − v̄)²) / (2 A²) − 0.1 u² − 2 max(0, 1 − time gap / 0.8 s)
+    − max(0, time gap / 4 s − 1)``, A the disturbance, u its command (m/s²): the usual quadratic costs of speed and
+    effort, and bounds on the time gap so that nobody hides far behind. The humans (a = 0.6, b = 1.5, T = 1, s0 = 2,
+    v0 = 30) amplify waves of 40–90 s at 10 m/s, by a quarter over ten vehicles. Terminated where vehicles touch.
+
+    Args:
+        speed: Mean speed v̄ of the head (m/s).
+        disturbance: Sum A of the amplitudes (m/s).
+        period: Range of the waves' periods (s).
+    """
+
+    name: ClassVar[str] = "platoon"
+    road: ClassVar[Road] = Lane()
+    own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Brakes())
+    own_parameters: ClassVar = {
+        "idm": {"max_accel": 0.6, "comfort_decel": 1.5, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 30.0}
+    }
+    machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
+    first_free: ClassVar[int] = 1
+
+    vehicles: int = 11
+    max_command: float = 2.0
+    speed: float = 10.0
+    disturbance: float = 3.0
+    period: float | Sequence[float] = (40.0, 90.0)
+
+    def __post_init__(self) -> None:
+        whole("vehicles", self.vehicles, 2)
+        super().__post_init__()
+        at_least("disturbance", self.disturbance, 1e-3, "m/s")
+        at_least("speed", self.speed, 2.0 * self.disturbance, "m/s")
+        span("period", self.period, 1.0, "s")
+
+    @property
+    def bounds(self) -> Bounds:
+        """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
+        low = (0.0, -10.0, -0.1, -10.0)
+        return Bounds(("speed", "relative_speed", "gap", "deviation"), low, (4.0, 10.0, 10.0, 10.0))
+
+    def begin(self, draw: Draw, params: Params) -> World:
+        """Return a platoon in equilibrium at v̄, with drawn waves ahead of it."""
+        like = params["idm"]["max_accel"]
+        low, high = span("period", self.period, 1.0, "s")
+        u = draw.uniforms(_WAVE_STREAM, 3 * _WAVES, like.dtype).view(-1, 3, _WAVES)
+        share = u[:, 2] + 0.2
+        waves = torch.stack(
+            (
+                2.0 * math.pi / (low + (high - low) * u[:, 0]),
+                2.0 * math.pi * u[:, 1],
+                self.disturbance * share / share.sum(-1, keepdim=True),
+            ),
+            dim=1,
+        )
+        step = torch.full((len(waves),), -self.warmup, device=waves.device)
+        first = self._motion(waves, step)
+        speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()
+        driver = IDM().driver(dict(params["idm"]))
+        gaps = equilibrium_gap(driver, speed).expand_as(speed)[:, 1:]
+        positions = queue(first[:, :1], gaps, self.vehicle_length)
+        state = self.simulator.state(positions, speed, params, length=self.vehicle_length, step=step)
+        return World(state, {"waves": waves})
+
+    def _motion(self, waves: Tensor, step: Tensor) -> Tensor:
+        """Return position, speed and acceleration of the head at a step, shape ``(n, 3)``."""
+        frequency, phase, amplitude = waves.unbind(1)
+        t = ((step + self.warmup) * self.simulator.dt).to(waves.dtype).unsqueeze(-1)
+        angle, fade = frequency * t + phase, torch.exp(-0.1 * t)
+        start = phase.cos()
+        moved = (angle.sin() - phase.sin()) / frequency - start * 10.0 * (1.0 - fade)
+        position = self.speed * t.squeeze(-1) + (amplitude * moved).sum(-1)
+        speed = self.speed + (amplitude * (angle.cos() - start * fade)).sum(-1)
+        accel = (amplitude * (-frequency * angle.sin() + 0.1 * start * fade)).sum(-1)
+        return torch.stack((position, speed, accel), dim=-1)
+
+    def inputs(
+        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+    ) -> Inputs:
+        """Return the inputs of one step, with the head's motion at its end."""
+        inputs = dict(super().inputs(world, command, normals, live))
+        state = world.state
+        first = self.constant("first", [True] + [False] * (self.vehicles - 1), state.speed.device, torch.bool)
+        inputs["replay"] = head(self._motion(world.episode["waves"], state.step + 1), first)
+        return inputs
+
+    def observe(self, world: World) -> Tensor:
+        """Return ``v/30, (v_lead − v)/10, gap/100, (v − v̄)/10`` of every agent."""
+        state = world.state
+        speed, lead_speed = self.pick(state.speed), self.pick(self.road.ahead(state.speed))
+        gap = self.pick(state.gap)
+        return self.clip([speed / 30.0, (lead_speed - speed) / 10.0, gap / 100.0, (speed - self.speed) / 10.0])
+
+    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return minus the quadratic costs of speed and effort, and of time gaps out of bounds."""
+        state = after.state
+        speed, last = self.pick(state.speed), state.speed[..., -1:]
+        off, off_last = speed - self.speed, last - self.speed
+        time_gap = self.pick(state.gap) / speed.clamp_min(1.0)
+        return (
+            -(off * off + off_last * off_last) / (2.0 * self.disturbance**2)
+            - 0.1 * command * command
+            - 2.0 * torch.relu(1.0 - time_gap / 0.8)
+            - torch.relu(time_gap / 4.0 - 1.0)
+        )

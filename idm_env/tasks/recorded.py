@@ -1,0 +1,95 @@
+"""Recorded leaders for tasks: from trajectory files, or the project's own made-up trace."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env.tasks.random import Draw
+from idm_env.types import Driver, Record
+
+_TRACE_STREAM, _START_STREAM = 11, 12
+
+
+class Leaders(NamedTuple):
+    """Recorded leaders: ``motion`` (leaders, time, 3) holds position (m), speed (m/s), acceleration (m/s²).
+
+    ``steps`` (leaders,) says how many time steps of each hold; the rest repeats the last one.
+    """
+
+    motion: np.ndarray
+    steps: np.ndarray
+
+
+def made_up_leader(dt: float, seconds: float = 600.0) -> Leaders:
+    """Return the project's own leader in congested motorway traffic, from a formula and not from any measurement.
+
+    A slow drift around 14 m/s and stop-and-go waves of 40–90 s whose depth swells and fades; speeds are 1–31 m/s and
+    accelerations within about ±2 m/s². Ten minutes are enough for thousands of different starts.
+    """
+    fine = 10
+    t = np.arange(int(seconds / dt) * fine + 1) * (dt / fine)
+    drift = 14.0 + 3.0 * np.sin(2 * np.pi * t / 310.0 + 0.4) + 2.0 * np.sin(2 * np.pi * t / 173.0 + 2.0)
+    swell = 0.55 + 0.45 * np.sin(2 * np.pi * t / 233.0 + 1.1)
+    waves = 12.5 * np.sin(2 * np.pi * t / 71.0) + 4.5 * np.sin(2 * np.pi * t / 43.0 + 0.9)
+    speed = drift + swell * waves + 0.5 * np.sin(2 * np.pi * t / 11.0)
+    # A soft floor keeps the speed positive and the acceleration continuous where a wave stops the traffic.
+    speed = np.logaddexp(0.0, 2.0 * speed) / 2.0
+    position = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * (dt / fine))))
+    accel = np.gradient(speed, dt / fine)
+    motion = np.stack((position, speed, accel), axis=-1)[::fine]
+    return Leaders(motion[None], np.array([len(motion)]))
+
+
+@lru_cache(maxsize=8)
+def recorded_leaders(path: str, dt: float) -> Leaders:
+    """Return every leader of a trajectory file that somebody follows, smoothed, on a clock of ``dt``.
+
+    Raises:
+        DataError: If the file cannot be used, or its step does not fit ``dt``.
+    """
+    from idm_env.data import episodes, load
+
+    found = episodes(load(path), smooth=True, dt=dt)
+    longest = max(len(e) for e in found)
+    motion = np.zeros((len(found), longest, 3))
+    for row, episode in zip(motion, found, strict=True):
+        lead = episode.leader
+        n = len(episode)
+        row[:n] = np.stack((lead.position_m - lead.position_m[0], lead.speed_mps, lead.accel_mps2), axis=-1)
+        row[n:] = row[n - 1]
+    return Leaders(motion, np.array([len(e) for e in found]))
+
+
+def starts(draw: Draw, steps: Tensor, wanted: int) -> tuple[Tensor, Tensor]:
+    """Return a leader and a first step for every environment, so that ``wanted`` steps remain where there are so many.
+
+    Leaders that are long enough are drawn alike; if none is, all are.
+    """
+    enough = steps > wanted
+    choices = torch.nonzero(enough if bool(enough.any()) else steps > 1).squeeze(-1)
+    trace = choices[(draw.uniforms(_TRACE_STREAM, 1, torch.float64).squeeze(-1) * len(choices)).long()]
+    room = (steps[trace] - wanted).clamp_min(1)
+    return trace, (draw.uniforms(_START_STREAM, 1, torch.float64).squeeze(-1) * room).long()
+
+
+def head(motion: Tensor, active: Tensor) -> Record:
+    """Return the replay of vehicle 0 from its motion at the end of the step, shape ``(n, 3)``."""
+    position, speed, accel = motion.unsqueeze(-2).unbind(-1)
+    return Record(position, speed, accel, active)
+
+
+def equilibrium_gap(driver: Driver, speed: Tensor) -> Tensor:
+    """Return the gap at which IDM drivers keep a speed (m): ``(s0 + v T)/√(1 − (v/v0)⁴)``, v at most 0.95 v0."""
+    ratio = (speed / driver.desired_speed).clamp(0.0, 0.95)
+    return (driver.min_gap + speed * driver.time_gap) / torch.sqrt(1.0 - ratio**4)
+
+
+def queue(lead_position: Tensor, gaps: Tensor, length: float) -> Tensor:
+    """Return positions of a queue behind a leader ``(n, 1)``; ``gaps`` are those of all but the first."""
+    behind = lead_position - torch.cumsum(gaps + length, dim=-1)
+    return torch.cat((lead_position, behind), dim=-1)

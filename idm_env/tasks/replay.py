@@ -1,0 +1,239 @@
+"""Task ``replay``: a recorded road replayed, with any chosen vehicles handed over to agents or to the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env import metrics
+from idm_env.effects import IDM, Brakes, Control, Effect, Replay
+from idm_env.parameters import nearest
+from idm_env.roads import Lane, Road
+from idm_env.tasks.base import Bounds, Ended, Task, World
+from idm_env.tasks.checks import whole
+from idm_env.tasks.follow import headway_penalty
+from idm_env.tasks.random import Draw
+from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene
+from idm_env.types import Inputs, Params, Record
+
+HORIZON = 300
+REWARDS = ("imitation", "follow")
+_START_STREAM = 31
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReplayTask(Task):
+    """Every vehicle of every lane of a file, where its smoothed record says; some are simulated instead.
+
+    An episode begins at a drawn time at which all agents are there, behind recorded leaders. Recorded vehicles do not
+    react to those that are handed over. A vehicle that is handed over and comes later begins from its record.
+
+    Observation, per agent: ``v/40, v_lead/40, gap/100`` (a missing leader: the own speed, gap 1000 m).
+    Reward, per agent: ``"imitation"``: ``−|x − x_record|/10``; ``"follow"``: ``1 − fuel/10 − 0.002 u² − 2 p − 50
+    [crash]``, the terms of task ``follow`` with the agent's own fuel.
+    Each agent for itself: terminated where it touches its leader, truncated where its record ends. All are truncated
+    after 300 steps.
+
+    Args:
+        data: A trajectory file; None is a made-up scene of the project's own.
+        runs: Some of its runs; None takes all, on one clock.
+        controlled: Which vehicles agents control: a number (those that follow longest), or ids, as ``"vehicle"`` or
+            ``"run/vehicle"``.
+        model: Which vehicles the drivers' model takes over: ids as for ``controlled``, or ``"all"`` with a recorded
+        leader. reward_terms: ``"imitation"`` or ``"follow"``.
+    """
+
+    name: ClassVar[str] = "replay"
+    road: ClassVar[Road] = Lane()
+    own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Brakes())
+    own_parameters: ClassVar = {}
+    machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
+
+    vehicles: int = 0
+    controlled: Any = 1
+    max_command: float = 3.0
+    data: str | None = None
+    runs: Sequence[str] | None = None
+    model: str | Sequence[str] = ()
+    reward_terms: str = "imitation"
+
+    def __post_init__(self) -> None:
+        if self.vehicles:
+            raise ValueError(f"vehicles = {self.vehicles}, but the file of task 'replay' decides. Leave it out.")
+        if self.warmup:
+            raise ValueError(f"warmup = {self.warmup}, but a replay begins from its record. Leave it out.")
+        if self.reward_terms not in REWARDS:
+            raise ValueError(
+                f"reward_terms = {self.reward_terms!r} is unknown.{nearest(str(self.reward_terms), REWARDS)}"
+            )
+        # The simulator needs no number of vehicles; everything that does comes after this line.
+        object.__setattr__(self, "vehicles", len(self.scene.ids))
+        self.params(torch.float64, "cpu")
+        _ = self.agents, self._simulated, self._starts
+
+    @property
+    def horizon(self) -> int:
+        """300 steps."""
+        return HORIZON
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """The recorded lane of each slot."""
+        return self.scene.lane
+
+    @property
+    def bounds(self) -> Bounds:
+        """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
+        return Bounds(("speed", "lead_speed", "gap"), (0.0, 0.0, -0.1), (2.5, 2.5, 10.0))
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The recorded road."""
+        dt = self.simulator.dt
+        if self.data is None:
+            return made_up_scene(dt)
+        return recorded_scene(str(self.data), dt, None if self.runs is None else tuple(self.runs))
+
+    @cached_property
+    def agents(self) -> tuple[int, ...]:
+        """Slots of the controlled vehicles."""
+        if isinstance(self.controlled, Sequence) and not isinstance(self.controlled, str):
+            chosen = tuple(sorted({self._slot(i) for i in self.controlled}))
+            if not chosen:
+                raise ValueError("controlled = [] must name at least one vehicle.")
+            return chosen
+        count = whole("controlled", self.controlled, 1)
+        led = self.scene.led
+        order = [int(i) for i in np.argsort(-led.sum(0), kind="stable") if self.scene.ids[i] != "—"]
+        picked: list[int] = []
+        together = np.ones(len(led), bool)
+        for slot in order:
+            if len(picked) < count and _longest(together & led[:, slot]) >= min(HORIZON, _longest(led[:, order[0]])):
+                picked.append(slot)
+                together &= led[:, slot]
+        if len(picked) < count:
+            raise ValueError(
+                f"controlled = {count}, but only {len(picked)} vehicles follow recorded leaders at one time. "
+                f"Control fewer."
+            )
+        return tuple(sorted(picked))
+
+    def _slot(self, vehicle: Any) -> int:
+        known = {key: i for i, key in enumerate(self.scene.ids) if key != "—"}
+        found = [i for key, i in known.items() if str(vehicle) in (key, key.rsplit("/", 1)[-1])]
+        if not found:
+            raise ValueError(
+                f"vehicle '{vehicle}' is not in the recording.{nearest(str(vehicle), list(known)[:200])[:160]}"
+            )
+        if len(found) > 1:
+            raise ValueError(
+                f"vehicle '{vehicle}' is in {len(found)} runs. Name one of them: '{self.scene.ids[found[0]]}'."
+            )
+        return found[0]
+
+    @cached_property
+    def _simulated(self) -> np.ndarray:
+        """Slots that are not replayed, bool."""
+        mine = np.zeros(self.vehicles, bool)
+        if self.model == "all":
+            mine |= self.scene.led.any(0) & (np.array(self.scene.ids) != "—")
+        elif isinstance(self.model, str):
+            raise ValueError(f"model = {self.model!r} must be 'all' or a list of vehicles.")
+        else:
+            mine[[self._slot(vehicle) for vehicle in self.model]] = True
+        mine[list(self.agents)] = True
+        return mine
+
+    @cached_property
+    def _starts(self) -> np.ndarray:
+        """Time steps at which an episode may begin: all agents follow for the horizon, or for as long as any do."""
+        together: np.ndarray = np.all(self.scene.led[:, list(self.agents)], axis=1)
+        remaining = np.zeros(len(together) + 1, int)
+        for t in range(len(together) - 1, -1, -1):
+            remaining[t] = remaining[t + 1] + 1 if together[t] else 0
+        longest = int(remaining.max())
+        if longest < 2:
+            ids = [self.scene.ids[i] for i in self.agents[:4]]
+            raise ValueError(f"vehicles {ids} never follow recorded leaders at one time. Control others or fewer.")
+        return np.flatnonzero(remaining[:-1] >= min(HORIZON + 1, longest))
+
+    def begin(self, draw: Draw, params: Params) -> World:
+        """Return the recorded road at a drawn time."""
+        like = params["idm"]["max_accel"]
+        starts = self.constant("starts", self._starts, draw.key.device, torch.int64)
+        start = starts[(draw.uniforms(_START_STREAM, 1, torch.float64).squeeze(-1) * len(starts)).long()]
+        motion, present = self._recorded(start, like.dtype)
+        length = self.constant("length", self.scene.length, start.device, like.dtype)
+        state = self.simulator.state(
+            motion[..., 0],
+            motion[..., 1],
+            params,
+            accel=motion[..., 2],
+            length=length,
+            present=present,
+            step=torch.zeros_like(start),
+        )
+        return World(state, {"start": start})
+
+    def _recorded(self, time: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Return motion ``(n, slots, 3)`` and presence ``(n, slots)`` at time steps of the record."""
+        motion = self.constant("motion", self.scene.motion, time.device, dtype)
+        present = self.constant("present", self.scene.present, time.device, dtype)
+        inside = time.clamp(0, len(motion) - 1)
+        return motion[inside], present[inside]
+
+    def inputs(
+        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+    ) -> Inputs:
+        """Return the inputs of one step, with the record at its end; who is not there yet is placed by it."""
+        inputs = dict(super().inputs(world, command, normals, live))
+        state = world.state
+        motion, present = self._recorded(world.episode["start"] + state.step + 1, state.speed.dtype)
+        replayed = self.constant("replayed", ~self._simulated, state.speed.device, torch.bool)
+        assert state.present is not None
+        position, speed, accel = motion.unbind(-1)
+        inputs["replay"] = Record(position, speed, accel, replayed | (state.present <= 0), present)
+        return inputs
+
+    def observe(self, world: World) -> Tensor:
+        """Return ``v/40, v_lead/40, gap/100`` of every agent."""
+        state = world.state
+        there = self.road.leader_present(state.present, state.speed) > 0
+        lead_speed = torch.where(there, self.road.ahead(state.speed), state.speed)
+        return self.clip([self.pick(x) for x in (state.speed / 40.0, lead_speed / 40.0, state.gap / 100.0)])
+
+    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return minus the distance to the record (10 m), or the terms of ``follow``."""
+        state = after.state
+        if self.reward_terms == "imitation":
+            return -0.1 * self.distance(after)
+        speed, gap = self.pick(state.speed), self.pick(state.gap)
+        fuel = 0.951 * metrics.fuel(speed, self.pick(state.accel))
+        crash = (gap <= 0.0).to(gap.dtype)
+        far = torch.where(gap < 1e3, headway_penalty(gap, speed), 0.0)
+        return 1.0 - 0.1 * fuel - 0.002 * command * command - 2.0 * far - 50.0 * crash
+
+    def distance(self, world: World) -> Tensor:
+        """Return how far the agents are from their records (m), 0 where these have ended, shape ``(…, agents)``."""
+        state = world.state
+        motion, present = self._recorded(world.episode["start"] + state.step, state.speed.dtype)
+        return self.pick((state.position - motion[..., 0]).abs() * present)
+
+    def ended(self, world: World) -> Ended:
+        """Return, for each agent, whether it touches its leader, and whether its record has ended."""
+        state = world.state
+        assert state.present is not None
+        over = world.episode["start"] + state.step + 1 >= len(self.scene.present)
+        return Ended(self.pick(state.gap) <= 0.0, (self.pick(state.present) <= 0) | over.unsqueeze(-1))
+
+
+def _longest(mask: np.ndarray) -> int:
+    """Return the length of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.view(np.int8), [0]))))
+    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0

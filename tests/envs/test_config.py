@@ -1,0 +1,116 @@
+"""YAML: a model goes out and comes back the same, configs/ can be made, and mistakes are one line with a cure."""
+
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+import torch
+import yaml
+
+import idm_env  # noqa: F401
+from idm_env.config import Model, load_environment, load_model, save_model
+from idm_env.effects import IDM, Brakes, Curve, Delay
+from idm_env.tasks import make_task
+
+CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+GOOD = {"configures": "model", "effects": ["idm", "brakes"], "parameters": {"idm": {"time_gap": 1.1}}}
+
+
+def write(path, content):
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return str(path)
+
+
+def test_a_model_comes_back_the_same(tmp_path):
+    model = Model(
+        (IDM(), Brakes(), Delay(max_delay=1.0), Curve(feature="gap", knots=(0.0, 20.0))),
+        {"idm": {"time_gap": 1.2}, "delay": {"delay": 0.4}, "curve_gap": {"knot_0": 0.3}},
+        0.2,
+        "euler",
+        {"r/1": {"idm": {"time_gap": 0.9}}},
+    )
+    save_model(tmp_path / "model.yaml", model)
+    assert load_model(tmp_path / "model.yaml") == model
+    assert float(model.params("r/1")["idm"]["time_gap"]) == pytest.approx(0.9)
+    assert float(model.params()["idm"]["time_gap"]) == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"effects": ["idm", "brakess"]}, "Did you mean 'brakes'"),
+        ({"effects": ["idm", {"effect": "delay", "max_dealy": 1}]}, "Did you mean 'max_delay'"),
+        ({"effects": []}, "needs effects"),
+        ({"effects": "idm"}, "must be a list"),
+        ({"parameters": {"idm": {"time_gab": 1.0}}}, "Did you mean 'idm.time_gap'"),
+        ({"parameters": {"imd": {"time_gap": 1.0}}}, "Did you mean 'idm'"),
+        ({"parameters": {"idm": {"time_gap": 50.0}}}, "outside"),
+        ({"parameters": {"idm": {"time_gap": "long"}}}, "must be a number"),
+        ({"parameters": {"idm": 3}}, "must be a mapping"),
+        ({"drivers": {"x": {"idm": {"time_gap": 50.0}}}}, "driver 'x'"),
+        ({"parameter": {}}, "Did you mean 'parameters'"),
+        ({"schema": 9}, "reads schema 1"),
+        ({"integration": "eulr"}, "Did you mean 'euler'"),
+        ({"configures": "environment"}, "a model is wanted"),
+        ({"dt": 0}, "must be positive"),
+    ],
+)
+def test_mistakes_in_a_model_are_one_line(tmp_path, change, words):
+    path = write(tmp_path / "model.yaml", {**GOOD, **change})
+    with pytest.raises(ValueError, match=words) as caught:
+        make_task("ring", effects=path)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_are_no_yaml(tmp_path):
+    (tmp_path / "bad.yaml").write_text("a: [1,", encoding="utf-8")
+    with pytest.raises(ValueError, match="not valid YAML") as caught:
+        load_model(tmp_path / "bad.yaml")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="is not a file"):
+        load_model(tmp_path / "none.yaml")
+
+
+def test_a_saved_model_makes_the_environment(tmp_path):
+    save_model(tmp_path / "model.yaml", Model((IDM(), Brakes(), Delay()), {"idm": {"time_gap": 1.3}}, 0.2))
+    env = gym.make("DiffIDM-v0", effects=str(tmp_path / "model.yaml"), warmup=5)
+    task = env.unwrapped.task
+    assert task.simulator.dt == 0.2
+    assert [e.name for e in task.simulator.effects] == ["idm", "brakes", "delay", "control", "noise"]
+    params = env.unwrapped.params
+    assert float(params["idm"]["time_gap"]) == pytest.approx(1.3)
+    # What neither the file nor a keyword names is the effect's default, not the task's.
+    assert float(params["idm"]["max_accel"]) == pytest.approx(1.4)
+    env.reset(seed=0)
+    env.step(None)
+
+
+def test_keywords_win_over_the_model(tmp_path):
+    save_model(tmp_path / "model.yaml", Model((IDM(), Brakes()), {"idm": {"time_gap": 1.3}}))
+    task = make_task("follow", effects=str(tmp_path / "model.yaml"), parameters={"idm.time_gap": 1.6}, dt=0.2)
+    assert float(task.params(torch.float64, "cpu")["idm"]["time_gap"]) == pytest.approx(1.6)
+    assert task.simulator.dt == 0.2
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_every_shipped_file_does_what_it_says(path):
+    kind = yaml.safe_load(path.read_text(encoding="utf-8"))["configures"]
+    if kind == "model":
+        assert load_model(path).effects
+    elif kind == "environment":
+        env = gym.make("DiffIDM-v0", config=str(path), **({"warmup": 3} if "warmup" in load_environment(path) else {}))
+        env.reset(seed=0)
+        env.step(None)
+
+
+def test_ring_yaml_is_the_default_ring():
+    path = next(path for path in CONFIGS if path.stem == "ring")
+    spelled, plain = (gym.make("DiffIDM-v0", warmup=20, **kw) for kw in ({"config": str(path)}, {}))
+    assert (spelled.reset(seed=5)[0] == plain.reset(seed=5)[0]).all()
+
+
+def test_an_environment_file_must_say_so(tmp_path):
+    with pytest.raises(ValueError, match="configures: environment"):
+        gym.make("DiffIDM-v0", config=write(tmp_path / "x.yaml", {"task": "ring"}))
+    with pytest.raises(ValueError, match="Did you mean 'vehicles'"):
+        gym.make("DiffIDM-v0", config=write(tmp_path / "y.yaml", {"configures": "environment", "vehicels": 9}))

@@ -1,0 +1,49 @@
+"""Traffic figures against values known by hand."""
+
+import pytest
+import torch
+
+from idm_env import metrics
+
+
+def test_fuel_is_the_published_polynomial():
+    speed, accel = torch.tensor([0.0, 20.0, 20.0]), torch.tensor([0.0, 0.0, 1.0])
+    rate = metrics.fuel(speed, accel)
+    assert float(rate[0]) == pytest.approx(0.1569)
+    assert float(rate[1]) == pytest.approx(0.1569 + 0.49 - 0.2966 + 0.478, abs=1e-4)
+    assert float(rate[2] - rate[1]) == pytest.approx(0.07224 + 1.9362 + 0.43, abs=1e-4)
+    steady = metrics.fuel_per_100_km(torch.full((10,), 20.0), torch.zeros(10))
+    assert float(steady) == pytest.approx(100.0 * float(rate[1]) / 20.0)
+
+
+def test_energy_of_a_steady_drive_is_force_times_way():
+    speed = torch.full((100,), 20.0, dtype=torch.float64)
+    energy = metrics.traction_energy(speed, torch.zeros_like(speed), 0.1)
+    assert float(energy) == pytest.approx((9.81 * 0.015 + 4e-4 * 400.0) * 200.0)
+    assert float(metrics.traction_energy(speed, torch.full_like(speed, -5.0), 0.1)) == 0.0
+
+
+def test_amplification_of_sines():
+    t = torch.linspace(0.0, 62.8, 629, dtype=torch.float64)
+    speed = 10.0 + torch.stack((torch.sin(t), 1.5 * torch.sin(t - 1.0), 0.5 * torch.sin(t - 2.0)), -1)
+    gain = metrics.amplification(speed)
+    torch.testing.assert_close(gain, torch.tensor([1.0, 1.5, 0.5], dtype=torch.float64), rtol=1e-2, atol=0)
+    assert bool(metrics.string_stable(speed))
+    assert not bool(metrics.string_stable(speed[:, :2]))
+
+
+def test_equilibrium_speed_does_not_accelerate():
+    from idm_env.effects import IDM
+    from idm_env.roads import Ring
+    from idm_env.simulator import Simulator
+
+    simulator = Simulator(Ring(200.0), (IDM(),))
+    params = simulator.defaults(dtype=torch.float64)
+    speed = metrics.equilibrium_speed(torch.tensor(15.0, dtype=torch.float64), params["idm"]).expand(10)
+    position = -20.0 * torch.arange(10, dtype=torch.float64)
+    accel = simulator.acceleration(simulator.state(position, speed, params), {}, params)
+    torch.testing.assert_close(accel, torch.zeros(10, dtype=torch.float64), rtol=0, atol=1e-10)
+
+
+def test_time_gaps_are_finite_at_standstill():
+    assert float(metrics.time_gap(torch.tensor(3.0), torch.tensor(0.0))) == 3.0

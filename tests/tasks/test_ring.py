@@ -1,0 +1,131 @@
+"""The ring: Flow's definition by hand, and the physics that the task is about."""
+
+import pytest
+import torch
+
+from idm_env import metrics
+from idm_env.tasks import Draw, make_task
+
+
+def start(task, count=1, seed=0, dtype=torch.float64):
+    params = task.params(dtype, "cpu")
+    return task.reset(Draw.of(torch.arange(count) + seed, torch.zeros(count, dtype=torch.int64)), params), params
+
+
+def test_observation_and_reward_are_flows():
+    task = make_task("ring", warmup=50)
+    before, params = start(task)
+    command = torch.tensor([[0.5]], dtype=torch.float64)
+    after = task.step(before, command, torch.zeros(1, 22, dtype=torch.float64), params)
+    v, position, ring = after.state.speed[0], after.state.position[0], float((after.state.gap + 5.0).sum())
+    seen = task.observe(after)[0, 0]
+    agent, leader = task.agents[0], (task.agents[0] - 1) % 22
+    headway = float((position[leader] - position[agent]) % ring)
+    expected = [float(v[agent]) / 15, float(v[leader] - v[agent]) / 15, headway / 270]
+    torch.testing.assert_close(seen, torch.tensor(expected, dtype=torch.float64))
+    reward = task.reward(before, command, after)
+    assert float(reward) == pytest.approx(4.0 * float(v.mean()) / 20.0 - 4.0 * 0.5)
+
+
+def test_noise_is_flows():
+    task = make_task("ring", effects=["noise"], warmup=0)
+    assert float(task.params(torch.float64, "cpu")["noise"]["sigma"]) == pytest.approx(0.2 * 0.1**0.5)
+
+
+def test_the_command_moves_only_the_controlled_vehicle():
+    task = make_task("ring", warmup=20, noise=0.0, controlled=[3])
+    before, params = start(task)
+    speeds = [
+        task.step(before, torch.tensor([[u]], dtype=torch.float64), None, params).state.speed for u in (-0.1, 0.5)
+    ]
+    changed = (speeds[0] - speeds[1]).abs()[0]
+    assert float(changed[3]) == pytest.approx(0.06)
+    changed[3] = 0.0
+    assert float(changed.max()) == 0.0
+
+
+def test_lengths_are_drawn_from_the_range():
+    task = make_task("ring", warmup=0, noise=0.0)
+    world, _ = start(task, count=500)
+    length = (world.state.gap + world.state.length).sum(-1)
+    assert 220.0 <= float(length.min()) < 222.0
+    assert 268.0 < float(length.max()) <= 270.0
+
+
+def test_a_wave_start_fits_the_ring():
+    task = make_task("ring", warmup=0, start="wave", length=250.0)
+    world, _ = start(task)
+    torch.testing.assert_close((world.state.gap + 5.0).sum(), torch.tensor(250.0, dtype=torch.float64))
+    assert float(world.state.gap.min()) > 0.5
+    gaps = task.road.gaps(world.state.position, world.state.length, torch.tensor([250.0]))
+    torch.testing.assert_close(gaps, world.state.gap)
+
+
+@pytest.mark.slow
+def test_without_control_the_wave_emerges_and_costs_a_third_of_the_speed():
+    task = make_task("ring", length=[220.0, 270.0])
+    with torch.no_grad():
+        world, params = start(task, count=12)
+        speeds = []
+        noise = Draw.of(torch.arange(12), torch.ones(12, dtype=torch.int64))
+        normals = noise.normals(torch.zeros(12, dtype=torch.int64), 3000, 22, torch.float64)
+        for t in range(3000):
+            world = task.step(world, None, normals[t], params)
+            speeds.append(world.state.speed)
+    speed = torch.stack(speeds)
+    even = metrics.equilibrium_speed((world.state.gap + 5.0).mean(-1) - 5.0, params["idm"])
+    lost = 1.0 - speed[2000:].mean((0, 2)) / even
+    assert 0.25 < float(lost.mean()) < 0.40
+    # A wave: at one time some stand while others drive, and it is not there in the beginning.
+    assert float(speed[-1].min()) < 0.5
+    assert float(speed[-1].max()) > 1.3 * float(even.max())
+    assert float(speed[0].std(-1).mean()) < 0.2 * float(speed[-1].std(-1).mean())
+
+
+def test_a_policy_of_constant_speed_calms_the_traffic():
+    # One vehicle that never exceeds 70 % of the equilibrium speed dissolves the wave, and all drive faster for it.
+    task = make_task("ring", length=250.0, start="wave", warmup=300, noise=0.0)
+    world, params = start(task)
+    even = metrics.equilibrium_speed(torch.tensor(250.0 / 22 - 5.0, dtype=torch.float64), params["idm"])
+    calm = even * 0.7
+    with torch.no_grad():
+        waves = float(world.state.speed.mean())
+        for _ in range(3000):
+            speed, gap = task.pick(world.state.speed), task.pick(world.state.gap)
+            wanted = torch.minimum(calm, (gap - 2.2).clamp_min(0.0))
+            world = task.step(world, (2.0 * (wanted - speed)).clamp(-1.0, 1.0), None, params)
+    assert float(world.state.speed.std()) < 1e-6
+    assert float(world.state.speed.mean()) > 1.03 * waves
+
+
+def test_tailgating_and_fuel_cost():
+    plain, dear = make_task("ring", warmup=30), make_task("ring", warmup=30, tailgating=3.0, fuel=2.0)
+    world, _ = start(plain)
+    close = world._replace(state=world.state._replace(gap=torch.full_like(world.state.gap, 0.4)))
+    none = torch.zeros(1, 1, dtype=torch.float64)
+    difference = plain.reward(close, none, close) - dear.reward(close, none, close)
+    fuel = float(metrics.fuel(close.state.speed, close.state.accel).mean())
+    assert float(difference) == pytest.approx(
+        3.0 * (1.0 - 0.4 / max(float(close.state.speed[0, 0]), 1.0) / 0.8) + 2.0 * fuel
+    )
+
+
+def test_touching_ends_it():
+    task = make_task("ring", warmup=0, controlled=2)
+    world, _ = start(task, count=2)
+    gap = world.state.gap.clone()
+    gap[1, 7] = 0.0
+    ends = task.ended(world._replace(state=world.state._replace(gap=gap)))
+    assert ends.terminated.tolist() == [[False, False], [True, True]]
+
+
+def test_any_effect_can_be_put_in():
+    from idm_env.effects import ALL
+
+    left_out = {"control", "replay", "imagined", "lateral", "idm"}
+    for name in sorted(set(ALL) - left_out):
+        task = make_task("ring", effects=[name], warmup=3, vehicles=6, length=100.0)
+        world, _ = start(task)
+        assert bool(torch.isfinite(world.state.speed).all()), name
+    with pytest.raises(ValueError, match="task 'ring' does not give"):
+        make_task("ring", effects=["lateral"])
