@@ -7,6 +7,7 @@ effects need. Rows of unequal length are padded; ``valid`` tells the samples tha
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -21,15 +22,19 @@ from idm_env.types import Record as Replayed
 
 COLUMNS = ("second_leader", "leader", "driver", "behind")
 
+INTEGRATION_STEP_S = 0.025
+"""Largest step (s) by which measured data are simulated: at 0.1 s the first-order error of a step biases parameters
+by up to 1 %, which is more than the noise of good data does (tests/fitting/test_recovery.py)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Episodes on one time step, padded to one length.
+    """Episodes on one time step ``dt``, padded to one length, and simulated with ``substeps`` steps per sample.
 
-    Time is first: ``gap``, ``speed`` and ``valid`` are [T, rows]; ``position``, ``all_speed``, ``accel`` and
-    ``present`` are [T, rows, 4] in the order of ``COLUMNS``, positions in the coordinate of places; ``length`` is
-    [rows, 4], ``first_step`` [rows]; ``beside`` is distance, speed and presence of the adjacent vehicle, each [T,
-    rows].
+    Time is first. Measured on T samples: ``gap``, ``speed`` and ``valid``, [T, rows]. Records on the steps in
+    between too, (T − 1) · substeps + 1 of them: ``position``, ``all_speed``, ``accel`` and ``present`` [·, rows, 4]
+    in the order of ``COLUMNS``, positions in the coordinate of places; ``beside`` is distance, speed and presence of
+    the adjacent vehicle, each [·, rows]. ``length`` is [rows, 4], ``first_step`` [rows].
     """
 
     episodes: tuple[Episode, ...]
@@ -44,10 +49,14 @@ class Batch:
     length: Tensor
     first_step: Tensor
     beside: tuple[Tensor, Tensor, Tensor]
+    substeps: int = 1
 
     @classmethod
-    def of(cls, episodes: Iterable[Episode], dtype: torch.dtype = torch.float64) -> Batch:
-        """Stack episodes. DataError if there is none, or if they differ in their time step."""
+    def of(cls, episodes: Iterable[Episode], dtype: torch.dtype = torch.float64, substeps: int | None = None) -> Batch:
+        """Stack episodes. DataError if there is none, or if they differ in their time step.
+
+        ``substeps`` None takes as many as ``INTEGRATION_STEP_S`` asks for.
+        """
         items = tuple(episodes)
         if not items:
             raise DataError("no episode of a driver behind a leader is left. Loosen the split or the shortest length.")
@@ -63,8 +72,12 @@ class Batch:
             padded = [np.pad(c, [(0, steps - len(c))], mode="edge") for c in columns]
             return torch.as_tensor(np.stack(padded, axis=1), dtype=dtype)
 
+        fine = substeps or max(1, math.ceil(dt / INTEGRATION_STEP_S - 1e-6))
+
         def four(field: str) -> Tensor:
             return torch.stack([stack([_column(e, name, field) for e in items]) for name in COLUMNS], dim=-1)
+
+        position, speed = four("position_m"), four("speed_mps")
 
         return cls(
             episodes=items,
@@ -72,17 +85,18 @@ class Batch:
             gap=stack([e.gap_m for e in items]),
             speed=stack([e.speed_mps for e in items]),
             valid=stack([np.ones(len(e)) for e in items]) * _inside([len(e) for e in items], steps, dtype),
-            position=four("position_m"),
-            all_speed=four("speed_mps"),
-            accel=four("accel_mps2"),
-            present=four("present"),
+            position=_between_positions(position, speed, dt, fine),
+            all_speed=_between(speed, fine),
+            accel=_between(four("accel_mps2"), fine),
+            present=_held(four("present"), fine),
             length=torch.as_tensor([[_length(e, name) for name in COLUMNS] for e in items], dtype=dtype),
-            first_step=torch.as_tensor([round(float(e.time_s[0]) / dt) for e in items]),
+            first_step=torch.as_tensor([round(float(e.time_s[0]) / dt * fine) for e in items]),
             beside=(
-                stack([e.adjacent.position_m - e.position_m for e in items]),
-                stack([e.adjacent.speed_mps for e in items]),
-                stack([e.adjacent.present.astype(float) for e in items]),
+                _between(stack([e.adjacent.position_m - e.position_m for e in items]), fine),
+                _between(stack([e.adjacent.speed_mps for e in items]), fine),
+                _held(stack([e.adjacent.present.astype(float) for e in items]), fine),
             ),
+            substeps=fine,
         )
 
     def __len__(self) -> int:
@@ -90,18 +104,28 @@ class Batch:
 
     @property
     def steps(self) -> int:
-        """Steps of the longest episode."""
-        return len(self.gap) - 1
+        """Simulated steps of the longest episode."""
+        return (len(self.gap) - 1) * self.substeps
+
+    @property
+    def step(self) -> float:
+        """Step of the simulation (s)."""
+        return self.dt / self.substeps
 
     def rows(self, index: Sequence[int]) -> Batch:
         """Return some of the rows, without the padding that they do not need."""
         at = torch.as_tensor(list(index))
         steps = max(len(self.episodes[i]) for i in index)
+        fine = (steps - 1) * self.substeps + 1
         changes = {
-            name: getattr(self, name)[:steps].index_select(1, at)
-            for name in ("gap", "speed", "valid", "position", "all_speed", "accel", "present")
+            name: getattr(self, name)[:length].index_select(1, at)
+            for length, names in (
+                (steps, ("gap", "speed", "valid")),
+                (fine, ("position", "all_speed", "accel", "present")),
+            )
+            for name in names
         }
-        beside = [x[:steps].index_select(1, at) for x in self.beside]
+        beside = [x[:fine].index_select(1, at) for x in self.beside]
         return dataclasses.replace(
             self,
             episodes=tuple(self.episodes[i] for i in index),
@@ -132,8 +156,11 @@ class Batch:
             step=self.first_step,
         )
 
-    def inputs(self, simulator: Simulator) -> Inputs:
-        """Return the record of everybody but the driver, and what other effects take from the measurement."""
+    def inputs(self, simulator: Simulator, seed: int = 0) -> Inputs:
+        """Return the record of everybody but the driver, and what other effects take from the measurement.
+
+        Normals of ``noise`` are drawn with ``seed``. DataError for an effect whose input no measurement has.
+        """
         at, driver = self.columns(simulator)
         position = self.position[1:, :, at]
         active = torch.arange(position.shape[-1]) != driver
@@ -149,11 +176,44 @@ class Batch:
         if "lateral" in simulator.by_name:
             distance, speed, present = (x[:-1, :, None].expand_as(position) for x in self.beside)
             inputs["lateral"] = Adjacent(distance, speed, present)
+        if "noise" in simulator.by_name:
+            generator = torch.Generator().manual_seed(seed)
+            inputs["noise"] = torch.randn(position.shape, generator=generator, dtype=position.dtype)
+        for name in ("control", "imagined"):
+            if name in simulator.by_name:
+                raise DataError(
+                    f"effect '{name}' takes an input that measured data do not have. Remove it from the model."
+                )
         return inputs
 
 
 def _inside(lengths: list[int], steps: int, dtype: torch.dtype) -> Tensor:
     return (torch.arange(steps)[:, None] < torch.as_tensor(lengths)).to(dtype)
+
+
+def _between(x: Tensor, substeps: int) -> Tensor:
+    """Interpolate linearly between samples, time first."""
+    share = torch.arange(substeps, dtype=x.dtype) / substeps
+    share = share.reshape(1, -1, *(1,) * (x.dim() - 1))
+    fine = x[:-1, None] + share * (x[1:] - x[:-1])[:, None]
+    return torch.cat((fine.flatten(0, 1), x[-1:]))
+
+
+def _held(x: Tensor, substeps: int) -> Tensor:
+    """Hold every sample until the next: for presence."""
+    return torch.cat((x[:-1].repeat_interleave(substeps, 0), x[-1:]))
+
+
+def _between_positions(position: Tensor, speed: Tensor, dt: float, substeps: int) -> Tensor:
+    """Interpolate positions by cubics that meet the samples' positions and speeds (Hermite)."""
+    s = (torch.arange(substeps, dtype=position.dtype) / substeps).reshape(1, -1, *(1,) * (position.dim() - 1))
+    a, b = position[:-1, None], position[1:, None]
+    u, v = dt * speed[:-1, None], dt * speed[1:, None]
+    cubic = a + s * u + s * s * (3 * (b - a) - 2 * u - v) + s**3 * (u + v - 2 * (b - a))
+    # Where a vehicle is exchanged for another, or speeds do not belong to positions, a cubic would overshoot.
+    plain = a + s * (b - a)
+    fine = torch.where((b - a - 0.5 * (u + v)).abs() < 0.5, cubic, plain)
+    return torch.cat((fine.flatten(0, 1), position[-1:]))
 
 
 def _record(episode: Episode, name: str) -> Record | None:

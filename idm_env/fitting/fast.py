@@ -1,5 +1,4 @@
-"""Fits of plain IDM behind recorded leaders by fused kernels, where numba is installed and the problem is one of
-theirs.
+"""Fits of plain IDM behind recorded leaders by fused kernels, where numba is installed and the problem fits.
 
 The same numbers as the torch path of ``Problem``, to rounding; a parity test holds both together.
 """
@@ -29,6 +28,7 @@ def matches(problem: Problem) -> bool:
         problem.kernels
         and kernels.available()
         and isinstance(problem.simulator.road, Lane)
+        and problem.simulator.integration != "midpoint"
         and {e.name for e in effects} == {"idm", "brakes", "replay"}
         and all(e == type(e)() for e in effects if not isinstance(e, Brakes))
         and all(isinstance(e, IDM | Brakes | Replay) for e in effects)
@@ -71,7 +71,11 @@ def simulate(problem: Problem, values: dict[str, Tensor]) -> tuple[Tensor, Tenso
 
     given, options, shape = _arguments(problem, values)
     followed = recorded.rollout(*given, **options)  # type: ignore[arg-type]
-    return followed.gap.reshape(-1, *shape), followed.speed.reshape(-1, *shape)
+    every = problem.batch.substeps
+    return (
+        followed.gap.reshape(-1, *shape)[every - 1 :: every],
+        followed.speed.reshape(-1, *shape)[every - 1 :: every],
+    )
 
 
 def equations(problem: Problem, values: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
@@ -80,11 +84,12 @@ def equations(problem: Problem, values: dict[str, Tensor]) -> tuple[Tensor, Tens
 
     given, options, shape = _arguments(problem, values)
     copies = shape[:-1].numel()
-    by_gap, by_speed = problem.weights
+    by_gap, by_speed = (_sparse(weight, problem.batch.substeps) for weight in problem.weights)
+    gap, speed = (_sparse(x[1:], problem.batch.substeps) for x in (problem.batch.gap, problem.batch.speed))
     found = recorded.normal_equations(
         *given,
-        gap_target=problem.batch.gap[1:].repeat(1, copies),
-        speed_target=problem.batch.speed[1:].repeat(1, copies),
+        gap_target=gap.repeat(1, copies),
+        speed_target=speed.repeat(1, copies),
         gap_weight=by_gap.repeat(1, copies),
         speed_weight=by_speed.repeat(1, copies),
         **options,  # type: ignore[arg-type]
@@ -95,3 +100,10 @@ def equations(problem: Problem, values: dict[str, Tensor]) -> tuple[Tensor, Tens
         found.gradient[:, order].reshape(*shape, -1),
         found.normal[:, order][:, :, order].reshape(*shape, len(order), len(order)),
     )
+
+
+def _sparse(x: Tensor, substeps: int) -> Tensor:
+    """Put samples [T, rows] on the last of every ``substeps`` steps, zeros between them."""
+    fine = x.new_zeros(len(x), substeps, x.shape[1])
+    fine[:, -1] = x
+    return fine.flatten(0, 1)

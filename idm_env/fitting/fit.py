@@ -138,6 +138,7 @@ def fit(
     starts: int = 4,
     iterations: int = 60,
     seed: int = 0,
+    substeps: int | None = None,
     start: tuple[Tensor, Tensor] | None = None,
     checkpoint: Path | None = None,
     resume: bool = False,
@@ -153,11 +154,9 @@ def fit(
     """
     if method not in ("lm", "adam"):
         raise ValueError(f"method = '{method}' is unknown. Use 'lm' or 'adam'.")
-    batch = Batch.of(episodes)
+    batch = Batch.of(episodes, substeps=substeps)
     group, names = group_of(batch.episodes, by)
-    simulator = simulator or base_simulator(batch.dt)
-    if abs(simulator.dt - batch.dt) > 1e-6:
-        simulator = dataclasses.replace(simulator, dt=batch.dt)
+    simulator = dataclasses.replace(simulator or base_simulator(), dt=batch.step)
     problem = Problem(
         simulator, batch, tuple(free), tuple(shared), group, names,
         objective=objective, relative=relative, loss=loss, skip=skip,

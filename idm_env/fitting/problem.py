@@ -57,12 +57,17 @@ class Problem:
     skip: float = 0.0
     scales: tuple[float, float] = (1.0, 0.3)
     kernels: bool = True
+    seed: int = 0
 
     def __post_init__(self) -> None:
         known = catalogue(self.simulator.effects)
         for name in self.own + self.shared:
             if name not in known:
                 raise ValueError(f"unknown parameter '{name}'.{nearest(name, known)}")
+        if abs(self.simulator.dt - self.batch.step) > 1e-9:
+            raise ValueError(
+                f"the simulator steps by {self.simulator.dt:g} s, the batch by {self.batch.step:g} s. Give both one dt."
+            )
         for what, value, known_values in (
             ("objective", self.objective, ("spacing", "speed", "both")),
             ("loss", self.loss, ("mse", "rmse")),
@@ -84,7 +89,7 @@ class Problem:
 
     @cached_property
     def _inputs(self) -> Inputs:
-        return self.batch.inputs(self.simulator)
+        return self.batch.inputs(self.simulator, self.seed)
 
     @cached_property
     def weight(self) -> Tensor:
@@ -118,7 +123,7 @@ class Problem:
             return now.gap[..., driver], now.speed[..., driver]
 
         _, kept = self.simulator.rollout(state, self._inputs, params, self.batch.steps, keep=keep)
-        return Simulated(*kept)
+        return Simulated(*(x[self.batch.substeps - 1 :: self.batch.substeps] for x in kept))
 
     def rows(self, own: Tensor, shared: Tensor) -> dict[str, Tensor]:
         """Return the value of every free parameter for every row, from values per group."""
@@ -200,6 +205,8 @@ class Problem:
             self.batch.steps,
             lambda state: (state.gap[..., driver], state.speed[..., driver]),
         )
+        every = self.batch.substeps
+        kept, along = ([x[every - 1 :: every] for x in both] for both in (kept, along))
         return self.residual(Simulated(*kept)), self._weigh(*along)
 
 

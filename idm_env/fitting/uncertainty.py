@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from idm_env.fitting.levenberg import row_equations, sum_groups
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.levenberg import normal, row_equations, sum_groups
 from idm_env.fitting.problem import Problem
 
 ENOUGH_ROWS = 10
@@ -71,6 +73,8 @@ def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
     meat = torch.where(many[:, None, None], sum_groups(problem, spread[None])[0], sum_groups(problem, by_row[None])[0])
     bread = _inverse(sum_groups(problem, rows.hessian)[0])
     covariance = bread @ meat @ bread
+    drift = integration_error(problem, own, shared)
+    covariance = covariance + drift[:, :, None] * drift[:, None, :]
     if problem.shared and groups > 1:
         covariance = _share(covariance, len(problem.own))
     error = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
@@ -81,6 +85,28 @@ def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
     limit = torch.where(strength, 0.25 * (high - low), 0.5 * value.abs())
     total = own.new_zeros(groups).index_add(0, problem.group, independent)
     return Uncertainty(covariance, error, total, at_bound, error < limit)
+
+
+def integration_error(problem: Problem, own: Tensor, shared: Tensor) -> Tensor:
+    """Return how far the step of the simulation has moved every group's parameters, [G, N], to first order.
+
+    A simulation with half as many substeps moves them as far again (twice as many: half as far back); one Gauss–Newton
+    step on it tells how far. Parameters at a bound do not move.
+    """
+    substeps = problem.batch.substeps
+    other, scale = (substeps // 2, 1.0) if substeps > 1 else (2, 2.0)
+    batch = Batch.of(problem.batch.episodes, dtype=problem.batch.gap.dtype, substeps=other)
+    coarse = dataclasses.replace(
+        problem, batch=batch, simulator=dataclasses.replace(problem.simulator, dt=batch.step)
+    )  # fmt: skip
+    here, there = (normal(p, own[None], shared[None]) for p in (problem, coarse))
+    value = torch.cat((own, shared.expand(len(own), -1)), dim=-1)
+    low, high = problem.bounds
+    inside = ((value > low) & (value < high)).to(value.dtype)
+    hessian = there.hessian[0] * inside[:, :, None] * inside[:, None, :] + torch.diag_embed(1.0 - inside)
+    pull = (there.gradient[0] - here.gradient[0]) * inside
+    moved = -scale * (_inverse(hessian) @ pull[..., None])[..., 0]
+    return torch.minimum(torch.maximum(moved, low - high), high - low)
 
 
 def _inverse(matrix: Tensor) -> Tensor:

@@ -1,0 +1,194 @@
+"""The command ``idm-env``: thin, one function per verb, errors in one line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Measured traffic in, a car-following model out: **fit** it, **explain** what it lacks, **simulate** it.\n\n"
+    "Start with `idm-env demo`, then `idm-env explain my.csv --out result`. A file needs the columns vehicle_id, "
+    "time_s and position_m (SI units, front bumper), or the official NGSIM or OpenACC layout; leader_id, lane, gap_m, "
+    "speed_mps, length_m and run_id are used where present. Ctrl-C keeps what is done: add `--resume` to go on.",
+)
+console = Console(stderr=True)
+
+Data = Annotated[Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if missing.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
+Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
+RingLength = Annotated[float | None, typer.Option(help="Circumference (m), if the traffic runs on a ring.")]
+Place = Annotated[str | None, typer.Option(help="Column that names places, such as track_s_m on a lap.")]
+Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim or openacc.")]
+MaxGap = Annotated[float, typer.Option(help="Gaps above this (m) mean a lost leader and are left out.")]
+MinSeconds = Annotated[float, typer.Option(help="Shorter stretches behind one leader are left out (s).")]
+Where = Annotated[str | None, typer.Option(help='Only runs or drivers with "column=value".')]
+Window = Annotated[float | None, typer.Option(help="Cut longer stretches into windows of so many seconds.")]
+Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample, to this step (s).")]
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, int, int, float], None]]:
+    """Show a bar per phase on standard error."""
+    columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TextColumn("{task.fields[value]}"), console=console, transient=False) as bars:
+        tasks: dict[str, Any] = {}
+
+        def report(phase: str, done: int, total: int, value: float) -> None:
+            if phase not in tasks:
+                tasks[phase] = bars.add_task(phase, total=total, value="")
+            words = "" if value != value else f"residual {value:.3f}"
+            bars.update(tasks[phase], completed=done, total=total, value=words)
+
+        yield report
+        for task in tasks.values():
+            bars.update(task, total=bars.tasks[task].completed)
+
+
+def _show(title: str, rows: list[dict[str, Any]]) -> None:
+    table = Table(title=title, title_justify="left")
+    for name in rows[0]:
+        table.add_column(
+            name.replace("_", " "), overflow="fold", justify="left" if isinstance(rows[0][name], str) else "right"
+        )
+    for row in rows:
+        table.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()))
+    Console().print(table)
+
+
+@app.command()
+def fit(
+    data: Data,
+    out: Out = Path("out/fit"),
+    by: Annotated[str, typer.Option(help="driver, all, or a column such as vehicle_name.")] = "driver",
+    held_out: Annotated[str | None, typer.Option(help='"column=value", or a share of the runs such as 0.25.')] = None,
+    objective: Annotated[str, typer.Option(help="spacing, speed or both.")] = "spacing",
+    relative: Annotated[bool, typer.Option(help="Divide residuals by each driver's mean.")] = False,
+    loss: Annotated[str, typer.Option(help="rmse (mean over episodes) or mse (all samples alike).")] = "rmse",
+    method: Annotated[str, typer.Option(help="lm (Levenberg-Marquardt) or adam (as in the paper).")] = "lm",
+    integration: Annotated[str, typer.Option(help="ballistic, or euler as in the paper.")] = "ballistic",
+    starts: Annotated[int, typer.Option(help="Starts per group.", min=1)] = 4,
+    substeps: Annotated[int | None, typer.Option(help="Simulated steps per sample; default: steps of 25 ms.")] = None,
+    seed: Seed = 0,
+    ring_length: RingLength = None,
+    place: Place = None,
+    layout: Layout = "auto",
+    max_gap: MaxGap = 80.0,
+    min_seconds: MinSeconds = 5.0,
+    window: Window = None,
+    dt: Step = None,
+    where: Where = None,
+    resume: Resume = False,
+) -> None:
+    """Calibrate IDM by gradients through the simulator: parameters with standard errors, per driver, group or pooled.
+
+    Writes parameters.parquet, model.yaml, report.json and report.html.
+    """
+    from idm_env.fitting.job import Options, Source, fit_file
+
+    source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+    share: str | float | None = held_out
+    if held_out is not None and "=" not in held_out:
+        share = _number("--held-out", held_out)
+    options = Options(by, share, objective, relative, loss, method, integration, starts, seed, substeps)  # type: ignore[arg-type]
+    with progress() as report:
+        result = fit_file(source, options, out, resume=resume, on_progress=report)
+    rows = [{"": "fitted", **result["fit"]}]
+    if result["held_out"] is not None:
+        rows.append({"": "held out", **result["held_out"]})
+    names = ("", "episodes", "gap_rmse_m", "gap_rmse_median_m", "gap_mae_m", "speed_rmse_mps", "collisions")
+    _show("Errors in free simulation", [{n: row[n] for n in names} for row in rows])
+    _done(out)
+
+
+@app.command()
+def simulate(
+    data: Data,
+    model: Annotated[Path, typer.Option(help="A model.yaml of fit or explain, or one of your own.")],
+    out: Out = Path("out/simulate"),
+    seed: Seed = 0,
+    ring_length: RingLength = None,
+    place: Place = None,
+    layout: Layout = "auto",
+    max_gap: MaxGap = 80.0,
+    min_seconds: MinSeconds = 5.0,
+    window: Window = None,
+    dt: Step = None,
+    where: Where = None,
+) -> None:
+    """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
+    from idm_env.fitting.job import Source, simulate_file
+
+    source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+    result = simulate_file(source, model, out, seed=seed)
+    _show("Errors in free simulation", [result["error"]])
+    _done(out)
+
+
+@app.command()
+def effects() -> None:
+    """List the catalogue of effects with their parameters."""
+    from idm_env.effects import ALL
+    from idm_env.parameters import table
+
+    rows = []
+    for name, cls in ALL.items():
+        effect = cls()
+        summary = (cls.__doc__ or "").strip().splitlines()[0]
+        for row in table([effect]) or [{"parameter": name, "symbol": "", "unit": "", "default": "", "null": ""}]:
+            keep = {
+                k: str(row[k] if row[k] is not None else "") for k in ("parameter", "symbol", "unit", "default", "null")
+            }
+            rows.append({**keep, "what": summary})
+            summary = ""
+    _show("Effects", rows)
+
+
+def _number(option: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f'{option} = {text!r} is neither "column=value" nor a share such as 0.25.') from None
+
+
+def _done(out: Path) -> None:
+    console.print(f"Report: [bold]{(out / 'report.html').resolve()}[/bold]", soft_wrap=True)
+
+
+def run() -> None:
+    """Run the command line: bad input ends with one line and exit code 1, Ctrl-C with 130."""
+    try:
+        app(standalone_mode=False)
+    except typer.Exit as stop:
+        sys.exit(stop.exit_code)
+    except typer.Abort:
+        _interrupted()
+    except KeyboardInterrupt:
+        _interrupted()
+    except Exception as error:
+        import click
+
+        if isinstance(error, click.ClickException):
+            error.show()
+            sys.exit(error.exit_code)
+        if isinstance(error, ValueError | ImportError | OSError):
+            print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+            sys.exit(1)
+        raise
+
+
+def _interrupted() -> None:
+    print("interrupted: what is done was kept. Run the same command with --resume to go on.", file=sys.stderr)
+    sys.exit(130)

@@ -1,0 +1,175 @@
+"""What every report shares: one self-contained HTML page, pictures inside it, and files that are never half written."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ title }}</title>
+<style>
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #1d2430; }
+h1 { font-size: 1.7rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
+p.lead { font-size: 1.1rem; } figure { margin: 1rem 0; } figure img { max-width: 100%; }
+figcaption, .note { color: #566; font-size: .92rem; }
+table { border-collapse: collapse; margin: .8rem 0; font-size: .92rem; display: block; overflow-x: auto; }
+th, td { padding: .25rem .8rem .25rem 0; text-align: left; border-bottom: 1px solid #dde; vertical-align: top; }
+td.number { text-align: right; font-variant-numeric: tabular-nums; }
+</style></head><body>
+<h1>{{ title }}</h1>
+{% for block in blocks %}
+{% if block.kind == "heading" %}<h2>{{ block.text }}</h2>
+{% elif block.kind == "lead" %}<p class="lead">{{ block.text }}</p>
+{% elif block.kind == "note" %}<p class="note">{{ block.text }}</p>
+{% elif block.kind == "text" %}<p>{{ block.text }}</p>
+{% elif block.kind == "list" %}<ul>{% for item in block.rows %}<li>{{ item }}</li>{% endfor %}</ul>
+{% elif block.kind == "figure" %}<figure><img alt="{{ block.text }}" src="{{ block.image }}">
+<figcaption>{{ block.text }}</figcaption></figure>
+{% elif block.kind == "table" %}<table>
+<thead><tr>{% for name in block.columns %}<th>{{ name }}</th>{% endfor %}</tr></thead>
+<tbody>{% for row in block.rows %}<tr>{% for cell in row %}<td{% if cell.number %} class="number"{% endif %}>{{
+cell.text }} </td>{% endfor %}</tr>{% endfor %}</tbody></table>
+{% endif %}{% endfor %}
+</body></html>
+"""
+
+
+@dataclass(frozen=True)
+class Block:
+    """One piece of a page: a heading, a paragraph, a list, a figure or a table."""
+
+    kind: str
+    text: str = ""
+    image: str = ""
+    columns: tuple[str, ...] = ()
+    rows: tuple[Any, ...] = ()
+
+
+def heading(text: str) -> Block:
+    """Return a section's heading."""
+    return Block("heading", text)
+
+
+def lead(text: str) -> Block:
+    """Return the paragraph that says the result."""
+    return Block("lead", text)
+
+
+def text(words: str) -> Block:
+    """Return a paragraph."""
+    return Block("text", words)
+
+
+def note(words: str) -> Block:
+    """Return a paragraph in small print."""
+    return Block("note", words)
+
+
+def bullets(items: Iterable[str]) -> Block:
+    """Return a list."""
+    return Block("list", rows=tuple(items))
+
+
+def table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> Block:
+    """Return a table of rows by column name; floats with four significant digits."""
+    names = tuple(columns or (rows[0] if rows else ()))
+    cells = tuple(tuple(_cell(row.get(name)) for name in names) for row in rows)
+    return Block("table", columns=names, rows=cells)
+
+
+def _cell(value: Any) -> dict[str, Any]:
+    if isinstance(value, bool):
+        return {"text": "yes" if value else "no", "number": False}
+    if isinstance(value, float):
+        return {"text": f"{value:.4g}", "number": True}
+    return {"text": "" if value is None else str(value), "number": isinstance(value, int)}
+
+
+def picture(figure: Figure, caption: str) -> Block:
+    """Return a matplotlib figure as a block; the picture travels inside the page. The figure is closed."""
+    import matplotlib.pyplot as plt
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
+    plt.close(figure)
+    image = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return Block("figure", caption, image)
+
+
+def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (9.0, 3.4)) -> tuple[Figure, Any]:
+    """Return a figure and its axes ([rows, columns] array) without a display; ImportError names the extra."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise ImportError("reports need matplotlib. Install it with: pip install 'idm-env[data]'") from None
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+
+
+def write_page(path: Path, title: str, blocks: Iterable[Block]) -> None:
+    """Write a self-contained HTML page."""
+    from jinja2 import Environment
+
+    page = Environment(autoescape=True).from_string(_PAGE).render(title=title, blocks=list(blocks))
+    write_text(path, page)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON; NaN and infinities, which JSON does not have, become null."""
+    write_text(path, json.dumps(_finite(content), indent=1, ensure_ascii=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        return None
+    return value
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a file in one piece: whoever is killed in between leaves the old one."""
+    beside = path.with_name(path.name + ".part")
+    beside.write_text(content, encoding="utf-8")
+    os.replace(beside, path)
+
+
+def output_folder(out: Path) -> Path:
+    """Return ``out`` as a folder that exists; ValueError if a file is in the way."""
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is a file. Give --out a folder.")
+    out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    found = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    for name in ("idm-env", "torch", "numpy", "polars", "scipy", "numba"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def command_line() -> str:
+    """Return the command that is running, as a user would type it."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
