@@ -72,17 +72,12 @@ class DiffIDMEnv(gymnasium.Env):
         tensor = None if action is None else action_tensor(action, self._shape, self.settings).unsqueeze(0)
         with torch.no_grad() if self._numpy else contextlib.nullcontext():
             outcome = self.batch.step(tensor)
-            reward = outcome.reward.mean() if len(self._shape) else outcome.reward
+            reward = outcome.reward.mean()
         if self.render_mode == "human":
             self.render()
         terminated, truncated = single_ends(outcome)
-        return (
-            self._out(outcome.observation),
-            reward.item() if self._numpy else reward,
-            bool(terminated),
-            bool(truncated),
-            {},
-        )
+        value = reward.item() if self._numpy else reward
+        return self._out(outcome.observation), value, terminated.item() is True, truncated.item() is True, {}
 
     def _out(self, observation: Tensor) -> Any:
         flat = observation.reshape(-1)
@@ -137,5 +132,7 @@ class DiffIDMEnv(gymnasium.Env):
 
 def single_ends(outcome: Outcome) -> tuple[Tensor, Tensor]:
     """Return terminated (with the first agent) and truncated (with the last) of whole environments, shape ``(n,)``."""
+    if outcome.terminated.shape[-1] == 1:
+        return outcome.terminated[..., 0], outcome.truncated[..., 0]
     terminated = outcome.terminated.any(-1)
     return terminated, (outcome.truncated | outcome.terminated).all(-1) & outcome.truncated.any(-1)

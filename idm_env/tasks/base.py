@@ -172,14 +172,21 @@ class Task(abc.ABC):
     def constant(self, name: str, values: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
         """Return a static tensor, made once per device and dtype; ``values`` may be a function that gives them."""
         key = (name, device, dtype)
-        if key not in self._tensors:
+        found = self._tensors.get(key)
+        if found is None:
             made = values() if callable(values) else values
-            self._tensors[key] = torch.as_tensor(made, device=device).to(dtype)
-        return self._tensors[key]
+            found = self._tensors[key] = torch.as_tensor(made, device=device).to(dtype)
+        return found
 
     def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
         """Return the parameters as tensors (a number: scalar; a list: one per vehicle; a tensor: as it is)."""
         return self._behaviour.params(self.vehicles, dtype, device)
+
+    def _is_agent(self) -> list[bool]:
+        return [i in self.agents for i in range(self.vehicles)]
+
+    def _agent_slots(self) -> list[int]:
+        return [self.agents.index(i) if i in self.agents else 0 for i in range(self.vehicles)]
 
     def pick(self, x: Tensor) -> Tensor:
         """Return what belongs to the controlled vehicles, shape ``(…, agents)``."""
@@ -227,11 +234,9 @@ class Task(abc.ABC):
             idle = self.constant("idle", [False] * self.vehicles, speed.device, torch.bool)
             inputs: dict[str, Any] = {"control": Command(speed.new_zeros(()), idle)}
         else:
-            mine = [i in self.agents for i in range(self.vehicles)]
-            active = self.constant("active", mine, speed.device, torch.bool)
+            active = self.constant("active", self._is_agent, speed.device, torch.bool)
             if len(self.agents) > 1:
-                slots = [self.agents.index(i) if i in self.agents else 0 for i in range(self.vehicles)]
-                slot = self.constant("slots", slots, speed.device, torch.int64)
+                slot = self.constant("slots", self._agent_slots, speed.device, torch.int64)
                 command = command.index_select(-1, slot)
                 live = None if live is None else live.index_select(-1, slot)
             active = active if live is None else active & live
@@ -264,15 +269,18 @@ class Task(abc.ABC):
 
     def ended(self, world: World) -> Ended:
         """Return whether it is over: terminated for all agents where any two vehicles have touched (a gap ≤ 0)."""
-        crashed = (world.state.gap <= 0.0).any(-1, keepdim=True).expand(-1, len(self.agents))
+        crashed = world.state.gap.amin(-1, keepdim=True) <= 0.0
+        if len(self.agents) > 1:
+            crashed = crashed.expand(-1, len(self.agents))
         return Ended(crashed, torch.zeros_like(crashed))
 
-    def clip(self, features: list[Tensor]) -> Tensor:
-        """Stack features of shape ``(…, agents)`` and clip them to ``bounds``."""
+    def clip(self, features: list[Tensor], scales: tuple[float, ...]) -> Tensor:
+        """Stack features of shape ``(…, agents)``, divide them by their scales, and clip them to ``bounds``."""
         seen = torch.stack(features, dim=-1)
-        low = self.constant("low", self.bounds.low, seen.device, seen.dtype)
-        high = self.constant("high", self.bounds.high, seen.device, seen.dtype)
-        return torch.maximum(torch.minimum(seen, high), low)
+        device, dtype = seen.device, seen.dtype
+        low = self.constant("low", lambda: self.bounds.low, device, dtype)
+        high = self.constant("high", lambda: self.bounds.high, device, dtype)
+        return (seen / self.constant("scales", scales, device, dtype)).clamp(low, high)
 
 
 __all__ = ["Advance", "Bounds", "Draw", "Ended", "Task", "World", "finite"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -120,7 +121,7 @@ class FollowTask(Task):
         """Return the inputs of one step, with the leader's record at its end."""
         inputs = dict(super().inputs(world, command, normals, live))
         state = world.state
-        first = self.constant("first", [True] + [False] * (self.vehicles - 1), state.speed.device, torch.bool)
+        first = self.constant("first", lambda: np.arange(self.vehicles) == 0, state.speed.device, torch.bool)
         inputs["replay"] = head(self._motion(dict(world.episode), state.step + 1, state.speed.dtype), first)
         return inputs
 
@@ -128,7 +129,7 @@ class FollowTask(Task):
         """Return ``v/40, v_lead/40, gap/100`` of every agent."""
         state = world.state
         lead_speed = self.pick(self.road.ahead(state.speed))
-        return self.clip([self.pick(state.speed) / 40.0, lead_speed / 40.0, self.pick(state.gap) / 100.0])
+        return self.clip([self.pick(state.speed), lead_speed, self.pick(state.gap)], (40.0, 40.0, 100.0))
 
     def reward(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``1 − fuel/10 − 0.002 u² − 2 p − 50 [crash]``."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -112,7 +113,7 @@ class PlatoonTask(Task):
         """Return the inputs of one step, with the head's motion at its end."""
         inputs = dict(super().inputs(world, command, normals, live))
         state = world.state
-        first = self.constant("first", [True] + [False] * (self.vehicles - 1), state.speed.device, torch.bool)
+        first = self.constant("first", lambda: np.arange(self.vehicles) == 0, state.speed.device, torch.bool)
         inputs["replay"] = head(self._motion(world.episode["waves"], state.step + 1), first)
         return inputs
 
@@ -121,7 +122,7 @@ class PlatoonTask(Task):
         state = world.state
         speed, lead_speed = self.pick(state.speed), self.pick(self.road.ahead(state.speed))
         gap = self.pick(state.gap)
-        return self.clip([speed / 30.0, (lead_speed - speed) / 10.0, gap / 100.0, (speed - self.speed) / 10.0])
+        return self.clip([speed, lead_speed - speed, gap, speed - self.speed], (30.0, 10.0, 100.0, 10.0))
 
     def reward(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return minus the quadratic costs of speed and effort, and of time gaps out of bounds."""

@@ -206,7 +206,7 @@ class ReplayTask(Task):
         state = world.state
         there = self.road.leader_present(state.present, state.speed) > 0
         lead_speed = torch.where(there, self.road.ahead(state.speed), state.speed)
-        return self.clip([self.pick(x) for x in (state.speed / 40.0, lead_speed / 40.0, state.gap / 100.0)])
+        return self.clip([self.pick(x) for x in (state.speed, lead_speed, state.gap)], (40.0, 40.0, 100.0))
 
     def reward(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return minus the distance to the record (10 m), or the terms of ``follow``."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -110,21 +111,28 @@ class RingTask(Task):
         speed = self.pick(state.speed)
         lead_speed = self._pick_lead(state.speed)
         headway = self.pick(state.gap) + self._pick_lead(state.length)
-        return self.clip([speed / 15.0, (lead_speed - speed) / 15.0, headway / 270.0])
+        return self.clip([speed, lead_speed - speed, headway], (15.0, 15.0, 270.0))
+
+    @cached_property
+    def _leaders(self) -> tuple[int, ...]:
+        return tuple((i - 1) % self.vehicles for i in self.agents)
 
     def _pick_lead(self, x: Tensor) -> Tensor:
-        leaders = [(i - 1) % self.vehicles for i in self.agents]
-        if len(leaders) == 1:
-            return x[..., leaders[0] : leaders[0] + 1]
-        return x.index_select(-1, self.constant("leaders", leaders, x.device, torch.int64))
+        if len(self._leaders) == 1:
+            return x[..., self._leaders[0] : self._leaders[0] + 1]
+        return x.index_select(-1, self.constant("leaders", self._leaders, x.device, torch.int64))
 
     def reward(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``4 mean(v)/20 − 4 mean|u|``, less the terms that have a weight."""
         state = after.state
-        reward = 0.2 * state.speed.mean(-1, keepdim=True) - 4.0 * command.abs().mean(-1, keepdim=True)
+        effort = command.abs()
+        if len(self.agents) > 1:
+            effort = effort.mean(-1, keepdim=True)
+        reward = 0.2 * state.speed.mean(-1, keepdim=True) - 4.0 * effort
         if self.fuel:
             reward = reward - self.fuel * metrics.fuel(state.speed, state.accel).mean(-1, keepdim=True)
-        reward = reward.expand(-1, len(self.agents))
+        if len(self.agents) > 1:
+            reward = reward.expand(-1, len(self.agents))
         if self.tailgating:
             time_gap = metrics.time_gap(self.pick(state.gap), self.pick(state.speed))
             reward = reward - self.tailgating * torch.relu(1.0 - time_gap / _TIME_GAP)
