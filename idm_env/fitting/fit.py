@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -119,6 +119,7 @@ def fingerprint(problem: Problem, *options: object) -> str:
     """Return a digest of everything that determines a fit."""
     digest = hashlib.sha256(repr((problem.simulator, problem.own, problem.shared, problem.groups, options)).encode())
     digest.update(repr((problem.objective, problem.relative, problem.loss, problem.skip)).encode())
+    digest.update(repr(sorted(problem.fixed.items())).encode())
     digest.update(problem.batch.gap.numpy().tobytes() + problem.batch.position.numpy().tobytes())
     return digest.hexdigest()
 
@@ -140,6 +141,7 @@ def fit(
     seed: int = 0,
     substeps: int | None = None,
     start: tuple[Tensor, Tensor] | None = None,
+    fixed: Mapping[str, float] | None = None,
     checkpoint: Path | None = None,
     resume: bool = False,
     on_progress: OnProgress | None = None,
@@ -148,7 +150,8 @@ def fit(
 
     ``by`` is ``driver``, ``all`` or a column. ``method`` is ``lm`` (Levenberg–Marquardt with exact forward-mode
     Jacobians, from ``starts`` starts per group, the pooled optimum among them) or ``adam`` (500 steps of reverse
-    mode, learning rate 0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead.
+    mode, learning rate 0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead;
+    ``fixed`` gives parameters that are not free another value than their default.
     ``checkpoint`` names the file that makes an interrupted fit resumable with the same result. ValueError and
     DataError for what cannot be fitted.
     """
@@ -159,7 +162,7 @@ def fit(
     simulator = dataclasses.replace(simulator or base_simulator(), dt=batch.step)
     problem = Problem(
         simulator, batch, tuple(free), tuple(shared), group, names,
-        objective=objective, relative=relative, loss=loss, skip=skip,
+        objective=objective, relative=relative, loss=loss, skip=skip, fixed=dict(fixed or {}),
     )  # fmt: skip
     saved = Checkpoint(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)
     begin = start or (_defaults(problem, problem.own).expand(len(names), -1), _defaults(problem, problem.shared))

@@ -6,8 +6,8 @@ tensors: ``own`` [..., groups, P] and ``shared`` [..., Q], in the order of the n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -42,7 +42,8 @@ class Problem:
     ``speed`` (m/s) or ``both`` (gap/``scales[0]`` and speed/``scales[1]``); ``relative`` divides by the row's mean
     measured value. Samples of the first ``skip`` seconds do not count. ``loss`` says how episodes of a group add up:
     ``mse`` sums squared residuals, ``rmse`` sums every episode's root mean square, so that a few bad episodes do not
-    decide for all. ``kernels=False`` keeps to the torch path where fused kernels would fit.
+    decide for all. ``kernels=False`` keeps to the torch path where fused kernels would fit. ``fixed`` gives parameters
+    that are not free another value than their default.
     """
 
     simulator: Simulator
@@ -58,10 +59,11 @@ class Problem:
     scales: tuple[float, float] = (1.0, 0.3)
     kernels: bool = True
     seed: int = 0
+    fixed: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         known = catalogue(self.simulator.effects)
-        for name in self.own + self.shared:
+        for name in (*self.own, *self.shared, *self.fixed):
             if name not in known:
                 raise ValueError(f"unknown parameter '{name}'.{nearest(name, known)}")
         if abs(self.simulator.dt - self.batch.step) > 1e-9:
@@ -106,7 +108,8 @@ class Problem:
     def params(self, values: dict[str, Tensor]) -> dict[str, dict[str, Tensor]]:
         """Return defaults with some parameters replaced, each by a tensor that broadcasts against rows × vehicles."""
         params = self.simulator.defaults(dtype=self.batch.gap.dtype)
-        for name, value in values.items():
+        kept = {name: torch.tensor(value, dtype=self.batch.gap.dtype) for name, value in self.fixed.items()}
+        for name, value in {**kept, **values}.items():
             effect, parameter = name.split(".")
             params[effect][parameter] = value
         return params
