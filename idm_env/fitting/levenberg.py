@@ -161,7 +161,7 @@ def minimise(
     progress: Progress,
     iterations: int,
     *,
-    tolerance: float = 1e-5,
+    tolerance: float = 1e-3,
     inner: int = 3,
     on_step: Callable[[Progress, Normal], None] | None = None,
 ) -> tuple[Progress, Normal]:

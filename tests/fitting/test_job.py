@@ -1,0 +1,93 @@
+"""The commands fit and simulate, from a file on disk to a folder of results, and their bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from idm_env.config import load_model
+from idm_env.data import synthetic
+from idm_env.fitting.job import Options, Source, fit_file, simulate_file
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small generated csv: four runs of two followers, 60 s, on disk as a user has it."""
+    path = tmp_path_factory.mktemp("data") / "platoon.csv"
+    trajectories, _ = synthetic.generate(1, runs=4, followers=2, seconds=60.0)
+    keep = [c for c in trajectories.table.columns if c not in ("gap_m", "gap_measured")]
+    trajectories.table.select(keep).write_csv(path)
+    return path
+
+
+def test_fit_writes_parameters_model_and_reports(file: Path, tmp_path: Path) -> None:
+    """Everything that the help promises, consistent with one another; the input file is untouched."""
+    before = file.read_bytes()
+    result = fit_file(Source(file, smooth=True), Options(starts=2, held_out=0.25), tmp_path)
+    assert file.read_bytes() == before
+    assert {p.name for p in tmp_path.iterdir()} == {"parameters.parquet", "model.yaml", "report.json", "report.html"}
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["fit"]["gap_rmse_m"] == pytest.approx(result["fit"]["gap_rmse_m"])
+    assert report["fit"]["gap_rmse_m"] < 0.3
+    # Drivers of held-out runs were never fitted: they take the pooled parameters, and do worse.
+    assert report["held_out"]["groups_not_fitted"] == 2
+    assert report["held_out"]["gap_rmse_m"] > report["fit"]["gap_rmse_m"]
+    table = pl.read_parquet(tmp_path / "parameters.parquet")
+    assert table.height == 5 * report["fit"]["groups"]
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2 and "http" not in page
+
+
+def test_simulate_repeats_what_fit_reported(file: Path, tmp_path: Path) -> None:
+    """A saved model rolled out behind the same leaders gives the error of its fit."""
+    fitted = fit_file(Source(file, smooth=True), Options(starts=1), tmp_path / "fit")
+    model = load_model(tmp_path / "fit" / "model.yaml")
+    assert len(model.drivers) == 8 and model.dt == pytest.approx(0.1)
+    result = simulate_file(Source(file, smooth=True), tmp_path / "fit" / "model.yaml", tmp_path / "sim")
+    assert result["drivers_with_own_parameters"] == 8
+    assert result["error"]["gap_rmse_m"] == pytest.approx(fitted["fit"]["gap_rmse_m"], rel=1e-6)
+    table = pl.read_parquet(tmp_path / "sim" / "simulated.parquet")
+    assert table.null_count().sum_horizontal().item() == 0
+    difference = table["gap_m"] - table["measured_gap_m"]
+    assert (difference**2).mean() ** 0.5 < 0.3
+
+
+def test_pooled_and_grouped_fits(file: Path, tmp_path: Path) -> None:
+    """``all`` gives one set of parameters, a column one per value."""
+    pooled = fit_file(Source(file), Options(by="all", starts=1), tmp_path / "all")
+    assert pooled["fit"]["groups"] == 1
+    by_vehicle = fit_file(Source(file), Options(by="vehicle_id", starts=1), tmp_path / "vehicle")
+    assert by_vehicle["fit"]["groups"] == 2
+    assert by_vehicle["fit"]["gap_rmse_m"] <= pooled["fit"]["gap_rmse_m"] * 1.001
+
+
+def test_a_model_with_an_effect_and_with_noise_is_simulated(file: Path, tmp_path: Path) -> None:
+    """Any effect of the catalogue; noise is drawn by the seed."""
+    model = tmp_path / "model.yaml"
+    model.write_text(
+        "configures: model\nschema: 1\neffects: [idm, brakes, {effect: delay, max_delay: 1.0}, noise]\n"
+        "parameters: {delay: {delay: 0.4}, noise: {sigma: 0.3}}\n"
+    )
+    one, again, other = (
+        simulate_file(Source(file), model, tmp_path / str(i), seed=seed)["error"]["gap_rmse_m"]
+        for i, seed in enumerate((1, 1, 2))
+    )
+    assert one == again != other
+
+
+def test_bad_input_is_one_line(file: Path, tmp_path: Path) -> None:
+    """What to fix, without a traceback."""
+    with pytest.raises(ValueError, match="is a file"):
+        fit_file(Source(file), Options(), file)
+    with pytest.raises(ValueError, match="cannot group by 'vehicle'"):
+        fit_file(Source(file), Options(by="vehicle"), tmp_path)
+    model = tmp_path / "model.yaml"
+    model.write_text("configures: model\nschema: 1\neffects: [idm, brakes, dely]\n")
+    with pytest.raises(ValueError, match="Did you mean 'delay'"):
+        simulate_file(Source(file), model, tmp_path / "sim")
+    model.write_text("configures: model\nschema: 1\neffects: [idm, brakes, imagined]\n")
+    with pytest.raises(ValueError, match="'imagined' takes an input"):
+        simulate_file(Source(file), model, tmp_path / "sim")
