@@ -1,7 +1,7 @@
 """Differentiable, vectorised lanes of Intelligent-Driver-Model vehicles, and a closed loop with measured traffic.
 
 Public names are loaded when first used, so ``import idm_env`` is quick and imports no torch; it registers the
-Gymnasium id ``DiffIDM-v0``.
+Gymnasium ids ``DiffIDM-v0`` and ``DiffIDM-Fit-v0``.
 """
 
 from __future__ import annotations
@@ -63,6 +63,13 @@ def _register() -> None:
             vector_entry_point="idm_env.envs.vector:DiffIDMVectorEnv",
             max_episode_steps=3000,
             # The checker's wrapper costs more than a step; tests run the full checker instead.
+            disable_env_checker=True,
+        )
+    if "DiffIDM-Fit-v0" not in registry:
+        register(
+            id="DiffIDM-Fit-v0",
+            entry_point="idm_env.wrappers.fitting:FittingEnv",
+            max_episode_steps=1,
             disable_env_checker=True,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from idm_env.wrappers.fitting import FittingEnv, ParameterFitting
 from idm_env.wrappers.statistics import (
     NormalizeObservation,
     RecordEpisodeStatistics,
@@ -10,7 +11,9 @@ from idm_env.wrappers.statistics import (
 )
 
 __all__ = [
+    "FittingEnv",
     "NormalizeObservation",
+    "ParameterFitting",
     "RecordEpisodeStatistics",
     "VectorNormalizeObservation",
     "VectorRecordEpisodeStatistics",

@@ -1,0 +1,266 @@
+"""Any environment as a fitting problem: find the driver and effect parameters that reproduce measured drivers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor
+
+from idm_env.effects import Replay
+from idm_env.parameters import catalogue, constrain, unconstrain
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
+from idm_env.tasks import Task
+from idm_env.types import Params
+
+if TYPE_CHECKING:
+    from idm_env.fitting.fit import Fit
+
+_OTHERS = ("control", "noise", "replay")
+"""Effects through which a task acts: no driver's, so they are left out of what is fitted."""
+
+
+class ParameterFitting:
+    """The drivers of an environment behind measured leaders: find the parameters that make them drive as measured.
+
+    The model is the environment's: its effects, its time step and every parameter that is not ``free``. Each measured
+    driver follows its measured leader from its measured state, and the residual is simulated minus measured gap (m).
+
+    ``parameters()`` are leaf tensors on the real line behind the parameters' bounds; ``loss()`` is differentiable in
+    them; ``fit()`` is the foundation's search; ``apply()`` puts the values into the environment. ``error(values)``
+    is the same loss of given values, for methods without gradients. ``DiffIDM-Fit-v0`` is this as a Gymnasium
+    environment.
+
+    Args:
+        env: An environment of this package (any face, wrapped or not), or a task.
+        trajectories: A file, ``idm_env.data.Trajectories``, or a sequence of ``Episode``.
+        free: Full names of the parameters to find; None takes all of the car-following effect.
+        by: ``"all"`` for one value for all drivers, ``"driver"``, or a column: one value per group.
+        objective: ``"spacing"`` (m), ``"speed"`` (m/s) or ``"both"``.
+
+    Raises:
+        ValueError: For parameters that do not exist, or an environment that is none of ours.
+        DataError: For trajectories that cannot be used.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        trajectories: Any,
+        *,
+        free: Sequence[str] | None = None,
+        by: str = "all",
+        objective: str = "spacing",
+    ) -> None:
+        from idm_env.fitting.batch import Batch
+        from idm_env.fitting.problem import Problem, group_of
+
+        self.env = env
+        task, params = _task_of(env)
+        following = next(e for e in task.simulator.effects if e.name not in _OTHERS and hasattr(e, "driver"))
+        self.free = tuple(f"{following.name}.{p.name}" for p in following.parameters) if free is None else tuple(free)
+        effects = tuple(e for e in task.simulator.effects if e.name not in _OTHERS)
+        simulator = Simulator(Lane(), (*effects, Replay()), task.simulator.dt, task.simulator.integration)
+        self.episodes = _episodes(trajectories, simulator.dt)
+        self.by = by
+        group, groups = group_of(self.episodes, by)
+        self.fixed = _fixed(simulator, params, self.free)
+        self.problem = Problem(
+            simulator,
+            # One step of the simulation per step of the environment: what is fitted is what will be driven.
+            Batch.of(self.episodes, substeps=1),
+            self.free,
+            (),
+            group,
+            groups,
+            objective=objective,  # type: ignore[arg-type]
+            fixed=self.fixed,
+        )
+        self._declared = {name: catalogue(simulator.effects)[name] for name in self.free}
+        self._leaves: dict[str, Tensor] = {}
+        self.set_values({name: _value(params, name, self._declared[name].default) for name in self.free})
+
+    # -- the differentiable view ---------------------------------------------------------------------------------
+
+    def parameters(self) -> list[Tensor]:
+        """Return the leaf tensors, one per free parameter, on the real line, shape ``(groups,)``: for any optimiser."""
+        return list(self._leaves.values())
+
+    def values(self) -> dict[str, Tensor]:
+        """Return the free parameters within their bounds, by full name, shape ``(groups,)``, with their graph."""
+        return {name: constrain(self._declared[name], leaf) for name, leaf in self._leaves.items()}
+
+    def set_values(self, values: Mapping[str, Any]) -> None:
+        """Set free parameters (numbers or one per group); the leaves are new tensors afterwards."""
+        for name, value in values.items():
+            if name not in self.free:
+                raise ValueError(f"parameter '{name}' is not free here. Free: {', '.join(self.free)}.")
+            full = torch.as_tensor(value, dtype=torch.float64).detach().expand(len(self.problem.groups))
+            self._leaves[name] = unconstrain(self._declared[name], full).clone().requires_grad_()
+
+    def loss(self) -> Tensor:
+        """Return the mean squared residual (m² for spacing), differentiable in ``parameters()``."""
+        return self.error(torch.stack(list(self.values().values()), dim=-1)).square()
+
+    def error(self, values: Tensor | np.ndarray) -> Tensor:
+        """Return the root mean square residual of values ``(free,)`` or ``(groups, free)``, ordered as ``free``."""
+        own = torch.as_tensor(values, dtype=torch.float64)
+        own = own.expand(len(self.problem.groups), len(self.free))
+        residual = self.problem.residual(self.problem.simulate(self.problem.rows(own, own.new_zeros(0))))
+        return torch.sqrt(residual.square().sum() / self.problem.samples.sum() + 1e-18)
+
+    @property
+    def vehicle_steps(self) -> int:
+        """Simulated steps of drivers in one evaluation of the loss, padding included."""
+        return self.problem.batch.steps * len(self.problem.batch)
+
+    # -- search and use ------------------------------------------------------------------------------------------
+
+    def fit(self, **options: Any) -> Fit:
+        """Search by ``idm_env.fitting`` (Levenberg–Marquardt or Adam; its options), keep and return the result."""
+        from idm_env.fitting.fit import fit
+
+        own = torch.stack([x.detach() for x in self.values().values()], dim=-1)
+        chosen: dict[str, Any] = {"loss": "mse", **options}
+        if chosen.get("starts") == 1:
+            chosen["start"] = (own, own.new_zeros(0))
+        result = fit(
+            self.episodes,
+            by=self.by,
+            simulator=self.problem.simulator,
+            free=self.free,
+            objective=self.problem.objective,
+            substeps=1,
+            fixed=self.fixed,
+            **chosen,
+        )
+        self.set_values({name: result.own[:, i] for i, name in enumerate(self.free)})
+        return result
+
+    def apply(self, group: int = 0) -> None:
+        """Put the values of one group into the environment; they hold from its next step on."""
+        owner = getattr(self.env, "unwrapped", self.env)
+        if not hasattr(owner, "params"):
+            raise ValueError("this environment has no parameters to set. Wrap a Gymnasium environment of this package.")
+        params = {effect: dict(part) for effect, part in owner.params.items()}
+        for name, value in self.values().items():
+            effect, parameter = name.split(".")
+            params[effect][parameter] = value[group].detach().to(params[effect][parameter])
+        owner.params = params
+
+    def model(self, group: int = 0) -> Any:
+        """Return the values of one group as an ``idm_env.config.Model``, for ``save_model`` and ``effects=``."""
+        from idm_env.config import Model, numbers
+
+        found = {name: float(value[group].detach()) for name, value in self.values().items()}
+        simulator = self.problem.simulator
+        effects = tuple(e for e in simulator.effects if e.name not in _OTHERS)
+        return Model(effects, numbers({**self.fixed, **found}), simulator.dt, simulator.integration)
+
+
+class FittingEnv(gymnasium.Env):
+    """``gym.make("DiffIDM-Fit-v0", trajectories="pairs.parquet", task="ring", …)``: one step, one guess.
+
+    Action: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean square
+    residual. Observation: the last guess, zeros at first. Episodes have one step. ``free``, ``by`` (one group only)
+    and ``objective`` are those of ``ParameterFitting``; all other keywords make the environment whose drivers are
+    fitted.
+
+    ``bounds`` narrows what [−1, 1] spans: ``{"idm.time_gap": [0.5, 3.0]}``.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium declares it so)
+
+    def __init__(
+        self,
+        trajectories: Any = None,
+        *,
+        free: Sequence[str] | None = None,
+        objective: str = "spacing",
+        bounds: Mapping[str, Sequence[float]] | None = None,
+        render_mode: None = None,
+        **keywords: Any,
+    ) -> None:
+        from idm_env.envs.settings import settings
+
+        if trajectories is None:
+            raise ValueError("trajectories = None, and a fit needs a file. Give trajectories='file.parquet'.")
+        self.problem = ParameterFitting(settings(**keywords).task, trajectories, free=free, objective=objective)
+        low, high = (x.numpy().copy() for x in self.problem.problem.bounds)
+        for name, (lowest, highest) in (bounds or {}).items():
+            if name not in self.problem.free:
+                raise ValueError(f"bounds name '{name}', which is not free. Free: {', '.join(self.problem.free)}.")
+            i = self.problem.free.index(name)
+            low[i], high[i] = max(low[i], lowest), min(high[i], highest)
+        self.low, self.high = low, high
+        count = len(self.problem.free)
+        self.render_mode = None
+        self.action_space = Box(-1.0, 1.0, (count,), np.float32)
+        self.observation_space = Box(-1.0, 1.0, (count,), np.float32)
+        self._last = np.zeros(count, np.float32)
+
+    def values(self, action: Any) -> np.ndarray:
+        """Return the parameters of an action, in the order of ``free``; ValueError for a wrong shape or NaN."""
+        guess = np.asarray(action, dtype=np.float64)
+        if guess.shape != self.action_space.shape or not np.isfinite(guess).all():
+            raise ValueError(f"action = {action!r} must be {len(self.low)} finite numbers in [-1, 1].")
+        return self.low + 0.5 * (np.clip(guess, -1.0, 1.0) + 1.0) * (self.high - self.low)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the last guess."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._last = np.zeros_like(self._last)
+        return self._last.copy(), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Judge a guess; the episode ends."""
+        with torch.no_grad():
+            error = float(self.problem.error(self.values(action)))
+        self._last = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
+        return self._last.copy(), -error, True, False, {}
+
+
+def _task_of(env: Any) -> tuple[Task, Params]:
+    owner = env if isinstance(env, Task) else getattr(env, "unwrapped", env)
+    task = owner if isinstance(owner, Task) else getattr(owner, "task", None)
+    if not isinstance(task, Task):
+        raise ValueError(
+            f"{type(env).__name__} is no environment of this package. Make one with gym.make('DiffIDM-v0')."
+        )
+    params = getattr(owner, "params", None)
+    return task, task.params(torch.float64, "cpu") if not isinstance(params, Mapping) else params
+
+
+def _episodes(trajectories: Any, dt: float) -> list[Any]:
+    from idm_env.data import Episode, Trajectories, episodes, load
+
+    if isinstance(trajectories, (str, Path)):
+        trajectories = load(trajectories)
+    if isinstance(trajectories, Trajectories):
+        return list(episodes(trajectories, smooth=True, dt=dt))
+    found = list(trajectories)
+    if not found or not all(isinstance(e, Episode) for e in found):
+        raise ValueError("trajectories must be a file, idm_env.data.Trajectories, or a sequence of episodes.")
+    return [dataclasses.replace(e) for e in found]
+
+
+def _value(params: Params, name: str, default: float) -> float:
+    effect, parameter = name.split(".")
+    value = params.get(effect, {}).get(parameter)
+    return default if value is None else float(torch.as_tensor(value).detach().double().mean())
+
+
+def _fixed(simulator: Simulator, params: Params, free: Sequence[str]) -> dict[str, float]:
+    """Return the environment's values of whatever is not free; where vehicles differ, their mean."""
+    known = catalogue(simulator.effects)
+    return {name: _value(params, name, p.default) for name, p in known.items() if name not in free}

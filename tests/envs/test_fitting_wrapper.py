@@ -1,0 +1,135 @@
+"""Environments as fitting problems: hidden parameters come back by gradients, by the fit, and by guesses."""
+
+import gymnasium as gym
+import numpy as np
+import polars as pl
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+import idm_env  # noqa: F401
+from idm_env.config import load_model, save_model
+from idm_env.data import Trajectories
+from idm_env.effects import IDM, Brakes, Replay
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
+from idm_env.tasks.recorded import head, made_up_leader
+from idm_env.wrappers import ParameterFitting
+
+HIDDEN = {"time_gap": 1.4, "max_accel": 1.1, "min_gap": 2.6}
+FREE = tuple(f"idm.{name}" for name in HIDDEN)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """A driver with hidden parameters, simulated exactly, behind the made-up leader."""
+    simulator = Simulator(Lane(), (IDM(), Brakes(), Replay()))
+    params = simulator.defaults(dtype=torch.float64)
+    for name, value in {**HIDDEN, "comfort_decel": 1.5, "desired_speed": 30.0}.items():
+        params["idm"][name] = torch.tensor(value, dtype=torch.float64)
+    leader = torch.as_tensor(made_up_leader(0.1).motion[0, :900])
+    state = simulator.state(leader[:1, 0] - torch.tensor([0.0, 35.0]), leader[:1, 1].expand(2).clone(), params)
+    rows = []
+    for t in range(900):
+        for i in range(2):
+            rows.append(
+                {
+                    "vehicle_id": "ab"[i],
+                    "time_s": 0.1 * t,
+                    "position_m": float(state.position[i]),
+                    "speed_mps": float(state.speed[i]),
+                    "length_m": 5.0,
+                    "leader_id": None if i == 0 else "a",
+                }
+            )
+        if t + 1 < 900:
+            record = head(leader[t + 1 : t + 2], torch.tensor([True, False]))
+            record = record._replace(**{k: getattr(record, k).squeeze(0) for k in ("position", "speed", "accel")})
+            state = simulator.step(state, {"replay": record}, params)
+    return Trajectories.from_frame(pl.DataFrame(rows, infer_schema_length=None))
+
+
+def problem(recording, **keywords):
+    env = gym.make("DiffIDM-v0", warmup=1, **keywords)
+    return env, ParameterFitting(env, recording, free=FREE)
+
+
+def test_the_loss_is_differentiable_and_falls_under_adam(recording):
+    _, fitting = problem(recording)
+    assert all(leaf.is_leaf and leaf.requires_grad for leaf in fitting.parameters())
+    optimiser = torch.optim.Adam(fitting.parameters(), lr=0.1)
+    first = float(fitting.loss().detach())
+    for _ in range(60):
+        optimiser.zero_grad()
+        loss = fitting.loss()
+        loss.backward()
+        optimiser.step()
+    assert float(loss.detach()) < 0.05 * first
+
+
+def test_gradcheck_of_the_loss(recording):
+    _, fitting = problem(recording)
+    values = torch.tensor([1.2, 0.9, 2.2], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(fitting.error, (values,), rtol=1e-2, atol=1e-5)
+
+
+def test_fit_finds_what_was_hidden_and_the_environment_takes_it(recording, tmp_path):
+    env, fitting = problem(recording)
+    fitting.fit()
+    found = {name: float(value.detach()) for name, value in fitting.values().items()}
+    for name, value in HIDDEN.items():
+        assert found[f"idm.{name}"] == pytest.approx(value, rel=0.02)
+    fitting.apply()
+    assert float(env.unwrapped.params["idm"]["time_gap"]) == pytest.approx(found["idm.time_gap"], rel=1e-5)
+    env.reset(seed=0)
+    env.step(None)
+    # What was not free is the environment's, and a saved model makes the same drivers.
+    assert fitting.fixed["idm.desired_speed"] == 30.0
+    save_model(tmp_path / "model.yaml", fitting.model())
+    model = load_model(tmp_path / "model.yaml")
+    assert model.parameters["idm"]["min_gap"] == pytest.approx(found["idm.min_gap"])
+    assert float(gym.make("DiffIDM-v0", effects=str(tmp_path / "model.yaml")).unwrapped.params["idm"]["min_gap"]) > 2.4
+
+
+def test_effects_of_the_environment_are_part_of_the_problem(recording):
+    env = gym.make("DiffIDM-v0", warmup=1, effects=["delay"], parameters={"delay.delay": 0.3})
+    fitting = ParameterFitting(env, recording, free=("idm.time_gap", "delay.delay"))
+    assert float(fitting.values()["delay.delay"].detach()) == pytest.approx(0.3, abs=1e-3)
+    fitting.loss().backward()
+    assert all(float(leaf.grad.abs()) > 0 for leaf in fitting.parameters())
+
+
+def test_the_gymnasium_environment(recording):
+    env = gym.make("DiffIDM-Fit-v0", trajectories=recording, free=FREE, bounds={"idm.time_gap": [0.4, 2.4]}, warmup=1)
+    check_env(env.unwrapped, skip_render_check=True)
+    env.reset(seed=0)
+    inner = env.unwrapped
+    best = np.array([1.4, 1.1, 2.6])
+    action = (2.0 * (best - inner.low) / (inner.high - inner.low) - 1.0).astype(np.float32)
+    np.testing.assert_allclose(inner.values(action), best, rtol=1e-5)
+    assert inner.values(np.zeros(3))[0] == pytest.approx(1.4)
+    _, good, terminated, _, _ = env.step(action)
+    assert terminated
+    env.reset()
+    bad = env.step(np.full(3, 0.5, np.float32))[1]
+    assert bad < good < 0.0
+    assert good > -0.05
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"),
+    [
+        ({}, "needs a file"),
+        ({"free": ["idm.time_gab"]}, "Did you mean 'idm.time_gap'"),
+        ({"bounds": {"idm.exponent": [1, 2]}}, "not free"),
+    ],
+)
+def test_bad_choices_are_errors(recording, keywords, words):
+    given = {} if not keywords else {"trajectories": recording}
+    with pytest.raises(ValueError, match=words):
+        gym.make("DiffIDM-Fit-v0", **given, **keywords)
+
+
+def test_what_is_no_environment_of_ours_is_an_error(recording):
+    with pytest.raises(ValueError, match="no environment of this package"):
+        ParameterFitting(gym.make("CartPole-v1"), recording)
