@@ -30,6 +30,21 @@ def load(
     Raises:
         DataError: If the file cannot be read or used; one line that names the value, the rule and the cure.
     """
+    frame, repairs = read(path, layout=layout)
+    path = Path(path)
+    try:
+        return Trajectories.from_frame(frame, source=path.name, ring_length=ring_length, place=place, repairs=repairs)
+    except pl.exceptions.PolarsError as error:
+        # Types that no rule foresaw, such as lists in a parquet column, or one name twice.
+        raise _unreadable(path, error) from error
+
+
+def read(path: str | Path, *, layout: str = "auto") -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the tidy frame of a file, in SI units and not checked yet, and what its reader repaired.
+
+    Raises:
+        DataError: If the file cannot be read or its layout is unknown.
+    """
     path = Path(path)
     if layout not in LAYOUTS:
         raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
@@ -40,12 +55,9 @@ def load(
         if layout == "openacc" or (layout == "auto" and above is not None):
             above = openacc.HEADER_LINES if above is None else above
             table = _table(path, extension, skip=above)
-            frame, repairs = openacc.read(table, lines[:above], path.name.split(".")[0], path.name)
-        else:
-            frame, repairs = _plain_layout(_table(path, extension), layout, path.name)
-        return Trajectories.from_frame(frame, source=path.name, ring_length=ring_length, place=place, repairs=repairs)
+            return openacc.read(table, lines[:above], path.name.split(".")[0], path.name)
+        return _plain_layout(_table(path, extension), layout, path.name)
     except pl.exceptions.PolarsError as error:
-        # Types that no rule foresaw, such as lists in a parquet column, or one name twice.
         raise _unreadable(path, error) from error
 
 

@@ -1,0 +1,118 @@
+"""What is reported of trajectories: the paper's three metrics, and errors against a truth where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+IMPLAUSIBLE_MPS2 = 10.0
+"""No road vehicle accelerates or brakes harder (m/s²): the paper's bound."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A trajectory on a regular clock: arrays [K] of time (s), position (m), speed (m/s) and acceleration (m/s²)."""
+
+    time_s: np.ndarray
+    position_m: np.ndarray
+    speed_mps: np.ndarray
+    accel_mps2: np.ndarray
+
+    def at(self, time_s: np.ndarray) -> np.ndarray:
+        """Return the positions (m) at other times (s), by linear interpolation between samples."""
+        return np.interp(time_s, self.time_s, self.position_m)
+
+
+def from_positions(time_s: np.ndarray, position_m: np.ndarray) -> Motion:
+    """Return the motion of positions on a regular clock: speed and acceleration are central differences."""
+    if len(time_s) < 2:
+        raise ValueError(f"{len(time_s)} position has no speed. Give at least two.")
+    speed = np.gradient(position_m, time_s)
+    return Motion(time_s, position_m, speed, np.gradient(speed, time_s))
+
+
+def position_error_rate(motion: Motion, time_s: np.ndarray, position_m: np.ndarray) -> float:
+    """Return the paper's average positional error rate: mean |p − data| over the trajectory's length (1).
+
+    NaN for a track that does not move.
+    """
+    length = float(np.abs(np.diff(position_m)).sum())
+    error = float(np.abs(motion.at(time_s) - position_m).mean())
+    return error / length if length > 0 else float("nan")
+
+
+def implausible(motion: Motion) -> bool:
+    """Tell whether any |acceleration| exceeds 10 m/s²."""
+    return bool((np.abs(motion.accel_mps2) > IMPLAUSIBLE_MPS2).any())
+
+
+@dataclass
+class Tally:
+    """Sums over trajectories, from which the row of a table is made; merging chunks is adding."""
+
+    tracks: int = 0
+    moving: int = 0
+    rate: float = 0.0
+    samples: int = 0
+    accel: float = 0.0
+    accel_square: float = 0.0
+    implausible: int = 0
+    seconds: float = 0.0
+    compared: int = 0
+    position_square: float = 0.0
+    speed_square: float = 0.0
+    accel_error_square: float = 0.0
+
+    def add(self, motion: Motion, time_s: np.ndarray, position_m: np.ndarray) -> None:
+        """Count one trajectory against its data."""
+        rate = position_error_rate(motion, time_s, position_m)
+        self.tracks += 1
+        if np.isfinite(rate):
+            self.moving += 1
+            self.rate += rate
+        size = np.abs(motion.accel_mps2)
+        self.samples += len(size)
+        self.accel += float(size.sum())
+        self.accel_square += float((size * size).sum())
+        self.implausible += implausible(motion)
+
+    def compare(self, motion: Motion, truth: Motion) -> None:
+        """Count errors against a truth on the same clock; samples whose true value is NaN do not count."""
+        known = np.isfinite(truth.speed_mps) & np.isfinite(truth.accel_mps2) & np.isfinite(truth.position_m)
+        self.compared += int(known.sum())
+        self.position_square += float(((motion.position_m - truth.position_m)[known] ** 2).sum())
+        self.speed_square += float(((motion.speed_mps - truth.speed_mps)[known] ** 2).sum())
+        self.accel_error_square += float(((motion.accel_mps2 - truth.accel_mps2)[known] ** 2).sum())
+
+    def merge(self, other: Tally) -> None:
+        """Add another tally, of another chunk."""
+        for name, value in vars(other).items():
+            setattr(self, name, getattr(self, name) + value)
+
+    def row(self) -> dict[str, float | int]:
+        """Return the row of a report; what was not measured is absent."""
+        mean = self.accel / self.samples if self.samples else float("nan")
+        spread = max(self.accel_square / self.samples - mean * mean, 0.0) ** 0.5 if self.samples else float("nan")
+        row: dict[str, float | int] = {
+            "trajectories": self.tracks,
+            "position_error_rate_percent": 100.0 * self.rate / self.moving if self.moving else float("nan"),
+            "accel_mean_mps2": mean,
+            "accel_std_mps2": spread,
+            "implausible_percent": 100.0 * self.implausible / self.tracks if self.tracks else float("nan"),
+            "milliseconds_per_trajectory": 1e3 * self.seconds / self.tracks if self.tracks else float("nan"),
+        }
+        if self.compared:
+            row["position_rmse_m"] = (self.position_square / self.compared) ** 0.5
+            row["speed_rmse_mps"] = (self.speed_square / self.compared) ** 0.5
+            row["accel_rmse_mps2"] = (self.accel_error_square / self.compared) ** 0.5
+        return row
+
+
+def tallied(motions: Sequence[Motion], data: Sequence[tuple[np.ndarray, np.ndarray]]) -> Tally:
+    """Return the tally of motions and their data (times, positions)."""
+    tally = Tally()
+    for motion, (time_s, position_m) in zip(motions, data, strict=True):
+        tally.add(motion, time_s, position_m)
+    return tally

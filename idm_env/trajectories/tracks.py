@@ -1,0 +1,220 @@
+"""Single trajectories as they were measured: read tolerantly, so that one bad track never stops the others.
+
+Unlike ``data.load``, which prepares followers behind leaders for calibration, a track needs neither a leader nor a
+regular clock. What is left out is counted, by reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from idm_env.data import DataError, Repair
+from idm_env.data.clean import NO_LEADER, check_columns, identifiers, natural, numbers, without_empty
+from idm_env.data.load import read
+from idm_env.data.schema import DEFAULT_LENGTH_M, HIGHEST_SPEED_MPS, LONGEST_LENGTH_M
+
+SMALLEST_JUMP_M = 8.0
+"""A change of position is a jump only above this, whatever the time step (m)."""
+REVERSED_M = 3.0
+"""A vehicle whose smoothed position falls by more than this drives backwards, which the simulator never does (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One unbroken stretch of one vehicle; arrays are [N], times rising strictly.
+
+    Attributes:
+        run_id, vehicle_id: Identifiers, as text.
+        piece: Number of the stretch, from 0, where holes or jumps divide a vehicle's track.
+        time_s: Times of the samples (s), not necessarily regular.
+        position_m: Front bumper along the lane (m), as measured.
+        length_m: Length of the vehicle (m).
+        leader: Identifier of the vehicle ahead at every sample, "" where there is none.
+        lane: Lane at every sample, −1 where it is not known.
+    """
+
+    run_id: str
+    vehicle_id: str
+    piece: int
+    time_s: np.ndarray
+    position_m: np.ndarray
+    length_m: float
+    leader: np.ndarray
+    lane: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def key(self) -> str:
+        """``run/vehicle/piece``."""
+        return f"{self.run_id}/{self.vehicle_id}/{self.piece}"
+
+    def part(self, at: slice | np.ndarray, piece: int | None = None) -> Track:
+        """Return some of the samples."""
+        return Track(
+            self.run_id, self.vehicle_id, self.piece if piece is None else piece, self.time_s[at], self.position_m[at],
+            self.length_m, self.leader[at], self.lane[at],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Table:
+    """A file of tracks: the table sorted by run, vehicle and time, what was repaired, and each run's time step (s)."""
+
+    frame: pl.DataFrame
+    repairs: tuple[Repair, ...]
+    source: str
+
+    def vehicles(self) -> list[tuple[str, str, int, int]]:
+        """Return (run, vehicle, first row, rows) of every vehicle, in order of the time at which it appears."""
+        rows = self.frame.with_row_index("row").group_by("run_id", "vehicle_id", maintain_order=True)
+        found = rows.agg(pl.col("row").first(), pl.len().alias("count"), pl.col("time_s").first().alias("begin"))
+        return found.sort("run_id", "begin", maintain_order=True).select("run_id", "vehicle_id", "row", "count").rows()
+
+
+def read_table(path: str | Path, layout: str = "auto") -> Table:
+    """Return the table of a csv, csv.gz or parquet file in any layout that ``data.load`` reads.
+
+    DataError, in one line, if the file as a whole cannot be used.
+    """
+    frame, repairs = read(path, layout=layout)
+    return from_frame(frame, Path(path).name, repairs)
+
+
+def from_frame(frame: pl.DataFrame, source: str = "table", repairs: list[Repair] | None = None) -> Table:
+    """Return the table of a tidy frame (vehicle_id, time_s, position_m at least)."""
+    done = list(repairs or ())
+    check_columns(frame, source)
+    frame, more = numbers(identifiers(frame), source)
+    done += more
+    frame, more = without_empty(frame, source)
+    done += more
+    lost = frame["position_m"].null_count()
+    if lost:
+        frame = frame.filter(pl.col("position_m").is_not_null())
+        done.append(Repair("no position", lost, f"{lost} rows without a position were left out."))
+    if frame.height == 0:
+        raise DataError(f"{source}: position_m is empty in every row; it must hold positions in metres.")
+    unsorted = int(frame.select((pl.col("time_s").diff().over("run_id", "vehicle_id") < 0).sum()).item() or 0)
+    if unsorted:
+        text = f"Time runs backward at {unsorted} rows; the rows were sorted by time."
+        done.append(Repair("time not increasing", unsorted, text))
+    frame = frame.sort(natural("run_id"), "run_id", natural("vehicle_id"), "vehicle_id", "time_s", maintain_order=True)
+    frame, more = _without_repeats(frame, source)
+    done += more
+    return Table(_with_leaders(frame), tuple(done), source)
+
+
+def _without_repeats(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+    before = frame.height
+    frame = frame.unique(["run_id", "vehicle_id", "time_s"], keep="first", maintain_order=True)
+    count = before - frame.height
+    text = f"{count} rows repeat a time of their vehicle and were left out; the first of each was kept."
+    return frame, [Repair("duplicated time", count, text)] if count else []
+
+
+def _with_leaders(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return the frame with ``leader_id`` ("" for none), derived from lane and position where the column is absent."""
+    if "leader_id" in frame.columns:
+        none = pl.col("leader_id").is_null() | pl.col("leader_id").str.to_lowercase().is_in(NO_LEADER)
+        return frame.with_columns(pl.when(none).then(pl.lit("")).otherwise(pl.col("leader_id")).alias("leader_id"))
+    if "lane" not in frame.columns:
+        # Without lanes, vehicles at one time may be anywhere: nobody is taken for anybody's leader.
+        return frame.with_columns(pl.lit("").alias("leader_id"))
+    order = frame.with_row_index("row").sort("run_id", "lane", "time_s", "position_m")
+    ahead = pl.col("vehicle_id").shift(-1).over("run_id", "lane", "time_s")
+    return order.with_columns(ahead.fill_null("").alias("leader_id")).sort("row").drop("row")
+
+
+class Pieces:
+    """Tracks of a table, in the order in which vehicles appear; ``left_out`` counts what could not be used.
+
+    ``bridge`` (s) is the longest hole that stays inside a track; None keeps every hole (reconstruction).
+    """
+
+    def __init__(self, table: Table, bridge: float | None = 2.0) -> None:
+        self.table = table
+        self.bridge = bridge
+        self.left_out: list[tuple[str, str]] = []
+        self.notes: list[tuple[str, str]] = []
+        frame = table.frame
+        self._columns = {name: frame[name].to_numpy() for name in ("time_s", "position_m")}
+        self._leader = frame["leader_id"].to_numpy()
+        self._lane = (
+            frame["lane"].fill_null(-1).to_numpy() if "lane" in frame.columns else np.full(frame.height, -1, np.int64)
+        )
+        self._length = frame["length_m"].to_numpy() if "length_m" in frame.columns else None
+        self.vehicles = table.vehicles()
+
+    def of(self, vehicles: list[tuple[str, str, int, int]]) -> Iterator[Track]:
+        """Yield the tracks of some vehicles, as ``vehicles`` lists them."""
+        for run, vehicle, first, count in vehicles:
+            at = slice(first, first + count)
+            length = np.nanmedian(self._length[at]) if self._length is not None else np.nan
+            good = np.isfinite(length) and 0 < length <= LONGEST_LENGTH_M
+            whole = Track(
+                run, vehicle, 0, self._columns["time_s"][at], self._columns["position_m"][at],
+                float(length) if good else DEFAULT_LENGTH_M, self._leader[at], self._lane[at],
+            )  # fmt: skip
+            yield from self._usable(whole)
+
+    def __iter__(self) -> Iterator[Track]:
+        return self.of(self.vehicles)
+
+    def _usable(self, whole: Track) -> Iterator[Track]:
+        name = f"{whole.run_id}/{whole.vehicle_id}"
+        if len(whole) < 2:
+            self.left_out.append((name, "a single point has no motion"))
+            return
+        number = 0
+        for begin, end in self._spans(whole):
+            track = whole.part(slice(begin, end), number)
+            if len(track) < 2:
+                self.left_out.append((name, f"a single point at t = {whole.time_s[begin]:g} s, apart from the rest"))
+                continue
+            fallen = reversing(track)
+            if fallen > REVERSED_M:
+                self.left_out.append((track.key, f"drives backwards by {fallen:.1f} m; positions must rise"))
+                continue
+            number += 1
+            yield track
+        if number > 1:
+            self.notes.append((name, f"divided into {number} tracks at holes or jumps"))
+
+    def _spans(self, whole: Track) -> list[tuple[int, int]]:
+        """Return [begin, end) of stretches without a long hole or a lasting jump."""
+        steps = np.diff(whole.time_s)
+        usual = float(np.median(steps))
+        cut = np.zeros(len(steps), bool) if self.bridge is None else steps > max(self.bridge, 2.5 * usual)
+        cut |= jumps(whole.time_s, whole.position_m)
+        edges = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(whole)]])
+        return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return [N − 1] where the position jumps and stays away: no vehicle moves so fast, and it does not come back.
+
+    A single sample that is off and back is an outlier for the noise model, not a cut.
+    """
+    far = np.maximum(SMALLEST_JUMP_M, HIGHEST_SPEED_MPS * np.diff(time))
+    away = np.abs(np.diff(position)) > far
+    for at in np.flatnonzero(away):
+        around = slice(max(0, at - 4), at + 1), slice(at + 1, at + 6)
+        before, after = (np.median(position[part]) for part in around)
+        between = np.median(time[around[1]]) - np.median(time[around[0]])
+        away[at] = abs(after - before) > max(SMALLEST_JUMP_M, HIGHEST_SPEED_MPS * between)
+    return away
+
+
+def reversing(track: Track) -> float:
+    """Return by how much (m) the position, as a running median over 5 samples, falls below what it had reached."""
+    x = track.position_m
+    if len(x) >= 5:
+        x = np.median(np.lib.stride_tricks.sliding_window_view(x, 5), axis=1)
+    return float((np.maximum.accumulate(x) - x).max())
