@@ -41,6 +41,7 @@ class Batch:
         self.count = count
         self.params: Params = self.task.params(made.dtype, made.device)
         self.advance = advance_of(self.task.simulator, made.output, made.device, made.dtype)
+        self._run = getattr(self.advance, "run", None)
         limits = [x for x in (made.limit, self.task.horizon) if x is not None]
         self.limit = min(limits) if limits else None
         self.seeds = np.zeros(count, dtype=np.int64)
@@ -86,11 +87,11 @@ class Batch:
 
     def _begin(self, draw: Draw) -> World:
         if not self.task.warmup_pool:
-            return self.task.reset(draw, self.params, self.advance)
+            return self.task.reset(draw, self.params, self._run)
         if self._pool is None:
             size, device = self.task.warmup_pool, self.settings.device
             seeds = torch.arange(size, device=device)
-            self._pool = self.task.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params, self.advance)
+            self._pool = self.task.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params, self._run)
         picked = (draw.uniforms(_POOL_STREAM, 1, torch.float64).squeeze(-1) * self.task.warmup_pool).long()
         return _map(lambda pooled: pooled[picked], self._pool)
 

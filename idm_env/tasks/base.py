@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -21,12 +21,15 @@ from idm_env.effects import Control, Effect, Noise
 from idm_env.roads import Road
 from idm_env.simulator import Simulator
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import agents_of, at_least, finite, whole
+from idm_env.tasks.checks import agents_of, at_least, whole
 from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params, State
 
 Advance = Callable[[State, Inputs, Params], State]
 """One step of a simulator: ``Simulator.step``, or a fused kernel that gives the same."""
+
+Run = Callable[[State, "Tensor | None", Params, int], State]
+"""Many steps without any control: state, normals with a leading time dimension or None, parameters, steps."""
 
 _NORMALS_AT_ONCE = 1 << 16
 _TAKE_INPUTS = {"control", "replay", "imagined", "lateral"}
@@ -200,23 +203,23 @@ class Task(abc.ABC):
     def begin(self, draw: Draw, params: Params) -> World:
         """Return the worlds before the warm-up, with ``state.step = −warmup``."""
 
-    def reset(self, draw: Draw, params: Params, advance: Advance | None = None) -> World:
-        """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control."""
-        world = self.begin(draw, params)
-        for normals in self.warmup_normals(draw, world.state):
-            world = self.step(world, None, normals, params, advance=advance)
-        return world
+    def reset(self, draw: Draw, params: Params, run: Run | None = None) -> World:
+        """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control.
 
-    def warmup_normals(self, draw: Draw, state: State) -> Iterator[Tensor | None]:
-        """Yield the normals of every step of the warm-up, drawn in blocks; None where there is no noise."""
-        rows, width = state.speed.shape
-        block = max(1, _NORMALS_AT_ONCE // max(rows * width, 1))
-        for begin in range(0, self.warmup, block):
-            steps = min(block, self.warmup - begin)
-            if self.noisy:
-                yield from draw.normals(state.step + begin, steps, width, state.speed.dtype)
-            else:
-                yield from [None] * steps
+        ``run`` does many steps at once, for tasks without records; None repeats ``step``.
+        """
+        world = self.begin(draw, params)
+        rows, width = world.state.speed.shape
+        block = max(16, _NORMALS_AT_ONCE // max(rows * width, 1))
+        for first in range(0, self.warmup, block):
+            steps = min(block, self.warmup - first)
+            normals = draw.normals(world.state.step, steps, width, world.state.speed.dtype) if self.noisy else None
+            if run is not None:
+                world = world._replace(state=run(world.state, normals, params, steps))
+                continue
+            for t in range(steps):
+                world = self.step(world, None, None if normals is None else normals[t], params)
+        return world
 
     def command(self, action: Tensor) -> Tensor:
         """Return the commanded accelerations (m/s²) of actions, which are clipped to [−1, 1] (no gradient beyond)."""
@@ -283,4 +286,4 @@ class Task(abc.ABC):
         return (seen / self.constant("scales", scales, device, dtype)).clamp(low, high)
 
 
-__all__ = ["Advance", "Bounds", "Draw", "Ended", "Task", "World", "finite"]
+__all__ = ["Advance", "Bounds", "Draw", "Ended", "Run", "Task", "World"]

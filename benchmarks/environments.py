@@ -1,0 +1,120 @@
+"""Environment steps per second beside HighwayEnv, and what warm-up costs.
+
+CPU time of one thread, everything in one run, so that ratios hold wherever it runs: ratios are the figures to compare,
+rates depend on the machine. Run: python benchmarks/environments.py [--quick]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+import idm_env  # noqa: F401
+
+warnings.filterwarnings("ignore")
+
+
+def rate(step: Callable[[], object], seconds: float) -> float:
+    """Return calls per second of CPU time."""
+    step()
+    count, begin = 0, time.process_time()
+    while time.process_time() - begin < seconds:
+        step()
+        count += 1
+    return count / (time.process_time() - begin)
+
+
+def driven(env: gym.Env, action: object) -> Callable[[], object]:
+    """Return a step that resets where an episode ends; the reset is part of the cost."""
+    env.reset(seed=0)
+
+    def step() -> None:
+        *_, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            env.reset()
+
+    return step
+
+
+def single(seconds: float) -> None:
+    try:
+        import highway_env
+
+        gym.register_envs(highway_env)
+    except ImportError:
+        print("highway-env is not installed (pip install highway-env): no ratio.")
+        return
+    theirs = gym.make("highway-fast-v0")
+    ours = gym.make("DiffIDM-v0")
+    them = rate(driven(theirs, 1), seconds)
+    us = rate(driven(ours, np.zeros(1, np.float32)), seconds)
+    config = theirs.unwrapped.config
+    per_step = config["simulation_frequency"] // config["policy_frequency"] * (config["vehicles_count"] + 1)
+    print("\nsingle environment            env steps/s   vehicle updates/s")
+    print(f"  HighwayEnv highway-fast-v0   {them:11,.0f} {them * per_step:19,.0f}")
+    print(f"  DiffIDM-v0 ring of 22        {us:11,.0f} {us * 22:19,.0f}")
+    print(f"  ratio                        {us / them:11,.0f} {us * 22 / (them * per_step):19,.0f}")
+
+
+def vector(seconds: float, count: int) -> None:
+    print(f"\nvector of {count}, ring of 22, numpy output, resets included       M env steps/s")
+    zero = np.zeros((count, 1), np.float32)
+    random = np.random.default_rng(0).uniform(-1.0, 1.0, (64, count, 1)).astype(np.float32)
+    for name, keywords in (("pool of 256", {"warmup_pool": 256}), ("no pool", {})):
+        for dtype in ("float32", "float64"):
+            for policy in ("constant speed", "random"):
+                env = gym.make_vec("DiffIDM-v0", num_envs=count, dtype=dtype, autoreset_mode="SameStep", **keywords)
+                env.reset(seed=0)
+                at = iter(range(10**9))
+                actions = (lambda: zero) if policy == "constant speed" else (lambda at=at: random[next(at) % 64])
+                ended = [0]
+
+                def step(env=env, actions=actions, ended=ended) -> None:
+                    info = env.step(actions())[4]
+                    ended[0] += int(info["_final_obs"].sum()) if info else 0
+
+                per_second = rate(step, seconds) * count
+                print(f"  {name:12s} {dtype} {policy:15s} {ended[0]:6d} episodes ended {per_second / 1e6:18.2f}")
+
+
+def warmup(count: int) -> None:
+    print("\nwarm-up of 750 steps, CPU ms per environment that ends")
+    for ending in (1, 64, count):
+        for name, keywords in (("drawn anew", {}), ("pool of 256", {"warmup_pool": 256})):
+            env = gym.make_vec("DiffIDM-v0", num_envs=count, autoreset_mode="Disabled", **keywords)
+            env.reset(seed=0)
+            mask = np.zeros(count, bool)
+            mask[:ending] = True
+            begin, runs = time.process_time(), 3
+            for _ in range(runs):
+                env.reset(options={"reset_mask": mask})
+            each = (time.process_time() - begin) / runs / ending * 1e3
+            print(f"  {name:12s} {ending:5d} of {count} end at once {each:12.4f}")
+    env = gym.make("DiffIDM-v0")
+    env.reset(seed=0)
+    print(f"  single environment, drawn anew {1e3 / rate(lambda: env.reset(), 0.5):26.4f}")
+    begin = time.process_time()
+    gym.make("DiffIDM-v0", warmup_pool=256).reset(seed=0)
+    print(f"  making the pool once (256 worlds, ms in all) {1e3 * (time.process_time() - begin):12.1f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="short measurements")
+    parser.add_argument("--envs", type=int, default=4096)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    seconds = 0.3 if options.quick else 4.0
+    single(seconds)
+    vector(seconds, options.envs)
+    warmup(options.envs)
+
+
+if __name__ == "__main__":
+    main()
