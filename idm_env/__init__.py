@@ -68,7 +68,7 @@ def _register() -> None:
     if "DiffIDM-Fit-v0" not in registry:
         register(
             id="DiffIDM-Fit-v0",
-            entry_point="idm_env.wrappers.fitting:FittingEnv",
+            entry_point="idm_env.wrappers.fitting_env:FittingEnv",
             max_episode_steps=1,
             disable_env_checker=True,
         )

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -22,42 +22,12 @@ from idm_env.roads import Road
 from idm_env.simulator import Simulator
 from idm_env.tasks.behaviour import Behaviour, behaviour
 from idm_env.tasks.checks import agents_of, at_least, whole
+from idm_env.tasks.nouns import Advance, Bounds, Ended, Run, World
 from idm_env.tasks.random import Draw
-from idm_env.types import Command, Inputs, Params, State
-
-Advance = Callable[[State, Inputs, Params], State]
-"""One step of a simulator: ``Simulator.step``, or a fused kernel that gives the same."""
-
-Run = Callable[[State, "Tensor | None", Params, int], State]
-"""Many steps without any control: state, normals with a leading time dimension or None, parameters, steps."""
+from idm_env.types import Command, Inputs, Params
 
 _NORMALS_AT_ONCE = 1 << 16
 _TAKE_INPUTS = {"control", "replay", "imagined", "lateral"}
-
-
-class World(NamedTuple):
-    """Everything that a step carries over: the state of the traffic, and what is constant in an episode.
-
-    Every tensor has the environments as its first dimension.
-    """
-
-    state: State
-    episode: Mapping[str, Tensor]
-
-
-class Ended(NamedTuple):
-    """Which agents have come to an end of their own, and which are cut off; bool, shape ``(…, agents)``."""
-
-    terminated: Tensor
-    truncated: Tensor
-
-
-class Bounds(NamedTuple):
-    """Names of what one agent observes, with the lowest and the highest value of each."""
-
-    names: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

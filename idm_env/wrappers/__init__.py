@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from idm_env.wrappers.fitting import FittingEnv, ParameterFitting
+from idm_env.wrappers.fitting import ParameterFitting
+from idm_env.wrappers.fitting_env import FittingEnv
 from idm_env.wrappers.statistics import (
     NormalizeObservation,
     RecordEpisodeStatistics,

@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from torch import Tensor
 
 from idm_env.effects import Replay
@@ -163,71 +161,6 @@ class ParameterFitting:
         simulator = self.problem.simulator
         effects = tuple(e for e in simulator.effects if e.name not in _OTHERS)
         return Model(effects, numbers({**self.fixed, **found}), simulator.dt, simulator.integration)
-
-
-class FittingEnv(gymnasium.Env):
-    """``gym.make("DiffIDM-Fit-v0", trajectories="pairs.parquet", task="ring", …)``: one step, one guess.
-
-    Action: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean square
-    residual. Observation: the last guess, zeros at first. Episodes have one step. ``free``, ``by`` (one group only)
-    and ``objective`` are those of ``ParameterFitting``; all other keywords make the environment whose drivers are
-    fitted.
-
-    ``bounds`` narrows what [−1, 1] spans: ``{"idm.time_gap": [0.5, 3.0]}``.
-    """
-
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium declares it so)
-
-    def __init__(
-        self,
-        trajectories: Any = None,
-        *,
-        free: Sequence[str] | None = None,
-        objective: str = "spacing",
-        bounds: Mapping[str, Sequence[float]] | None = None,
-        render_mode: None = None,
-        **keywords: Any,
-    ) -> None:
-        from idm_env.envs.settings import settings
-
-        if trajectories is None:
-            raise ValueError("trajectories = None, and a fit needs a file. Give trajectories='file.parquet'.")
-        self.problem = ParameterFitting(settings(**keywords).task, trajectories, free=free, objective=objective)
-        low, high = (x.numpy().copy() for x in self.problem.problem.bounds)
-        for name, (lowest, highest) in (bounds or {}).items():
-            if name not in self.problem.free:
-                raise ValueError(f"bounds name '{name}', which is not free. Free: {', '.join(self.problem.free)}.")
-            i = self.problem.free.index(name)
-            low[i], high[i] = max(low[i], lowest), min(high[i], highest)
-        self.low, self.high = low, high
-        count = len(self.problem.free)
-        self.render_mode = None
-        self.action_space = Box(-1.0, 1.0, (count,), np.float32)
-        self.observation_space = Box(-1.0, 1.0, (count,), np.float32)
-        self._last = np.zeros(count, np.float32)
-
-    def values(self, action: Any) -> np.ndarray:
-        """Return the parameters of an action, in the order of ``free``; ValueError for a wrong shape or NaN."""
-        guess = np.asarray(action, dtype=np.float64)
-        if guess.shape != self.action_space.shape or not np.isfinite(guess).all():
-            raise ValueError(f"action = {action!r} must be {len(self.low)} finite numbers in [-1, 1].")
-        return self.low + 0.5 * (np.clip(guess, -1.0, 1.0) + 1.0) * (self.high - self.low)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return the last guess."""
-        super().reset(seed=seed)
-        if seed is not None:
-            self._last = np.zeros_like(self._last)
-        return self._last.copy(), {}
-
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Judge a guess; the episode ends."""
-        with torch.no_grad():
-            error = float(self.problem.error(self.values(action)))
-        self._last = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
-        return self._last.copy(), -error, True, False, {}
 
 
 def _task_of(env: Any) -> tuple[Task, Params]:

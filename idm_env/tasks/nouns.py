@@ -1,0 +1,41 @@
+"""The nouns of tasks: what a step carries over, how episodes end, what agents see, and who advances a state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from torch import Tensor
+
+from idm_env.types import Inputs, Params, State
+
+Advance = Callable[[State, Inputs, Params], State]
+"""One step of a simulator: ``Simulator.step``, or a fused kernel that gives the same."""
+
+Run = Callable[[State, "Tensor | None", Params, int], State]
+"""Many steps without any control: state, normals with a leading time dimension or None, parameters, steps."""
+
+
+class World(NamedTuple):
+    """Everything that a step carries over: the state of the traffic, and what is constant in an episode.
+
+    Every tensor has the environments as its first dimension.
+    """
+
+    state: State
+    episode: Mapping[str, Tensor]
+
+
+class Ended(NamedTuple):
+    """Which agents have come to an end of their own, and which are cut off; bool, shape ``(…, agents)``."""
+
+    terminated: Tensor
+    truncated: Tensor
+
+
+class Bounds(NamedTuple):
+    """Names of what one agent observes, with the lowest and the highest value of each."""
+
+    names: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
