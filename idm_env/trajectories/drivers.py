@@ -1,0 +1,103 @@
+"""Driver parameters from filtered tracks: the calibration of ``fitting.fit`` behind the real, filtered leaders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from idm_env.data import Episode, Record
+from idm_env.data.records import FAR_M
+from idm_env.effects import IDM
+from idm_env.fitting.fit import Fit, fit
+from idm_env.trajectories.recipe import Filtered
+
+SHORTEST_S = 10.0
+"""Shorter stretches behind one leader say too little about a driver (s)."""
+FARTHEST_M = 100.0
+"""A leader farther away than this is not followed (m)."""
+
+
+def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]]) -> Episode | None:
+    """Return the longest stretch behind one filtered leader as an episode, None if there is none of 10 s."""
+    found: tuple[int, int, Filtered] | None = None
+    clock = filtered.motion.time_s
+    dt = float(clock[1] - clock[0]) if len(clock) > 1 else 0.1
+    near = np.isfinite(filtered.gap) & (filtered.gap > 0) & (filtered.gap < FARTHEST_M)
+    for begin, end in _stretches(filtered.leader, near):
+        for lead in leaders.get((filtered.track.run_id, str(filtered.leader[begin])), ()):
+            inside = (clock[begin:end] >= lead.motion.time_s[0] - 1e-9) & (
+                clock[begin:end] <= lead.motion.time_s[-1] + 1e-9
+            )
+            if inside.all() and (found is None or end - begin > found[1] - found[0]):
+                found = begin, end, lead
+    if found is None or (found[1] - found[0]) * dt < SHORTEST_S:
+        return None
+    begin, end, lead = found
+    part = slice(begin, end)
+    time = clock[part]
+    position, speed = filtered.motion.position_m[part], filtered.motion.speed_mps[part]
+    length = lead.track.length_m
+    ahead = Record(
+        position + filtered.gap[part] + length,
+        np.interp(time, lead.motion.time_s, lead.motion.speed_mps),
+        np.interp(time, lead.motion.time_s, lead.motion.accel_mps2),
+        length,
+        np.ones(end - begin, bool),
+    )
+    nobody = np.zeros(end - begin, bool)
+    far = [Record(position + away, speed, np.zeros(end - begin), 4.5, nobody) for away in (FAR_M, -FAR_M, FAR_M)]
+    track = filtered.track
+    return Episode(
+        track.run_id, track.vehicle_id, str(filtered.leader[begin]), track.key, dt, time, position, speed,
+        filtered.gap[part], track.length_m, ahead, far[0], far[1], far[2], position, {}, {},
+    )  # fmt: skip
+
+
+def _stretches(leader: np.ndarray, usable: np.ndarray) -> list[tuple[int, int]]:
+    """Return [begin, end) of stretches of usable steps behind one leader."""
+    change = (leader[1:] != leader[:-1]) | (usable[1:] != usable[:-1])
+    edges = np.concatenate([[0], np.flatnonzero(change) + 1, [len(leader)]])
+    return [(b, e) for b, e in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True) if usable[b] and leader[b]]
+
+
+def fit_drivers(
+    filtered: Sequence[Filtered], before: Sequence[Filtered] = (), *, iterations: int = 15
+) -> tuple[Fit | None, list[Episode]]:
+    """Calibrate IDM for every track that follows a leader for at least 10 s; None where nobody does."""
+    leaders: dict[tuple[str, str], list[Filtered]] = {}
+    for f in (*filtered, *before):
+        leaders.setdefault((f.track.run_id, f.track.vehicle_id), []).append(f)
+    episodes = [e for e in (episode_of(f, leaders) for f in filtered) if e is not None]
+    if not episodes:
+        return None, []
+    found = fit(episodes, by="driver", loss="mse", starts=1, iterations=iterations)
+    return found, episodes
+
+
+def parameter_rows(filtered: Sequence[Filtered], before: Sequence[Filtered] = ()) -> list[dict[str, Any]]:
+    """Return one row per track: the five parameters, their standard errors, and whether the data tell them.
+
+    ``source`` is ``leader`` for a calibration behind the real leader; ``none`` marks a track that follows nobody for
+    10 s: its parameters are empty, since an imagined leader explains any motion at any parameters.
+    """
+    found, _ = fit_drivers(filtered, before)
+    values: dict[str, dict[str, Any]] = {}
+    if found is not None:
+        for g, group in enumerate(found.problem.groups):
+            row: dict[str, Any] = {"source": "leader"}
+            for i, p in enumerate(IDM.declared):
+                row[p.name] = float(found.own[g, i])
+                row[f"{p.name}_error"] = float(found.uncertainty.standard_error[g, i])
+                row[f"{p.name}_identified"] = bool(found.uncertainty.identified[g, i])
+            values[group] = row
+    empty: dict[str, Any] = {"source": "none"}
+    for p in IDM.declared:
+        empty |= {p.name: None, f"{p.name}_error": None, f"{p.name}_identified": False}
+    rows = []
+    for f in filtered:
+        key = f"{f.track.run_id}/{f.track.vehicle_id}"
+        names = {"run_id": f.track.run_id, "vehicle_id": f.track.vehicle_id, "piece": f.track.piece}
+        rows.append(names | values.get(key, empty))
+    return rows

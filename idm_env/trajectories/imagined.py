@@ -1,0 +1,88 @@
+"""The imagined leader: which gap makes a driver do what a trajectory shows, and the simulator driven by it.
+
+IDM's acceleration falls strictly with 1/s², so at given parameters, speed and closing speed one gap belongs to every
+acceleration below ``a [1 − (v/v0)⁴]``. Fitting accelerations or imagined gaps is therefore the same problem, and what
+comes out is always the simulator's own rollout, whose bounds are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env.effects import IDM, Brakes, ImaginedLeader
+from idm_env.effects.idm import desired_gap
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
+from idm_env.types import FAR, Driver, Imagined
+
+CAPABLE = {"max_accel": 5.0, "comfort_decel": 2.0, "time_gap": 1.5, "min_gap": 2.0, "desired_speed": 70.0}
+"""The vehicle whose imagined leader is sought: its free acceleration and top speed are what no car exceeds."""
+FLOOR_WIDTH = 0.1
+"""Accelerations stay this far above the brakes' floor, where it is exactly the identity (m/s²)."""
+
+
+def simulator(dt: float) -> Simulator:
+    """Return IDM behind an imagined leader, with exact brakes, in ballistic steps of ``dt`` (s)."""
+    return Simulator(Lane(), (IDM(), ImaginedLeader(), Brakes(width=FLOOR_WIDTH)), dt=dt)
+
+
+def imagined_gap(accel: Tensor, speed: Tensor, closing_speed: Tensor, driver: Driver) -> Tensor:
+    """Return the gap (m) at which IDM accelerates so: ``s = s* / √(1 − (v/v0)⁴ − A/a)``, at most FAR."""
+    wanted = desired_gap(driver, speed, closing_speed)
+    square = (speed / driver.desired_speed).square()
+    left = 1.0 - square * square - accel / driver.max_accel
+    return (wanted / torch.sqrt(left.clamp_min(1e-12))).clamp_max(FAR)
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """What the simulator did, per track: position (m), speed (m/s), acceleration (m/s²), imagined gap (m), each [K].
+
+    The acceleration of the last step is that which would follow.
+    """
+
+    position: np.ndarray
+    speed: np.ndarray
+    accel: np.ndarray
+    gap: np.ndarray
+
+
+def drive(
+    starts: Sequence[tuple[float, float]], accels: Sequence[np.ndarray], dt: float, highest: float, lowest: float
+) -> list[Driven]:
+    """Drive every track through the simulator by the imagined gaps that its accelerations [K] ask for.
+
+    ``starts`` are positions (m) and speeds (m/s). Each gap is found at the speed that the simulator has at that step,
+    so nothing but the bounds changes an acceleration: it never exceeds ``highest`` nor what the engine gives at that
+    speed, never falls below ``lowest``, and the vehicle never reverses.
+    """
+    sim = simulator(dt)
+    steps = max(len(a) for a in accels)
+    wanted = torch.zeros(steps, len(accels), 1, dtype=torch.float64)
+    for i, values in enumerate(accels):
+        wanted[: len(values), i, 0] = torch.as_tensor(values)
+    params = sim.defaults(dtype=torch.float64)
+    params["idm"] = {name: torch.tensor(value, dtype=torch.float64) for name, value in CAPABLE.items()}
+    params["brakes"]["max_decel"] = torch.tensor(-lowest + FLOOR_WIDTH, dtype=torch.float64)
+    driver = Driver(**params["idm"])
+    start = torch.tensor([[p, max(v, 0.0)] for p, v in starts], dtype=torch.float64)
+    origin = start[:, :1]
+    state = sim.state(torch.zeros_like(origin), start[:, 1:], params)
+    still = torch.zeros_like(origin)
+    kept = torch.empty(4, steps, len(accels), dtype=torch.float64)
+    with torch.no_grad():
+        for k in range(steps):
+            square = (state.speed / driver.desired_speed).square()
+            engine = driver.max_accel * (1.0 - square * square) - 1e-6
+            accel = torch.minimum(wanted[k].clamp(lowest, highest), engine)
+            gap = imagined_gap(accel, state.speed, still, driver)
+            kept[0, k], kept[1, k], kept[3, k] = (x[:, 0] for x in (state.position + origin, state.speed, gap))
+            state = sim.step(state, {"imagined": Imagined(gap, still)}, params)
+            kept[2, k] = state.accel[:, 0]
+    arrays = kept.numpy()
+    return [Driven(*(column[: len(a), i].copy() for column in arrays)) for i, a in enumerate(accels)]

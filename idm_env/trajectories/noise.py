@@ -1,0 +1,78 @@
+"""The noise of a file, fitted to the file itself by maximum likelihood: no truth and no user's guess.
+
+White and correlated noise of positions and the liveliness of the driving have different spectra, so dense data tell
+them apart; data sparser than the correlation of the noise do not, and get white noise only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.signal import savgol_filter
+
+from idm_env.trajectories.smoother import Noise, Observed, log_likelihood
+
+MOST_TRACKS = 32
+MOST_SAMPLES = 400
+DENSE_S = 0.25
+"""Up to this sampling interval correlated noise can be told from white noise (s)."""
+BOUNDS = {"white": (2e-3, 5.0), "sigma": (2e-3, 10.0), "time": (0.1, 3.0), "jerk": (1e-3, 30.0)}
+
+
+def sample(tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return parts of tracks (times, positions) that speak for all: evenly chosen, the longest stretch of each."""
+    usable = [track for track in tracks if len(track[0]) >= 5] or list(tracks)
+    chosen = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, MOST_TRACKS).round().astype(int))]
+    return [(time[:MOST_SAMPLES], position[:MOST_SAMPLES]) for time, position in chosen]
+
+
+def outlying(position: np.ndarray) -> np.ndarray:
+    """Return an extra variance for samples far off a local parabola (m²), 0 for all others."""
+    if len(position) < 9:
+        return np.zeros(len(position))
+    rest = position - savgol_filter(position, 9, 2)
+    scale = 1.4826 * float(np.median(np.abs(rest)))
+    return np.where(np.abs(rest) > 5.0 * scale + 1e-3, 100.0 * (rest * rest + 1e-6), 0.0)
+
+
+def fit_noise(
+    tracks: Sequence[tuple[np.ndarray, np.ndarray]], dt: float, start: Noise | None = None, evaluations: int = 110
+) -> Noise:
+    """Return the noise model under which the tracks (times, positions) are most likely.
+
+    Four numbers for dense data (white, correlated, its time, jerk), two for sparse (white, jerk), by a simplex search
+    over their logarithms. ValueError if no track has three samples.
+    """
+    parts = [part for part in sample(tracks) if len(part[0]) >= 3]
+    if not parts:
+        raise ValueError("no track has three samples to fit the noise to. Give noise=Noise(…).")
+    interval = float(np.median(np.concatenate([np.diff(time) for time, _ in parts])))
+    dense = interval <= DENSE_S
+    begin = start or (Noise(0.1, 0.2, 0.3, 0.5) if dense else Noise(0.1, 0.0, 0.3, 0.3))
+    names = ("white", "sigma", "time", "jerk") if dense else ("white", "jerk")
+    observed = [Observed.of(time, position, dt) for time, position in parts]
+    inflated = [outlying(position) if dense else np.zeros(len(position)) for _, position in parts]
+
+    def noise(point: np.ndarray) -> Noise:
+        values = {
+            name: min(max(math.exp(x), BOUNDS[name][0]), BOUNDS[name][1]) for name, x in zip(names, point, strict=True)
+        }
+        return dataclasses.replace(begin, **values)
+
+    def cost(point: np.ndarray) -> float:
+        model = noise(point)
+        total = -sum(log_likelihood(o, model, extra) for o, extra in zip(observed, inflated, strict=True))
+        low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
+        return total + float((np.maximum(low - point, 0) ** 2 + np.maximum(point - high, 0) ** 2).sum())
+
+    first = np.log([getattr(begin, name) for name in names])
+    simplex = np.vstack([first, first + 0.7 * np.eye(len(names))])
+    found = minimize(
+        cost, first, method="Nelder-Mead",
+        options={"maxfev": evaluations, "xatol": 0.03, "fatol": 0.3, "initial_simplex": simplex},
+    )  # fmt: skip
+    return noise(found.x)

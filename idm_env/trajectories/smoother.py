@@ -1,0 +1,196 @@
+"""The prior and the noise of a trajectory, and the fit of both to one track: the inputs that the simulator will get.
+
+The unknowns of a track are the accelerations of ballistic steps, which the imagined leader's gap sets one to one
+(``imagined.py``). Their prior is that they change little from step to step: a random walk whose variance adapts to
+how lively the driving is (Student-t jerk). The measured positions carry white and correlated noise, and outliers.
+With the step's dynamics linear in the accelerations, every Gauss–Newton step is a Kalman smoother, in time linear in
+the length of the track; reweighting and the active set of bounds repeat it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from idm_env.trajectories import smoother_loops as loops
+
+N = loops.N
+TIGHT = 1e-8
+"""Variance of an observation that stands for a bound."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How positions are wrong, and how lively the driving is.
+
+    Attributes:
+        white: Standard deviation of noise that is independent from sample to sample (m).
+        sigma: Standard deviation of the correlated noise, an Ornstein–Uhlenbeck process (m).
+        time: Its correlation time (s).
+        jerk: Spectral density of the jerk, m²/s⁵, the prior of the imagined inputs.
+        accel_time: Time in which an acceleration fades (s); infinite is a random walk.
+    """
+
+    white: float = 0.05
+    sigma: float = 0.0
+    time: float = 0.3
+    jerk: float = 0.3
+    accel_time: float = math.inf
+
+    def step(self, dt: float) -> tuple[float, float, float, float]:
+        """Return what remains of acceleration and noise after a step, and the variances that each gains."""
+        keep = math.exp(-dt / self.accel_time)
+        fade = math.exp(-dt / self.time)
+        return keep, fade, self.jerk * dt, self.sigma**2 * (1 - fade * fade) + 1e-12
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Static choices of the smoother.
+
+    ``rounds`` of reweighting; ``degrees`` of freedom of the positions' Student-t noise; ``jerk_degrees`` and
+    ``window`` (s): weight, in samples, of the prior variance of the jerk against that over a window around each step
+    (None keeps the prior's); ``highest`` and ``lowest`` acceleration (m/s²), exact in the result.
+    """
+
+    rounds: int = 10
+    degrees: float = 4.0
+    jerk_degrees: float | None = 0.5
+    window: float = 1.0
+    highest: float = 5.0
+    lowest: float = -8.0
+
+
+@dataclass(eq=False)
+class Observed:
+    """Observations of a track on the clock of its steps, positions relative to ``origin`` (m).
+
+    Step of each, the row that looks at the state, value and whether it is measured (else it is a bound).
+    """
+
+    steps: int
+    dt: float
+    origin: float
+    at: np.ndarray
+    look: np.ndarray
+    value: np.ndarray
+    measured: np.ndarray
+
+    @classmethod
+    def of(cls, time_s: np.ndarray, position_m: np.ndarray, dt: float, steps: int | None = None) -> Observed:
+        """Put samples on the clock ``time_s[0] + k dt``; a sample between ticks is seen from the tick before it."""
+        since = (time_s - time_s[0]) / dt
+        at = np.floor(since + 1e-6).astype(np.int64)
+        rest = np.maximum(since - at, 0.0) * dt
+        rest[rest < 1e-6] = 0.0
+        look = np.stack([np.ones_like(rest), rest, 0.5 * rest * rest, np.ones_like(rest)], axis=1)
+        count = int(np.ceil(since[-1] - 1e-6)) + 1 if steps is None else steps
+        origin = float(position_m[0])
+        return cls(count, dt, origin, at, look, position_m - origin, np.ones(len(at), bool))
+
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and covariance before the first sample: the mean speed over 3 s, give or take 10 m/s."""
+        span = min(len(self.at) - 1, int(np.searchsorted(self.at, self.at[0] + 3.0 / self.dt)))
+        seconds = max(self.at[span] - self.at[0], 1) * self.dt
+        mean = np.array([self.value[0], (self.value[span] - self.value[0]) / seconds, 0.0, 0.0])
+        return mean, np.diag([25.0, 100.0, 4.0, 0.0])
+
+    def bounded(self, at: np.ndarray, which: int, value: np.ndarray) -> Observed:
+        """Return these observations and bounds: state ``which`` (0 position, 1 speed, 2 acceleration) at steps."""
+        look = np.zeros((len(at), N))
+        look[:, which] = 1.0
+        every = np.concatenate([self.at, at])
+        order = np.argsort(every, kind="stable")
+        measured = np.concatenate([self.measured, np.zeros(len(at), bool)])
+        values = np.concatenate([self.value, value - (self.origin if which == 0 else 0.0)])
+        looks = np.concatenate([self.look, look])
+        return Observed(
+            self.steps, self.dt, self.origin, every[order], looks[order], values[order], measured[order]
+        )  # fmt: skip
+
+
+@dataclass(eq=False)
+class Smoothed:
+    """Position, speed and acceleration per step [K] with their standard deviations [K, 3], and the likelihood."""
+
+    position: np.ndarray
+    speed: np.ndarray
+    accel: np.ndarray
+    sigma: np.ndarray
+    likelihood: float
+
+
+def log_likelihood(observed: Observed, noise: Noise, inflated: np.ndarray | None = None) -> float:
+    """Return the log-likelihood of a track, with ``inflated`` white variances of single samples where given."""
+    start, spread = observed.start()
+    spread[3, 3] = noise.sigma**2
+    variance = np.full(len(observed.at), noise.white**2) if inflated is None else noise.white**2 + inflated
+    keep, fade, push, drift = noise.step(observed.dt)
+    return float(
+        loops.likelihood(
+            observed.steps, observed.at, observed.look, observed.value, variance, start, spread,
+            observed.dt, keep, fade, push, drift,
+        )
+    )  # fmt: skip
+
+
+def smooth(observed: Observed, noise: Noise, choices: Choices = Choices()) -> Smoothed:
+    """Return the most likely motion of a track, reweighted for outliers and bursts, within its bounds.
+
+    Bounds (no reverse, accelerations between ``lowest`` and ``highest``) enter as an active set: where the motion
+    breaks one, it is tied to it, until none is broken by more than what rounding and a final clip take away.
+    """
+    mean, cov, push = _fitted(observed, noise, choices, None)
+    for _ in range(6):
+        broken = _broken(mean, choices)
+        if not any(len(at) for at, _, _ in broken):
+            break
+        for at, which, value in broken:
+            observed = observed.bounded(at, which, np.full(len(at), value))
+        mean, cov, push = _fitted(observed, noise, choices, push)
+    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", cov)[:, :3], 0.0))
+    return Smoothed(
+        mean[:, 0] + observed.origin, mean[:, 1], mean[:, 2], sigma, log_likelihood(observed, noise)
+    )  # fmt: skip
+
+
+def _broken(mean: np.ndarray, choices: Choices) -> list[tuple[np.ndarray, int, float]]:
+    speed, accel = mean[:, 1], mean[:, 2]
+    return [
+        (np.flatnonzero(speed < -0.01), 1, 0.0),
+        (np.flatnonzero(accel > choices.highest + 0.01), 2, choices.highest),
+        (np.flatnonzero(accel < choices.lowest - 0.01), 2, choices.lowest),
+    ]
+
+
+def _fitted(
+    observed: Observed, noise: Noise, choices: Choices, push: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mean [K, 4], covariance [K, 4, 4] and the variances of the jerk, fitted unless they are given."""
+    start, spread = observed.start()
+    spread[3, 3] = noise.sigma**2
+    keep, fade, scale, drift = noise.step(observed.dt)
+    white = max(noise.white, 1e-4) ** 2
+    variance = np.where(observed.measured, white, TIGHT)
+    mean, cov = np.empty((observed.steps, N)), np.empty((observed.steps, N, N))
+    square = np.empty(observed.steps)
+    rounds = choices.rounds if push is None else 2
+    adapting = push is None and choices.jerk_degrees is not None
+    if push is None:
+        push = np.full(observed.steps, scale)
+    half = max(1, round(0.5 * choices.window / observed.dt))
+    for turn in range(rounds):
+        loops.smooth(
+            observed.at, observed.look, observed.value, variance, start, spread, observed.dt,
+            keep, fade, push, drift, mean, cov, square,
+        )  # fmt: skip
+        if turn == rounds - 1:
+            break
+        loops.reweigh(
+            observed.at, observed.look, observed.value, mean, cov, white, choices.degrees, observed.measured, variance
+        )
+        if adapting and choices.jerk_degrees is not None:
+            loops.adapt(square, push, half, choices.jerk_degrees, scale)
+    return mean, cov, push
