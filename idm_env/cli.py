@@ -170,23 +170,20 @@ def _done(out: Path) -> None:
 def run() -> None:
     """Run the command line: bad input ends with one line and exit code 1, Ctrl-C with 130."""
     try:
-        app(standalone_mode=False)
-    except typer.Exit as stop:
-        sys.exit(stop.exit_code)
-    except typer.Abort:
+        code = app(standalone_mode=False)  # an exit code where typer has dealt with the end itself
+        if code == 130:
+            _interrupted()
+        sys.exit(code if isinstance(code, int) else 0)
+    except (KeyboardInterrupt, typer.Abort):
         _interrupted()
-    except KeyboardInterrupt:
-        _interrupted()
+    except (ValueError, ImportError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(1)
     except Exception as error:
-        import click
-
-        if isinstance(error, click.ClickException):
-            error.show()
-            sys.exit(error.exit_code)
-        if isinstance(error, ValueError | ImportError | OSError):
-            print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-            sys.exit(1)
-        raise
+        if not hasattr(error, "show"):
+            raise
+        error.show()  # a usage error: typer's own message, with the usage line
+        sys.exit(getattr(error, "exit_code", 2))
 
 
 def _interrupted() -> None:

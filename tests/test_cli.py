@@ -1,0 +1,139 @@
+"""The command line as a user meets it: help, exit codes, one-line errors, interruption and resume."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from idm_env.data import synthetic
+
+
+def call(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
+    """Run the command and return what it printed."""
+    return subprocess.run(
+        [sys.executable, "-m", "idm_env", *map(str, arguments)], capture_output=True, text=True, **options
+    )
+
+
+@pytest.fixture(scope="module")
+def frame() -> pl.DataFrame:
+    """Two runs of a leader and a follower, 30 s, with gaps by position."""
+    trajectories, _ = synthetic.generate(2, runs=2, followers=1, seconds=30.0)
+    return trajectories.table.select(
+        "run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m"
+    )
+
+
+def test_help_teaches() -> None:
+    """What a file needs, what to type first, and every command."""
+    done = call("--help")
+    assert done.returncode == 0
+    for word in ("vehicle_id", "position_m", "idm-env demo", "fit", "explain", "simulate", "--resume"):
+        assert word in done.stdout
+    for command in ("fit", "explain", "simulate"):
+        assert "--out" in call(command, "--help").stdout
+
+
+def bad_files(frame: pl.DataFrame) -> dict[str, tuple[Callable[[Path], None], str]]:
+    """Return bad inputs by name: how to write one, and what the error must say."""
+    follower = pl.col("leader_id").is_not_null()
+    return {
+        "missing column": (lambda p: frame.drop("position_m").with_columns(positon_m=1.0).write_csv(p), "position_m"),
+        "empty": (lambda p: p.write_text(""), "empty"),
+        "header only": (lambda p: frame.head(0).write_csv(p), "no rows|empty"),
+        "only leaders": (lambda p: frame.filter(~follower).with_columns(leader_id=None).write_csv(p), "follow|leader"),
+        "text": (lambda p: p.write_text("hello\nworld\n"), "column"),
+        "km/h": (
+            lambda p: frame.with_columns(pl.col("speed_mps") * 3.6).write_csv(p), "km/h",
+        ),
+        "feet": (lambda p: frame.with_columns(pl.col("length_m") * 3.28, pl.col("position_m") * 3.28,
+                 pl.col("speed_mps") * 3.28).write_csv(p), "feet"),
+        "short": (lambda p: frame.filter(pl.col("time_s") < 3 + pl.min("time_s").over("run_id")).write_csv(p), "5 s"),
+        "no time": (lambda p: frame.with_columns(time_s=float("nan")).write_csv(p), "time_s"),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name", ["missing column", "empty", "header only", "only leaders", "text", "km/h", "feet", "short", "no time"]
+)
+def test_bad_input_is_one_line_and_exit_code_1(frame: pl.DataFrame, tmp_path: Path, name: str) -> None:
+    """No traceback, no NaN result, no silent drop."""
+    write, words = bad_files(frame)[name]
+    path = tmp_path / "data.csv"
+    write(path)
+    done = call("fit", path, "--out", tmp_path / "out")
+    assert done.returncode == 1, done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: ")
+    assert any(word in lines[0] for word in words.split("|")), lines[0]
+    assert not (tmp_path / "out" / "report.json").exists()
+
+
+def test_bad_paths_and_options(frame: pl.DataFrame, tmp_path: Path) -> None:
+    """A missing file, a corrupt parquet, a misspelled column and a wrong share."""
+    good = tmp_path / "good.csv"
+    frame.write_csv(good)
+    broken = tmp_path / "broken.parquet"
+    broken.write_bytes(b"PAR1 not really")
+    for arguments, words in (
+        (("fit", tmp_path / "none.csv"), "none.csv"),
+        (("fit", broken), "broken.parquet"),
+        (("fit", good, "--by", "vehicle_nam"), "cannot group by"),
+        (("fit", good, "--held-out", "half"), "--held-out"),
+        (("fit", good, "--objective", "speeed"), "Did you mean 'speed'"),
+        (("fit", good, "--method", "newton"), "lm"),
+        (("simulate", good, "--model", tmp_path / "none.yaml"), "none.yaml"),
+        (("fit", good, "--out", good), "is a file"),
+    ):
+        options = () if "--out" in arguments else ("--out", tmp_path / "out")
+        done = call(*arguments, *options)
+        assert done.returncode == 1, (arguments, done.stderr)
+        assert len(done.stderr.strip().splitlines()) == 1 and words in done.stderr, done.stderr
+    assert call("fit").returncode == 2
+    assert call("fitt", good).returncode == 2
+
+
+def test_bad_rows_are_repaired_and_counted(frame: pl.DataFrame, tmp_path: Path) -> None:
+    """NaN and duplicated rows do not stop a fit, and the report says how many there were."""
+    position = frame["position_m"].to_numpy().copy()
+    position[[50, 400]] = np.nan
+    dirty = frame.with_columns(pl.Series("position_m", position))
+    path = tmp_path / "dirty.csv"
+    pl.concat([dirty, dirty[100:110]]).write_csv(path)
+    done = call("fit", path, "--by", "all", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "10 rows repeat" in page, page[-800:]
+
+
+def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
+    """SIGINT ends with code 130 and a hint; SIGKILL leaves a checkpoint; --resume ends as an undisturbed run does."""
+    path = tmp_path / "good.csv"
+    synthetic.generate(2, runs=6, followers=3, seconds=120.0)[0].table.drop("gap_m").write_csv(path)
+    options = ("--method", "adam", "--out")
+    assert call("fit", path, *options, tmp_path / "whole").returncode == 0
+    for number in (signal.SIGINT, signal.SIGKILL):
+        out = tmp_path / number.name
+        running = subprocess.Popen(
+            [sys.executable, "-m", "idm_env", "fit", str(path), *options, str(out)], stderr=subprocess.PIPE, text=True
+        )
+        deadline = time.monotonic() + 120
+        while not (out / "fit.resume.pt").exists() and running.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        os.kill(running.pid, number)
+        _, words = running.communicate(timeout=60)
+        if number == signal.SIGINT:
+            assert running.returncode == 130 and "--resume" in words
+        assert (out / "fit.resume.pt").exists()
+        assert call("fit", path, *options, out, "--resume").returncode == 0
+        whole, resumed = (pl.read_parquet(folder / "parameters.parquet") for folder in (tmp_path / "whole", out))
+        assert whole.equals(resumed)
