@@ -18,10 +18,11 @@ from torch.utils.checkpoint import checkpoint
 
 from idm_env import parameters
 from idm_env.effects.base import CarFollowing, Effect, Hook
+from idm_env.kernels import dispatch
 from idm_env.roads.base import Road
-from idm_env.types import FAR, Driver, Inputs, Motion, Params, Scene, State
+from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Scene, State
 
-Integration = Literal["ballistic", "euler"]
+Integration = Literal["ballistic", "euler", "midpoint"]
 
 
 class Trajectory(NamedTuple):
@@ -44,7 +45,9 @@ class Simulator:
     One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps.
 
     ``integration`` is ``"ballistic"`` (``x += v Δt + a Δt²/2``, and a car that would reverse stops inside the step) or
-    ``"euler"`` (the paper's: ``x += v Δt`` with the old speed).
+    ``"euler"`` (the paper's: ``x += v Δt`` with the old speed). ``"midpoint"`` is ballistic with speeds and gaps of the
+    scene taken half a step ahead, by the accelerations of the step before: second order for one evaluation a step. The
+    other two act on the past half step, a hidden delay of Δt/2 that a search for missing effects would find.
 
     ValueError: two effects of one name, or not exactly one car-following effect.
     """
@@ -168,7 +171,7 @@ class Simulator:
         road = self.road
         there = road.leader_present(state.present, state.speed)
         leader = road.leader(state.gap, state.speed, state.accel, there)
-        return Scene(
+        scene = Scene(
             position=state.position,
             speed=state.speed,
             accel=state.accel,
@@ -183,6 +186,7 @@ class Simulator:
             inputs=inputs,
             memory=state.memory,
         )
+        return half_ahead(scene) if self.integration == "midpoint" else scene
 
     def time(self, state: State) -> Tensor:
         """Return the time (s), shaped to broadcast against ``(..., vehicles)``."""
@@ -249,17 +253,20 @@ class Simulator:
             gap = torch.where(now & ~before, self.road.gaps(motion.position, state.length), gap)
         return torch.where(now, gap, FAR)
 
-    def slices(self, inputs: Inputs, steps: int) -> list[dict[str, Any]]:
-        """Return the inputs of each step, from inputs with a leading time dimension.
-
-        ValueError for inputs that are too short or belong to no effect.
-        """
+    def _covered(self, inputs: Inputs, steps: int) -> None:
         for name, value in inputs.items():
             if name not in self.by_name:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
             have = min(len(x) for x in _leaves(value) if x is not None)
             if have < steps:
                 raise ValueError(f"input '{name}' covers {have} steps of {steps}. Its first dimension is time.")
+
+    def slices(self, inputs: Inputs, steps: int) -> list[dict[str, Any]]:
+        """Return the inputs of each step, from inputs with a leading time dimension.
+
+        ValueError for inputs that are too short or belong to no effect.
+        """
+        self._covered(inputs, steps)
         unbound = {name: _unbind(value) for name, value in inputs.items()}
         return [{name: value[t] for name, value in unbound.items()} for t in range(steps)]
 
@@ -271,21 +278,31 @@ class Simulator:
         steps: int,
         *,
         checkpoint_every: int = 0,
-        keep: Callable[[State], tuple[Tensor, ...]] = _kept,
+        keep: Callable[[State], tuple[Tensor, ...]] | None = _kept,
     ) -> tuple[State, Any]:
         """Repeat ``step``; return the last state and what ``keep`` takes of every state after a step, time first.
+
+        ``keep`` None keeps nothing, and None is returned in its place. Where a compiled kernel knows this simulator it
+        runs instead of ``step`` (``kernels.dispatch`` says when, and ``kernels.dispatch.off()`` prevents it).
 
         ``inputs`` carry a leading time dimension of at least ``steps``. ``checkpoint_every`` k > 0 saves the graph's
         tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps
         instead of ``steps``, for about one more forward pass. ValueError for inputs that are too short or of no effect.
         """
+        if steps > 0 and keep in (_kept, None) and dispatch.refusal(self, state, inputs, params) is None:
+            from idm_env.kernels import lanes
+
+            self._covered(inputs, steps)
+            block = min(checkpoint_every or lanes.BLOCK, 4 * lanes.BLOCK)
+            last, fast = lanes.rollout(self, state, inputs, params, steps, block=block, keep=keep is not None)
+            return last, None if fast is None else Trajectory(*fast)
         slices = self.slices(inputs, steps)
 
         def run(state: State, begin: int, end: int) -> tuple[State, list[tuple[Tensor, ...]]]:
             kept = []
             for t in range(begin, end):
                 state = self.step(state, slices[t], params)
-                kept.append(keep(state))
+                kept.append(() if keep is None else keep(state))
             return state, kept
 
         kept: list[tuple[Tensor, ...]] = []
@@ -299,6 +316,8 @@ class Simulator:
             kept += part
         if not kept:
             raise ValueError(f"steps = {steps}: a rollout needs at least one step.")
+        if keep is None:
+            return state, None
         columns = (torch.stack(column) for column in zip(*kept, strict=True))
         first = kept[0]
         return state, type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
@@ -334,7 +353,32 @@ def euler(speed: Tensor, accel: Tensor, dt: float) -> tuple[Tensor, Tensor, Tens
     return speed * dt, (speed + accel * dt).clamp_min(0.0), accel
 
 
+def half_ahead(scene: Scene) -> Scene:
+    """Return speeds and gaps half a step later, at the accelerations of the step before; positions stay."""
+    half = 0.5 * scene.dt
+
+    def later(speed: Tensor, accel: Tensor) -> Tensor:
+        return torch.relu(speed + half * accel)
+
+    def moved(other: Neighbour | None, sign: float) -> Neighbour | None:
+        if other is None:
+            return None
+        opening = (other.speed - scene.speed) + 0.5 * half * (other.accel - scene.accel)
+        gap = other.gap + sign * half * opening * other.present
+        return other._replace(gap=gap, speed=later(other.speed, other.accel))
+
+    leader = moved(scene.leader, 1.0)
+    assert leader is not None
+    return scene._replace(
+        speed=later(scene.speed, scene.accel),
+        leader=leader,
+        second_leader=moved(scene.second_leader, 1.0),
+        behind=moved(scene.behind, -1.0),
+    )
+
+
 INTEGRATORS: Mapping[Integration, Callable[[Tensor, Tensor, float], tuple[Tensor, Tensor, Tensor]]] = {
     "ballistic": ballistic,
     "euler": euler,
+    "midpoint": ballistic,
 }

@@ -1,0 +1,11 @@
+"""Finds the effect that a model lacks: residual → ranked candidates → corrected model → error before and after.
+
+Needs the extras ``data`` and ``kernels``.
+"""
+
+from __future__ import annotations
+
+from idm_env.discovery.discover import Discovery, discover
+from idm_env.discovery.write import write_report
+
+__all__ = ["Discovery", "discover", "write_report"]

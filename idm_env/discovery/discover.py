@@ -1,0 +1,360 @@
+"""From trajectories to a verdict: what does the Intelligent Driver Model lack on these roads, how sure is that, and how
+much better is the corrected model on runs that had no part in it.
+"""  # noqa: D205
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from idm_env.config import Model as SavedModel
+from idm_env.data import Trajectories, episodes
+from idm_env.discovery import checkpoint, judge, places, records, search, summary
+from idm_env.discovery import model as terms
+from idm_env.discovery.model import Model, Term
+from idm_env.discovery.records import Records
+from idm_env.discovery.score import Verdict, held_out, westfall_young
+from idm_env.discovery.search import OnProgress, Scored, Search
+from idm_env.discovery.solve import NAMES, Prior, Solution, Task, solve
+from idm_env.effects import CANDIDATES, IDM, Brakes
+from idm_env.parameters import nearest
+
+ALPHA = 0.05
+LEAST_GAIN = 0.01
+"""Least gain in the logarithm of the whitened 5 s prediction error, on held-out runs."""
+LEAST_SHARE = 0.5
+FEWEST_RUNS = 5
+MOST_ROUNDS = 3
+MOST_WINDOWS = 6000
+SAME = 0.15
+"""Candidates whose gain is within this share of the best one's are told apart by nothing but their names."""
+CLASSES = ({"delay", "lag"},)
+PAIRS = (("delay", "leader_acceleration"), ("delay", "second_leader"), ("lag", "leader_acceleration"))
+
+
+@dataclass(eq=False)
+class Round:
+    """What one round of the search saw, for the report."""
+
+    scored: list[Scored]
+    verdict: Verdict
+    before: np.ndarray
+    left: np.ndarray
+    winner: int | None
+    equivalent: list[int] = field(default_factory=list)
+    share: float = float("nan")
+    why_not: str = ""
+
+
+@dataclass(eq=False)
+class Discovery:
+    """Result: the report's content, the corrected model, and what the pictures are drawn from."""
+
+    report: dict[str, Any]
+    model: SavedModel
+    records: Records
+    chosen: Model
+    values: np.ndarray
+    null: Solution
+    final: Solution
+    task: Task
+    rounds: list[Round]
+    before: judge.Judged | None
+    after: judge.Judged | None
+    responses: tuple[places.Responses, places.Responses]
+
+    @property
+    def verdict(self) -> str:
+        """``none``, ``named``, ``located``, ``unexplained`` or ``cannot_tell``."""
+        return str(self.report["verdict"])
+
+
+def discover(
+    trajectories: Trajectories,
+    *,
+    by: str = "driver",
+    effects: Sequence[str] | None = None,
+    known: Sequence[str] = (),
+    place: str | None = None,
+    out: Path | None = None,
+    resume: bool = False,
+    on_progress: OnProgress | None = None,
+    seed: int = 0,
+    located: bool = True,
+    lockbox: float = 0.25,
+) -> Discovery:
+    """Find the effect that IDM lacks on ``trajectories``, or say that there is none or that the data cannot tell.
+
+    Args:
+        trajectories: Checked trajectories; at least 7 runs for a decision.
+        by: Who shares IDM parameters: ``driver``, ``all``, or a column that is constant for a driver.
+        effects: Names of candidates; None is the whole catalogue and everything that can only be located.
+        known: Effects that are given in the data and belong to the null: ``grade`` (column ``grade``, rise over run).
+        place: Column with the coordinate of places, if not that of ``trajectories``; a lap's wraps are noticed.
+        out: Folder in which an interrupted search keeps what is done, or None.
+        resume: Go on from there.
+        on_progress: Called with stage, candidate, done and total.
+        seed: Of the draw of the lockbox and of sign flips.
+        located: Whether effects without a name are looked for too.
+        lockbox: Share of the runs that neither fit nor choose.
+
+    Raises:
+        ValueError: For unknown effects, or a folder left by other data.
+        DataError: For data that cannot be used.
+    """
+    progress: OnProgress = on_progress or (lambda *_: None)
+    names = _names(effects, known)
+    prepared = prepare(trajectories, by, place)
+    names, refused = terms.testable(prepared, names)
+    names = [n for n in names if n not in known]
+    fit_runs, kept_runs = _split(prepared, lockbox, seed)
+    rows = records.windows(prepared.of_runs(fit_runs))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    mark = checkpoint.fingerprint(prepared, names, tuple(known), seed, located, lockbox)
+    saved = checkpoint.Checkpoint(None if out is None else out / "discovery.npz", mark, resume)
+    task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
+    searching = Search(task, names, located and effects is None, saved, progress)
+    progress("null", "idm", 0, 1)
+    base = Model(tuple(_known_terms(prepared, known, trajectories)))
+    null = searching.null(base)
+    first_task = searching.task
+    final, rounds = _rounds(searching, null, len(fit_runs), seed)
+    final = _delete(searching, final, len(base.terms))
+    saved.done()
+    return _finish(
+        trajectories,
+        prepared,
+        fit_runs,
+        kept_runs,
+        searching,
+        first_task,
+        null,
+        final,
+        rounds,
+        refused,
+        by,
+        seed,
+        names,
+    )
+
+
+# -- before the search -----------------------------------------------------------------------------------------------
+
+
+def _names(effects: Sequence[str] | None, known: Sequence[str]) -> list[str]:
+    for name in (*(effects or ()), *known):
+        if name not in CANDIDATES:
+            raise ValueError(f"effect '{name}' is no candidate.{nearest(name, CANDIDATES)}")
+    for name in known:
+        if name != "grade":
+            raise ValueError(f"known effect '{name}' cannot be read from data; only 'grade' can (column grade).")
+    return list(effects or CANDIDATES)
+
+
+def prepare(trajectories: Trajectories, by: str, place: str | None = None) -> Records:
+    """Return the flat records of smoothed episodes, thinned where there are more than can be rolled out in time."""
+    if place is not None:
+        if place not in trajectories.table.columns:
+            raise ValueError(f"place column '{place}' is missing.{nearest(place, trajectories.table.columns)}")
+        trajectories = replace(trajectories, place=place)
+    found = episodes(trajectories, smooth=True, min_seconds=12.0)
+    column = trajectories.table[trajectories.place]
+    period = 0.0
+    if trajectories.place != "position_m":
+        steps = column.diff().abs().drop_nulls().to_numpy()
+        reach = float(np.nanmax(column.to_numpy()) - np.nanmin(column.to_numpy()))
+        if np.mean(steps > 0.7 * reach) > 1e-5:
+            period = reach
+    if "ring_length_m" in trajectories.table.columns:
+        rings = trajectories.table["ring_length_m"].drop_nulls()
+        period = float(rings[0]) if len(rings) and rings.n_unique() == 1 else period
+    return records.gather(list(found), by, period, trajectories)
+
+
+def _split(prepared: Records, share: float, seed: int) -> tuple[list[str], list[str]]:
+    runs = [r for i, r in enumerate(prepared.runs) if np.any(prepared.run == i)]
+    if len(runs) < 2:
+        return runs, []
+    count = min(max(1, round(share * len(runs))), len(runs) - 1)
+    order = np.random.default_rng(seed).permutation(len(runs))
+    kept = {runs[i] for i in order[:count]}
+    return [r for r in runs if r not in kept], [r for r in runs if r in kept]
+
+
+def _known_terms(prepared: Records, known: Sequence[str], trajectories: Trajectories) -> list[Term]:
+    if "grade" not in known:
+        return []
+    if "grade" not in trajectories.table.columns:
+        raise ValueError("known effect 'grade' needs a column grade (rise over run), and the data have none.")
+    place = np.concatenate([e.place_m for e in prepared.episodes])
+    slope = np.concatenate([e.columns["grade"] for e in prepared.episodes])
+    period = prepared.period
+    place = np.mod(place, period) if period else place
+    low, high = (0.0, period) if period else (float(place.min()), float(place.max()))
+    count = int(np.clip((high - low) / 30.0, 3, 60))
+    distance = (high - low) / (count if period else count - 1)
+    index = np.round((place - low) / distance).astype(int) % count
+    total = np.bincount(index, slope, minlength=count)
+    number = np.bincount(index, minlength=count)
+    profile = np.interp(np.arange(count), np.flatnonzero(number), total[number > 0] / number[number > 0])
+    return [terms.known_grade(low, distance, profile.tolist(), period)]
+
+
+# -- the search ------------------------------------------------------------------------------------------------------
+
+
+def _rounds(searching: Search, null: Solution, runs: int, seed: int) -> tuple[Solution, list[Round]]:
+    now, rounds = null, []
+    for number in range(1, MOST_ROUNDS + 1):
+        scored, before = searching.round(now, number)
+        verdict = westfall_young(np.array([s.gains for s in scored]), seed)
+        order = np.argsort(-verdict.gain)
+        fitted = [i for i in order if scored[i].solution is not None and verdict.p_value[i] < 2 * ALPHA]
+        if fitted and verdict.gain[fitted[0]] > 0.3 * LEAST_GAIN:
+            now, scored = searching.again(now, scored[fitted[0]], scored)
+            verdict = westfall_young(np.array([s.gains for s in scored]), seed)
+        left = judge.ceiling(places.respond(searching.task, now))
+        this = Round(scored, verdict, before, left, None)
+        rounds.append(this)
+        _choose(searching, now, this, runs)
+        if this.winner is None:
+            break
+        chosen = scored[this.winner].solution
+        assert chosen is not None
+        now = searching.null(chosen.model, chosen)
+    return now, rounds
+
+
+def _choose(searching: Search, now: Solution, this: Round, runs: int) -> None:
+    """Set the winner of a round, or say why there is none."""
+    if runs < FEWEST_RUNS:
+        this.why_not = f"only {runs} runs are left to choose on: the smallest p-value is {2.0**-runs:.2g}"
+        return
+    verdict, scored = this.verdict, this.scored
+    able = [
+        i for i, s in enumerate(scored)
+        if s.solution is not None and verdict.p_value[i] < ALPHA and verdict.gain[i] >= LEAST_GAIN
+    ]  # fmt: skip
+    if not able:
+        this.why_not = "no candidate gains enough on held-out runs"
+        return
+    best = max(able, key=lambda i: verdict.gain[i])
+    same = [i for i in able if verdict.gain[i] >= (1.0 - SAME) * verdict.gain[best]]
+    same += [
+        i for i in able
+        if i not in same and {scored[i].term.label, scored[best].term.label} in CLASSES
+        and verdict.gain[i] >= 0.7 * verdict.gain[best]
+    ]  # fmt: skip
+    named = [i for i in same if scored[i].term.effect is not None]
+    # What has a name goes before what is only located, where both explain the same.
+    winner = max(named, key=lambda i: verdict.gain[i]) if named else best
+    chosen = scored[winner].solution
+    assert chosen is not None
+    after = judge.ceiling(places.respond(searching.task, chosen))
+    gained, rest = float(verdict.gain[winner]), max(float(after.mean()), 0.0)
+    explained = 1.0 - np.exp(-2 * gained)
+    this.share = float(explained / max(explained + np.exp(-2 * gained) * (1.0 - np.exp(-2 * rest)), 1e-12))
+    if this.share < LEAST_SHARE:
+        this.why_not = f"{scored[winner].term.label} explains only {this.share:.0%} of what can be explained"
+        return
+    if not _free_run_holds(searching, now, chosen):
+        this.why_not = f"{scored[winner].term.label} makes free simulation worse"
+        return
+    this.winner = winner
+    this.equivalent = [i for i in same if i != winner]
+
+
+def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
+    prepared = searching.task.rows.records
+    costs = []
+    for s in (now, chosen):
+        prior = Prior(s.prior.centre, s.prior.width)
+        fitted = judge.calibrate(prepared, s.model, s.values, prior)
+        costs.append(float(np.minimum((fitted.linear.residual**2).mean(1), 100.0**2).sum()))
+    return costs[1] <= 1.02 * costs[0]
+
+
+def _delete(searching: Search, final: Solution, base: int) -> Solution:
+    """Take back every added term whose loss costs less than an addition must gain."""
+    while len(final.model.terms) > base + 1:
+        now = held_out(searching.task, final)
+        losses = []
+        for index in range(base, len(final.model.terms)):
+            begin = sum(t.size for t in final.model.terms[:index])
+            keep = np.delete(final.values, np.arange(begin, begin + final.model.terms[index].size))
+            less = solve(searching.task, final.model.without(index), final.theta, keep)
+            losses.append((float(0.5 * np.log(held_out(searching.task, less) / now).mean()), index, less))
+        loss, _, less = min(losses, key=lambda x: x[0])
+        if loss >= LEAST_GAIN:
+            break
+        final = less
+    return final
+
+
+# -- after the search ------------------------------------------------------------------------------------------------
+
+
+def _finish(
+    trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], searching: Search,
+    first_task: Task, null: Solution, final: Solution, rounds: list[Round], refused: dict[str, str], by: str,
+    seed: int, names: list[str],
+) -> Discovery:  # fmt: skip
+    adapt = by == "driver"
+    base = len(null.model.terms)
+    fit_records = prepared.of_runs(fit_runs)
+    thetas = []
+    for s in (null, final):
+        thetas.append(judge.calibrate(prepared if adapt else fit_records, s.model, s.values, s.prior))
+    before = after = None
+    if kept_runs:
+        kept = prepared.of_runs(kept_runs)
+        before, after = (
+            judge.judge(kept, s.model, s.values, s.prior, th.theta, adapt)
+            for s, th in zip((null, final), thetas, strict=True)
+        )
+    if len(final.model.terms) == base:
+        after, thetas[1] = before, thetas[0]
+    confirmed = before is None or after is None or after.horizon_rmse < before.horizon_rmse
+    if not confirmed and len(final.model.terms) > base:
+        rounds[-1].why_not = "the lockbox does not confirm the finding"
+        final, after, thetas[1] = null, before, thetas[0]
+    responses = (places.respond(first_task, null), places.respond(searching.task, final))
+    report = summary.report(
+        trajectories, prepared, fit_runs, kept_runs, searching.task, null, final, rounds, refused, before, after,
+        thetas, by, seed, names,
+    )  # fmt: skip
+    return Discovery(
+        report, corrected(prepared, final, thetas[1].theta, by), prepared, final.model, final.values, null, final,
+        searching.task, rounds, before, after, responses,
+    )  # fmt: skip
+
+
+ORDER = ("memory", "speed_zone", "regime_shift", "driver_curve", "speed_dependent_gap")
+
+
+def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:
+    """Return the corrected model as it is saved: effects, shared parameters, the median driver and every driver."""
+    added, numbers = terms.effects_of(final.model, final.values)
+    # Effects that adapt a driver are chained in the order of the compiled twin.
+    added.sort(key=lambda e: ORDER.index(e.kind) if e.kind in ORDER else 0)
+    seen = np.unique(prepared.group)
+    middle = np.exp(np.median(theta[seen], axis=0))
+
+    def bounded(values: np.ndarray) -> dict[str, float]:
+        return {n: float(np.clip(v, p.low, p.high)) for n, v, p in zip(NAMES, values, IDM.declared, strict=True)}
+
+    drivers = {}
+    for group in seen:
+        drivers[prepared.groups[group]] = {"idm": bounded(np.exp(theta[group]))}
+    return SavedModel(
+        effects=(IDM(), *added, Brakes()),
+        parameters={"idm": bounded(middle), **numbers},
+        dt=prepared.dt,
+        integration="midpoint",
+        drivers=drivers if by != "all" else {},
+    )

@@ -1,0 +1,156 @@
+"""Errors on runs that neither fitted nor chose anything, parameters for the drivers in them, and what is left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from idm_env.data import noise_sigma
+from idm_env.discovery import march as twin
+from idm_env.discovery import places
+from idm_env.discovery.model import Frozen, Model
+from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
+from idm_env.discovery.solve import Prior, Solution, Task, solve
+
+CORRELATION_S = 5.0
+"""Time over which errors of free simulation stay alike (s)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Errors of every record's free simulation and what was simulated: gap [R, samples] beside the measured one."""
+
+    rows: Rows
+    theta: np.ndarray
+    gap: np.ndarray
+    scored: np.ndarray
+    gap_rmse: np.ndarray
+    speed_rmse: np.ndarray
+    horizon_rmse: float
+
+    def summary(self) -> dict[str, float]:
+        """Return the four errors of the report; the pooled ones weigh every scored sample alike."""
+        samples = self.scored.sum(1)
+        ok = samples > 0
+        pooled = float(np.sqrt((self.gap_rmse[ok] ** 2 * samples[ok]).sum() / samples[ok].sum()))
+        speed = float(np.sqrt((self.speed_rmse[ok] ** 2 * samples[ok]).sum() / samples[ok].sum()))
+        return {
+            "gap_rmse_m": pooled,
+            "gap_rmse_median_driver_m": float(np.median(self.gap_rmse[ok])),
+            "horizon_rmse_m": self.horizon_rmse,
+            "speed_rmse_mps": speed,
+        }
+
+
+def calibrate(records: Records, model: Model, values: np.ndarray, prior: Prior, rows: Rows | None = None) -> Solution:
+    """Fit θ of every group in free simulation behind the measured leader, with φ as it stands.
+
+    A first fit tells how large errors are; in the second, errors of ``CORRELATION_S`` seconds count as one, so that the
+    population, as prior, speaks for a driver whose record is short or noisy.
+    """
+    rows = whole(records) if rows is None else rows
+    frozen, empty = Frozen(model, values), np.zeros(0)
+    task = Task(rows, None, replace(prior, free=False), np.ones(len(rows)))
+    start = np.tile(prior.centre, (task.groups, 1))
+    first = solve(task, frozen, start, empty, iterations=25, tolerance=1e-5)
+    square = (first.linear.residual**2).sum(1) * task.sigma**2 / np.maximum(rows.valid.sum(1), 1)
+    correlated = CORRELATION_S / (rows.every * records.dt)
+    sigma = float(np.sqrt(max(np.median(square), 1e-4) * correlated))
+    return solve(replace(task, sigma=sigma), frozen, first.theta, empty, iterations=25, tolerance=1e-5)
+
+
+def halves(rows: Rows) -> np.ndarray:
+    """Return [R, samples] which samples lie in the blocks of time that are scored; the others fit θ."""
+    records = rows.records
+    scored = np.zeros(rows.valid.shape, bool)
+    for i in range(len(rows)):
+        r = rows.record[i]
+        span = float(records.bounds[r + 1] - records.first[r]) * records.dt
+        at = (rows.samples[i] - records.first[r]) * records.dt
+        scored[i] = (at // block_seconds(span)).astype(int) % 2 == 1
+    return scored & rows.valid
+
+
+def judge(
+    records: Records, model: Model, values: np.ndarray, prior: Prior, theta: np.ndarray | None, adapt: bool
+) -> Judged:
+    """Return the errors on held-out records.
+
+    With ``adapt`` θ of every driver comes from every other block of time (30 s, or a quarter of a shorter record), with
+    the population as prior, and the blocks between are scored; without it ``theta`` [G, 5] is used, and everything is.
+    """
+    rows = whole(records)
+    scored = halves(rows) if adapt else rows.valid
+    if adapt:
+        fitted = calibrate(records, model, values, prior, replace(rows, valid=rows.valid & ~scored))
+        theta = fitted.theta
+    assert theta is not None
+    frozen = Frozen(model, values)
+    empty = np.zeros((1, 0))
+    task = Task(rows, None, prior, np.ones(len(rows)))
+    gap, speed = (x[0] for x in task.predict(theta[None], frozen, empty))
+    at = rows.samples
+    count = np.maximum(scored.sum(1), 1)
+    gap_error = np.where(scored, np.clip(gap - records.gap[at], -200, 200), 0.0)
+    speed_error = np.where(scored, speed - records.speed[at], 0.0)
+    short = windows(records)
+    near = Task(short, None, prior, np.ones(len(short)))
+    ahead = near.errors(theta[None], frozen, empty)[0][:, -1]
+    odd = short.block % 2 == 1 if adapt else np.ones(len(short), bool)
+    return Judged(
+        rows, theta, gap, scored, np.sqrt((gap_error**2).sum(1) / count), np.sqrt((speed_error**2).sum(1) / count),
+        float(np.sqrt(np.mean(ahead[odd] ** 2))) if odd.any() else float("nan"),
+    )  # fmt: skip
+
+
+def floor(records: Records) -> dict[str, float]:
+    """Return the errors that measurement noise alone would leave: third differences of gap and speed."""
+    gaps, speeds = [], []
+    for e in records.episodes:
+        gaps.append(noise_sigma(e.gap_m))
+        speeds.append(noise_sigma(e.speed_mps))
+    gap = float(np.sqrt(np.mean(np.square(gaps))))
+    return {
+        "gap_rmse_m": gap,
+        "gap_rmse_median_driver_m": float(np.median(gaps)),
+        "horizon_rmse_m": gap * 2**0.5,
+        "speed_rmse_mps": float(np.sqrt(np.mean(np.square(speeds)))),
+    }
+
+
+def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarray:
+    """Return the honest gain of every run [runs] from any smooth acceleration over the state: what is left to explain.
+
+    A ridge regression on products of speed, gap, closing speed and the leader's acceleration, now and up to 1.5 s ago,
+    through the responses of the predictions and projected off the drivers' own parameters. It knows no names.
+    """
+    rows = responses.rows
+    signals, dt = rows.records.signals, rows.records.dt
+    pieces = responses.change.shape[1]
+    second = round(1.0 / dt)
+    at = rows.start[:, None] + second * np.arange(pieces) + second // 2
+    column = {name: i for i, name in enumerate(twin.COLUMNS)}
+
+    def state(lag: float) -> list[np.ndarray]:
+        j = np.maximum(at - round(lag / dt), rows.records.bounds[rows.record][:, None])
+        v = signals[j, column["speed"]]
+        gap = signals[j, column["lead_rear"]] - signals[j, column["position"]]
+        closing = v - signals[j, column["lead_speed"]]
+        return [v / 10.0, 2.0 * np.log(np.maximum(gap, 0.5) / 15.0), closing / 2.0, signals[j, column["lead_accel"]]]
+
+    now = state(0.0)
+    features = [*now, *(a * b for i, a in enumerate(now) for b in now[i:])]
+    features += [a * b * c for a in now[:3] for b in now[:3] for c in now[:3]][::3]
+    features += [np.abs(now[2]), np.minimum(now[3], 0.0)]
+    for lag in (0.5, 1.0, 1.5):
+        past = state(lag)
+        features += [p - n for p, n in zip(past, now, strict=True)]
+        features += [(past[2] - now[2]) * now[1], (past[0] - now[0]) * now[1]]
+    for name in ("second_speed", "behind_speed"):
+        there = signals[at, column[name.replace("speed", "present")]]
+        features.append((signals[at, column[name]] - signals[at, column["speed"]]) / 3.0 * there)
+    basis = np.clip(np.stack(features, axis=-1), -10.0, 10.0)
+    scale = basis.std((0, 1)) + 1e-9
+    keep = scale > 1e-6
+    return places.linear_curve(responses, "acceleration", basis[..., keep] / scale[keep], prior_spread)[1]

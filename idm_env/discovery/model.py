@@ -1,0 +1,297 @@
+"""Candidates: which entries of φ an effect has, where its search starts, and the effects that a finding becomes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from idm_env import effects as catalogue
+from idm_env.discovery import march as twin
+from idm_env.discovery.records import Records
+from idm_env.effects import Effect
+from idm_env.parameters import Parameter
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect as discovery varies it: entries of φ with declarations, and the slot of its curve, if it has one.
+
+    ``effect`` is the catalogue's name or None for what is only located; ``what`` and ``coordinate`` say what changes
+    and over which coordinate; ``form`` is NONE, CURVE or INTERVAL; ``knots`` (first, distance, count) of a curve.
+    ``starts`` are values of all parameters to start a search from; ``fixed`` are entries that are not searched.
+    """
+
+    label: str
+    effect: str | None
+    parameters: tuple[Parameter, ...]
+    starts: tuple[tuple[float, ...], ...]
+    what: str = ""
+    coordinate: str = ""
+    form: int = twin.NONE
+    knots: tuple[float, float, int] = (0.0, 1.0, 2)
+    period: float = 0.0
+    profile: tuple[float, ...] | None = None
+    smoothness: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    def entries(self, slot: int) -> list[int]:
+        """Return the places in φ of the parameters, for a term whose curve lies in ``slot``."""
+        if self.form == twin.NONE:
+            return [twin.INDEX[f"{self.effect}.{p.name}"] for p in self.parameters]
+        at = twin.FIRST + twin.ROOM * slot
+        if self.form == twin.INTERVAL:
+            return [at + 4, at, at + 1][: self.size]
+        if self.profile is not None:
+            return [at + twin.ROOM - 1]
+        return [at + 4 + i for i in range(self.size)]
+
+
+@dataclass(frozen=True)
+class Model:
+    """Terms that are in the model, in the order of adding."""
+
+    terms: tuple[Term, ...] = ()
+    slots: np.ndarray = field(init=False)
+    entries: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        slots = np.zeros((twin.SLOTS, 4), np.int64)
+        entries: list[int] = []
+        used = 0
+        for term in self.terms:
+            if term.form != twin.NONE:
+                what, where = twin.WHATS.index(term.what), twin.COORDINATES.index(term.coordinate)
+                slots[used] = (term.form, what, where, term.knots[2])
+            entries += term.entries(used)
+            used += term.form != twin.NONE
+        object.__setattr__(self, "slots", slots)
+        object.__setattr__(self, "entries", np.array(entries, dtype=np.int64))
+
+    def adding(self, term: Term) -> Model:
+        """Return the model with one term more."""
+        return Model((*self.terms, term))
+
+    def without(self, index: int) -> Model:
+        """Return the model without a term."""
+        return Model(self.terms[:index] + self.terms[index + 1 :])
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Declarations of all entries."""
+        return tuple(p for term in self.terms for p in term.parameters)
+
+    def phi(self, values: np.ndarray) -> np.ndarray:
+        """Return φ [..., SIZE] from the values of all parameters [..., Q]."""
+        values = np.asarray(values, float)
+        phi = np.zeros((*values.shape[:-1], twin.SIZE))
+        phi[..., : twin.FIRST] = twin.NULL
+        used = 0
+        for term in self.terms:
+            if term.form == twin.NONE:
+                continue
+            at = twin.FIRST + twin.ROOM * used
+            used += 1
+            phi[..., at + 3] = term.period
+            if term.form == twin.CURVE:
+                phi[..., at], phi[..., at + 1] = term.knots[:2]
+                if term.profile is not None:
+                    phi[..., at + 4 : at + 4 + len(term.profile)] = term.profile
+            else:
+                phi[..., at + 2] = EDGES[term.coordinate]
+        phi[..., self.entries] = values
+        return phi
+
+    @property
+    def lead(self) -> float:
+        """Seconds before a window in which memories are wound up on the measured record."""
+        return 2.0 if {"lag", "action_point"} & {t.effect for t in self.terms} else 0.1
+
+
+class Frozen(Model):
+    """A model whose φ stands: only the drivers' own parameters are left to fit."""
+
+    def __init__(self, model: Model, values: np.ndarray) -> None:
+        super().__init__(model.terms)
+        object.__setattr__(self, "_phi", model.phi(values))
+        object.__setattr__(self, "entries", np.zeros(0, np.int64))
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """None."""
+        return ()
+
+    def phi(self, values: np.ndarray) -> np.ndarray:
+        """Return the same φ for every copy and group."""
+        phi: np.ndarray = np.broadcast_to(self._phi, (*values.shape[:-1], twin.SIZE))  # type: ignore[attr-defined]
+        return phi
+
+
+EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed": 0.2, "lead_accel": 0.1}
+"""Half-width over which an interval of a located effect sets in."""
+
+_BOUNDS = {
+    # Wider than plausible where the declaration is narrow, narrower where IDM would collide.
+    "delay.delay": (0.0, 1.2), "lag.lag": (0.0, 2.0), "power_limit.power": (2.0, 60.0),
+}  # fmt: skip
+_STARTS: dict[str, tuple[tuple[float, ...], ...]] = {
+    "delay": ((0.3,), (0.8,)), "lag": ((0.3,), (0.8,)), "second_leader": ((0.1,),), "leader_acceleration": ((0.1,),),
+    "brake_light": ((0.1,),), "asymmetry": ((0.05,),), "power_limit": ((10.0,), (18.0,)), "drag": ((1e-4,),),
+    "speed_dependent_gap": ((0.5,),), "memory": ((0.5, 30.0), (0.5, 150.0)), "follower": ((0.03,),),
+    "dead_zone": ((0.001,), (0.004,)), "action_point": ((0.15,), (0.4,)), "lateral": ((0.03,),), "gap_bias": ((0.2,),),
+}  # fmt: skip
+
+
+def simple(name: str) -> Term:
+    """Return the term of an effect of the catalogue that needs no place."""
+    declared = catalogue.ALL[name]().parameters
+    parameters = tuple(_narrowed(f"{name}.{p.name}", p) for p in declared)
+    return Term(name, name, parameters, _STARTS[name], what=_WHAT.get(name, "acceleration"), coordinate="state")
+
+
+_WHAT = {
+    "delay": "response", "lag": "response", "memory": "time_gap", "dead_zone": "closing_speed", "gap_bias": "gap",
+    "action_point": "response", "speed_dependent_gap": "desired_gap",
+}  # fmt: skip
+
+
+def _narrowed(full: str, p: Parameter) -> Parameter:
+    if full not in _BOUNDS:
+        return p
+    low, high = _BOUNDS[full]
+    return replace(p, low=low, high=high, default=min(max(p.default, low), high))
+
+
+def speed_zone(begin: float, end: float, factor: float, period: float = 0.0) -> Term:
+    """Return one factor on v0 over one interval of positions."""
+    effect = catalogue.SpeedZone()
+    p = effect.parameters
+    return Term(
+        "speed_zone", "speed_zone", p, ((factor, begin, end),), what="desired_speed", coordinate="position",
+        period=period,
+    )  # fmt: skip
+
+
+def regime_shift(time: float, strength: float) -> Term:
+    """Return one step of T in time."""
+    return Term(
+        "regime_shift", "regime_shift", catalogue.RegimeShift().parameters, ((strength, time),),
+        what="time_gap", coordinate="time",
+    )  # fmt: skip
+
+
+def grade(first: float, distance: float, count: int, period: float) -> Term:
+    """Return an unknown profile of slopes over position."""
+    parameters = tuple(Parameter(f"slope_{i}", f"θ{i}", "1", 0.0, -0.2, 0.2, null=0.0) for i in range(count))
+    return Term(
+        "grade", "grade", parameters, ((0.0,) * count,), what="slope", coordinate="position", form=twin.CURVE,
+        knots=(first, distance, count), period=period, smoothness=0.03,
+    )  # fmt: skip
+
+
+def known_grade(first: float, distance: float, profile: Sequence[float], period: float) -> Term:
+    """Return a known profile of slopes of which some share acts."""
+    share = (Parameter("share", "", "1", 0.5, -2.0, 3.0, null=0.0),)
+    return Term(
+        "grade", "grade", share, ((0.2,),), what="share", coordinate="position", form=twin.CURVE,
+        knots=(first, distance, len(profile)), period=period, profile=tuple(profile),
+    )  # fmt: skip
+
+
+def interval(what: str, coordinate: str, begin: float, end: float, amount: float, period: float = 0.0) -> Term:
+    """Return an unnamed change of ``what`` inside one interval of a coordinate."""
+    unit = "m/s²" if what == "acceleration" else "1"
+    size = (-5.0, 5.0) if what == "acceleration" else (-0.9, 3.0)
+    along = {"position": "m", "time": "s", "speed": "m/s", "gap": "m"}.get(coordinate, "m/s")
+    parameters = (
+        Parameter("amount", "k", unit, 0.0, *size, null=0.0),
+        Parameter("begin", "x1", along, 0.0, -1e7, 1e7, role="place"),
+        Parameter("end", "x2", along, 1.0, -1e7, 1e7, role="place"),
+    )
+    return Term(
+        f"{what} over {coordinate}", None, parameters, ((amount, begin, end),), what=what, coordinate=coordinate,
+        form=twin.INTERVAL, period=period,
+    )  # fmt: skip
+
+
+def curve(
+    what: str, coordinate: str, first: float, distance: float, count: int, period: float = 0.0, label: str = ""
+) -> Term:
+    """Return an unnamed piecewise-linear change of ``what`` over a coordinate."""
+    unit = "m/s²" if what == "acceleration" else "1"
+    size = (-5.0, 5.0) if what == "acceleration" else (-0.9, 3.0)
+    parameters = tuple(Parameter(f"knot_{i}", f"c{i}", unit, 0.0, *size, null=0.0) for i in range(count))
+    return Term(
+        label or f"{what} curve over {coordinate}", None, parameters, ((0.0,) * count,), what=what,
+        coordinate=coordinate, form=twin.CURVE, knots=(first, distance, count), period=period,
+        smoothness=0.3 if what == "acceleration" else 0.5,
+    )  # fmt: skip
+
+
+def testable(records: Records, names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """Return which effects the data can show at all, and why others cannot be tested."""
+    share = {
+        name: float(records.signals[:, twin.COLUMNS.index(column)].mean())
+        for name, column in (("second_leader", "second_present"), ("follower", "behind_present"),
+                             ("lateral", "beside_present"))
+    }  # fmt: skip
+    reasons = {
+        "second_leader": "no second leader is measured",
+        "follower": "no vehicle behind is measured",
+        "lateral": "no vehicle in an adjacent lane is measured",
+    }
+    refused = {name: reasons[name] for name in names if share.get(name, 1.0) < 0.02}
+    return [name for name in names if name not in refused], refused
+
+
+def effects_of(model: Model, values: np.ndarray) -> tuple[list[Effect], dict[str, dict[str, float]]]:
+    """Return the simulator's effects of a model's terms and their parameters as numbers."""
+    made: list[Effect] = []
+    numbers: dict[str, dict[str, float]] = {}
+    at = 0
+    for term in model.terms:
+        mine = np.asarray(values[at : at + term.size], float)
+        at += term.size
+        for effect, given in _effects(term, mine):
+            made.append(effect)
+            numbers[effect.name] = given
+    return made, numbers
+
+
+def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, float]]]:
+    names = [p.name for p in term.parameters]
+    if term.form == twin.NONE:
+        assert term.effect is not None
+        lap = {"period": term.period} if term.effect == "speed_zone" and term.period else {}
+        return [(catalogue.make(term.effect, **lap), dict(zip(names, map(float, values), strict=True)))]
+    period = term.period or None
+    if term.form == twin.INTERVAL:
+        amount, begin, end = values
+        edge = EDGES[term.coordinate]
+        middle = max(begin + edge, end - edge)
+        knots = tuple(float(k) for k in (begin - edge, begin + edge, middle, max(end, begin) + edge))
+        knots = tuple(k + 1e-6 * i for i, k in enumerate(knots))
+        heights = [0.0, amount, amount, 0.0]
+    else:
+        first, distance, count = term.knots
+        knots = tuple(float(first + distance * i) for i in range(count))
+        heights = list(values)
+    if term.what in ("slope", "share"):
+        if term.profile is not None:
+            effect = catalogue.Grade(knots=knots, profile=term.profile, period=period)
+            return [(effect, {"share": float(values[0])})]
+        effect = catalogue.Grade(knots=knots, period=period)
+        return [(effect, {f"slope_{i}": float(h) for i, h in enumerate(heights)})]
+    given = {f"knot_{i}": float(h) for i, h in enumerate(heights)}
+    if term.what == "acceleration":
+        return [(catalogue.Curve(feature=term.coordinate, knots=knots, period=period), given)]
+    targets = {"accel_and_decel": ("max_accel", "comfort_decel")}.get(term.what, (term.what,))
+    return [
+        (catalogue.DriverCurve(target=t, feature=term.coordinate, knots=knots, period=period), given)  # type: ignore[arg-type]
+        for t in targets
+    ]

@@ -1,0 +1,70 @@
+"""What errors of prediction look like where nothing is missing: their covariance within and between windows.
+
+The errors e_w of one window (speed every 0.5 s, gap at half and full horizon) are correlated, because drivers' own
+noise adds up, and so are neighbouring windows. The model of noise is a vector autoregression,
+``e_w = B e_{w−1} + ε, ε ~ N(0, Σ)``, estimated from the errors themselves, so white measurement noise, an
+Ornstein–Uhlenbeck driver and anything between are one case. The null and every candidate are judged by the same one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+SHRINK = 0.02
+HEAVY = 3.0
+"""A window whose whitened error exceeds this many times the usual is weighed down, for all models alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Autoregression B [m, m], whiteners of first and later windows [m, m], and weights of rows [R]."""
+
+    carry: np.ndarray
+    first: np.ndarray
+    later: np.ndarray
+    weight: np.ndarray
+    log_det: float
+
+    def whiten(self, errors: np.ndarray, joined: np.ndarray) -> np.ndarray:
+        """Return whitened errors [..., R, m]: independent and of unit variance where nothing is missing."""
+        before = np.zeros_like(errors)
+        before[..., 1:, :] = errors[..., :-1, :]
+        before *= joined[:, None]
+        rest = errors - before @ self.carry.T
+        white = np.where(joined[:, None], rest @ self.later.T, rest @ self.first.T)
+        return white * np.sqrt(self.weight)[:, None]
+
+
+def estimate(errors: np.ndarray, joined: np.ndarray, rounds: int = 3) -> Noise:
+    """Return the noise of errors [R, m], by weighted least squares with heavy windows weighed down."""
+    rows, size = errors.shape
+    before = np.zeros_like(errors)
+    before[1:] = errors[:-1]
+    before *= joined[:, None]
+    weight = np.ones(rows)
+    for _ in range(rounds):
+        w = weight * joined
+        past = (before * w[:, None]).T @ before
+        ridge = (SHRINK * np.trace(past) / size + 1e-12) * np.eye(size)
+        carry = np.linalg.solve(past + ridge, (before * w[:, None]).T @ errors).T
+        rest = errors - before @ carry.T
+        later, log_det = _whitener(rest[joined], weight[joined], errors, weight)
+        first, _ = _whitener(errors, weight, errors, weight)
+        white = np.where(joined[:, None], rest @ later.T, errors @ first.T)
+        size_of = np.sqrt((white**2).mean(1) / max(float(np.median((white**2).mean(1))), 1e-12))
+        weight = np.minimum(1.0, HEAVY / np.maximum(size_of, 1e-9))
+    return Noise(carry, first, later, weight, log_det)
+
+
+def _whitener(
+    rest: np.ndarray, weight: np.ndarray, everything: np.ndarray, all_weight: np.ndarray
+) -> tuple[np.ndarray, float]:
+    if len(rest) < 3 * rest.shape[1]:
+        rest, weight = everything, all_weight
+    covariance = (rest * weight[:, None]).T @ rest / weight.sum()
+    diagonal = np.diag(np.diag(covariance)) + 1e-10 * np.eye(len(covariance))
+    factor = np.linalg.cholesky((1.0 - SHRINK) * covariance + SHRINK * diagonal)
+    return solve_triangular(factor, np.eye(len(factor)), lower=True), 2.0 * float(np.log(np.diag(factor)).sum())

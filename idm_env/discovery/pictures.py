@@ -1,0 +1,289 @@
+"""Pictures of a discovery as SVG or PNG data, to be put into one HTML file."""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from idm_env.discovery import march as twin
+from idm_env.discovery import places
+
+if TYPE_CHECKING:
+    from idm_env.discovery.discover import Discovery, Round
+
+BEFORE, AFTER, TRUTH, GREY = "#c0392b", "#1f6fb2", "#222222", "#9aa5b1"
+plt.rcParams.update(
+    {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 110, "legend.frameon": False}
+)
+
+
+def encode(figure: Figure) -> str:
+    """Return a figure as a PNG data URI and close it."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", bbox_inches="tight")
+    plt.close(figure)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def all_of(d: Discovery) -> list[tuple[str, str, str]]:
+    """Return title, caption and data URI of every picture that this discovery has."""
+    made: list[tuple[str, str, str]] = []
+
+    def put(title: str, caption: str, figure: Figure | None) -> None:
+        if figure is not None:
+            made.append((title, caption, encode(figure)))
+
+    put(
+        "What each candidate gains",
+        "Fall of the 5 s prediction error on runs that the candidate was not fitted to, in units of its noise, with "
+        "95 % intervals over runs. Grey: not significant after correction for the whole list.",
+        ranking(d.rounds[0]),
+    )
+    put(
+        "What re-calibration hides",
+        "Share of each candidate's response that the drivers' own parameters absorb: an effect at the right end cannot "
+        "be seen in the residual of a calibrated model.",
+        absorption(d),
+    )
+    put(
+        "Who looks like whom, on these data",
+        "Cosine between responses, after the drivers' own parameters are projected out: ±1 cannot be told apart.",
+        look_alikes(d),
+    )
+    put(
+        "Added-variable plot of the winner",
+        "Residual of the model before against the response of the added effect, both projected off the drivers' own "
+        "parameters; each point is one 5 s window.",
+        added_variable(d),
+    )
+    put(
+        "Residual against features, before and after",
+        "Acceleration (m/s²) that would mend each second of prediction, averaged in bins, with two standard errors.",
+        features(d),
+    )
+    put("Residual over position and time, before and after", "The same acceleration as a map.", maps(d))
+    put(
+        "Measured and simulated gap",
+        "Best, median and worst held-out driver in free simulation behind the measured leader. Shaded blocks are "
+        "scored; the drivers' own parameters come from the others.",
+        gaps(d),
+    )
+    put("Error of every held-out driver", "Free simulation, before and after; below the line is better.", scatter(d))
+    return made
+
+
+def ranking(this: Round) -> Figure:
+    """Bars of all candidates of a round, best on top."""
+    order = np.argsort(this.verdict.gain)[-22:]
+    gain = 100 * (1 - np.exp(-this.verdict.gain[order]))
+    low, high = (100 * (1 - np.exp(-this.verdict.interval[order, k])) for k in range(2))
+    figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.24 * len(order) + 1.0))
+    colours = [AFTER if p < 0.05 else GREY for p in this.verdict.p_value[order]]
+    axes.barh(range(len(order)), gain, color=colours)
+    axes.errorbar(gain, range(len(order)), xerr=[gain - low, high - gain], fmt="none", ecolor=TRUTH, lw=0.8)
+    axes.set_yticks(range(len(order)), [this.scored[i].term.label.replace("_", " ") for i in order])
+    axes.set_xlabel("held-out gain (%)")
+    axes.axvline(0, color=TRUTH, lw=0.6)
+    edge = max(float(gain.max()), 1.0)
+    axes.set_xlim(max(float(low.min()), -edge) - 0.05 * edge, max(float(high.max()), 1.0) * 1.05)
+    return figure
+
+
+def absorption(d: Discovery) -> Figure | None:
+    """Bars of the absorbed share."""
+    rows = [c for c in d.report["candidates"] if c["round"] == 1 and c["named"] and c["absorbed_share"] is not None]
+    if not rows:
+        return None
+    rows.sort(key=lambda c: c["absorbed_share"])
+    figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.22 * len(rows) + 0.9))
+    axes.barh(range(len(rows)), [100 * c["absorbed_share"] for c in rows], color=GREY)
+    axes.set_yticks(range(len(rows)), [c["effect"].replace("_", " ") for c in rows])
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("absorbed by re-calibration (%)")
+    return figure
+
+
+def _projected(d: Discovery, scored: Any) -> np.ndarray | None:
+    solution = scored.solution
+    if solution is None or not solution.linear.by_phi.shape[-1]:
+        return None
+    linear = solution.linear
+    column = linear.by_phi[..., -scored.term.size :].mean(-1)
+    if scored.term.size > 4:
+        column = np.einsum("rmq,q->rm", linear.by_phi[..., -scored.term.size :], solution.values[-scored.term.size :])
+    else:
+        column = linear.by_phi[..., -scored.term.size]
+    return _off(d, linear.by_theta, column)
+
+
+def _off(d: Discovery, by_theta: np.ndarray, column: np.ndarray) -> np.ndarray:
+    group = d.task.rows.group
+    groups = d.task.groups
+    matrix, cross = np.zeros((groups, 5, 5)), np.zeros((groups, 5))
+    np.add.at(matrix, group, np.einsum("rmi,rmj->rij", by_theta, by_theta))
+    np.add.at(cross, group, np.einsum("rmi,rm->ri", by_theta, column))
+    follow = np.linalg.solve(matrix + 1e-6 * np.eye(5), cross[..., None])[..., 0]
+    return column - np.einsum("rmi,ri->rm", by_theta, follow[group])
+
+
+def look_alikes(d: Discovery) -> Figure | None:
+    """Heat map of cosines."""
+    names, columns = [], []
+    for s in d.rounds[0].scored:
+        column = _projected(d, s) if s.term.effect is not None else None
+        if column is not None and np.sum(column**2) > 1e-9:
+            names.append(s.term.label.replace("_", " "))
+            columns.append(column.ravel() / np.sqrt(np.sum(column**2)))
+    if len(names) < 2:
+        return None
+    cosine = np.array(columns) @ np.array(columns).T
+    figure, axes = plt.subplots(layout="constrained", figsize=(6.6, 5.8))
+    image = axes.imshow(cosine, cmap="RdBu_r", vmin=-1, vmax=1)
+    axes.set_xticks(range(len(names)), names, rotation=70, ha="right")
+    axes.set_yticks(range(len(names)), names)
+    for i in range(len(names)):
+        for j in range(len(names)):
+            if i != j and abs(cosine[i, j]) > 0.4:
+                axes.text(j, i, f"{cosine[i, j]:.1f}", ha="center", va="center", fontsize=6)
+    figure.colorbar(image, shrink=0.8)
+    return figure
+
+
+def added_variable(d: Discovery) -> Figure | None:
+    """Scatter of the residual against the winner's response, per window."""
+    this = d.rounds[0]
+    if this.winner is None:
+        return None
+    scored = this.scored[this.winner]
+    column = _projected(d, scored)
+    if column is None:
+        return None
+    residual = _off(d, d.null.linear.by_theta, d.task.residual(
+        d.task.errors(d.null.theta[None], d.null.model, d.null.values[None])
+    )[0])  # fmt: skip
+    x, y = (column**2).sum(1) ** 0.5 * np.sign(column[:, -1]), -(residual * column).sum(1)
+    y = y / np.maximum((column**2).sum(1) ** 0.5, 1e-9) * np.sign(column[:, -1])
+    figure, axes = plt.subplots(layout="constrained", figsize=(5.4, 3.6))
+    axes.plot(x, y, ".", ms=2.5, color=AFTER, alpha=0.5)
+    slope = float((x * y).sum() / max((x * x).sum(), 1e-12))
+    reach = np.array([x.min(), x.max()])
+    axes.plot(reach, slope * reach, color=BEFORE, lw=1.2)
+    axes.set_xlabel(f"response to {scored.term.label.replace('_', ' ')} (in units of noise)")
+    axes.set_ylabel("residual along it")
+    return figure
+
+
+def _mending(responses: places.Responses) -> np.ndarray:
+    """Return the acceleration per row and second that would mend the residual best, each second by itself [R, J]."""
+    change = responses.change[0]
+    weight = (change**2).sum(-1)
+    push = -(change * responses.residual[None]).sum(-1)
+    return (push / np.maximum(weight, 1e-2 * weight.max())).T
+
+
+def features(d: Discovery) -> Figure:
+    """Binned means over speed, gap, closing speed, leader's acceleration, position and time."""
+    figure, axes = plt.subplots(2, 3, layout="constrained", figsize=(9.0, 4.8), sharey=True)
+    column = {name: i for i, name in enumerate(twin.COLUMNS)}
+    for responses, colour, label in zip(d.responses, (BEFORE, AFTER), ("before", "after"), strict=True):
+        mend = _mending(responses)
+        rows = responses.rows
+        signals = rows.records.signals
+        second = round(1.0 / rows.records.dt)
+        at = rows.start[:, None] + second * np.arange(mend.shape[1]) + second // 2
+        c = responses.coordinates
+        closing = signals[at, column["speed"]] - signals[at, column["lead_speed"]]
+        shown = {
+            "speed (m/s)": c["speed"], "gap (m)": c["gap"], "closing speed (m/s)": closing,
+            "leader's acceleration (m/s²)": signals[at, column["lead_accel"]], "position (m)": c["position"],
+            "time (s)": c["time"],
+        }  # fmt: skip
+        for axis, (name, values) in zip(axes.ravel(), shown.items(), strict=True):
+            edges = np.unique(np.quantile(values, np.linspace(0.01, 0.99, 17)))
+            index = np.digitize(values.ravel(), edges) - 1
+            centre, mean, error = [], [], []
+            for b in range(len(edges) - 1):
+                mine = mend.ravel()[index == b]
+                if len(mine) > 5:
+                    centre.append(0.5 * (edges[b] + edges[b + 1]))
+                    mean.append(float(np.mean(mine)))
+                    error.append(2 * float(np.std(mine)) / np.sqrt(len(mine)))
+            axis.errorbar(centre, mean, error, color=colour, lw=1.1, marker=".", ms=4, label=label, capsize=0)
+            axis.axhline(0, color=TRUTH, lw=0.5)
+            axis.set_xlabel(name)
+    axes[0, 0].legend()
+    axes[0, 0].set_ylabel("residual (m/s²)")
+    axes[1, 0].set_ylabel("residual (m/s²)")
+    return figure
+
+
+def maps(d: Discovery) -> Figure:
+    """Residual over position and time."""
+    figure, axes = plt.subplots(1, 2, layout="constrained", figsize=(9.0, 3.2), sharey=True, sharex=True)
+    grids, extent = [], (0.0, 1.0, 0.0, 1.0)
+    for responses in d.responses:
+        x, t = responses.coordinates["position"].ravel(), responses.coordinates["time"].ravel()
+        bins = [np.linspace(x.min(), x.max() + 1e-6, 40), np.linspace(t.min(), t.max() + 1e-6, 30)]
+        total = np.histogram2d(x, t, bins, weights=_mending(responses).ravel())[0]
+        count = np.histogram2d(x, t, bins)[0]
+        grids.append(np.where(count > 0, total / np.maximum(count, 1), np.nan).T)
+        extent = (bins[0][0], bins[0][-1], bins[1][0], bins[1][-1])
+    limit = float(np.nanquantile(np.abs(grids[0]), 0.95)) or 1.0
+    for axis, grid, title in zip(axes, grids, ("before", "after"), strict=True):
+        image = axis.imshow(grid, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-limit, vmax=limit)
+        axis.set_title(title)
+        axis.set_xlabel("position (m)")
+    axes[0].set_ylabel("time (s)")
+    figure.colorbar(image, ax=axes, shrink=0.8, label="m/s²")
+    return figure
+
+
+def gaps(d: Discovery) -> Figure | None:
+    """Best, median and worst held-out driver."""
+    if d.before is None or d.after is None:
+        return None
+    rows = d.before.rows
+    able = np.flatnonzero(d.before.scored.any(1))
+    order = able[np.argsort(d.after.gap_rmse[able])]
+    picks = [order[0], order[len(order) // 2], order[-1]]
+    figure, axes = plt.subplots(3, 1, layout="constrained", figsize=(9.0, 6.6))
+    for axis, i, title in zip(axes, picks, ("best", "median", "worst"), strict=True):
+        valid = rows.valid[i]
+        at = rows.samples[i][valid]
+        time = (at - rows.records.first[rows.record[i]]) * rows.records.dt
+        axis.plot(time, rows.records.gap[at], color=TRUTH, lw=1.4, label="measured")
+        axis.plot(time, d.before.gap[i][valid], color=BEFORE, lw=1, label=f"before: {d.before.gap_rmse[i]:.2f} m")
+        axis.plot(time, d.after.gap[i][valid], color=AFTER, lw=1, ls="--", label=f"after: {d.after.gap_rmse[i]:.2f} m")
+        scored = d.before.scored[i][valid]
+        axis.fill_between(time, 0, 1, where=scored, transform=axis.get_xaxis_transform(), color="#eef2f6", zorder=-5)
+        episode = rows.records.episodes[rows.record[i]]
+        axis.set_title(f"{title}: run {episode.run_id}, vehicle {episode.vehicle_id}", loc="left")
+        axis.set_ylabel("gap (m)")
+        axis.legend(ncols=3, loc="upper right")
+    axes[-1].set_xlabel("time (s)")
+    return figure
+
+
+def scatter(d: Discovery) -> Figure | None:
+    """Errors after against errors before, one point per held-out driver."""
+    if d.before is None or d.after is None:
+        return None
+    ok = d.before.scored.any(1)
+    x, y = d.before.gap_rmse[ok], d.after.gap_rmse[ok]
+    figure, axes = plt.subplots(layout="constrained", figsize=(4.4, 4.0))
+    axes.plot(x, y, "o", ms=4, color=AFTER, alpha=0.7)
+    reach = [0.9 * min(x.min(), y.min()), 1.1 * max(x.max(), y.max())]
+    axes.plot(reach, reach, color=TRUTH, lw=0.7)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("gap RMSE before (m)")
+    axes.set_ylabel("gap RMSE after (m)")
+    return figure

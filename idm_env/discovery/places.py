@@ -1,0 +1,238 @@
+"""Where and when: responses to short pulses, projected off the drivers' own parameters, and scans over all intervals.
+
+In every second of every window something is changed a little: an acceleration added, T, v0, or a and b raised. The
+responses of the predictions are added up over any WHERE (an interval of places or times, a ramp, a phase of a period),
+so that thousands of places cost one rollout of 21 copies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from idm_env.discovery.records import Rows
+from idm_env.discovery.solve import Solution, Task, equations
+
+WHATS = ("acceleration", "time_gap", "desired_speed", "accel_and_decel")
+PULSE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Responses [what, second, R, m] per unit, residual [R, m], and every row's coordinates in every second [R, J]."""
+
+    rows: Rows
+    change: np.ndarray
+    residual: np.ndarray
+    by_theta: np.ndarray
+    absorbed: np.ndarray
+    coordinates: dict[str, np.ndarray]
+    square: np.ndarray
+
+    def design(self, what: str, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return per run the matrix [runs, B, B] and vector [runs, B] of a basis [R, J, B] over the coordinates.
+
+        Both are projected off what re-calibrated drivers would absorb.
+        """
+        rows = self.rows
+        response = np.einsum("jrm,rjb->rmb", self.change[WHATS.index(what)], basis)
+        groups, count = len(rows.records.groups), basis.shape[-1]
+        cross = np.zeros((groups, 5, count))
+        np.add.at(cross, rows.group, np.einsum("rmi,rmb->rib", self.by_theta, response))
+        follow = np.einsum("gij,gjb->gib", self.absorbed, cross)
+        response -= np.einsum("rmi,rib->rmb", self.by_theta, follow[rows.group])
+        runs = len(rows.records.runs)
+        matrix, vector = np.zeros((runs, count, count)), np.zeros((runs, count))
+        for run in range(runs):
+            mine = response[rows.run == run].reshape(-1, count)
+            matrix[run] = mine.T @ mine
+            vector[run] = -mine.T @ self.residual[rows.run == run].reshape(-1)
+        return matrix, vector
+
+
+def respond(task: Task, solution: Solution) -> Responses:
+    """Return the responses at a solution."""
+    rows, records = task.rows, task.rows.records
+    seconds = round(1.0 / records.dt)
+    pieces = max(rows.steps // seconds, 1)
+    pulses = np.zeros((1 + len(WHATS) * pieces, 4))
+    for w in range(len(WHATS)):
+        for j in range(pieces):
+            pulses[1 + w * pieces + j] = (w + 1, j * seconds, (j + 1) * seconds, PULSE)
+    copies = len(pulses)
+    theta = np.repeat(solution.theta[None], copies, axis=0)
+    values = np.repeat(solution.values[None], copies, axis=0)
+    residual = task.residual(task.errors(theta, solution.model, values, pulses))
+    counts = task.counts[:, None]
+    change = (residual[1:] - residual[0]).reshape(len(WHATS), pieces, len(rows), -1) / PULSE * counts
+    at = rows.start[:, None] + seconds * np.arange(pieces) + seconds // 2
+    signals = records.signals
+    place = signals[at, 18]
+    coordinates = {
+        "position": np.mod(place, records.period) if records.period else place,
+        "time": signals[at, 17],
+        "speed": signals[at, 15],
+        "gap": signals[at, 0] - signals[at, 14],
+    }
+    linear = solution.linear
+    matrix = equations(task, solution.model, solution.theta, solution.values, linear)[1]
+    square = np.zeros(len(records.runs))
+    np.add.at(square, rows.run, (linear.residual**2).sum(-1) * task.counts)
+    return Responses(
+        rows, change, linear.residual * counts, linear.by_theta * counts[:, :, None],
+        np.linalg.inv(matrix + 1e-9 * np.eye(5)), coordinates, square,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best interval [begin, end) and amount on all runs, its linear gain, and honest gains of every run.
+
+    ``gains`` [runs] is the gain in log RMSE of each run with interval and amount from the other runs; ``stable`` [runs]
+    says whether they chose nearly the same interval.
+    """
+
+    begin: float
+    end: float
+    amount: float
+    gain: float
+    gains: np.ndarray
+    stable: np.ndarray
+
+
+def bins_of(values: np.ndarray, width: float, most: int = 60) -> tuple[np.ndarray, float]:
+    """Return the first edge and edges of at most ``most`` bins over a coordinate."""
+    low, high = float(values.min()), float(values.max()) + 1e-6
+    width = max(width, (high - low) / most)
+    count = max(1, int(np.ceil((high - low) / width)))
+    return low + width * np.arange(count + 1), width
+
+
+def scan(
+    responses: Responses, what: str, coordinate: str, width: float, *, open_end: bool = False, shortest: int = 1
+) -> Found | None:
+    """Return the interval of a coordinate in which a change of ``what`` explains most, or None without enough data.
+
+    ``open_end`` takes only intervals that last to the end: steps.
+    """
+    values = responses.coordinates[coordinate]
+    edges, _ = bins_of(values, width)
+    count = len(edges) - 1
+    if count < 2 + shortest:
+        return None
+    index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, count - 1)
+    basis = np.zeros((*values.shape, count))
+    np.put_along_axis(basis, index[..., None], 1.0, axis=-1)
+    matrix, vector = responses.design(what, basis)
+    runs = len(vector)
+    allowed = _allowed(count, open_end, shortest, coordinate == "time" and not open_end)
+    if not allowed.any():
+        return None
+    total = _best(matrix.sum(0), vector.sum(0), allowed)
+    gains, stable = np.zeros(runs), np.zeros(runs, bool)
+    for run in range(runs):
+        i, j, amount, _ = _best(matrix.sum(0) - matrix[run], vector.sum(0) - vector[run], allowed)
+        pick = np.zeros(count)
+        pick[i : j + 1] = 1.0
+        gained = 2 * amount * pick @ vector[run] - amount**2 * pick @ matrix[run] @ pick
+        gains[run] = log_gain(gained, responses.square[run])
+        stable[run] = abs(i - total[0]) <= 1 and abs(j - total[1]) <= 1
+    i, j, amount, gain = total
+    return Found(float(edges[i]), float(edges[j + 1]), amount, gain, gains, stable)
+
+
+def log_gain(gained: float, square: float) -> float:
+    """Gain in log RMSE where the squared residual falls by ``gained`` (limited to nine tenths)."""
+    return float(-0.5 * np.log(1.0 - np.clip(gained / max(square, 1e-12), -9.0, 0.9)))
+
+
+def _allowed(count: int, open_end: bool, shortest: int, inner: bool) -> np.ndarray:
+    i, j = np.indices((count, count))
+    allowed = j - i + 1 >= shortest
+    # An interval that covers nearly everything is no place, and one that reaches the end of time is a step.
+    allowed &= j - i + 1 <= max(1, int(0.9 * count))
+    if inner:
+        margin = max(1, count // 10)
+        allowed &= (i >= margin) & (j <= count - 1 - margin)
+    if open_end:
+        allowed &= (j == count - 1) & (i >= 1)
+    return allowed
+
+
+def _best(matrix: np.ndarray, vector: np.ndarray, allowed: np.ndarray) -> tuple[int, int, float, float]:
+    count = len(vector)
+    sums = np.zeros((count + 1, count + 1))
+    sums[1:, 1:] = matrix.cumsum(0).cumsum(1)
+    along = np.append(0.0, vector.cumsum())
+    i, j = np.indices((count, count))
+    up = j + 1
+    weight = sums[up, up] - sums[i, up] - sums[up, i] + sums[i, i]
+    push = along[up] - along[i]
+    # A little ridge keeps intervals that hardly anybody passed from winning by chance.
+    weight = weight + 0.02 * np.trace(matrix) / count
+    gain = np.where(allowed, push**2 / np.maximum(weight, 1e-12), -np.inf)
+    at = np.unravel_index(gain.argmax(), gain.shape)
+    return int(at[0]), int(at[1]), float(push[at] / weight[at]), float(gain[at])
+
+
+def linear_curve(responses: Responses, what: str, basis: np.ndarray, spread: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coefficients [B] of a basis [R, J, B] and honest gains per run, with a prior of width spread."""
+    matrix, vector = responses.design(what, basis)
+    ridge = np.eye(vector.shape[1]) / spread**2
+    gains = np.zeros(len(vector))
+    for run in range(len(vector)):
+        c = np.linalg.solve(matrix.sum(0) - matrix[run] + ridge, vector.sum(0) - vector[run])
+        gains[run] = log_gain(float(2 * c @ vector[run] - c @ matrix[run] @ c), responses.square[run])
+    return np.linalg.solve(matrix.sum(0) + ridge, vector.sum(0)), gains
+
+
+def hats(values: np.ndarray, first: float, distance: float, count: int, period: float = 0.0) -> np.ndarray:
+    """Return the hat functions of a piecewise-linear curve at values [R, J]: [R, J, count]."""
+    at = (np.mod(values, period) if period else values) - first
+    at = at / distance
+    if period:
+        low = np.floor(at).astype(int)
+        share = at - low
+        low %= count
+        high = (low + 1) % count
+    else:
+        at = np.clip(at, 0.0, count - 1.0)
+        low = np.minimum(at.astype(int), count - 2)
+        share, high = at - low, low + 1
+    basis = np.zeros((*values.shape, count))
+    np.put_along_axis(basis, low[..., None], (1.0 - share)[..., None], axis=-1)
+    held = np.take_along_axis(basis, high[..., None], axis=-1)
+    np.put_along_axis(basis, high[..., None], held + share[..., None], axis=-1)
+    return basis
+
+
+def best_period(
+    responses: Responses, what: str, shortest: float = 6.0, longest: float = 90.0
+) -> tuple[float, np.ndarray]:
+    """Return the period (s) of the clock at which a sine of ``what`` explains most, and honest gains per run."""
+    time = responses.coordinates["time"]
+    periods = np.geomspace(shortest, longest, 60)
+    designs = []
+    for period in periods:
+        phase = 2 * np.pi * time / period
+        designs.append(responses.design(what, np.stack([np.cos(phase), np.sin(phase)], axis=-1)))
+    runs = len(designs[0][1])
+
+    def best(skip: int | None) -> tuple[int, np.ndarray]:
+        top, found = -np.inf, (0, np.zeros(2))
+        for k, (matrix, vector) in enumerate(designs):
+            a, g = matrix.sum(0), vector.sum(0)
+            if skip is not None:
+                a, g = a - matrix[skip], g - vector[skip]
+            c = np.linalg.solve(a + 1e-6 * np.trace(a) * np.eye(2) + 1e-12 * np.eye(2), g)
+            if c @ g > top:
+                top, found = c @ g, (k, c)
+        return found
+
+    gains = np.zeros(runs)
+    for run in range(runs):
+        k, c = best(run)
+        matrix, vector = designs[k][0][run], designs[k][1][run]
+        gains[run] = log_gain(float(2 * c @ vector - c @ matrix @ c), responses.square[run])
+    return float(periods[best(None)[0]]), gains

@@ -1,0 +1,255 @@
+"""Measured episodes as flat arrays for the compiled rollout, and the rows (windows) that are rolled out from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from idm_env.data import DataError, Episode, Trajectories
+from idm_env.data.records import Record
+from idm_env.discovery import march as twin
+
+WINDOW_S = 5.0
+"""Horizon of a prediction: long enough for every effect to show, short enough for drivers' noise not to add up."""
+TRIM_S = (8.0, 3.0)
+"""Left out at the beginning and end of long records: start-up transients and edges of the smoother."""
+SHORT_S = 60.0
+"""Records shorter than this lose only 1 s at either end."""
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """All records behind one another: ``signals`` [samples, columns], record r in ``bounds[r] : bounds[r + 1]``.
+
+    A record begins with what is known of the driver before the episode does, for memories; the episode itself begins at
+    ``first[r]``.
+    ``group`` and ``run`` [records] index ``groups`` (who shares IDM parameters) and ``runs``; ``gap`` and ``speed`` are
+    the driver's measured ones [samples]; ``period`` is the length of a lap (m) or 0.
+    """
+
+    episodes: tuple[Episode, ...]
+    dt: float
+    signals: np.ndarray
+    bounds: np.ndarray
+    first: np.ndarray
+    length: np.ndarray
+    group: np.ndarray
+    groups: tuple[str, ...]
+    run: np.ndarray
+    runs: tuple[str, ...]
+    period: float
+
+    @property
+    def gap(self) -> np.ndarray:
+        """Measured gap (m)."""
+        return self.signals[:, 0] - self.signals[:, 14]
+
+    @property
+    def speed(self) -> np.ndarray:
+        """Measured speed (m/s)."""
+        return self.signals[:, 15]
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def of_runs(self, runs: Sequence[str]) -> Records:
+        """Return the records of some runs; groups and their numbers stay."""
+        wanted = set(runs)
+        keep = [i for i, e in enumerate(self.episodes) if e.run_id in wanted]
+        pieces = [self.signals[self.bounds[i] : self.bounds[i + 1]] for i in keep]
+        names = tuple(r for r in self.runs if r in wanted)
+        return replace(
+            self,
+            episodes=tuple(self.episodes[i] for i in keep),
+            signals=np.ascontiguousarray(np.concatenate(pieces)),
+            bounds=(bounds := np.append(0, np.cumsum([len(p) for p in pieces]))),
+            first=bounds[:-1] + (self.first - self.bounds[:-1])[keep],
+            length=self.length[keep],
+            group=self.group[keep],
+            run=np.array([names.index(self.episodes[i].run_id) for i in keep]),
+            runs=names,
+        )
+
+
+def labels(episodes: Sequence[Episode], by: str) -> list[str]:
+    """Return each episode's group: its driver, ``all``, or a column that is constant over an episode."""
+    if by == "driver":
+        return [f"{e.run_id}/{e.vehicle_id}" for e in episodes]
+    if by == "all":
+        return ["all"] * len(episodes)
+    if by in ("run_id", "vehicle_id", "leader_id"):
+        return [str(getattr(e, by)) for e in episodes]
+    known = sorted(set.intersection(*(set(e.labels) for e in episodes)))
+    if by not in known:
+        raise DataError(f"by = {by!r} is no column that is constant for a driver; use driver, all or one of {known}.")
+    return [e.labels[by] for e in episodes]
+
+
+def gather(
+    episodes: Sequence[Episode], by: str = "driver", period: float = 0.0, trajectories: Trajectories | None = None
+) -> Records:
+    """Return the flat arrays of smoothed episodes; DataError if there is none or their steps differ.
+
+    ``trajectories`` tell how fast drivers went before their episodes began.
+    """
+    if not episodes:
+        raise DataError("no episode of a driver behind a leader is left; loosen the split or give longer tracks.")
+    dt = episodes[0].dt
+    odd = next((e for e in episodes if abs(e.dt - dt) > 1e-3 * dt), None)
+    if odd is not None:
+        raise DataError(f"episodes {episodes[0].key} and {odd.key} have steps of {dt:g} and {odd.dt:g} s; give one dt.")
+    names = labels(episodes, by)
+    groups = tuple(dict.fromkeys(names))
+    runs = tuple(dict.fromkeys(e.run_id for e in episodes))
+    before = _histories(episodes, trajectories)
+    pieces = [_with_history(_signals(e, period), h, dt) for e, h in zip(episodes, before, strict=True)]
+    bounds = np.append(0, np.cumsum([len(p) for p in pieces]))
+    return Records(
+        episodes=tuple(episodes),
+        dt=dt,
+        signals=np.ascontiguousarray(np.concatenate(pieces)),
+        bounds=bounds,
+        first=bounds[:-1] + np.array([len(h) for h in before]),
+        length=np.array([e.length_m for e in episodes]),
+        group=np.array([groups.index(n) for n in names]),
+        groups=groups,
+        run=np.array([runs.index(e.run_id) for e in episodes]),
+        runs=runs,
+        period=period,
+    )
+
+
+def _signals(e: Episode, period: float) -> np.ndarray:
+    def rear(record: Record) -> np.ndarray:
+        return record.position_m - record.length_m
+
+    place = e.place_m
+    if period > 0.0:
+        place = np.unwrap(place, period=period)
+    accel = np.gradient(e.speed_mps, e.dt)
+    columns = [
+        rear(e.leader), e.leader.speed_mps, e.leader.accel_mps2,
+        rear(e.second_leader), e.second_leader.speed_mps, e.second_leader.accel_mps2, e.second_leader.present,
+        e.behind.position_m, e.behind.speed_mps, e.behind.accel_mps2, e.behind.present,
+        e.adjacent.position_m - e.position_m, e.adjacent.speed_mps, e.adjacent.present,
+        e.position_m, e.speed_mps, accel, e.time_s, place,
+    ]  # fmt: skip
+    assert len(columns) == len(twin.COLUMNS)
+    return np.stack([np.asarray(c, float) for c in columns], axis=1)
+
+
+def _histories(episodes: Sequence[Episode], trajectories: Trajectories | None) -> list[np.ndarray]:
+    """Return the measured speeds before every episode, on its clock, back to the first hole in time."""
+    if trajectories is None:
+        return [np.zeros(0)] * len(episodes)
+    tracks = {
+        key: (part["time_s"].to_numpy(), part["speed_mps"].to_numpy())
+        for key, part in trajectories.table.partition_by(
+            ["run_id", "vehicle_id"], as_dict=True, maintain_order=True
+        ).items()
+    }
+    found = []
+    for e in episodes:
+        time, speed = tracks[e.run_id, e.vehicle_id]
+        end = int(np.searchsorted(time, e.time_s[0] - 1e-6))
+        step = trajectories.steps[e.run_id]
+        holes = np.flatnonzero(np.diff(time[: end + 1]) > 1.5 * step)
+        begin = int(holes[-1]) + 1 if len(holes) else 0
+        stride = max(1, round(e.dt / step))
+        found.append(speed[end - stride : begin - 1 if begin else None : -stride][::-1] if end > stride else speed[:0])
+    return found
+
+
+def _with_history(signals: np.ndarray, speeds: np.ndarray, dt: float) -> np.ndarray:
+    """Put the driver's past in front: his own speeds, everything else as at the episode's first sample."""
+    before = np.repeat(signals[:1], len(speeds), axis=0)
+    before[:, 15] = speeds
+    before[:, 17] -= dt * np.arange(len(speeds), 0, -1)
+    return np.concatenate([before, signals])
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """What is rolled out: row i is ``steps`` steps from sample ``start[i]`` of ``record[i]``.
+
+    ``valid`` [rows, samples] says which kept samples (every ``every``-th) are inside the record and count; ``joined``
+    says that row i − 1 ends where row i begins; ``block`` numbers blocks of a record that are held out in turn.
+    """
+
+    records: Records
+    record: np.ndarray
+    start: np.ndarray
+    steps: int
+    every: int
+    valid: np.ndarray
+    joined: np.ndarray
+    block: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.record)
+
+    @property
+    def group(self) -> np.ndarray:
+        """Group of every row."""
+        return self.records.group[self.record]
+
+    @property
+    def run(self) -> np.ndarray:
+        """Run of every row."""
+        return self.records.run[self.record]
+
+    @property
+    def samples(self) -> np.ndarray:
+        """Index of every kept sample, [rows, samples], inside the record."""
+        ahead = self.start[:, None] + self.every * (1 + np.arange(self.steps // self.every))
+        return np.minimum(ahead, self.records.bounds[self.record + 1][:, None] - 1)
+
+
+def windows(records: Records, seconds: float = WINDOW_S, every_s: float = 0.5) -> Rows:
+    """Return contiguous windows of ``seconds`` over every record; short or trimmed-away records give none."""
+    dt = records.dt
+    steps, every = round(seconds / dt), round(every_s / dt)
+    record, start, joined, block = [], [], [], []
+    for r in range(len(records)):
+        begin, end = int(records.first[r]), int(records.bounds[r + 1])
+        span = (end - begin) * dt
+        before, after = TRIM_S if span >= SHORT_S else (1.0, 1.0)
+        size = block_seconds(span)
+        starts = np.arange(begin + round(before / dt), end - round(after / dt) - steps, steps)
+        record += [r] * len(starts)
+        start += starts.tolist()
+        joined += [i > 0 for i in range(len(starts))]
+        block += ((starts - begin) * dt // size).astype(int).tolist()
+    if not record:
+        raise DataError(f"no record is longer than {seconds + 2:g} s; discovery needs longer tracks.")
+    valid = np.ones((len(record), steps // every), bool)
+    return Rows(records, np.array(record), np.array(start), steps, every, valid, np.array(joined), np.array(block))
+
+
+def whole(records: Records, longest_s: float = 300.0, every_s: float = 0.5) -> Rows:
+    """Return rows that cover every record from its first sample, cut where it is longer than ``longest_s``."""
+    dt = records.dt
+    every = round(every_s / dt)
+    record, start, lasts = [], [], []
+    for r in range(len(records)):
+        begin, end = int(records.first[r]), int(records.bounds[r + 1])
+        pieces = max(1, int(np.ceil((end - begin) * dt / longest_s - 0.2)))
+        cuts = np.linspace(begin, end, pieces + 1).astype(int)
+        record += [r] * pieces
+        start += cuts[:-1].tolist()
+        lasts += cuts[1:].tolist()
+    first = np.array(start)
+    count = int(max(np.array(lasts) - first) - 1) // every
+    at = first[:, None] + every * (1 + np.arange(count))
+    valid = at < np.array(lasts)[:, None]
+    return Rows(
+        records, np.array(record), first, count * every, every, valid, np.zeros(len(first), bool),
+        np.zeros(len(first), int),
+    )  # fmt: skip
+
+
+def block_seconds(span: float) -> float:
+    """Length of the blocks that are held out in turn: 30 s, or a quarter of a shorter record, at least 5 s."""
+    return float(np.clip(span / 4.0, 5.0, 30.0))

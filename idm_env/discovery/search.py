@@ -1,0 +1,246 @@
+"""One round of the search: the null, every candidate fitted behind it, and what each gains on held-out runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from idm_env.discovery import model as terms
+from idm_env.discovery import noise as noises
+from idm_env.discovery import places
+from idm_env.discovery.checkpoint import Checkpoint
+from idm_env.discovery.model import Model, Term
+from idm_env.discovery.records import Rows
+from idm_env.discovery.score import held_out
+from idm_env.discovery.solve import NAMES, Prior, Solution, Task, centred, finish, linearise, solve, with_noise
+from idm_env.effects import IDM
+
+OnProgress = Callable[[str, str, int, int], None]
+"""Called with the stage, the current candidate, candidates done and candidates in all."""
+
+POPULATION = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
+WIDTH = 0.6
+"""Width of the first, weak prior of log θ; later the drivers' own spread is taken, between 0.3 and this."""
+WORTH = 0.01
+"""Linear gain in log RMSE from which a located candidate is worth a nested fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """A candidate: its best solution, or None where only its linear response was scored, and gains [runs]."""
+
+    term: Term
+    solution: Solution | None
+    gains: np.ndarray
+    honest: np.ndarray | None = None
+
+
+@dataclass(eq=False)
+class Search:
+    """The state of a search on the runs that may choose."""
+
+    task: Task
+    names: Sequence[str]
+    located: bool
+    saved: Checkpoint
+    on_progress: OnProgress
+    base: Model = field(default_factory=Model)
+
+    def null(self, model: Model, start: Solution | None = None) -> Solution:
+        """Fit the null (or a model already chosen) and its noise in turn until both stand; updates ``task``."""
+        theta = np.tile(self.task.prior.centre, (self.task.groups, 1)) if start is None else start.theta
+        values = _starting_values(model) if start is None else start.values
+        solution = solve(self.task, model, theta, values)
+        for _ in range(3):
+            self.task = self._renoised(solution)
+            solution = solve(self.task, model, solution.theta, solution.values, iterations=6)
+        return solution
+
+    def _renoised(self, solution: Solution) -> Task:
+        errors = self.task.errors(solution.theta[None], solution.model, solution.values[None])[0]
+        task = with_noise(self.task, noises.estimate(errors, self.task.rows.joined))
+        return replace(task, prior=population(solution.theta, task.rows))
+
+    def round(self, solution: Solution, number: int) -> tuple[list[Scored], np.ndarray]:
+        """Score every candidate on top of ``solution``; return them and the null's held-out squares [runs]."""
+        have = {t.label for t in solution.model.terms}
+        before = held_out(self.task, solution)
+        wanted = [terms.simple(n) for n in self.names if n in terms._STARTS and n not in have]
+        found = []
+        responses = places.respond(self.task, solution)
+        for i, term in enumerate(wanted):
+            self.on_progress(f"round {number}", term.label, i, len(wanted) + 12)
+            found.append(self._nested(solution, term, before, f"{number}/{term.label}"))
+        for i, scored in enumerate(self._places(solution, responses, before, number)):
+            self.on_progress(f"round {number}", scored.term.label, len(wanted) + i, len(wanted) + 12)
+            found.append(scored)
+        return found, before
+
+    def again(self, solution: Solution, best: Scored, scored: list[Scored]) -> tuple[Solution, list[Scored]]:
+        """Judge the leading candidates once more, all by the noise that the best one leaves."""
+        assert best.solution is not None
+        self.task = self._renoised(best.solution)
+        null = solve(self.task, solution.model, solution.theta, solution.values, iterations=8)
+        before = held_out(self.task, null)
+        highest = best.gains.mean()
+        result = []
+        for s in scored:
+            if s.solution is None or s.gains.mean() < 0.3 * highest:
+                result.append(s)
+                continue
+            fresh = solve(self.task, s.solution.model, s.solution.theta, s.solution.values, iterations=10)
+            gains = 0.5 * np.log(before / held_out(self.task, fresh))
+            result.append(Scored(s.term, fresh, gains if s.honest is None else np.where(s.honest, gains, s.gains)))
+        return null, result
+
+    def _nested(
+        self, solution: Solution, term: Term, before: np.ndarray, key: str, start: np.ndarray | None = None
+    ) -> Scored:
+        model = solution.model.adding(term)
+        kept = self.saved.get(key)
+        if kept is not None:
+            theta, values = kept["theta"], kept["values"]
+            task = centred(self.task, theta)
+            linear = linearise(task, model, theta, values)
+            best = finish(task, model, theta, values, linear, float(kept["cost"]))
+        else:
+            starts = [np.array(s) for s in term.starts] if start is None else [start]
+            first = [
+                solve(self.task, model, solution.theta, np.append(solution.values, s), iterations=5) for s in starts
+            ]
+            best = min(first, key=lambda s: s.cost)
+            best = solve(self.task, model, best.theta, best.values, iterations=8)
+            self.saved.put(key, theta=best.theta, values=best.values, cost=np.array(best.cost))
+        gains = 0.5 * np.log(before / held_out(self.task, best))
+        return Scored(term, best, gains)
+
+    # -- where and when ----------------------------------------------------------------------------------------------
+
+    def _places(self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int) -> list[Scored]:
+        have = {t.label for t in solution.model.terms}
+        period = self.task.rows.records.period
+        result: list[Scored] = []
+
+        def interval_of(what: str, coordinate: str, open_end: bool = False, named: str = "") -> None:
+            width = {"position": 20.0, "time": 2.0}[coordinate]
+            shortest = {"position": 2, "time": 3}[coordinate]
+            found = places.scan(responses, what, coordinate, width, open_end=open_end, shortest=shortest)
+            if found is None:
+                return
+            term = _interval_term(what, coordinate, found, open_end, named, period)
+            if term.label in have:
+                return
+            if not named and found.gains.mean() < WORTH:
+                result.append(Scored(term, None, found.gains))
+                return
+            one = self._nested(solution, term, before, f"{number}/{term.label}")
+            # Runs that chose another place than all together are judged by what they would have gained there.
+            gains = np.where(found.stable, one.gains, found.gains)
+            result.append(Scored(term, one.solution, gains, found.stable))
+
+        def curve_of(term: Term, coordinate: str) -> None:
+            if term.label in have:
+                return
+            values = responses.coordinates[coordinate]
+            first, distance, count = term.knots
+            basis = places.hats(values, first, distance, count, term.period)
+            what = "acceleration" if term.what == "slope" else term.what
+            scale = -9.81 if term.what == "slope" else 1.0
+            spread = term.smoothness * abs(scale)
+            start, gains = places.linear_curve(responses, what, basis, spread)
+            if term.effect is None and gains.mean() < WORTH:
+                result.append(Scored(term, None, gains))
+                return
+            low, high = term.parameters[0].low, term.parameters[0].high
+            result.append(
+                self._nested(
+                    solution, term, before, f"{number}/{term.label}", np.clip(start / scale, 0.9 * low, 0.9 * high)
+                )
+            )
+
+        position = _knots(responses.coordinates["position"], 80.0, 48, period)
+        if "grade" in self.names:
+            curve_of(terms.grade(*position, period), "position")
+        if "speed_zone" in self.names:
+            interval_of("desired_speed", "position", named="speed_zone")
+        if "regime_shift" in self.names:
+            interval_of("time_gap", "time", open_end=True, named="regime_shift")
+        if not self.located:
+            return result
+        for what in ("time_gap", "accel_and_decel", "acceleration"):
+            interval_of(what, "position")
+        for what in places.WHATS:
+            interval_of(what, "time")
+        for what in ("desired_speed", "accel_and_decel", "acceleration"):
+            interval_of(what, "time", open_end=True)
+        coarse = _knots(responses.coordinates["position"], 150.0, 30, period)
+        curve_of(terms.curve("time_gap", "position", *coarse, period), "position")
+        time = responses.coordinates["time"]
+        ramp = (float(time.min()), float(np.ptp(time)) + 1e-6, 2)
+        curve_of(terms.curve("time_gap", "time", *ramp, label="time_gap ramp"), "time")
+        curve_of(terms.curve("acceleration", "time", *_knots(time, 8.0, 24)), "time")
+        for what, coordinate, step in (("acceleration", "speed", 3.0), ("time_gap", "speed", 3.0),
+                                       ("acceleration", "gap", 6.0), ("time_gap", "gap", 6.0)):  # fmt: skip
+            curve_of(terms.curve(what, coordinate, *_knots(responses.coordinates[coordinate], step, 10)), coordinate)
+        cycle, gains = places.best_period(responses, "acceleration")
+        term = terms.curve("acceleration", "time", 0.0, cycle / 8, 8, cycle, label="acceleration over phase")
+        if term.label not in have:
+            if gains.mean() < WORTH:
+                result.append(Scored(term, None, gains))
+            else:
+                one = self._nested(solution, term, before, f"{number}/{term.label}", np.zeros(8))
+                result.append(Scored(term, one.solution, np.minimum(one.gains, gains + 0.5 * np.abs(gains))))
+        return result
+
+
+def _interval_term(what: str, coordinate: str, found: places.Found, open_end: bool, named: str, period: float) -> Term:
+    if named == "speed_zone":
+        # The response is that of (v/v0)⁴, whose factor f^−4 is known to all orders.
+        factor = float(np.clip(1.0 - 4.0 * found.amount, 0.3, 100.0)) ** -0.25
+        return terms.speed_zone(found.begin, found.end, min(max(factor, 0.25), 1.9), period)
+    if named == "regime_shift":
+        return terms.regime_shift(found.begin, float(np.clip(found.amount, -0.6, 1.5)))
+    limit = 3.0 if what == "acceleration" else 0.6
+    amount = float(np.clip(found.amount, -limit, limit))
+    term = terms.interval(what, coordinate, found.begin, 1e6 if open_end else found.end, amount,
+                          period if coordinate == "position" else 0.0)  # fmt: skip
+    return replace(term, label=f"{what} step in {coordinate}") if open_end else term
+
+
+def _knots(values: np.ndarray, distance: float, most: int, period: float = 0.0) -> tuple[float, float, int]:
+    if period > 0.0:
+        count = int(np.clip(round(period / distance), 4, most))
+        return 0.0, period / count, count
+    low, high = float(np.quantile(values, 0.002)), float(np.quantile(values, 0.998))
+    count = int(np.clip(np.ceil((high - low) / distance) + 1, 3, most))
+    return low, max((high - low) / (count - 1), 1e-6), count
+
+
+def _starting_values(model: Model) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *(np.array(t.starts[0]) for t in model.terms)])
+
+
+def population(theta: np.ndarray, rows: Rows) -> Prior:
+    """Return the drivers' own spread as prior: median and scaled median deviation of log θ over fitted groups."""
+    seen = np.unique(rows.group)
+    if len(seen) < 5:
+        return first_prior()
+    centre = np.median(theta[seen], axis=0)
+    spread = 1.4826 * np.median(np.abs(theta[seen] - centre), axis=0)
+    return Prior(centre, np.clip(1.5 * spread, 0.3, WIDTH))
+
+
+def first_prior() -> Prior:
+    """Return the weak prior that a search starts from."""
+    assert {p.name for p in IDM.declared} == set(NAMES)
+    return Prior(np.log([POPULATION[n] for n in NAMES]), np.full(5, WIDTH))
+
+
+def first_noise(rows: Rows) -> noises.Noise:
+    """Return independent errors of 0.15 m/s and 0.3 m, to begin with."""
+    size = rows.valid.shape[1] + 2
+    sigma = np.append(np.full(size - 2, 0.15), [0.2, 0.4])
+    white = np.diag(1.0 / sigma)
+    return noises.Noise(np.zeros((size, size)), white, white, np.ones(len(rows)), 0.0)

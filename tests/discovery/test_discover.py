@@ -1,0 +1,99 @@
+"""The whole chain on small data with a hidden effect: verdicts, report and the corrected model."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from idm_env.config import load_model
+from idm_env.data import Trajectories, synthetic
+from idm_env.discovery import Discovery, discover, write_report
+from idm_env.roads import Lane
+
+FEW = ("lag", "leader_acceleration", "drag", "grade", "speed_zone", "regime_shift")
+
+
+def data(effect: str | None, runs: int = 8, **changes: object) -> Trajectories:
+    options: dict[str, object] = {"runs": runs, "followers": 2, "seconds": 90.0, "effect": effect} | changes
+    return synthetic.generate(21, **options)[0]  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def drag() -> Discovery:
+    return discover(data("leader_acceleration"), effects=FEW)
+
+
+def test_the_hidden_effect_is_named(drag: Discovery) -> None:
+    assert drag.verdict == "named"
+    assert [f["effect"] for f in drag.report["found"]] == ["leader_acceleration"]
+    gain = drag.report["found"][0]["parameters"]["gain"]
+    assert gain["estimate"] == pytest.approx(0.4, rel=0.1)
+    assert gain["low"] < 0.4 < gain["high"]
+    error = drag.report["error"]
+    assert error["after"]["gap_rmse_m"] < 0.5 * error["before"]["gap_rmse_m"]
+    fitted_on = set(drag.task.rows.records.runs)
+    assert error["held_out_runs"] and not fitted_on & set(error["held_out_runs"])
+
+
+def test_report_files(drag: Discovery, tmp_path: Path) -> None:
+    paths = write_report(drag, tmp_path)
+    report = json.loads(paths["report.json"].read_text())
+    assert {"schema", "verdict", "found", "error", "candidates", "data", "seed", "versions"} <= set(report)
+    assert {c["effect"] for c in report["candidates"]} >= set(FEW) - {"leader_acceleration"}
+    page = paths["report.html"].read_text()
+    assert page.count("data:image/png;base64,") >= 7
+    assert not re.search(r'(src|href)="(?!data:)', page)  # nothing is fetched from elsewhere
+    model = load_model(paths["model.yaml"])
+    assert [e.name for e in model.effects] == ["idm", "leader_acceleration", "brakes"]
+    simulator = model.simulator(Lane())
+    params = model.params(dtype=torch.float64)
+    state = simulator.state(torch.tensor([100.0, 60.0]).double(), torch.tensor([20.0, 20.0]).double(), params)
+    end, _ = simulator.rollout(state, {}, params, 50)
+    assert torch.isfinite(end.gap).all()
+
+
+def test_nothing_is_found_where_nothing_is_hidden() -> None:
+    for ou in (0.0, 0.1):
+        found = discover(data(None, ou=ou), effects=FEW)
+        assert found.verdict == "none"
+        assert found.report["found"] == []
+        assert found.report["error"]["after"] == found.report["error"]["before"]
+
+
+def test_few_runs_cannot_tell() -> None:
+    found = discover(data("leader_acceleration", runs=4), effects=FEW)
+    assert found.verdict == "cannot_tell"
+    assert "3 runs" in found.report["sentence"]
+    assert found.report["found"] == []
+
+
+def test_unknown_effect_is_refused() -> None:
+    with pytest.raises(ValueError, match="Did you mean 'grade'"):
+        discover(data(None, runs=2), effects=["grad"])
+
+
+def test_an_interrupted_search_goes_on(tmp_path: Path) -> None:
+    seen: list[str] = []
+
+    def stop(stage: str, candidate: str, done: int, total: int) -> None:
+        seen.append(candidate)
+        if candidate == "drag":
+            raise KeyboardInterrupt
+
+    trajectories = data("leader_acceleration", runs=6)
+    with pytest.raises(KeyboardInterrupt):
+        discover(trajectories, effects=FEW, out=tmp_path, on_progress=stop)
+    assert seen[-1] == "drag" and (tmp_path / "discovery.npz").exists()
+    resumed = discover(trajectories, effects=FEW, out=tmp_path, resume=True)
+    fresh = discover(trajectories, effects=FEW)
+    assert not (tmp_path / "discovery.npz").exists()
+    assert resumed.report["verdict"] == fresh.report["verdict"]
+    assert resumed.values == pytest.approx(fresh.values, rel=1e-6)
+    with pytest.raises(KeyboardInterrupt):
+        discover(trajectories, effects=FEW, out=tmp_path, on_progress=stop)
+    with pytest.raises(ValueError, match="other data or options"):
+        discover(trajectories, effects=FEW[:3], out=tmp_path, resume=True)

@@ -1,0 +1,110 @@
+"""The compiled twin does what the simulator does, for every effect that discovery can name or locate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from idm_env.discovery import model as terms
+from idm_env.discovery.judge import Frozen
+from idm_env.discovery.model import Model, Term
+from idm_env.discovery.records import Records, whole
+from idm_env.discovery.search import first_prior
+from idm_env.discovery.solve import Task
+from idm_env.effects import CANDIDATES, IDM, Brakes, Replay
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.problem import Problem
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
+
+THETA = np.log([1.4, 1.8, 1.3, 2.2, 28.0])
+STRENGTHS = {
+    "delay": (0.46,), "lag": (0.5,), "second_leader": (0.3,), "leader_acceleration": (0.4,), "brake_light": (0.5,),
+    "asymmetry": (0.3,), "power_limit": (9.0,), "drag": (6e-4,), "speed_dependent_gap": (4.0,), "memory": (0.7, 40.0),
+    "follower": (0.15,), "dead_zone": (0.002,), "action_point": (0.3,), "lateral": (0.1,), "gap_bias": (1.2,),
+}  # fmt: skip
+
+
+def places(records: Records) -> dict[str, tuple[Term, tuple[float, ...]]]:
+    low, high = (float(f(records.signals[:, 18])) for f in (np.min, np.max))
+    step = (high - low) / 6
+    slopes = (0.02, -0.03, 0.04, 0.0, -0.01, 0.03, -0.02)
+    middle = (low + 2 * step, low + 4 * step)
+    return {
+        "grade": (terms.grade(low, step, 7, 0.0), slopes),
+        "known grade": (terms.known_grade(low, step, slopes, 0.0), (0.6,)),
+        "speed_zone": (terms.speed_zone(*middle, 0.6), (0.6, *middle)),
+        "regime_shift": (terms.regime_shift(40.0, 0.3), (0.3, 40.0)),
+        "T over places": (terms.interval("time_gap", "position", *middle, 0.4), (0.4, *middle)),
+        "a and b over time": (terms.interval("accel_and_decel", "time", 30.0, 50.0, -0.3), (-0.3, 30.0, 50.0)),
+        "push over speed": (terms.curve("acceleration", "speed", 0.0, 5.0, 5), (0.3, -0.2, 0.1, 0.2, -0.1)),
+        "push over phase": (terms.curve("acceleration", "time", 0.0, 4.0, 4, 16.0), (0.3, -0.2, 0.1, 0.2)),
+    }
+
+
+def simulated(records: Records, model: Model, values: np.ndarray) -> np.ndarray:
+    """The gap of the simulator, on the samples that discovery keeps."""
+    effects, numbers = terms.effects_of(model, values)
+    simulator = Simulator(Lane(), (IDM(), Replay(), *effects, Brakes()), dt=records.dt, integration="midpoint")
+    batch = Batch.of(records.episodes, substeps=1)
+    problem = Problem(
+        simulator, batch, (), (), torch.zeros(len(batch), dtype=torch.long), ("all",), kernels=False
+    )  # fmt: skip
+    given = dict(zip((f"idm.{p.name}" for p in IDM.declared), np.exp(THETA), strict=True))
+    given |= {f"{effect}.{name}": x for effect, p in numbers.items() for name, x in p.items()}
+    rows = {name: torch.full((len(batch),), float(x), dtype=torch.float64) for name, x in given.items()}
+    with torch.no_grad():
+        return problem.simulate(rows).gap.numpy()[4::5].T
+
+
+def twin(records: Records, model: Model, values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+    monkeypatch.setattr(Model, "lead", 0.0)
+    rows = whole(records)
+    task = Task(rows, None, first_prior(), np.ones(len(rows)))
+    theta = np.tile(THETA, (1, task.groups, 1))
+    return task.predict(theta, Frozen(model, values), np.zeros((1, 0)))[0][0]
+
+
+def numbers_of(model: Model, values: np.ndarray) -> set[str]:
+    _, numbers = terms.effects_of(model, values)
+    return {f"{effect}.{name}" for effect, p in numbers.items() for name in p}
+
+
+def check(records: Records, term: Term | None, values: tuple[float, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    model, numbers = Model(() if term is None else (term,)), np.array(values, float)
+    mine, reference = twin(records, model, numbers, monkeypatch), simulated(records, model, numbers)
+    valid = whole(records).valid
+    count = min(mine.shape[1], reference.shape[1])
+    worst = float(np.abs(mine[:, :count] - reference[:, :count])[valid[:, :count]].max())
+    # The level of a memory starts half a step apart: the twin takes it from the measured record.
+    assert worst < (1e-2 if "memory.strength" in numbers_of(model, numbers) else 1e-6), worst
+    if term is not None:
+        without = twin(records, Model(), np.zeros(0), monkeypatch)
+        assert np.abs(mine - without)[valid].max() > 0.01  # so that the parity is of something
+
+
+def test_idm_alone(platoon: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+    check(platoon, None, (), monkeypatch)
+
+
+@pytest.mark.parametrize("name", sorted(STRENGTHS))
+def test_effect(platoon: Records, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    check(platoon, terms.simple(name), STRENGTHS[name], monkeypatch)
+
+
+def test_places_and_times(platoon: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = places(platoon)
+    for term, values in found.values():
+        check(platoon, term, values, monkeypatch)
+    assert set(STRENGTHS) | set(found) >= set(CANDIDATES)
+
+
+def test_all_together(platoon: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = Model(
+        tuple(terms.simple(n) for n in ("delay", "leader_acceleration", "speed_dependent_gap", "drag", "asymmetry"))
+    )
+    values = np.array([0.3, 0.2, 2.0, 3e-4, 0.1])
+    mine, reference = twin(platoon, model, values, monkeypatch), simulated(platoon, model, values)
+    valid = whole(platoon).valid[:, : reference.shape[1]]
+    assert np.abs(mine[:, : reference.shape[1]] - reference)[valid].max() < 1e-6
