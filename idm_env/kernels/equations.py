@@ -1,14 +1,15 @@
 """IDM + Brakes for one vehicle and one step, compiled: values as ``Simulator.step`` computes them, and derivatives.
 
 The second source of the mathematics, so every function here has a parity test. ``follow``, ``brake`` and
-``integrate`` do the same operations in the same order as the effects do in torch, without fused multiply-adds: results
-differ only where torch's vectorised square root is not correctly rounded, by its last bit. ``linearise`` gives every
+``integrate`` do the same operations in the same order as the effects do in torch, without fused multiply-adds, save
+that divisions by parameters are products with ``inverses``: results differ by rounding only. ``linearise`` gives every
 first derivative of one step, which the tangent and the adjoint sweeps share.
 
 Everything is scalar code that LLVM vectorises over the vehicles of a tile: no branches, only selections, and constants
 of the state's own precision (a Python literal would promote float32 to float64). The loops around it run over rows of
 one flat workspace at distances that the compiler knows, so it need not test two dozen arrays for overlap, which it
-refuses to do and then emits scalar code.
+refuses to do and then emits scalar code. Every loop reads all that it needs before it selects: with loads inside a
+selection, LLVM has been seen to move one past the store that follows it.
 """
 
 from __future__ import annotations
@@ -91,12 +92,17 @@ def unpack(c: Array) -> Constants:
 
 
 @exact_inlined
-def follow(gap, speed, lead_speed, led, a, b, time_gap, min_gap, v0, k):  # type: ignore[no-untyped-def]
+def inverses(a, b, v0, k):  # type: ignore[no-untyped-def]
+    """Return ``1 / (2 √(a b))`` and ``1 / v0``: a division costs ten products, and parameters hold for many steps."""
+    return k.half / np.sqrt(a * b), k.one / v0
+
+
+@exact_inlined
+def follow(gap, speed, lead_speed, led, a, inverse_brake, time_gap, min_gap, inverse_v0, k):  # type: ignore[no-untyped-def]
     """Return ``a [1 − (v/v0)⁴ − (s*/s)²]``, as ``effects.idm.IDM`` with δ = 4 and no sharpness (m/s²)."""
-    ratio = speed / v0
+    ratio = speed * inverse_v0
     square = ratio * ratio
-    brake = k.two * np.sqrt(a * b)
-    dynamic = speed * (time_gap + (speed - lead_speed) / brake)
+    dynamic = speed * (time_gap + (speed - lead_speed) * inverse_brake)
     wanted = min_gap + (k.zero if dynamic < k.zero else dynamic)
     safe = k.smallest_gap if gap < k.smallest_gap else gap
     below = k.smallest_gap - gap
@@ -131,7 +137,7 @@ def integrate(speed, accel, is_euler, k):  # type: ignore[no-untyped-def]
     return (
         stopped if stops else moved,
         k.zero if stops else after,
-        -speed / k.dt if stops else accel,
+        -speed * k.inverse_dt if stops else accel,
     )
 
 
@@ -163,7 +169,9 @@ class Slopes(NamedTuple):
 
 
 @swift_inlined
-def linearise(gap, speed, lead_speed, led, raw, a, b, time_gap, min_gap, v0, max_decel, is_euler, k):  # type: ignore[no-untyped-def]
+def linearise(  # type: ignore[no-untyped-def]
+    gap, speed, lead_speed, led, raw, a, b, inverse_brake, time_gap, min_gap, inverse_v0, max_decel, is_euler, k
+):
     """Return ``Slopes`` at one state; ``raw`` is the acceleration before the brakes (m/s²).
 
     At kinks the one-sided derivative that torch's autograd takes (``relu`` 0, ``clamp`` 1, ``maximum`` one half).
@@ -183,10 +191,8 @@ def linearise(gap, speed, lead_speed, led, raw, a, b, time_gap, min_gap, v0, max
     x = above - part
     accel = floor + part * part * (k.double_width - part) * k.inverse_square_width + x
     # IDM
-    inverse_v0 = k.one / v0
     ratio = speed * inverse_v0
     cube = ratio * ratio * ratio
-    inverse_brake = k.half / np.sqrt(a * b)
     closing = speed - lead_speed
     rate = time_gap + closing * inverse_brake
     dynamic = speed * rate

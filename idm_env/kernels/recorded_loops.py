@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from idm_env.kernels.equations import brake, exact, follow, integrate, linearise, swift, unpack
+from idm_env.kernels.equations import brake, exact, follow, integrate, inverses, linearise, swift, unpack
 
 TILE = 512
 """Drivers per tile: parameters, state and tangents stay in cache, and time-major rows are read in long runs."""
@@ -31,7 +31,8 @@ GRADIENT = ROW * 38
 NORMAL = ROW * 43
 ON_GAP, ON_SPEED, SEED_GAP, SEED_SPEED, SEED_ACCEL = (ROW * row for row in range(68, 73))
 ON_P = ROW * 73
-ROWS = 79
+P_BRAKE, P_FREE = ROW * 79, ROW * 80
+ROWS = 81
 
 
 @exact
@@ -53,9 +54,12 @@ def _clear(w, row, count):
 
 
 @exact
-def _begin(w, params, gap0, speed0, left, n):
+def _begin(w, params, gap0, speed0, left, n, c):
     for j in range(6):
         _get(w, P_A + j * ROW, params[j, left:], n)
+    k = unpack(c)
+    for i in range(n):
+        w[P_BRAKE + i], w[P_FREE + i] = inverses(w[P_A + i], w[P_B + i], w[P_V0 + i], k)
     _get(w, GAP, gap0[left:], n)
     _get(w, SPEED, speed0[left:], n)
 
@@ -74,7 +78,7 @@ def _advance(w, n, is_euler, c):
         gap, speed = w[GAP + i], w[SPEED + i]
         wanted = follow(
             gap, speed, w[LEAD_SPEED + i], k.one,
-            w[P_A + i], w[P_B + i], w[P_TIME + i], w[P_MIN + i], w[P_V0 + i], k,
+            w[P_A + i], w[P_BRAKE + i], w[P_TIME + i], w[P_MIN + i], w[P_FREE + i], k,
         )  # fmt: skip
         accel = brake(wanted, speed, w[P_MAX + i], is_euler, k)
         moved, after, felt = integrate(speed, accel, is_euler, k)
@@ -89,7 +93,7 @@ def forward(gap0, speed0, lead_position, lead_speed, params, gap, speed, accel, 
     w = np.empty(ROWS * ROW, gap.dtype)
     for left in range(begin, end, TILE):
         n = min(TILE, end - left)
-        _begin(w, params, gap0, speed0, left, n)
+        _begin(w, params, gap0, speed0, left, n, c)
         for t in range(gap.shape[0]):
             _look(w, lead_position, lead_speed, t, left, n)
             _advance(w, n, is_euler, c)
@@ -104,9 +108,10 @@ def _linear_step(w, n, is_euler, c):
     k = unpack(c)
     for i in range(n):
         gap, speed, lead_speed = w[GAP + i], w[SPEED + i], w[LEAD_SPEED + i]
-        a, b, time_gap, min_gap, v0 = w[P_A + i], w[P_B + i], w[P_TIME + i], w[P_MIN + i], w[P_V0 + i]
-        raw = follow(gap, speed, lead_speed, k.one, a, b, time_gap, min_gap, v0, k)
-        d = linearise(gap, speed, lead_speed, k.one, raw, a, b, time_gap, min_gap, v0, w[P_MAX + i], is_euler, k)
+        a, b, time_gap, min_gap = w[P_A + i], w[P_B + i], w[P_TIME + i], w[P_MIN + i]
+        slow, free, max_decel = w[P_BRAKE + i], w[P_FREE + i], w[P_MAX + i]
+        raw = follow(gap, speed, lead_speed, k.one, a, slow, time_gap, min_gap, free, k)
+        d = linearise(gap, speed, lead_speed, k.one, raw, a, b, slow, time_gap, min_gap, free, max_decel, is_euler, k)
         w[BY_GAP + i], w[BY_SPEED + i] = d.accel_gap, d.accel_speed + d.accel_floor_speed
         w[STAYS + i], w[PUSHES + i] = d.speed_speed, d.speed_accel
         w[DRIFTS + i], w[SHIFTS + i] = d.moved_speed, d.moved_accel
@@ -140,7 +145,7 @@ def sensitivities(
     w = np.empty(ROWS * ROW, gap.dtype)
     for left in range(begin, end, TILE):
         n = min(TILE, end - left)
-        _begin(w, params, gap0, speed0, left, n)
+        _begin(w, params, gap0, speed0, left, n, c)
         _clear(w, GAP_BY, 2 * FIVE)
         for t in range(gap.shape[0]):
             _look(w, lead_position, lead_speed, t, left, n)
@@ -179,7 +184,7 @@ def normal_equations(
     w = np.empty(ROWS * ROW, gap0.dtype)
     for left in range(begin, end, TILE):
         n = min(TILE, end - left)
-        _begin(w, params, gap0, speed0, left, n)
+        _begin(w, params, gap0, speed0, left, n, c)
         _clear(w, GAP_BY, 2 * FIVE)
         _clear(w, COST, 1 + FIVE + FIVE * FIVE)
         for t in range(gap_target.shape[0]):
@@ -204,9 +209,10 @@ def _back(w, n, is_euler, c):
     k = unpack(c)
     for i in range(n):
         gap, speed, lead_speed = w[GAP + i], w[SPEED + i], w[LEAD_SPEED + i]
-        a, b, time_gap, min_gap, v0 = w[P_A + i], w[P_B + i], w[P_TIME + i], w[P_MIN + i], w[P_V0 + i]
-        raw = follow(gap, speed, lead_speed, k.one, a, b, time_gap, min_gap, v0, k)
-        d = linearise(gap, speed, lead_speed, k.one, raw, a, b, time_gap, min_gap, v0, w[P_MAX + i], is_euler, k)
+        a, b, time_gap, min_gap = w[P_A + i], w[P_B + i], w[P_TIME + i], w[P_MIN + i]
+        slow, free, max_decel = w[P_BRAKE + i], w[P_FREE + i], w[P_MAX + i]
+        raw = follow(gap, speed, lead_speed, k.one, a, slow, time_gap, min_gap, free, k)
+        d = linearise(gap, speed, lead_speed, k.one, raw, a, b, slow, time_gap, min_gap, free, max_decel, is_euler, k)
         on_gap = w[ON_GAP + i] + w[SEED_GAP + i]
         on_speed = w[ON_SPEED + i] + w[SEED_SPEED + i]
         seed = w[SEED_ACCEL + i]
@@ -231,7 +237,7 @@ def adjoint(
     w = np.empty(ROWS * ROW, gap.dtype)
     for left in range(begin, end, TILE):
         n = min(TILE, end - left)
-        _begin(w, params, gap0, speed0, left, n)
+        _begin(w, params, gap0, speed0, left, n, c)
         _clear(w, ON_GAP, 2)
         _clear(w, ON_P, 6)
         for t in range(gap.shape[0] - 1, -1, -1):

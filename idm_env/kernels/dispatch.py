@@ -1,0 +1,111 @@
+"""Which path runs, and why: a compiled kernel where simulator, tensors and surroundings fit, torch everywhere else.
+
+The choice looks at types, shapes, devices and at what is installed, never at ``requires_grad``: values are the same
+bits with and without a graph. It imports numba only once a kernel is to run.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from idm_env.effects import IDM, Brakes, Control, Noise, Replay
+from idm_env.kernels import available
+from idm_env.roads import Lane, Ring
+from idm_env.types import Inputs, Params, Record, State
+
+if TYPE_CHECKING:
+    from idm_env.simulator import Simulator
+
+_off: ContextVar[str | None] = ContextVar("idm_env_kernels_off", default=None)
+
+
+@contextmanager
+def off(reason: str = "switched off by kernels.off()") -> Iterator[None]:
+    """Run everything inside on the torch path."""
+    token = _off.set(reason)
+    try:
+        yield
+    finally:
+        _off.reset(token)
+
+
+def unfit(simulator: Simulator) -> str | None:
+    """Return why this simulator has no kernel, or None if it has one."""
+    if type(simulator.road) not in (Lane, Ring):
+        return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
+    if simulator.integration not in ("ballistic", "euler"):
+        return f"integration is '{simulator.integration}'; kernels know ballistic and euler"
+    kinds = {type(e) for e in simulator.effects}
+    others = sorted(e.name for e in simulator.effects if type(e) not in (IDM, Brakes, Control, Replay, Noise))
+    if others:
+        return f"effect '{others[0]}' has no kernel"
+    if not {IDM, Brakes} <= kinds:
+        return "kernels need IDM and Brakes"
+    for effect in simulator.effects:
+        if isinstance(effect, IDM) and (effect.exponent != 4.0 or effect.sharpness is not None):
+            return "IDM has a free exponent or the published smooth form; the kernel has δ = 4 and exact bounds"
+        if isinstance(effect, Brakes) and effect.sharpness is not None:
+            return "Brakes have the published smooth form; the kernel has the exact floor"
+        if isinstance(effect, Noise) and effect.correlated:
+            return "the noise is correlated; the kernel's is white"
+    return None
+
+
+def refusal(simulator: Simulator, state: State, inputs: Inputs, params: Params) -> str | None:
+    """Return why this call takes the torch path, or None if a kernel takes it."""
+    why = _off.get() or unfit(simulator)
+    if why is not None:
+        return why
+    if os.environ.get("IDM_ENV_KERNELS", "1") == "0":
+        return "IDM_ENV_KERNELS=0"
+    if not available():
+        return "numba is not installed; pip install 'idm-env[kernels]'"
+    if torch._C._are_functorch_transforms_active() or torch.autograd.forward_ad._current_level >= 0:
+        return "a torch.func transform or forward-mode differentiation is active"
+    if torch.compiler.is_compiling():
+        return "torch is compiling"
+    record = inputs.get("replay")
+    if isinstance(record, Record) and record.present is not None:
+        return "the record says who is present, step by step"
+    return _unfit_tensors(state, inputs, params)
+
+
+def _unfit_tensors(state: State, inputs: Inputs, params: Params) -> str | None:
+    kind = state.speed.dtype
+    if kind not in (torch.float32, torch.float64):
+        return f"tensors are {kind}; kernels take float32 and float64"
+    if state.speed.numel() == 0:
+        return "there are no vehicles"
+    shape = state.speed.shape
+    tensors = [state.position, state.speed, state.gap, *_tensors(inputs)]
+    for effect, values in params.items():
+        for name, value in values.items():
+            if not isinstance(value, Tensor):
+                return f"{effect}.{name} is no tensor"
+            if torch.broadcast_shapes(value.shape, shape) != shape:
+                return f"{effect}.{name} enlarges the batch"
+            tensors.append(value)
+    for x in tensors:
+        if x.device.type != "cpu":
+            return f"tensors are on {x.device}; kernels run on the CPU"
+        if x.dtype not in (kind, torch.bool):
+            return f"tensors are {kind} and {x.dtype}"
+    for x in _tensors(inputs):
+        if x.dim() == 0 or torch.broadcast_shapes(x.shape[1:], shape) != shape:
+            return "an input enlarges the batch"
+    return None
+
+
+def _tensors(inputs: Inputs) -> list[Tensor]:
+    found: list[Tensor] = []
+    for value in inputs.values():
+        parts: Any = (value,) if isinstance(value, Tensor) else value
+        found += [x for x in parts if x is not None]
+    return found
