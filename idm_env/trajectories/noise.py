@@ -20,7 +20,15 @@ MOST_TRACKS = 32
 MOST_SAMPLES = 400
 DENSE_S = 0.25
 """Up to this sampling interval correlated noise can be told from white noise (s)."""
-BOUNDS = {"white": (2e-3, 5.0), "sigma": (2e-3, 10.0), "time": (0.1, 3.0), "jerk": (1e-3, 30.0)}
+SPARSE_WHITE_M = 0.02
+"""White noise assumed of sparse samples (m)."""
+BOUNDS = {
+    "white": (2e-3, 5.0),
+    "sigma": (2e-3, 10.0),
+    "time": (0.1, 3.0),
+    "jerk": (1e-3, 30.0),
+    "accel_time": (0.5, 100.0),
+}
 
 
 def sample(tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -28,6 +36,11 @@ def sample(tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.nda
     usable = [track for track in tracks if len(track[0]) >= 5] or list(tracks)
     chosen = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, MOST_TRACKS).round().astype(int))]
     return [(time[:MOST_SAMPLES], position[:MOST_SAMPLES]) for time, position in chosen]
+
+
+def is_dense(times: Sequence[np.ndarray]) -> bool:
+    """Tell whether samples are dense enough to tell noise from driving."""
+    return float(np.median(np.concatenate([np.diff(time) for time in times]))) <= DENSE_S
 
 
 def outlying(position: np.ndarray) -> np.ndarray:
@@ -44,16 +57,15 @@ def fit_noise(
 ) -> Noise:
     """Return the noise model under which the tracks (times, positions) are most likely.
 
-    Four numbers for dense data (white, correlated, its time, jerk), two for sparse (white, jerk), by a simplex search
-    over their logarithms. ValueError if no track has three samples.
+    Four numbers for dense data (white, correlated, its time, jerk), two for sparse (jerk and the time in which an
+    acceleration fades), by a simplex search over their logarithms. ValueError if no track has three samples.
     """
     parts = [part for part in sample(tracks) if len(part[0]) >= 3]
     if not parts:
         raise ValueError("no track has three samples to fit the noise to. Give noise=Noise(…).")
-    interval = float(np.median(np.concatenate([np.diff(time) for time, _ in parts])))
-    dense = interval <= DENSE_S
-    begin = start or (Noise(0.1, 0.2, 0.3, 0.5) if dense else Noise(0.1, 0.0, 0.3, 0.3))
-    names = ("white", "sigma", "time", "jerk") if dense else ("white", "jerk")
+    dense = is_dense([time for time, _ in parts])
+    begin = start or (Noise(0.1, 0.2, 0.3, 0.5) if dense else Noise(SPARSE_WHITE_M, 0.0, 0.3, 0.5, 5.0))
+    names = ("white", "sigma", "time", "jerk") if dense else ("jerk", "accel_time")
     observed = [Observed.of(time, position, dt) for time, position in parts]
     inflated = [outlying(position) if dense else np.zeros(len(position)) for _, position in parts]
 

@@ -50,17 +50,22 @@ class Noise:
 class Choices:
     """Static choices of the smoother.
 
-    ``rounds`` of reweighting; ``degrees`` of freedom of the positions' Student-t noise; ``jerk_degrees`` and
-    ``window`` (s): weight, in samples, of the prior variance of the jerk against that over a window around each step
-    (None keeps the prior's); ``highest`` and ``lowest`` acceleration (m/s²), exact in the result.
+    ``rounds`` of reweighting; ``degrees`` of freedom of the positions' Student-t noise (None for normal noise);
+    ``jerk_degrees`` and ``window`` (s): weight, in samples, of the prior variance of the jerk against that over a
+    window around each step (None keeps the prior's); ``highest`` and ``lowest`` acceleration (m/s²), exact in the
+    result.
     """
 
     rounds: int = 10
-    degrees: float = 4.0
+    degrees: float | None = 4.0
     jerk_degrees: float | None = 0.5
     window: float = 1.0
     highest: float = 5.0
     lowest: float = -8.0
+
+
+SPARSE = Choices(rounds=1, degrees=None, jerk_degrees=None)
+"""For sparse samples, among which outliers cannot be told."""
 
 
 @dataclass(eq=False)
@@ -188,9 +193,11 @@ def _fitted(
         )  # fmt: skip
         if turn == rounds - 1:
             break
-        loops.reweigh(
-            observed.at, observed.look, observed.value, mean, cov, white, choices.degrees, observed.measured, variance
-        )
+        if choices.degrees is not None:
+            loops.reweigh(
+                observed.at, observed.look, observed.value, mean, cov, white, choices.degrees, observed.measured,
+                variance,
+            )  # fmt: skip
         if adapting and choices.jerk_degrees is not None:
             loops.adapt(square, push, half, choices.jerk_degrees, scale)
     return mean, cov, push

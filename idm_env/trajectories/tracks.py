@@ -156,7 +156,8 @@ class Pieces:
         """Yield the tracks of some vehicles, as ``vehicles`` lists them."""
         for run, vehicle, first, count in vehicles:
             at = slice(first, first + count)
-            length = np.nanmedian(self._length[at]) if self._length is not None else np.nan
+            known = self._length[at] if self._length is not None else np.empty(0)
+            length = np.median(known[np.isfinite(known)]) if np.isfinite(known).any() else np.nan
             good = np.isfinite(length) and 0 < length <= LONGEST_LENGTH_M
             whole = Track(
                 run, vehicle, 0, self._columns["time_s"][at], self._columns["position_m"][at],
