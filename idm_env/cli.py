@@ -40,16 +40,16 @@ Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample,
 
 
 @contextmanager
-def progress() -> Iterator[Callable[[str, int, int, float], None]]:
+def progress() -> Iterator[Callable[[str, int, int, float | str], None]]:
     """Show a bar per phase on standard error."""
     columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TextColumn("{task.fields[value]}"), console=console, transient=False) as bars:
         tasks: dict[str, Any] = {}
 
-        def report(phase: str, done: int, total: int, value: float) -> None:
+        def report(phase: str, done: int, total: int, value: float | str) -> None:
             if phase not in tasks:
                 tasks[phase] = bars.add_task(phase, total=total, value="")
-            words = "" if value != value else f"residual {value:.3f}"
+            words = value if isinstance(value, str) else f"residual {value:.3f}"
             bars.update(tasks[phase], completed=done, total=total, value=words)
 
         yield report
@@ -114,6 +114,95 @@ def fit(
 
 
 @app.command()
+def explain(
+    data: Data,
+    out: Out = Path("out/explain"),
+    by: Annotated[str, typer.Option(help="Who shares IDM parameters: driver, all, or a column.")] = "driver",
+    effects: Annotated[str | None, typer.Option(help="Candidates, by comma; default: the whole catalogue.")] = None,
+    known: Annotated[str | None, typer.Option(help="Effects whose values are in the file, such as grade.")] = None,
+    seed: Seed = 0,
+    ring_length: RingLength = None,
+    place: Place = None,
+    layout: Layout = "auto",
+    where: Where = None,
+    resume: Resume = False,
+) -> None:
+    """Fit IDM, find the residual, trace it to the effect that the model lacks, add it, and report before and after.
+
+    Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
+    """
+    from idm_env.data import load
+
+    trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
+    if where is not None:
+        trajectories = trajectories.where(where)
+    _explain(trajectories, out, by, _names(effects), _names(known) or (), seed, resume)
+
+
+def _explain(
+    trajectories: Any,
+    out: Path,
+    by: str = "driver",
+    effects: tuple[str, ...] | None = None,
+    known: tuple[str, ...] = (),
+    seed: int = 0,
+    resume: bool = False,
+) -> None:
+    import json
+
+    from idm_env.discovery import discover, write_report
+
+    with progress() as report:
+        found = discover(
+            trajectories,
+            by=by,
+            effects=effects,
+            known=known,
+            out=out,
+            resume=resume,
+            seed=seed,
+            on_progress=lambda stage, candidate, done, total: report(stage, done, total, candidate),
+        )
+        write_report(found, out)
+    result = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    names = [entry["effect"] or f"{entry['what']} over {entry['where']['coordinate']}" for entry in result["found"]]
+    console.print(f"Verdict: [bold]{result['verdict']}[/bold]{': ' + ', '.join(names) if names else ''}")
+    keys = ("gap_rmse_m", "gap_rmse_median_driver_m", "horizon_rmse_m", "speed_rmse_mps")
+    rows = [{"": when, **{k: result["error"][when].get(k) for k in keys}} for when in ("before", "after", "floor")]
+    _show("Errors on runs that neither fitted nor chose anything", rows)
+    _done(out)
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+@app.command()
+def demo(
+    data: Annotated[
+        Path | None, typer.Option(help="Your own file; default: generated data with a hidden effect.")
+    ] = None,
+    out: Out = Path("out/demo"),
+    seed: Seed = 7,
+) -> None:
+    """Show the main job: a platoon whose generator has an effect that the fitted model is not told of.
+
+    The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
+    """
+    from idm_env.data import load, synthetic
+
+    path = data
+    if path is None:
+        out.mkdir(parents=True, exist_ok=True)
+        path = out / "platoon.csv"
+        made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
+        columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
+        made.table.select(columns).write_csv(path)
+        console.print(f"Ten runs of a leader and three followers: {path}")
+    _explain(load(path), out)
+
+
+@app.command()
 def simulate(
     data: Data,
     model: Annotated[Path, typer.Option(help="A model.yaml of fit or explain, or one of your own.")],
@@ -154,6 +243,59 @@ def effects() -> None:
             rows.append({**keep, "what": summary})
             summary = ""
     _show("Effects", rows)
+
+
+@app.command()
+def plot(
+    source: Annotated[Path, typer.Argument(help="A trajectory file, or a YAML file of configs/ to roll out.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture: png, svg or pdf.")] = Path(
+        "out/space-time.png"
+    ),
+    where: Where = None,
+    seconds: Annotated[
+        float, typer.Option(help="Length of a rollout, all vehicles left to their drivers (s).")
+    ] = 300.0,
+    seed: Seed = 0,
+) -> None:
+    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout."""
+    from idm_env.diagrams import space_time
+
+    if source.suffix in (".yaml", ".yml"):
+        figure = _rollout_figure(source, seconds, seed)
+    else:
+        from idm_env.data import load
+
+        trajectories = load(source)
+        if where is not None:
+            trajectories = trajectories.where(where)
+        figure = space_time(trajectories, title=source.name)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out)
+    console.print(f"Picture: [bold]{out.resolve()}[/bold]", soft_wrap=True)
+
+
+def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
+    import gymnasium
+    import torch
+
+    from idm_env.diagrams import space_time
+    from idm_env.roads import Ring
+    from idm_env.simulator import Trajectory
+
+    env: Any = gymnasium.make("DiffIDM-v0", config=str(config)).unwrapped
+    env.reset(seed=seed)
+    dt = env.task.simulator.dt
+    kept = []
+    for _ in range(round(seconds / dt)):
+        _, _, terminated, truncated, _ = env.step(None)
+        state = env.batch.world.state
+        kept.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
+        if terminated or truncated:
+            break
+    # On a ring gaps and lengths add up to the circumference.
+    length = float((state.gap[0] + state.length[0]).sum()) if isinstance(env.task.simulator.road, Ring) else None
+    states = Trajectory(*(torch.stack(column) for column in zip(*kept, strict=True)))
+    return space_time(states, dt=dt, ring_length=length, title=config.name)
 
 
 def _number(option: str, text: str) -> float:
