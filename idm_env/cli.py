@@ -275,14 +275,14 @@ def plot(
 
 
 def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
-    import gymnasium
     import torch
 
     from idm_env.diagrams import space_time
+    from idm_env.envs.gym import DiffIDMEnv
     from idm_env.roads import Ring
     from idm_env.simulator import Trajectory
 
-    env: Any = gymnasium.make("DiffIDM-v0", config=str(config)).unwrapped
+    env: Any = DiffIDMEnv(config=str(config))
     env.reset(seed=seed)
     dt = env.task.simulator.dt
     kept = []
