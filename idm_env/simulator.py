@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -52,6 +52,9 @@ class Simulator:
     ValueError: two effects of one name, or not exactly one car-following effect.
     """
 
+    kernels: ClassVar[bool] = True
+    """Whether a kernel may stand in for repeated steps."""
+
     road: Road
     effects: tuple[Effect, ...]
     dt: float = 0.1
@@ -73,6 +76,12 @@ class Simulator:
             raise ValueError(f"integration = '{self.integration}' is unknown.{hint}")
         if not self.dt > 0:
             raise ValueError(f"dt = {self.dt} s must be positive.")
+
+    def compile(self, *, backend: str = "inductor", dynamic: bool | None = False) -> Simulator:
+        """Return this simulator with a compiled step; where nothing can compile it, with one warning, as it is."""
+        from idm_env.compiled import Compiled
+
+        return Compiled(self.road, self.effects, self.dt, self.integration, backend, dynamic)
 
     # -- composition ---------------------------------------------------------------------------------------------
 

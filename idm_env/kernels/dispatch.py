@@ -38,6 +38,8 @@ def off(reason: str = "switched off by kernels.off()") -> Iterator[None]:
 
 def unfit(simulator: Simulator) -> str | None:
     """Return why this simulator has no kernel, or None if it has one."""
+    if not simulator.kernels:
+        return "the step is compiled by torch"
     if type(simulator.road) not in (Lane, Ring):
         return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
     if simulator.integration not in ("ballistic", "euler"):
