@@ -19,7 +19,7 @@ from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.score import Verdict, held_out, westfall_young
 from idm_env.discovery.search import OnProgress, Scored, Search
-from idm_env.discovery.solve import NAMES, Prior, Solution, Task, solve
+from idm_env.discovery.solve import NAMES, Solution, Task, solve
 from idm_env.effects import CANDIDATES, IDM, Brakes
 from idm_env.parameters import nearest
 
@@ -48,6 +48,7 @@ class Round:
     equivalent: list[int] = field(default_factory=list)
     share: float = float("nan")
     why_not: str = ""
+    partial: int | None = None
 
 
 @dataclass(eq=False)
@@ -65,7 +66,7 @@ class Discovery:
     rounds: list[Round]
     before: judge.Judged | None
     after: judge.Judged | None
-    responses: tuple[places.Responses, places.Responses]
+    responses: places.Responses
 
     @property
     def verdict(self) -> str:
@@ -122,7 +123,6 @@ def discover(
     progress("null", "idm", 0, 1)
     base = Model(tuple(_known_terms(prepared, known, trajectories)))
     null = searching.null(base)
-    first_task = searching.task
     final, rounds = _rounds(searching, null, len(fit_runs), seed)
     final = _delete(searching, final, len(base.terms))
     saved.done()
@@ -132,7 +132,6 @@ def discover(
         fit_runs,
         kept_runs,
         searching,
-        first_task,
         null,
         final,
         rounds,
@@ -212,6 +211,7 @@ def _rounds(searching: Search, null: Solution, runs: int, seed: int) -> tuple[So
     now, rounds = null, []
     for number in range(1, MOST_ROUNDS + 1):
         scored, before = searching.round(now, number)
+        scored = [s for s in scored if not _same_class(s.term, now.model)]
         verdict = westfall_young(np.array([s.gains for s in scored]), seed)
         order = np.argsort(-verdict.gain)
         fitted = [i for i in order if scored[i].solution is not None and verdict.p_value[i] < 2 * ALPHA]
@@ -228,6 +228,11 @@ def _rounds(searching: Search, null: Solution, runs: int, seed: int) -> tuple[So
         assert chosen is not None
         now = searching.null(chosen.model, chosen)
     return now, rounds
+
+
+def _same_class(term: Term, model: Model) -> bool:
+    """Tell whether the model has an effect already that only sharp inputs tell from this one."""
+    return any({term.effect, other.effect} in CLASSES for other in model.terms)
 
 
 def _choose(searching: Search, now: Solution, this: Round, runs: int) -> None:
@@ -259,6 +264,7 @@ def _choose(searching: Search, now: Solution, this: Round, runs: int) -> None:
     gained, rest = float(verdict.gain[winner]), max(float(after.mean()), 0.0)
     explained = 1.0 - np.exp(-2 * gained)
     this.share = float(explained / max(explained + np.exp(-2 * gained) * (1.0 - np.exp(-2 * rest)), 1e-12))
+    this.partial = winner
     if this.share < LEAST_SHARE:
         this.why_not = f"{scored[winner].term.label} explains only {this.share:.0%} of what can be explained"
         return
@@ -271,12 +277,8 @@ def _choose(searching: Search, now: Solution, this: Round, runs: int) -> None:
 
 def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
     prepared = searching.task.rows.records
-    costs = []
-    for s in (now, chosen):
-        prior = Prior(s.prior.centre, s.prior.width)
-        fitted = judge.calibrate(prepared, s.model, s.values, prior)
-        costs.append(float(np.minimum((fitted.linear.residual**2).mean(1), 100.0**2).sum()))
-    return costs[1] <= 1.02 * costs[0]
+    before, after = (judge.free_run_rmse(prepared, s) for s in (now, chosen))
+    return after <= 1.02 * before
 
 
 def _delete(searching: Search, final: Solution, base: int) -> Solution:
@@ -301,7 +303,7 @@ def _delete(searching: Search, final: Solution, base: int) -> Solution:
 
 def _finish(
     trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], searching: Search,
-    first_task: Task, null: Solution, final: Solution, rounds: list[Round], refused: dict[str, str], by: str,
+    null: Solution, final: Solution, rounds: list[Round], refused: dict[str, str], by: str,
     seed: int, names: list[str],
 ) -> Discovery:  # fmt: skip
     adapt = by == "driver"
@@ -309,12 +311,12 @@ def _finish(
     fit_records = prepared.of_runs(fit_runs)
     thetas = []
     for s in (null, final):
-        thetas.append(judge.calibrate(prepared if adapt else fit_records, s.model, s.values, s.prior))
+        thetas.append(judge.calibrate(prepared if adapt else fit_records, s.model, s.values, s.prior, start=s.theta))
     before = after = None
     if kept_runs:
         kept = prepared.of_runs(kept_runs)
         before, after = (
-            judge.judge(kept, s.model, s.values, s.prior, th.theta, adapt)
+            judge.judge(kept, s.model, s.values, s.prior, None if adapt else th.theta, adapt)
             for s, th in zip((null, final), thetas, strict=True)
         )
     if len(final.model.terms) == base:
@@ -323,10 +325,16 @@ def _finish(
     if not confirmed and len(final.model.terms) > base:
         rounds[-1].why_not = "the lockbox does not confirm the finding"
         final, after, thetas[1] = null, before, thetas[0]
-    responses = (places.respond(first_task, null), places.respond(searching.task, final))
+    partial = None
+    if kept_runs and len(final.model.terms) == base and rounds[0].partial is not None:
+        best = rounds[0].scored[rounds[0].partial].solution
+        assert best is not None
+        pooled = None if adapt else judge.calibrate(fit_records, best.model, best.values, best.prior).theta
+        partial = judge.judge(prepared.of_runs(kept_runs), best.model, best.values, best.prior, pooled, adapt)
+    responses = places.respond(searching.task, final)
     report = summary.report(
         trajectories, prepared, fit_runs, kept_runs, searching.task, null, final, rounds, refused, before, after,
-        thetas, by, seed, names,
+        partial, thetas, by, seed, names,
     )  # fmt: skip
     return Discovery(
         report, corrected(prepared, final, thetas[1].theta, by), prepared, final.model, final.values, null, final,

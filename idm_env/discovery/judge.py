@@ -11,7 +11,7 @@ from idm_env.discovery import march as twin
 from idm_env.discovery import places
 from idm_env.discovery.model import Frozen, Model
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
-from idm_env.discovery.solve import Prior, Solution, Task, solve
+from idm_env.discovery.solve import Prior, Solution, Task, cost_of, solve
 
 CORRELATION_S = 5.0
 """Time over which errors of free simulation stay alike (s)."""
@@ -43,21 +43,41 @@ class Judged:
         }
 
 
-def calibrate(records: Records, model: Model, values: np.ndarray, prior: Prior, rows: Rows | None = None) -> Solution:
+def calibrate(
+    records: Records, model: Model, values: np.ndarray, prior: Prior, rows: Rows | None = None,
+    start: np.ndarray | None = None,
+) -> Solution:  # fmt: skip
     """Fit θ of every group in free simulation behind the measured leader, with φ as it stands.
 
-    A first fit tells how large errors are; in the second, errors of ``CORRELATION_S`` seconds count as one, so that the
-    population, as prior, speaks for a driver whose record is short or noisy.
+    From two starts, the prior's centre and ``start`` [G, 5]; every group keeps the better one. A first fit tells how
+    large errors are; in the second, errors of ``CORRELATION_S`` seconds count as one, so that the population, as prior,
+    speaks for a driver whose record is short or noisy.
     """
     rows = whole(records) if rows is None else rows
     frozen, empty = Frozen(model, values), np.zeros(0)
     task = Task(rows, None, replace(prior, free=False), np.ones(len(rows)))
-    start = np.tile(prior.centre, (task.groups, 1))
-    first = solve(task, frozen, start, empty, iterations=25, tolerance=1e-5)
-    square = (first.linear.residual**2).sum(1) * task.sigma**2 / np.maximum(rows.valid.sum(1), 1)
+    centre = np.tile(prior.centre, (task.groups, 1))
+    fits = [
+        solve(task, frozen, x, empty, iterations=25, tolerance=1e-5)
+        for x in (centre, *([] if start is None else [start]))
+    ]
+    costs = np.stack([cost_of(task, f.theta[None], f.linear.residual[None])[0] for f in fits])
+    theta = np.where((costs.argmin(0) == 0)[:, None], fits[0].theta, fits[-1].theta)
+    residual = task.residual(task.errors(theta[None], frozen, np.zeros((1, 0))))[0]
+    square = (residual**2).sum(1) * task.sigma**2 / np.maximum(rows.valid.sum(1), 1)
     correlated = CORRELATION_S / (rows.every * records.dt)
     sigma = float(np.sqrt(max(np.median(square), 1e-4) * correlated))
-    return solve(replace(task, sigma=sigma), frozen, first.theta, empty, iterations=25, tolerance=1e-5)
+    return solve(replace(task, sigma=sigma), frozen, theta, empty, iterations=25, tolerance=1e-5)
+
+
+def free_run_rmse(records: Records, s: Solution) -> float:
+    """Return the pooled gap RMSE (m) of free simulation with θ fitted to it; one error counts as 30 m at most."""
+    model, values, prior = s.model, s.values, s.prior
+    fitted = calibrate(records, model, values, prior, start=s.theta)
+    rows = whole(records)
+    task = Task(rows, None, prior, np.ones(len(rows)))
+    errors = task.errors(fitted.theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
+    return float(np.sqrt((np.clip(errors, -30.0, 30.0) ** 2).sum() / rows.valid.sum()))
 
 
 def halves(rows: Rows) -> np.ndarray:
@@ -78,12 +98,14 @@ def judge(
     """Return the errors on held-out records.
 
     With ``adapt`` θ of every driver comes from every other block of time (30 s, or a quarter of a shorter record), with
-    the population as prior, and the blocks between are scored; without it ``theta`` [G, 5] is used, and everything is.
+    the population as prior, and the blocks between are scored; without it ``theta`` [G, 5] is used, and everything
+    scored.
     """
     rows = whole(records)
     scored = halves(rows) if adapt else rows.valid
     if adapt:
-        fitted = calibrate(records, model, values, prior, replace(rows, valid=rows.valid & ~scored))
+        part = replace(rows, valid=rows.valid & ~scored)
+        fitted = calibrate(records, model, values, prior, part, theta)
         theta = fitted.theta
     assert theta is not None
     frozen = Frozen(model, values)
@@ -122,8 +144,9 @@ def floor(records: Records) -> dict[str, float]:
 def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarray:
     """Return the honest gain of every run [runs] from any smooth acceleration over the state: what is left to explain.
 
-    A ridge regression on products of speed, gap, closing speed and the leader's acceleration, now and up to 1.5 s ago,
-    through the responses of the predictions and projected off the drivers' own parameters. It knows no names.
+    A ridge regression on products of speed, gap, closing speed and the leader's acceleration, and on what the leader
+    did up to 1.5 s ago, through the responses of the predictions, projected off the drivers' own parameters. It knows
+    no names. The driver's own past is left out: it would tell of the driver's noise, which lasts.
     """
     rows = responses.rows
     signals, dt = rows.records.signals, rows.records.dt
@@ -132,21 +155,17 @@ def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarr
     at = rows.start[:, None] + second * np.arange(pieces) + second // 2
     column = {name: i for i, name in enumerate(twin.COLUMNS)}
 
-    def state(lag: float) -> list[np.ndarray]:
-        j = np.maximum(at - round(lag / dt), rows.records.bounds[rows.record][:, None])
-        v = signals[j, column["speed"]]
-        gap = signals[j, column["lead_rear"]] - signals[j, column["position"]]
-        closing = v - signals[j, column["lead_speed"]]
-        return [v / 10.0, 2.0 * np.log(np.maximum(gap, 0.5) / 15.0), closing / 2.0, signals[j, column["lead_accel"]]]
-
-    now = state(0.0)
+    v = signals[at, column["speed"]]
+    gap = signals[at, column["lead_rear"]] - signals[at, column["position"]]
+    closing = v - signals[at, column["lead_speed"]]
+    now = [v / 10.0, 2.0 * np.log(np.maximum(gap, 0.5) / 15.0), closing / 2.0, signals[at, column["lead_accel"]]]
     features = [*now, *(a * b for i, a in enumerate(now) for b in now[i:])]
     features += [a * b * c for a in now[:3] for b in now[:3] for c in now[:3]][::3]
     features += [np.abs(now[2]), np.minimum(now[3], 0.0)]
     for lag in (0.5, 1.0, 1.5):
-        past = state(lag)
-        features += [p - n for p, n in zip(past, now, strict=True)]
-        features += [(past[2] - now[2]) * now[1], (past[0] - now[0]) * now[1]]
+        j = np.maximum(at - round(lag / dt), rows.records.bounds[rows.record][:, None])
+        change = (signals[j, column["lead_speed"]] - signals[at, column["lead_speed"]]) / 2.0
+        features += [change, change * now[1], change * now[0], np.abs(change)]
     for name in ("second_speed", "behind_speed"):
         there = signals[at, column[name.replace("speed", "present")]]
         features.append((signals[at, column[name]] - signals[at, column["speed"]]) / 3.0 * there)

@@ -14,7 +14,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from idm_env.discovery import march as twin
-from idm_env.discovery import places
 
 if TYPE_CHECKING:
     from idm_env.discovery.discover import Discovery, Round
@@ -66,7 +65,8 @@ def all_of(d: Discovery) -> list[tuple[str, str, str]]:
     )
     put(
         "Residual against features, before and after",
-        "Acceleration (m/s²) that would mend each second of prediction, averaged in bins, with two standard errors.",
+        "By how much the measured driver accelerated more than the predicted one (m/s²), second by second in windows "
+        "of 5 s, averaged in bins, with two standard errors.",
         features(d),
     )
     put("Residual over position and time, before and after", "The same acceleration as a map.", maps(d))
@@ -181,20 +181,23 @@ def added_variable(d: Discovery) -> Figure | None:
     return figure
 
 
-def _mending(responses: places.Responses) -> np.ndarray:
-    """Return the acceleration per row and second that would mend the residual best, each second by itself [R, J]."""
-    change = responses.change[0]
-    weight = (change**2).sum(-1)
-    push = -(change * responses.residual[None]).sum(-1)
-    return (push / np.maximum(weight, 1e-2 * weight.max())).T
+def _residual(d: Discovery) -> list[np.ndarray]:
+    """Return the residual acceleration before and after [R, J]: how much more the driver gains in speed each second."""
+    task = d.task
+    shown = []
+    for s in (d.null, d.final):
+        errors = task.errors(s.theta[None], s.model, s.values[None])[0]
+        seconds = errors[:, 1:-2:2]
+        shown.append(-np.diff(seconds, axis=1, prepend=0.0))
+    return shown
 
 
 def features(d: Discovery) -> Figure:
     """Binned means over speed, gap, closing speed, leader's acceleration, position and time."""
     figure, axes = plt.subplots(2, 3, layout="constrained", figsize=(9.0, 4.8), sharey=True)
     column = {name: i for i, name in enumerate(twin.COLUMNS)}
-    for responses, colour, label in zip(d.responses, (BEFORE, AFTER), ("before", "after"), strict=True):
-        mend = _mending(responses)
+    for mend, colour, label in zip(_residual(d), (BEFORE, AFTER), ("before", "after"), strict=True):
+        responses = d.responses
         rows = responses.rows
         signals = rows.records.signals
         second = round(1.0 / rows.records.dt)
@@ -229,10 +232,11 @@ def maps(d: Discovery) -> Figure:
     """Residual over position and time."""
     figure, axes = plt.subplots(1, 2, layout="constrained", figsize=(9.0, 3.2), sharey=True, sharex=True)
     grids, extent = [], (0.0, 1.0, 0.0, 1.0)
-    for responses in d.responses:
+    for residual in _residual(d):
+        responses = d.responses
         x, t = responses.coordinates["position"].ravel(), responses.coordinates["time"].ravel()
         bins = [np.linspace(x.min(), x.max() + 1e-6, 40), np.linspace(t.min(), t.max() + 1e-6, 30)]
-        total = np.histogram2d(x, t, bins, weights=_mending(responses).ravel())[0]
+        total = np.histogram2d(x, t, bins, weights=residual.ravel())[0]
         count = np.histogram2d(x, t, bins)[0]
         grids.append(np.where(count > 0, total / np.maximum(count, 1), np.nan).T)
         extent = (bins[0][0], bins[0][-1], bins[1][0], bins[1][-1])

@@ -198,63 +198,68 @@ def solve(
     linear = linearise(task, model, theta, values)
     now = cost_of(task, theta[None], linear.residual[None])[0]
     total = now.sum() + (ridge * values**2).sum()
-    damping = 1e-3
+    # Every group has a damping of its own, or one that refuses its step would wait for ever while others improve.
+    damping = np.full(task.groups, 1e-3)
+    shared_damping = 1e-3
+    seen = np.isin(np.arange(task.groups), task.rows.group)
     for _ in range(iterations):
         if on_step is not None:
             on_step()
-        step_theta, step_phi, alone = _step(task, model, theta, values, linear, damping, low, high, ridge)
-        sizes = np.array([1.0, 0.4, 0.1]) if len(values) else np.array([1.0])
+        step_theta, step_phi, alone = _step(
+            task, model, theta, values, linear, damping, shared_damping, low, high, ridge
+        )  # fmt: skip
+        sizes = np.array([1.0, 0.4, 0.1]) if len(values) else np.zeros(0)
         trial_values = np.clip(values + sizes[:, None] * step_phi, low, high)
-        trial_theta = np.clip(theta + sizes[:, None, None] * step_theta, BOUNDS[:, 0], BOUNDS[:, 1])
-        if len(values):
-            only = np.clip(theta + alone, BOUNDS[:, 0], BOUNDS[:, 1])
-            trial_theta = np.concatenate([trial_theta, only[None]])
-            trial_values = np.concatenate([trial_values, values[None]])
+        trial_theta = theta + sizes[:, None, None] * step_theta
+        # The last trial leaves φ where it is, and every group decides for itself.
+        trial_theta = np.clip(np.concatenate([trial_theta, (theta + alone)[None]]), BOUNDS[:, 0], BOUNDS[:, 1])
+        trial_values = np.concatenate([trial_values, values[None]])
         residual = task.residual(task.errors(trial_theta, model, trial_values))
         costs = cost_of(task, trial_theta, residual)
         sums = costs.sum(1) + (ridge * trial_values**2).sum(1)
-        # Where φ stays, every group decides for itself.
         keep = costs[-1] < now
-        sums[-1] = np.where(keep, costs[-1], now).sum() + (ridge * trial_values[-1] ** 2).sum()
-        if not len(values) or sums.argmin() == len(sums) - 1:
+        sums[-1] = np.where(keep, costs[-1], now).sum() + (ridge * values**2).sum()
+        best = int(sums.argmin())
+        gain = float(total - sums[best])
+        damping = np.where(keep, 0.3 * damping, np.minimum(10.0 * damping, 1e6))
+        if best == len(sums) - 1:
             theta = np.where(keep[:, None], trial_theta[-1], theta)
-            best = sums[-1]
-        else:
-            best = sums.min()
-            if best < total:
-                theta, values = trial_theta[sums.argmin()], trial_values[sums.argmin()]
-        gain = total - best
-        damping = damping * 0.3 if gain > 0.01 * total else damping * (1.0 if gain > 0 else 10.0)
+            shared_damping *= 10.0
+        elif gain > 0:
+            theta, values = trial_theta[best], trial_values[best]
+            shared_damping *= 0.3 if best == 0 else 1.0
         if gain > 0:
             task = centred(task, theta)
             linear = linearise(task, model, theta, values)
             now = cost_of(task, theta[None], linear.residual[None])[0]
             total = now.sum() + (ridge * values**2).sum()
-        if gain <= tolerance * total and (gain > 0 or damping > 1.0):
+        waiting = (~keep & seen & (damping < 1.0)).any()
+        if gain <= tolerance * total and not waiting and (not len(values) or shared_damping > 1e-2 or gain > 0):
             break
     return finish(task, model, theta, values, linear, float(total))
 
 
 def _step(
-    task: Task, model: Model, theta: np.ndarray, values: np.ndarray, linear: Linear, damping: float, low: np.ndarray,
-    high: np.ndarray, ridge: np.ndarray,
+    task: Task, model: Model, theta: np.ndarray, values: np.ndarray, linear: Linear, damping: np.ndarray,
+    shared_damping: float, low: np.ndarray, high: np.ndarray, ridge: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     gradient, matrix, cross, phi_gradient, phi_matrix = equations(task, model, theta, values, linear)
     out = ((theta <= BOUNDS[:, 0] + 1e-9) & (gradient > 0)) | ((theta >= BOUNDS[:, 1] - 1e-9) & (gradient < 0))
     free = ~out
     matrix = matrix * free[:, :, None] * free[:, None, :]
     diagonal = np.einsum("gii->gi", matrix)
-    matrix = matrix + np.einsum("gi,ij->gij", np.where(free, damping * diagonal + 1e-9, 1.0), np.eye(5))
+    matrix = matrix + np.einsum("gi,ij->gij", np.where(free, damping[:, None] * diagonal + 1e-9, 1.0), np.eye(5))
     gradient, cross = gradient * free, cross * free[:, :, None]
     alone = -np.linalg.solve(matrix, gradient[..., None])[..., 0]
     if not len(values):
-        return np.clip(alone, -LONGEST, LONGEST), np.zeros(0), alone
+        alone = np.clip(alone, -LONGEST, LONGEST)
+        return alone, np.zeros(0), alone
     follow = np.linalg.solve(matrix, cross)
     s = phi_gradient.sum(0) + ridge * values - np.einsum("giq,gi->q", follow, gradient)
     big = (phi_matrix - np.einsum("giq,gis->gqs", cross, follow)).sum(0) + np.diag(ridge)
     active = ~(((values <= low) & (s > 0)) | ((values >= high) & (s < 0)))
     scale = np.maximum(np.diag(big), 1e-12)
-    big = big * active[:, None] * active[None, :] + np.diag(np.where(active, damping * scale, 1.0) + 1e-12)
+    big = big * active[:, None] * active[None, :] + np.diag(np.where(active, shared_damping * scale, 1.0) + 1e-12)
     step = -np.linalg.solve(big, s * active)
     most = np.array([
         200.0 if p.role == "place" and p.unit == "m" else 20.0 if p.role == "place" else 0.5 * (h - lo)

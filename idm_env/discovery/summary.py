@@ -40,7 +40,8 @@ WOULD_TELL = {
 def report(
     trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], task: Task,
     null: Solution, final: Solution, rounds: list[Any], refused: dict[str, str], before: judge.Judged | None,
-    after: judge.Judged | None, thetas: list[Solution], by: str, seed: int, names: list[str],
+    after: judge.Judged | None,
+    partial: judge.Judged | None, thetas: list[Solution], by: str, seed: int, names: list[str],
 ) -> dict[str, Any]:  # fmt: skip
     """Return the report as plain numbers and texts."""
     base = len(null.model.terms)
@@ -62,6 +63,7 @@ def report(
             "after": None if after is None else after.summary(),
             "floor": judge.floor(lockbox),
         },
+        "partial": _partial(rounds[0], partial, before),
         "candidates": _candidates(rounds, refused),
         "parameters": _parameters(thetas, prepared),
         "data": _data(trajectories, prepared, fit_runs, task, null, by, rounds),
@@ -69,6 +71,22 @@ def report(
         "versions": _versions(),
     }
     return _plain(content)
+
+
+def _partial(first: Any, after: judge.Judged | None, before: judge.Judged | None) -> dict[str, Any] | None:
+    """Return the best partial explanation where nothing was added: its name, share and error on the lockbox."""
+    if after is None or before is None or first.partial is None:
+        return None
+    s = first.scored[first.partial]
+    values = s.solution.values[-s.term.size :]
+    ok = before.scored.any(1)
+    return {
+        "effect": s.term.effect or s.term.label,
+        "parameters": dict(zip([p.name for p in s.term.parameters][:4], values[:4].tolist(), strict=False)),
+        "explained_share": first.share,
+        "after": after.summary(),
+        "share_of_drivers_improved": float((after.gap_rmse[ok] < before.gap_rmse[ok]).mean()),
+    }
 
 
 def _drivers(before: judge.Judged | None, after: judge.Judged | None) -> list[tuple[Any, float, float]]:

@@ -1,0 +1,246 @@
+"""How often discovery is right: hidden effects of two strengths, no effect, effects outside the catalogue, pairs.
+
+Every set is generated from a fresh seed by idm_env.data.synthetic, whose code shares nothing with the simulator; the
+tool sees positions, speeds and lengths only. One line of JSON per set is kept, so that a run goes on where it stopped:
+
+    python benchmarks/discovery.py --sets 2 --jobs 2 --out /tmp/discovery_benchmark.jsonl
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections import Counter, defaultdict
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+import numpy as np  # noqa: E402 (threads are set before numpy starts)
+
+RESPONSE = {"delay", "lag"}
+TRUE = {
+    "delay": ("delay", 1.0), "lag": ("lag", 1.0), "second_leader": ("weight", 1.0),
+    "leader_acceleration": ("gain", 1.0), "brake_light": ("gain", 1.0), "asymmetry": ("strength", 1.0), "power_limit": ("power", 1.0),
+    "drag": ("coefficient", 1.0), "speed_dependent_gap": ("extra_gap", 1.0), "memory": ("strength", 1.0),
+    "follower": ("gain", 1.0), "dead_zone": ("threshold", 1.0), "action_point": ("threshold", 1.0),
+    "speed_zone": ("factor", 1.0), "regime_shift": ("strength", 1.0), "lateral": ("gain", 1.0),
+    # The driver goes by the true gap, which is the measured one less the bias.
+    "gap_bias": ("bias", -1.0),
+}  # fmt: skip
+"""Parameter of each effect that has one number to recover, and the sign between generator and model."""
+OUTSIDE = ("time_gap over places", "time_gap ramp", "a and b step", "period", "speed-dependent T", "run")
+TWO = (("delay", "grade"), ("speed_zone", "leader_acceleration"), ("drag", "regime_shift"), ("memory", "brake_light"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One set: what is hidden in it."""
+
+    kind: str
+    effect: str
+    strength: str
+    ou: float
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """What the set is called in the file of results."""
+        return f"{self.kind}|{self.effect}|{self.strength}|{self.ou}|{self.seed}"
+
+
+def jobs(sets: int, first: int) -> list[Job]:
+    from idm_env.data.synthetic import EFFECTS
+
+    made = []
+    for number in range(sets):
+        for i, effect in enumerate(EFFECTS):
+            for j, (strength, ou) in enumerate((("middle", 0.0), ("half", 0.0), ("middle", 0.1), ("half", 0.1))):
+                made.append(Job("one", effect, strength, ou, first + 1000 * number + 10 * i + j))
+        for j, ou in enumerate((0.0, 0.1, 0.2)):
+            made += [Job("none", "none", "", ou, first + 1000 * number + 300 + 10 * j + k) for k in range(6)]
+        made += [Job("outside", e, "", 0.0, first + 1000 * number + 400 + k) for k, e in enumerate(OUTSIDE)]
+        made += [Job("two", "+".join(e), "", 0.0, first + 1000 * number + 500 + k) for k, e in enumerate(TWO)]
+    return made
+
+
+def generated(job: Job) -> tuple[Any, Any]:
+    """Return the trajectories of a set and their truth."""
+    from idm_env.data import synthetic
+
+    if job.kind == "two":
+        effects = {e: synthetic.EFFECTS[e].middle for e in job.effect.split("+")}
+        return synthetic.generate(job.seed, effect=effects)
+    if job.kind != "outside":
+        return synthetic.generate(job.seed, effect=job.effect, strength=job.strength or "middle", ou=job.ou)
+    original = synthetic.Platoon
+    synthetic.Platoon = outside(original, job.effect)  # type: ignore[attr-defined]
+    try:
+        return synthetic.generate(job.seed)
+    finally:
+        synthetic.Platoon = original  # type: ignore[attr-defined]
+
+
+def outside(base: type, kind: str) -> type:
+    """Return a platoon whose drivers have an effect that the catalogue has no name for."""
+
+    class Outside(base):  # type: ignore[misc,valid-type]
+        def _rates(self, k: int, known: int, state: np.ndarray) -> np.ndarray:
+            drivers, place, speed = self.drivers, state[0], state[1]
+            time = (self.starts + k * self.step)[:, None]
+            change = {}
+            if kind == "time_gap over places":
+                change["time_gap"] = drivers.time_gap * (1 + 0.6 * ((place > 700) & (place < 1000)))
+            elif kind == "time_gap ramp":
+                change["time_gap"] = drivers.time_gap * (1 + 0.6 * np.clip((time - 20) / 180, 0, 1))
+            elif kind == "a and b step":
+                factor = np.where(time > 100, 0.6, 1.0)
+                change["max_accel"], change["comfort_decel"] = (
+                    drivers.max_accel * factor,
+                    drivers.comfort_decel * factor,
+                )
+            elif kind == "speed-dependent T":
+                change["time_gap"] = drivers.time_gap * (1 + 0.5 * np.exp(-(((speed - 8) / 3) ** 2)))
+            self.drivers = dataclasses.replace(drivers, **change)
+            try:
+                rates = super()._rates(k, known, state)
+            finally:
+                self.drivers = drivers
+            if kind == "period":
+                rates[1] += np.where(state[1] > 1.0, 0.35 * np.sin(2 * np.pi * time / 20.0), 0.0)
+            if kind == "run":  # one run out of five brakes late
+                late = (np.arange(len(place)) % 5 == 0)[:, None]
+                rates[1] += np.where(late & (rates[1] < -0.3), 0.35 * np.abs(rates[1]), 0.0)
+            return rates
+
+    return Outside
+
+
+def measure(job: Job) -> dict[str, Any]:
+    """Run the tool on one set and score what it says."""
+    from idm_env.discovery import discover
+
+    trajectories, truth = generated(job)
+    begin = time.process_time()
+    found = discover(trajectories, seed=job.seed)
+    report = found.report
+    names = [f["effect"] or f["label"] for f in report["found"]]
+    row: dict[str, Any] = dataclasses.asdict(job) | {
+        "key": job.key,
+        "verdict": report["verdict"],
+        "found": names,
+        "named": [f["effect"] for f in report["found"] if f["effect"]],
+        "equivalent": [f["equivalent"] for f in report["found"]],
+        "cpu_s": time.process_time() - begin,
+        "before": report["error"]["before"]["gap_rmse_m"],
+        "after": report["error"]["after"]["gap_rmse_m"],
+        "floor": report["error"]["floor"]["gap_rmse_m"],
+        "why": [r.why_not for r in found.rounds][-1],
+        "best": next((c["effect"] for c in report["candidates"]), ""),
+        "best_gain": next((c["held_out_gain"] for c in report["candidates"]), 0.0),
+        "where": [f["where"] for f in report["found"]],
+    }
+    if job.kind == "one" and names[:1] == [job.effect] and job.effect in TRUE:
+        parameter, sign = TRUE[job.effect]
+        got = report["found"][0]["parameters"][parameter]
+        true = sign * truth.effects[job.effect]
+        # A factor's strength is its distance from 1.
+        null = 1.0 if parameter == "factor" else 0.0
+        row["parameter_error"] = abs(got["estimate"] - true) / abs(true - null)
+        row["covered"] = got["low"] <= true <= got["high"]
+    return row
+
+
+def right(row: dict[str, Any]) -> bool:
+    """Tell whether the first name is the right one; delay and lag are one class."""
+    first = row["found"][0] if row["found"] else ""
+    return first == row["effect"] or (first in RESPONSE and row["effect"] in RESPONSE)
+
+
+def share(rows: list[Any]) -> str:
+    return f"{100 * np.mean(rows):.0f} % of {len(rows)}" if rows else "–"
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the table of results and the confusion matrix as text."""
+    one = [r for r in rows if r["kind"] == "one"]
+    groups = defaultdict(list)
+    for r in one:
+        groups[r["strength"], r["ou"]].append(r)
+    clean = [r for r in groups["middle", 0.0] if right(r)]
+    lines = ["criterion | result", "--- | ---"]
+    for strength, ou, text in (
+        ("middle", 0.0, "right name first, middle strength"), ("half", 0.0, "right name first, half strength"),
+        ("middle", 0.1, "same, middle strength, OU 0.1"), ("half", 0.1, "same, half strength, OU 0.1"),
+    ):  # fmt: skip
+        lines.append(f"{text} | {share([right(r) for r in groups[strength, ou]])}")
+    for ou in (0.0, 0.1, 0.2):
+        none = [bool(r["found"]) for r in rows if r["kind"] == "none" and r["ou"] == ou]
+        lines.append(f"something found where nothing is, OU {ou:g} | {share(none)}")
+    outside_rows = [r for r in rows if r["kind"] == "outside"]
+    lines.append(f"catalogue name for an effect outside it | {share([bool(r['named']) for r in outside_rows])}")
+    both = [set(r["effect"].split("+")) <= set(r["named"]) for r in rows if r["kind"] == "two"]
+    lines.append(f"two effects at once, both named | {share(both)}")
+    if clean:
+        lines.append(
+            f"held-out gap RMSE after / before, median | {np.median([r['after'] / r['before'] for r in clean]):.3f}"
+        )
+        lines.append(f"held-out gap RMSE after / noise of measurement, median | "
+                     f"{np.median([r['after'] / r['floor'] for r in clean]):.3f}")  # fmt: skip
+    for ou in (0.0, 0.1):
+        errors = [r["parameter_error"] for r in one if r["ou"] == ou and "parameter_error" in r]
+        if errors:
+            lines.append(f"parameter error, median, OU {ou:g} | {100 * np.median(errors):.1f} % of {len(errors)}")
+    lines.append(f"95 % intervals cover the truth | {share([r['covered'] for r in one if 'covered' in r])}")
+    edges = [
+        abs(x - true)
+        for r in one if r["effect"] == "speed_zone" and r["found"][:1] == ["speed_zone"]
+        for x, true in zip(r["where"][0]["interval"], (800.0, 1500.0), strict=True)
+    ]  # fmt: skip
+    times = [abs(r["where"][0]["interval"][0] - 100.0) for r in one if r["found"][:1] == ["regime_shift"]]
+    if edges:
+        lines.append(f"place of a zone's edge, median error | {np.median(edges):.1f} m")
+    if times:
+        lines.append(f"time of a shift, median error | {np.median(times):.2f} s")
+    lines.append(f"CPU seconds per set, median | {np.median([r['cpu_s'] for r in rows]):.1f}")
+    lines += ["", "hidden | found (sets)", "--- | ---"]
+    confusion: dict[str, Counter[str]] = defaultdict(Counter)
+    for r in rows:
+        label = r["effect"] if r["kind"] != "none" else f"none, OU {r['ou']:g}"
+        confusion[label]["+".join(r["found"]) or r["verdict"]] += 1
+    for effect, counts in confusion.items():
+        lines.append(f"{effect} | " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sets", type=int, default=1, help="sets of every kind")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--first-seed", type=int, default=70_000)
+    parser.add_argument("--only", default="", help="part of the keys of the sets to run, such as 'one|delay'")
+    parser.add_argument("--out", type=Path, default=Path("discovery_benchmark.jsonl"))
+    arguments = parser.parse_args()
+    done: dict[str, dict[str, Any]] = {}
+    if arguments.out.exists():
+        done = {r["key"]: r for r in map(json.loads, arguments.out.read_text().splitlines())}
+    wanted = [j for j in jobs(arguments.sets, arguments.first_seed) if arguments.only in j.key]
+    missing = [j for j in wanted if j.key not in done]
+    with ProcessPoolExecutor(arguments.jobs) as pool, arguments.out.open("a") as file:
+        for number, future in enumerate(as_completed([pool.submit(measure, j) for j in missing]), 1):
+            row = future.result()
+            done[row["key"]] = row
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+            print(f"{number}/{len(missing)} {row['key']}: {row['verdict']} {row['found']}", file=sys.stderr)
+    print(table([done[j.key] for j in wanted if j.key in done]))
+
+
+if __name__ == "__main__":
+    main()
