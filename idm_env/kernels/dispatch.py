@@ -91,7 +91,7 @@ def _unfit_tensors(state: State, inputs: Inputs, params: Params) -> str | None:
         for name, value in values.items():
             if not isinstance(value, Tensor):
                 return f"{effect}.{name} is no tensor"
-            if torch.broadcast_shapes(value.shape, shape) != shape:
+            if not _within(value.shape, shape):
                 return f"{effect}.{name} enlarges the batch"
             tensors.append(value)
     for x in tensors:
@@ -100,9 +100,16 @@ def _unfit_tensors(state: State, inputs: Inputs, params: Params) -> str | None:
         if x.dtype not in (kind, torch.bool):
             return f"tensors are {kind} and {x.dtype}"
     for x in _tensors(inputs):
-        if x.dim() == 0 or torch.broadcast_shapes(x.shape[1:], shape) != shape:
+        if x.dim() == 0 or not _within(x.shape[1:], shape):
             return "an input enlarges the batch"
     return None
+
+
+def _within(shape: torch.Size, full: torch.Size) -> bool:
+    """Whether a shape broadcasts to the full one; plain Python, because torch.broadcast_shapes takes 20 µs."""
+    if len(shape) > len(full):
+        return False
+    return all(a in (1, b) for a, b in zip(reversed(shape), reversed(full), strict=False))
 
 
 def _tensors(inputs: Inputs) -> list[Tensor]:

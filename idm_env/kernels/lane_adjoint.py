@@ -172,6 +172,23 @@ def _recompute(w, tape, operands, flags, strides, begin_step, steps, row, first,
 
 
 @exact
+def _seed(w, to, source, dense, row, first, n, size):
+    """Load an adjoint; an array of one element stands for zeros."""
+    if source.size == 1:
+        clear(w, to, n)
+        w[to] = source[0]
+    else:
+        load(w, to, source, 0, dense, row, first, n, size)
+
+
+@exact
+def _result(target, base, w, row, n, count):
+    """Store an adjoint, unless the array is a stand-in for one that nobody asked for."""
+    if target.size == count:
+        store(target, base, w, row, n)
+
+
+@exact
 def backward(
     gap, speed, position, seeds, on_gap, on_speed, on_position, on_accel, gap_begin, speed_begin, position_begin,
     on_parameters, fresh, on_inputs, operands, flags, strides, begin_step, steps, rows, size, wide, has, c, begin, end,
@@ -183,7 +200,7 @@ def backward(
     """
     w = np.zeros(ROWS * ROW, gap.dtype)
     tape = np.empty(2 * steps * ROW, gap.dtype)
-    dense, is_ring = strides[STATE], has & RING != 0
+    dense, is_ring, count = strides[STATE], has & RING != 0, rows * size
     filled = 0
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, steps, wide, is_ring)
@@ -191,17 +208,18 @@ def backward(
         if tile + 1 < end:
             following = place(tile + 1, rows, size, steps, wide, is_ring)
             fetch_next(gap, speed, position, operands, strides, following, size)
-            fetch_next(on_gap, on_speed, on_position, operands, strides, following, size)
+            fetch_next(on_gap, on_speed, on_position, operands, strides[:0], following, size)
         load(w, GAP, gap, 0, dense, row, first, n, size)
         load(w, SPEED, speed, 0, dense, row, first, n, size)
-        load(w, POSITION, position, 0, dense, row, first, n, size)
+        if has & REPLAY:
+            load(w, POSITION, position, 0, dense, row, first, n, size)
         load_static(w, operands, strides, row, first, n, size, n <= filled, c)
         filled = max(filled, n)
         _recompute(w, tape, operands, flags, strides, begin_step, steps, row, first, n, size, has, c)
-        load(w, ON_GAP, on_gap, 0, dense, row, first, n, size)
-        load(w, ON_SPEED, on_speed, 0, dense, row, first, n, size)
-        load(w, ON_POSITION, on_position, 0, dense, row, first, n, size)
-        load(w, ON_ACCEL, on_accel, 0, dense, row, first, n, size)
+        _seed(w, ON_GAP, on_gap, dense, row, first, n, size)
+        _seed(w, ON_SPEED, on_speed, dense, row, first, n, size)
+        _seed(w, ON_POSITION, on_position, dense, row, first, n, size)
+        _seed(w, ON_ACCEL, on_accel, dense, row, first, n, size)
         for j in range(7):
             clear(w, G_A + j * ROW, n)
         for t in range(steps - 1, -1, -1):
@@ -221,9 +239,9 @@ def backward(
             if on_inputs.shape[1]:
                 for j in range(5):
                     store(on_inputs[j, now], at, w, G_COMMAND + j * ROW + skip, own)
-        store(gap_begin, at, w, ON_GAP + skip, own)
-        store(speed_begin, at, w, ON_SPEED + skip, own)
-        store(position_begin, at, w, ON_POSITION + skip, own)
+        _result(gap_begin, at, w, ON_GAP + skip, own, count)
+        _result(speed_begin, at, w, ON_SPEED + skip, own, count)
+        _result(position_begin, at, w, ON_POSITION + skip, own, count)
         for j in range(on_parameters.shape[0]):
             if fresh:
                 store(on_parameters[j], at, w, G_A + j * ROW + skip, own)

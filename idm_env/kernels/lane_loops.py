@@ -163,7 +163,7 @@ def fetch_next(gap, speed, position, operands, strides, placed, size):
     prefetch(gap, begin, n)
     prefetch(speed, begin, n)
     prefetch(position, begin, n)
-    for j in range(8):
+    for j in range(min(8, strides.shape[0])):
         if strides[j][2] == 1 and strides[j][1] == size:
             prefetch(operands[j], begin, n)
 

@@ -7,6 +7,7 @@ too.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -55,7 +56,7 @@ class _Plan(NamedTuple):
 
     @property
     def rows(self) -> int:
-        return int(np.prod(self.shape[:-1], dtype=np.int64))
+        return math.prod(self.shape[:-1])
 
     def blocks(self) -> list[tuple[int, int]]:
         """First step and number of steps of every block."""
@@ -93,7 +94,7 @@ def _plan(
 ) -> tuple[_Plan, list[Tensor | None]]:  # fmt: skip
     *batch, size = state.speed.shape
     sources = _sources(simulator, inputs, params)
-    kind = dense(state.speed.new_zeros(1), (1,)).dtype
+    kind = np.dtype(np.float32 if state.speed.dtype == torch.float32 else np.float64)
     nothing: tuple[Array, Strides] = (np.zeros(1, kind), (0, 0, 0))
     made = [operand(simulator.road.leader_present(state.present, state.speed), batch, size)]
     for i, tensor in enumerate(sources):
@@ -180,25 +181,26 @@ def _backward(
     needed: tuple[bool, ...],
 ) -> list[Tensor | None]:
     count, kind = start[0].size, start[0].dtype
-    on = [np.zeros(count, kind) if s is None else dense(s, plan.shape) for s in seeds[:4]]
+    nothing = np.zeros(1, kind)
+    on = [nothing if s is None else dense(s, plan.shape) for s in seeds[:4]]
     every = [s for s in seeds[4:] if s is not None]
     along = take((4, plan.steps if every else 0, count), kind)
     for j, seed in enumerate(seeds[4:] if every else ()):
         along[j] = 0 if seed is None else dense(seed, (plan.steps, *plan.shape)).reshape(plan.steps, count)
     on_inputs = take((5, plan.steps if any(needed[10:]) else 0, count), kind)
     on_parameters = take((7 if plan.has & lane_loops.NOISE else 6, count), kind)
-    still = np.zeros(count, kind)
     blocks = plan.blocks()
     for number in range(len(blocks) - 1, -1, -1):
         first, steps = blocks[number]
         source = slots[number - 1] if number else start
-        begin = [take((count,), kind) for _ in range(3)]
         fresh = number == len(blocks) - 1
+        # What nobody asks for is not written: half the time of a short rollout goes to memory.
+        begin = [take((count,), kind) if number or wanted else np.zeros(1, kind) for wanted in needed[:3]]
         plan.run(
-            lane_adjoint.backward, steps, *source, along, *on[:3], on[3] if fresh else still, *begin,
+            lane_adjoint.backward, steps, *source, along, *on[:3], on[3], *begin,
             on_parameters, fresh, on_inputs, plan.operands, plan.flags, plan.strides, first,
         )  # fmt: skip
-        on = [*begin, still]
+        on = [*begin, nothing]
     full = [*on[:3], *on_parameters, *([None] if len(on_parameters) == 6 else [])]
     command, normals, place, pace, pull = on_inputs
     gradients: list[Tensor | None] = []

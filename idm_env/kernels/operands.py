@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -21,6 +22,12 @@ def operand(x: Tensor, batch: Sequence[int], size: int, steps: int | None = None
     ``x`` broadcasts against ``(*batch, size)``, after a leading dimension of at least ``steps`` where that is given.
     """
     x = x.detach()
+    if steps is None and x.is_contiguous():
+        # The two commonest shapes, without the arithmetic below.
+        if x.numel() == 1:
+            return x.reshape(1).numpy(), (0, 0, 0)
+        if x.shape == (*batch, size):
+            return x.view(-1).numpy(), (0, size, 1)
     if steps is not None:
         gap = len(batch) + 2 - x.dim()
         x = x[(slice(0, steps), *([None] * gap))].expand(steps, *batch, size)
@@ -32,7 +39,7 @@ def operand(x: Tensor, batch: Sequence[int], size: int, steps: int | None = None
         by_row = size
     by_step = x.stride(0) if x.shape[0] > 1 else 0
     by_vehicle = x.stride(-1) if size > 1 else by_row
-    rows = int(np.prod(batch, dtype=np.int64))
+    rows = math.prod(batch)
     reach = (x.shape[0] - 1) * by_step + (rows - 1) * by_row + (size - 1) * by_vehicle + 1 if x.numel() else 0
     flat = x.as_strided((max(reach, 0),), (1,), x.storage_offset())
     if flat.dtype == torch.bool:

@@ -19,6 +19,7 @@ from torch import Tensor
 from idm_env.kernels import recorded_loops as loops
 from idm_env.kernels import threads as pool
 from idm_env.kernels.equations import Array, constants
+from idm_env.kernels.workspace import take
 
 PARAMETERS = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 """Order of the five parameters in every last dimension of size 5 here."""
@@ -121,7 +122,7 @@ def _problem(
 
 
 def _forward(problem: _Problem) -> tuple[Array, Array, Array]:
-    gap, speed, accel = (np.empty(problem.shape, problem.gap.dtype) for _ in range(3))
+    gap, speed, accel = (take(problem.shape, problem.gap.dtype) for _ in range(3))
     p = problem
     p.run(loops.forward, p.gap, p.speed, p.lead_position, p.lead_speed, p.params, gap, speed, accel)
     return gap, speed, accel
@@ -195,8 +196,8 @@ def sensitivities(
     """
     problem = _problem(gap, speed, lead_position, lead_speed, params, max_decel, dt, width, integration, threads)
     steps, drivers = problem.shape
-    out = [np.empty((steps, drivers), problem.gap.dtype) for _ in range(3)]
-    by = [np.empty((steps, 5, drivers), problem.gap.dtype) for _ in range(2)]
+    out = [take((steps, drivers), problem.gap.dtype) for _ in range(3)]
+    by = [take((steps, 5, drivers), problem.gap.dtype) for _ in range(2)]
     p = problem
     p.run(loops.sensitivities, p.gap, p.speed, p.lead_position, p.lead_speed, p.params, *out, *by)
     jacobians = [torch.from_numpy(x).transpose(1, 2) for x in by]

@@ -1,0 +1,25 @@
+"""All figures of speed: ``python benchmarks/performance.py --out out/bench`` (what ``idm-env bench`` runs)."""
+
+from __future__ import annotations
+
+import argparse
+
+from idm_env import bench
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", help="folder for performance.json and performance.png")
+    parser.add_argument("--sizes", type=int, nargs="+", default=list(bench.SIZES))
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--no-compile", action="store_true")
+    parser.add_argument("--no-peers", action="store_true")
+    parser.add_argument("--verbose", action="store_true")
+    a = parser.parse_args()
+    bench.run(
+        a.out, sizes=a.sizes, rounds=a.rounds, compiled=not a.no_compile, others=not a.no_peers, verbose=a.verbose
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""The benchmark runs, interleaves, and says what it did; no test here looks at a time."""
+
+import json
+
+import pytest
+
+from idm_env import bench
+from idm_env.bench import peers
+from idm_env.bench.measure import Case, measure
+
+
+def test_cases_take_turns():
+    order = []
+    cases = {name: Case(lambda name=name: order.append(name), 2.0) for name in "ab"}
+    found = measure(cases, 3)
+    assert order == ["a", "b"] * 4
+    assert set(found) == {"a", "b"}
+    assert all(v["cpu_min_ms"] <= v["cpu_median_ms"] and v["wall_min_ms"] >= 0 for v in found.values())
+
+
+def test_growth_is_the_slope():
+    part = {str(n): {"times_ms_per_step": {"x": {"cpu_min_ms": 3e-6 * n**1.5}}} for n in (2_000, 20_000, 200_000)}
+    assert bench.growth(part)["x"] == pytest.approx(1.5)
+
+
+def test_a_small_run_writes_json_and_picture(tmp_path, monkeypatch):
+    for name in ("recorded_leaders", "rings"):
+        monkeypatch.setattr(bench.fits, name, lambda *_: {})
+    lines = []
+    result = bench.run(
+        tmp_path, sizes=(100, 200), rounds=1, compiled=False, others=False, verbose=True, say=lines.append
+    )
+    written = json.loads((tmp_path / "performance.json").read_text())
+    assert written["one_core"].keys() == {"100", "200"} == result["one_core"].keys()
+    assert (tmp_path / "performance.png").stat().st_size > 5_000
+    assert any("kernels run" in line or "kernels do not run:" in line for line in lines)
+    assert any("diffidm" in line or "eager" in line for line in lines)
+    assert result["gradient_error"]["kernel float64"] < 1e-10
+
+
+def test_the_torch_path_says_why_no_kernel_runs(monkeypatch):
+    monkeypatch.setenv("IDM_ENV_KERNELS", "0")
+    lines = []
+    made = bench._lanes(100, 1, False, True, lines.append)
+    assert lines == ["100 vehicles: kernels do not run: IDM_ENV_KERNELS=0"]
+    assert not any("kernel" in name for name in made["times_ms_per_step"])
+
+
+def test_absent_peers_are_none(monkeypatch):
+    monkeypatch.setattr(peers, "find_spec", lambda _: None)
+    assert peers.diffidm_layer() is None and peers.sumo() is None and peers.highway() is None
+
+
+def test_sizes_must_be_whole_lanes():
+    with pytest.raises(ValueError, match=r"size 70 is no multiple of 50"):
+        bench.run(sizes=(70,))
