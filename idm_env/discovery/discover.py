@@ -321,8 +321,7 @@ def _finish(
         )
     if len(final.model.terms) == base:
         after, thetas[1] = before, thetas[0]
-    confirmed = before is None or after is None or after.horizon_rmse < before.horizon_rmse
-    if not confirmed and len(final.model.terms) > base:
+    elif kept_runs and judge.confirmed(prepared.of_runs(kept_runs), searching.task, null, final) <= 0:
         rounds[-1].why_not = "the lockbox does not confirm the finding"
         final, after, thetas[1] = null, before, thetas[0]
     partial = None

@@ -233,7 +233,8 @@ def solve(
             linear = linearise(task, model, theta, values)
             now = cost_of(task, theta[None], linear.residual[None])[0]
             total = now.sum() + (ridge * values**2).sum()
-        waiting = (~keep & seen & (damping < 1.0)).any()
+        # Candidates start where every driver of the null has arrived: they need not wait for each.
+        waiting = not len(values) and (~keep & seen & (damping < 1.0)).any()
         if gain <= tolerance * total and not waiting and (not len(values) or shared_damping > 1e-2 or gain > 0):
             break
     return finish(task, model, theta, values, linear, float(total))
