@@ -1,0 +1,67 @@
+"""The fallback: road users who are on no lane, and pedestrians, keep their motion, with a spread."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.stats import norm, qmc
+
+from idm_env.data.womd import Agent
+
+DRAWS = 128
+WANDER = {"pedestrian": 0.35, "cyclist": 0.2, "vehicle": 0.25}
+"""Deviation of the direction (rad) that each kind takes within some seconds."""
+STOPPING = 0.15
+FADE_S = 2.0
+"""Time in which the present acceleration and yaw rate fade (s)."""
+
+
+@lru_cache(maxsize=1)
+def _quantiles() -> np.ndarray:
+    return np.asarray(qmc.Sobol(3, seed=1).random(DRAWS))
+
+
+def motion_now(agent: Agent, present: int, dt: float = 0.1) -> tuple[float, float, float, float]:
+    """Return speed (m/s), direction (rad), acceleration (m/s²) and yaw rate (rad/s) from the last second.
+
+    Slopes of least squares; a direction is that of the velocity where it moves, else that of the body.
+    """
+    steps = np.arange(max(0, present - 10), present + 1)
+    steps = steps[agent.valid[steps]]
+    speeds = np.hypot(*agent.velocity[steps].T)
+    speed = float(speeds[-1])
+    vx, vy = agent.velocity[present]
+    direction = float(np.arctan2(vy, vx)) if speed > 0.5 else float(agent.heading[present])
+    if len(steps) < 4:
+        return speed, direction, 0.0, 0.0
+    time = (steps - steps[-1]) * dt
+    accel = float(np.clip(np.polyfit(time, speeds, 1)[0], -4.0, 3.0))
+    turning = float(np.clip(np.polyfit(time, np.unwrap(agent.heading[steps]), 1)[0], -0.6, 0.6))
+    return speed, direction, accel, turning if speed > 0.5 else 0.0
+
+
+def free_futures(agent: Agent, present: int, steps: int, dt: float = 0.1) -> np.ndarray:
+    """Return futures [DRAWS, S, 2]: speed and direction go on, fading trends and a random change in each.
+
+    ``v(t) = max(0, v + (a/2 + ξ) τ (1 − e^(−t/τ)))`` with ξ normal of 0.2 + 0.04 v m/s²; the direction likewise, with
+    the yaw rate and a wandering of 0.2 to 0.35 rad; 15 % brake to a stop with 1 m/s².
+    """
+    u = np.clip(_quantiles(), 1e-3, 1 - 1e-3)
+    speed, direction, accel, turning = motion_now(agent, present, dt)
+    time = dt * np.arange(1, steps + 1)
+    faded = FADE_S * (1 - np.exp(-time / FADE_S))
+    push = 0.5 * accel + (0.2 + 0.04 * speed) * norm.ppf(u[:, 0])
+    speeds = np.maximum(speed + push[:, None] * faded, 0.0)
+    stopping = u[:, 2] < STOPPING
+    speeds[stopping] = np.maximum(speed - (0.5 + u[stopping, 0])[:, None] * time, 0.0)
+    wander = WANDER.get(agent.kind, 0.3) * norm.ppf(u[:, 1])
+    angle = direction + turning * faded + wander[:, None] * (1 - np.exp(-time / 3.0))
+    step = dt * speeds[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.asarray(agent.position[present] + np.cumsum(step, axis=1))
+
+
+def constant_velocity(agent: Agent, present: int, steps: int, dt: float = 0.1) -> np.ndarray:
+    """Return the future [1, S, 2] at the present velocity."""
+    time = dt * np.arange(1, steps + 1)
+    return np.asarray(agent.position[present] + time[:, None] * agent.velocity[present])[None]

@@ -1,0 +1,144 @@
+"""Metrics of motion prediction as the Waymo Open Motion Dataset defines them (Ettinger et al. 2021, section 5).
+
+Predictions and truth are compared at 2 Hz. At a horizon T: minADE is the smallest mean distance up to T over the
+futures of an agent, minFDE the smallest distance at T; an agent is missed where no future ends within a box around
+the truth, along its heading and across it, whose size grows with T and with the initial speed. mAP is the mean over
+eight shapes of trajectories of the area under the interpolated precision-recall curve, where a future that hits is a
+true positive, only one per agent, and all others are false positives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+HORIZONS = (3, 5, 8)
+MISS_M = {3: (1.0, 2.0), 5: (1.8, 3.6), 8: (3.0, 6.0)}
+"""Horizon (s) → lateral and longitudinal bound (m) at 11 m/s and above."""
+SLOW, FAST = 1.4, 11.0
+"""Speeds (m/s) between which the bounds grow from half to full."""
+PER_SECOND = 2
+SHAPES = (
+    "stationary", "straight", "straight left", "straight right", "left", "left U-turn", "right", "right U-turn",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One agent: futures [F, S, 2] with confidences [F], truth [S, 2], headings [S] and validity [S] at 10 Hz.
+
+    ``speed`` (m/s) is that of the present; ``shape`` one of ``SHAPES``; ``kind`` the type of the agent.
+    """
+
+    futures: np.ndarray
+    confidence: np.ndarray
+    truth: np.ndarray
+    heading: np.ndarray
+    valid: np.ndarray
+    speed: float
+    shape: str
+    kind: str
+
+
+def speed_scale(speed: float) -> float:
+    """Return ½ up to 1.4 m/s, 1 from 11 m/s on, and the straight line between."""
+    return float(np.clip(0.5 + 0.5 * (speed - SLOW) / (FAST - SLOW), 0.5, 1.0))
+
+
+def at_two_hertz(seconds: int, rate: int = 10) -> np.ndarray:
+    """Return the indices, at 10 Hz from the first future step on, of the samples up to ``seconds``."""
+    stride = rate // PER_SECOND
+    return np.arange(1, seconds * PER_SECOND + 1) * stride - 1
+
+
+def displacement(case: Case, seconds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean distance up to a horizon and distance at it, of every future [F] (m); NaN where no truth is."""
+    at = at_two_hertz(seconds)
+    at = at[at < len(case.truth)]
+    distance = np.linalg.norm(case.futures[:, at] - case.truth[at], axis=-1)
+    valid = case.valid[at]
+    count = len(case.futures)
+    mean = distance[:, valid].mean(1) if valid.any() else np.full(count, np.nan)
+    return mean, distance[:, -1] if len(at) == seconds * PER_SECOND and valid[-1] else np.full(count, np.nan)
+
+
+def hits(case: Case, seconds: int) -> np.ndarray | None:
+    """Return which futures end within the box around the truth [F]; None where there is no truth at the horizon."""
+    at = seconds * 10 - 1
+    if at >= len(case.truth) or not case.valid[at]:
+        return None
+    apart = case.futures[:, at] - case.truth[at]
+    c, s = np.cos(case.heading[at]), np.sin(case.heading[at])
+    along, across = apart @ np.array([c, s]), apart @ np.array([-s, c])
+    lateral, longitudinal = (bound * speed_scale(case.speed) for bound in MISS_M[seconds])
+    return np.asarray((np.abs(across) <= lateral) & (np.abs(along) <= longitudinal))
+
+
+def shape_of(
+    position: np.ndarray, heading: np.ndarray, speed: np.ndarray, valid: np.ndarray
+) -> str:  # fmt: skip
+    """Return the shape of a true trajectory from its present (index 0) to its last valid step."""
+    known = np.flatnonzero(valid)
+    if len(known) == 0 or known[-1] == 0:
+        return "stationary"
+    last = known[-1]
+    apart = position[last] - position[0]
+    turn = float((heading[last] - heading[0] + np.pi) % (2 * np.pi) - np.pi)
+    c, s = np.cos(heading[0]), np.sin(heading[0])
+    ahead, left = float(apart @ np.array([c, s])), float(apart @ np.array([-s, c]))
+    if max(speed[0], speed[last]) < 2.0 and np.hypot(ahead, left) < 5.0:
+        return "stationary"
+    if abs(turn) < np.pi / 6:
+        if abs(left) < 5.0:
+            return "straight"
+        return "straight right" if left < 0 else "straight left"
+    if turn < -np.pi / 6 and left < 0:
+        return "right U-turn" if ahead < -5.0 else "right"
+    return "left U-turn" if ahead < -5.0 else "left"
+
+
+def average_precision(cases: Sequence[Case], seconds: int) -> float:
+    """Return the area under the interpolated precision-recall curve of these agents; NaN without truth."""
+    confidence, correct, agents = [], [], 0
+    for case in cases:
+        hit = hits(case, seconds)
+        if hit is None:
+            continue
+        agents += 1
+        # of several futures that hit, only the most confident is a true positive
+        order = np.argsort(-case.confidence, kind="stable")
+        first = next((i for i in order if hit[i]), None)
+        for i in order:
+            confidence.append(case.confidence[i])
+            correct.append(i == first)
+    if agents == 0:
+        return float("nan")
+    order = np.argsort(-np.array(confidence), kind="stable")
+    true = np.cumsum(np.array(correct)[order])
+    precision, recall = true / np.arange(1, len(true) + 1), true / agents
+    best = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(np.sum(np.diff(np.concatenate([[0.0], recall])) * best))
+
+
+def summary(cases: Sequence[Case]) -> dict[str, float | int]:
+    """Return agents and, per horizon, minADE and minFDE (m), miss rate and mAP; NaN where there is no truth."""
+    row: dict[str, float | int] = {"agents": len(cases)}
+    for seconds in HORIZONS:
+        both = [displacement(case, seconds) for case in cases]
+        reached = [hits(case, seconds) for case in cases]
+        row[f"minADE_{seconds}s"] = _mean([mean.min() for mean, _ in both])
+        row[f"minFDE_{seconds}s"] = _mean([end.min() for _, end in both])
+        row[f"miss_rate_{seconds}s"] = _mean([0.0 if hit.any() else 1.0 for hit in reached if hit is not None])
+        shapes = {case.shape for case in cases}
+        precisions = [average_precision([c for c in cases if c.shape == shape], seconds) for shape in sorted(shapes)]
+        row[f"mAP_{seconds}s"] = _mean(precisions)
+    for name in ("minADE", "minFDE", "miss_rate", "mAP"):
+        row[name] = _mean([float(row[f"{name}_{seconds}s"]) for seconds in HORIZONS])
+    return row
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [float(v) for v in values if np.isfinite(v)]
+    return float(np.mean(known)) if known else float("nan")

@@ -1,0 +1,54 @@
+"""The scene from above: lanes, everybody, and of one agent its history, futures and what it did."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from idm_env.data.womd import Agent, Scenario
+from idm_env.prediction.predict import Prediction
+
+LANE, OTHERS, OWN, FUTURE, TRUTH = "#cfcfcf", "#9a9a9a", "#111111", "#0b5fa5", "#d1495b"
+
+
+def body(agent: Agent, step: int) -> np.ndarray:
+    """Return the corners [4, 2] of an agent at a step."""
+    c, s = np.cos(agent.heading[step]), np.sin(agent.heading[step])
+    half = 0.5 * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * [agent.length, agent.width]
+    return np.asarray(agent.position[step] + half @ np.array([[c, s], [-s, c]]))
+
+
+def scene_picture(scenario: Scenario, prediction: Prediction, source: str = "") -> Figure:
+    """Return the picture of one agent's prediction; wider lines are more probable futures."""
+    present = scenario.present
+    agent = scenario.agents[prediction.agent]
+    past = np.flatnonzero(agent.valid[: present + 1])
+    later = present + np.flatnonzero(agent.valid[present:])
+    here = agent.position[present]
+    shown = np.concatenate([prediction.futures.reshape(-1, 2), agent.position[later], here[None]])
+    reach = max(25.0, float(np.abs(shown - here).max()) + 8.0)
+    figure = Figure(figsize=(6.5, 6.5), layout="constrained")
+    axis = figure.subplots()
+    for lane in scenario.lanes:
+        axis.plot(*lane.line.T, color=LANE, lw=1, zorder=0)
+    for other in scenario.agents:
+        if other.valid[present]:
+            mine = other is agent
+            axis.add_patch(Polygon(body(other, present), color=OWN if mine else OTHERS, zorder=3 if mine else 1, lw=0))
+    for number, (future, confidence) in enumerate(zip(prediction.futures, prediction.confidence, strict=True)):
+        line = np.concatenate([here[None], future])
+        axis.plot(
+            *line.T, color=FUTURE, lw=1 + 4 * confidence, alpha=0.75, zorder=2, label=None if number else "futures"
+        )
+        axis.plot(*future[-1], "o", color=FUTURE, ms=4, zorder=4)
+        axis.annotate(f"{100 * confidence:.0f} %", future[-1], (4, 4), textcoords="offset points", fontsize=7)
+    axis.plot(*agent.position[past].T, color=OWN, lw=2, zorder=4, label="last second")
+    if len(later) > 1:
+        axis.plot(*agent.position[later].T, "--", color=TRUTH, lw=1.8, zorder=5, label="what it did")
+        axis.plot(*agent.position[later[-1]], "x", color=TRUTH, ms=7, mew=2, zorder=5)
+    axis.set(xlim=(here[0] - reach, here[0] + reach), ylim=(here[1] - reach, here[1] + reach), aspect="equal")
+    axis.set(xlabel="x (m)", ylabel="y (m)", title=f"{source}{agent.kind} {agent.id}, by {prediction.source}")
+    axis.ticklabel_format(useOffset=False)
+    axis.legend(loc="upper right", fontsize=8, framealpha=0.9)
+    return figure

@@ -1,0 +1,102 @@
+"""The benchmark's metrics on cases that can be checked by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from idm_env.prediction.metrics import (
+    SHAPES,
+    Case,
+    at_two_hertz,
+    average_precision,
+    displacement,
+    hits,
+    shape_of,
+    speed_scale,
+    summary,
+)
+
+STEPS = 80
+LINE = np.stack([np.linspace(1, 80, STEPS), np.zeros(STEPS)], axis=1)
+
+
+def case(
+    *shifts: tuple[float, float], confidence: list[float] | None = None, heading: float = 0.0, speed: float = 11.0
+) -> Case:
+    futures = np.stack([LINE + np.array(shift) for shift in shifts])
+    weights = np.array(confidence) if confidence else np.full(len(shifts), 1 / len(shifts))
+    return Case(futures, weights, LINE, np.full(STEPS, heading), np.ones(STEPS, bool), speed, "straight", "vehicle")
+
+
+def test_samples_are_taken_at_two_hertz() -> None:
+    assert at_two_hertz(3).tolist() == [4, 9, 14, 19, 24, 29]
+    assert len(at_two_hertz(8)) == 16 and at_two_hertz(8)[-1] == 79
+
+
+def test_distances_are_those_of_the_best_future() -> None:
+    row = summary([case((3.0, 4.0), (0.0, 2.0))])
+    assert row["minADE_3s"] == row["minADE_8s"] == row["minFDE_5s"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("speed", "scale"), [(0.0, 0.5), (1.4, 0.5), (6.2, 0.75), (11.0, 1.0), (30.0, 1.0)])
+def test_boxes_grow_with_the_speed(speed: float, scale: float) -> None:
+    assert speed_scale(speed) == pytest.approx(scale)
+
+
+@pytest.mark.parametrize(("seconds", "lateral", "longitudinal"), [(3, 1.0, 2.0), (5, 1.8, 3.6), (8, 3.0, 6.0)])
+def test_a_hit_is_inside_the_box_along_the_true_heading(seconds: int, lateral: float, longitudinal: float) -> None:
+    near = 0.01
+    inside = case((longitudinal - near, lateral - near), (longitudinal + near, 0.0), (0.0, lateral + near))
+    found = hits(inside, seconds)
+    assert found is not None and found.tolist() == [True, False, False]
+    turned = case((0.0, longitudinal - near), (longitudinal - near, 0.0), heading=np.pi / 2)
+    found = hits(turned, seconds)
+    assert found is not None and found.tolist() == [True, False]
+    slow = case((0.5 * longitudinal + near, 0.0), (0.5 * longitudinal - near, 0.0), speed=1.0)
+    found = hits(slow, seconds)
+    assert found is not None and found.tolist() == [False, True]
+
+
+def test_what_has_no_truth_does_not_count() -> None:
+    lost = case((0.0, 0.0))
+    lost.valid[40:] = False
+    assert hits(lost, 8) is None and hits(lost, 3) is not None
+    mean, end = displacement(lost, 8)
+    assert mean.tolist() == [0.0] and np.isnan(end).all()
+    row = summary([lost, case((9.0, 0.0))])
+    assert row["miss_rate_8s"] == 1.0 and row["miss_rate_3s"] == 0.5
+
+
+def test_average_precision_by_hand() -> None:
+    good = case((0.0, 0.0), (50.0, 0.0), confidence=[0.9, 0.1])
+    late = case((50.0, 0.0), (0.0, 0.0), confidence=[0.8, 0.2])
+    # in order of confidence: hit, miss, hit, miss; recall ½ at precision 1, recall 1 at precision 2/3
+    assert average_precision([good, late], 3) == pytest.approx(0.5 + 0.5 * 2 / 3)
+    twice = case((0.0, 0.0), (0.1, 0.0), confidence=[0.6, 0.4])  # the second hit is a false positive
+    assert average_precision([twice], 3) == 1.0
+    assert average_precision([case((50.0, 0.0))], 3) == 0.0
+
+
+def path(turn: float, length: float = 40.0) -> tuple[np.ndarray, np.ndarray]:
+    heading = np.linspace(0.0, turn, 81)
+    step = length / 80 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return np.cumsum(step, axis=0) - step[0], heading
+
+
+@pytest.mark.parametrize(
+    ("turn", "length", "shape"),
+    [
+        (0.0, 40.0, "straight"), (0.0, 1.0, "stationary"), (0.5, 40.0, "straight left"),
+        (-0.5, 40.0, "straight right"), (1.6, 40.0, "left"), (-1.6, 40.0, "right"), (4.5, 80.0, "left U-turn"),
+        (-4.5, 80.0, "right U-turn"),
+    ],
+)  # fmt: skip
+def test_the_eight_shapes(turn: float, length: float, shape: str) -> None:
+    position, heading = path(turn, length)
+    if "U-turn" in shape:
+        heading = np.clip(heading, -3.0, 3.0)
+        position = position - np.linspace(0, 12, 81)[:, None] * [1.0, 0.0]
+    speed = np.full(81, length / 8)
+    assert shape in SHAPES
+    assert shape_of(position, heading, speed, np.ones(81, bool)) == shape
