@@ -298,6 +298,80 @@ def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
     return space_time(states, dt=dt, ring_length=length, title=config.name)
 
 
+Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]
+FixedParameters = Annotated[bool, typer.Option("--fixed-parameters", help="Keep the driver parameters fixed.")]
+
+
+@app.command("filter")
+def filter_(
+    data: Data,
+    out: Out = Path("out/filter"),
+    recipe: Recipe = "default",
+    fixed_parameters: FixedParameters = False,
+    layout: Layout = "auto",
+    resume: Resume = False,
+) -> None:
+    """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
+    from idm_env.trajectories.files import filter_file
+
+    with progress() as report:
+        filter_file(
+            data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
+            on_progress=lambda done, total: report("filter", done, total, ""),
+        )  # fmt: skip
+    _done(out)
+
+
+@app.command()
+def reconstruct(
+    data: Data,
+    out: Out = Path("out/reconstruct"),
+    dt: Annotated[float, typer.Option(help="Step of the dense trajectories (s).")] = 0.1,
+    recipe: Recipe = "default",
+    fixed_parameters: FixedParameters = False,
+    layout: Layout = "auto",
+    resume: Resume = False,
+) -> None:
+    """Reconstruct dense trajectories from sparse ones, a second or more between points."""
+    from idm_env.trajectories.files import reconstruct_file
+
+    with progress() as report:
+        reconstruct_file(
+            data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
+            on_progress=lambda done, total: report("reconstruct", done, total, ""),
+        )  # fmt: skip
+    _done(out)
+
+
+@app.command()
+def predict(
+    scenarios: Annotated[list[Path], typer.Argument(help="Waymo Open Motion scenarios: JSON, json.gz or TFRecord.")],
+    out: Out = Path("out/predict"),
+) -> None:
+    """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
+    from idm_env.prediction.files import predict_files
+
+    with progress() as report:
+        predict_files(scenarios, out, on_progress=lambda done, total: report("predict", done, total, ""))
+    _done(out)
+
+
+@app.command()
+def bench(
+    out: Out = Path("out/bench"),
+    sizes: Annotated[str, typer.Option(help="Numbers of vehicles, by comma.")] = "2000,20000,200000,2000000",
+    rounds: Annotated[int, typer.Option(help="Interleaved rounds; minimum and median are reported.", min=1)] = 5,
+    compiled: Annotated[bool, typer.Option(help="Include the step compiled by inductor.")] = True,
+    peers: Annotated[bool, typer.Option(help="Include SUMO and HighwayEnv.")] = True,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Say which path ran, and why.")] = False,
+) -> None:
+    """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine."""
+    from idm_env.bench import run as measure
+
+    numbers = [int(_number("--sizes", size)) for size in sizes.split(",")]
+    measure(out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, verbose=verbose)
+
+
 def _number(option: str, text: str) -> float:
     try:
         return float(text)
