@@ -5,7 +5,7 @@ import json
 import pytest
 
 from idm_env import bench
-from idm_env.bench import peers
+from idm_env.bench import memory, peers
 from idm_env.bench.measure import Case, measure
 
 
@@ -44,6 +44,14 @@ def test_the_torch_path_says_why_no_kernel_runs(monkeypatch):
     made = bench._lanes(100, 1, False, True, lines.append)
     assert lines == ["100 vehicles: kernels do not run: IDM_ENV_KERNELS=0"]
     assert not any("kernel" in name for name in made["times_ms_per_step"])
+
+
+@pytest.mark.skipif(not memory._STATUS.exists(), reason="Linux tells the peak of a process")
+def test_memory_is_measured_in_a_process_of_its_own():
+    found = memory.peaks((200_000,), 20)
+    # Six parameters with gradients, four arrays of state and four of results, in float32: 80 B per vehicle at least.
+    assert found["200000"] > 200_000 * 80 / 2**20
+    assert memory.peaks((2_000,), 20) == {}
 
 
 def test_absent_peers_are_none(monkeypatch):

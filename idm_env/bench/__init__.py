@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from idm_env import kernels
-from idm_env.bench import fits, peers, traffic
+from idm_env.bench import fits, memory, peers, traffic
 from idm_env.bench.measure import Case, machine, measure
 from idm_env.kernels import dispatch
 
@@ -52,6 +52,7 @@ def run(
         torch.set_num_threads(1)
         result["one_core"] = {str(n): _lanes(n, rounds, compiled, verbose, say) for n in sizes}
         result["growth"] = growth(result["one_core"])
+        result["memory_mb_100_steps"] = memory.peaks(sizes, 100)
         result["gradient_error"] = traffic.accuracy() if kernels.available() else {}
         result["fit"] = fits.recorded_leaders(rounds) if kernels.available() else {}
         result["rings"] = fits.rings() if kernels.available() else {}
@@ -94,8 +95,9 @@ def _lanes(vehicles: int, rounds: int, compiled: bool, verbose: bool, say: Say) 
         cases["kernel forward, one step per call"] = made.calls()
     cases["triad"], moved = traffic.triad()
     times = measure(cases, rounds)
-    triad = times["triad"]
-    return {"times_ms_per_step": times, "triad_bytes": moved, "triad_gb_s": moved / triad["wall_min_ms"] / 1e6}
+    clock = "cpu" if torch.get_num_threads() == 1 else "wall"
+    triad = times["triad"][f"{clock}_min_ms"]
+    return {"times_ms_per_step": times, "triad_bytes": moved, "triad_gb_s": moved / triad / 1e6}
 
 
 def _gpu(sizes: Sequence[int], rounds: int) -> dict[str, Any]:
@@ -147,7 +149,7 @@ def summary(result: dict[str, Any]) -> list[str]:
         if name in every["times_ms_per_step"]:
             rate = size * BYTES / every["times_ms_per_step"][name]["wall_min_ms"] / 1e6
             lines.append(f"  {name}: {BYTES} B per vehicle-step make {rate:.1f} GB/s, {rate / every['triad_gb_s']:.0%}")
-    for name in ("growth", "gradient_error", "fit", "rings", "peers", "gpu"):
+    for name in ("growth", "memory_mb_100_steps", "gradient_error", "fit", "rings", "peers", "gpu"):
         if result.get(name):
             lines.append(f"{name}: {json.dumps(result[name])}")
     return lines
