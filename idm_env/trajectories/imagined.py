@@ -25,6 +25,11 @@ CAPABLE = {"max_accel": 5.0, "comfort_decel": 2.0, "time_gap": 1.5, "min_gap": 2
 FLOOR_WIDTH = 0.1
 """Accelerations stay this far above the brakes' floor, where it is exactly the identity (m/s²)."""
 
+CATCH_UP = (0.25, 1.0)
+"""Acceleration per metre (1/s²) and per m/s (1/s) that a vehicle is behind its wanted motion: critical, in 2 s."""
+HURRY_MPS2 = 1.0
+"""No catching up is faster than this (m/s²)."""
+
 
 def simulator(dt: float) -> Simulator:
     """Return IDM behind an imagined leader, with exact brakes, in ballistic steps of ``dt`` (s)."""
@@ -53,36 +58,40 @@ class Driven:
 
 
 def drive(
-    starts: Sequence[tuple[float, float]], accels: Sequence[np.ndarray], dt: float, highest: float, lowest: float
+    wanted: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], dt: float, highest: float, lowest: float
 ) -> list[Driven]:
-    """Drive every track through the simulator by the imagined gaps that its accelerations [K] ask for.
+    """Drive every track through the simulator by the imagined gaps that its wanted motion asks for.
 
-    ``starts`` are positions (m) and speeds (m/s). Each gap is found at the speed that the simulator has at that step,
-    so nothing but the bounds changes an acceleration: it never exceeds ``highest`` nor what the engine gives at that
-    speed, never falls below ``lowest``, and the vehicle never reverses.
+    ``wanted`` are positions (m), speeds (m/s) and accelerations (m/s²), each [K], of ballistic steps. Each gap is found
+    at the speed that the simulator has at that step, so nothing but the bounds changes an acceleration: it never
+    exceeds ``highest`` nor what the engine gives at that speed, never falls below ``lowest``, and the vehicle never
+    reverses. Where a bound did change it, the lost distance is made up gently (``CATCH_UP``).
     """
     sim = simulator(dt)
-    steps = max(len(a) for a in accels)
-    wanted = torch.zeros(steps, len(accels), 1, dtype=torch.float64)
-    for i, values in enumerate(accels):
-        wanted[: len(values), i, 0] = torch.as_tensor(values)
+    steps = max(len(a) for _, _, a in wanted)
+    goal = torch.zeros(3, steps, len(wanted), 1, dtype=torch.float64)
+    for i, columns in enumerate(wanted):
+        for c, values in enumerate(columns):
+            goal[c, : len(values), i, 0] = torch.as_tensor(values)
     params = sim.defaults(dtype=torch.float64)
     params["idm"] = {name: torch.tensor(value, dtype=torch.float64) for name, value in CAPABLE.items()}
     params["brakes"]["max_decel"] = torch.tensor(-lowest + FLOOR_WIDTH, dtype=torch.float64)
     driver = Driver(**params["idm"])
-    start = torch.tensor([[p, max(v, 0.0)] for p, v in starts], dtype=torch.float64)
-    origin = start[:, :1]
-    state = sim.state(torch.zeros_like(origin), start[:, 1:], params)
+    origin = goal[0, 0].clone()
+    goal[0] -= origin
+    state = sim.state(torch.zeros_like(origin), goal[1, 0].clamp_min(0.0), params)
     still = torch.zeros_like(origin)
-    kept = torch.empty(4, steps, len(accels), dtype=torch.float64)
+    kept = torch.empty(4, steps, len(wanted), dtype=torch.float64)
     with torch.no_grad():
         for k in range(steps):
+            behind = CATCH_UP[0] * (goal[0, k] - state.position) + CATCH_UP[1] * (goal[1, k] - state.speed)
             square = (state.speed / driver.desired_speed).square()
             engine = driver.max_accel * (1.0 - square * square) - 1e-6
-            accel = torch.minimum(wanted[k].clamp(lowest, highest), engine)
+            accel = goal[2, k] + behind.clamp(-HURRY_MPS2, HURRY_MPS2)
+            accel = torch.minimum(accel.clamp(lowest, highest), engine)
             gap = imagined_gap(accel, state.speed, still, driver)
             kept[0, k], kept[1, k], kept[3, k] = (x[:, 0] for x in (state.position + origin, state.speed, gap))
             state = sim.step(state, {"imagined": Imagined(gap, still)}, params)
             kept[2, k] = state.accel[:, 0]
     arrays = kept.numpy()
-    return [Driven(*(column[: len(a), i].copy() for column in arrays)) for i, a in enumerate(accels)]
+    return [Driven(*(column[: len(a), i].copy() for column in arrays)) for i, (_, _, a) in enumerate(wanted)]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
-from idm_env.trajectories.imagined import drive
+from idm_env.trajectories.imagined import Driven, drive
 from idm_env.trajectories.scores import Motion
 from idm_env.trajectories.smoother import Choices, Noise, Observed, Smoothed, smooth
 from idm_env.trajectories.tracks import Track
@@ -101,7 +103,7 @@ def recipe(
     observed = [
         Observed.of(track.time_s, track.position_m, dt, len(clock)) for track, clock in zip(tracks, clocks, strict=True)
     ]
-    smoothed = [smooth(o, noise, choices) for o in observed]
+    smoothed = _smoothed(observed, noise, choices)
     around = Neighbourhood(
         [*tracks, *(f.track for f in before)], [*clocks, *(f.motion.time_s for f in before)]
     )  # fmt: skip
@@ -134,9 +136,17 @@ def recipe(
     ]  # fmt: skip
 
 
-def _driven(smoothed: Sequence[Smoothed], dt: float, choices: Choices) -> list:
-    starts = [(float(s.position[0]), float(s.speed[0])) for s in smoothed]
-    return drive(starts, [s.accel for s in smoothed], dt, choices.highest, choices.lowest)
+def _smoothed(observed: Sequence[Observed], noise: Noise, choices: Choices) -> list[Smoothed]:
+    """Fit every track, on as many threads as torch has; the compiled loops release the interpreter lock."""
+    threads = min(torch.get_num_threads(), len(observed))
+    if threads < 2:
+        return [smooth(o, noise, choices) for o in observed]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(lambda o: smooth(o, noise, choices), observed))
+
+
+def _driven(smoothed: Sequence[Smoothed], dt: float, choices: Choices) -> list[Driven]:
+    return drive([(s.position, s.speed, s.accel) for s in smoothed], dt, choices.highest, choices.lowest)
 
 
 def _gap(m: Meeting, around: Neighbourhood, positions: Sequence[np.ndarray]) -> np.ndarray:

@@ -29,10 +29,12 @@ def direct(tracks: list[Track], dt: float, iterations: int) -> tuple[torch.Tenso
     def roll() -> torch.Tensor:
         x, v = torch.zeros(count, dtype=torch.float64), speed0
         kept = []
+        # unbound once: indexing step by step would make the backward pass quadratic in time
+        gaps, closings = gap.unbind(0), closing.unbind(0)
         for k in range(steps):
             kept.append(x)
             a = IDMLayer.apply(
-                values[:, 0], floor, values[:, 1], v, values[:, 4], gap[k], closing[k], values[:, 3], values[:, 2],
+                values[:, 0], floor, values[:, 1], v, values[:, 4], gaps[k], closings[k], values[:, 3], values[:, 2],
                 torch.tensor(dt),
             )  # fmt: skip
             x, v = x + v * dt, v + a * dt

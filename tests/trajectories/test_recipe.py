@@ -81,16 +81,28 @@ def test_noise_is_found_from_the_data_alone() -> None:
 
 
 def test_every_acceleration_has_its_imagined_gap_and_the_simulator_does_it() -> None:
-    motion = swinging(30.0)
-    (driven,) = drive([(100.0, 12.0)], [motion.accel_mps2], 0.1, 5.0, -8.0)
-    assert np.allclose(driven.accel, motion.accel_mps2, atol=1e-9)
-    speed = 12.0 + 0.1 * np.concatenate([[0.0], np.cumsum(motion.accel_mps2[:-1])])
+    accel = swinging(30.0).accel_mps2
+    speed = 12.0 + 0.1 * np.concatenate([[0.0], np.cumsum(accel[:-1])])
+    position = 100.0 + np.concatenate([[0.0], np.cumsum(0.1 * speed[:-1] + 0.005 * accel[:-1])])
+    (driven,) = drive([(position, speed, accel)], 0.1, 5.0, -8.0)
+    assert np.allclose(driven.accel, accel, atol=1e-9)
     assert np.allclose(driven.speed, speed, atol=1e-8)
+    assert np.allclose(driven.position, position, atol=1e-7)
     assert (driven.gap > 2.0).all() and np.isfinite(driven.gap).all()
     driver = Driver(**{name: torch.tensor(value) for name, value in CAPABLE.items()})
     speed = torch.linspace(0, 40, 50)
     gaps = torch.stack([imagined_gap(torch.tensor(a), speed, torch.tensor(0.0), driver) for a in (-3.0, 0.0, 2.0)])
     assert (gaps.diff(dim=0) > 0).all()  # braking harder means a nearer leader
+
+
+def test_distance_that_a_bound_took_is_made_up() -> None:
+    """A motion that drifts backwards by 2 m at a standstill and then drives off: no reverse, and nothing is lost."""
+    speed = np.concatenate([np.full(200, -0.1), np.minimum(np.arange(400) * 0.1, 5.0)])
+    accel = np.append(np.diff(speed) / 0.1, 0.0)
+    position = np.concatenate([[0.0], np.cumsum(0.05 * (speed[1:] + speed[:-1]))])
+    (driven,) = drive([(position, speed, accel)], 0.1, 5.0, -8.0)
+    assert (np.diff(driven.position) >= 0).all() and driven.position[150] < 1e-6
+    assert driven.position[-1] == pytest.approx(position[-1], abs=0.01)
 
 
 def test_bounds_are_exact_whatever_the_data_say() -> None:

@@ -1,0 +1,201 @@
+"""Filtering and reconstruction side by side with every baseline, on vehicles that no tuning has seen; and their times.
+
+    python benchmarks/trajectories.py --data FOLDER [--part filter|reconstruct|time]
+
+FOLDER holds the measured files named in ``FILES``. Baselines are tuned on the truth of every other vehicle, for each
+figure by itself; ours sees no truth: its noise is fitted to the noisy positions of those same vehicles. The published
+recipe is run as published; its speed is compared with a direct implementation on the published layer (diffidm).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import torch
+
+from idm_env.trajectories import baselines, paper
+from idm_env.trajectories.noise import fit_noise
+from idm_env.trajectories.recipe import clock_of, overlaps, recipe
+from idm_env.trajectories.scores import Motion, Tally
+from idm_env.trajectories.smoother import SPARSE
+from idm_env.trajectories.tracks import Pieces, Track, read_table
+
+RAW, CLEAN = "ngsim_i80_rawlike.csv.gz", "ngsim_i80_lanes.parquet"
+FILES = {
+    "I-80": (CLEAN, 100, 30.0),
+    "ZalaZone": ("openacc_zalazone.parquet", 20, 60.0),
+    "TGSIM": ("tgsim_pairs.parquet", 60, 20.0),
+}
+SPARSE_S = (1.0, 2.0, 5.0, 10.0)
+
+
+def truth_of(frame: pl.DataFrame, with_run: bool) -> Callable[[Track], Motion]:
+    """Return a function from a track to its measured motion at its own samples, NaN where there is none."""
+    keys = ["run_id", "vehicle_id"] if with_run else ["vehicle_id"]
+    frame = frame.with_columns(pl.col(key).cast(pl.String) for key in keys).sort("time_s")
+    parts = dict(iter(frame.group_by(keys)))
+
+    def motion(track: Track) -> Motion:
+        part = parts[(track.run_id, track.vehicle_id) if with_run else (track.vehicle_id,)]
+        clock = clock_of(track, 0.1)
+        known = part["time_s"].to_numpy()
+        at = np.clip(np.searchsorted(known, clock - 0.05), 0, len(known) - 1)
+        there = np.abs(known[at] - clock) < 0.051
+        position, speed, accel = (part[name].to_numpy() for name in ("position_m", "speed_mps", "accel_mps2"))
+        if not np.isfinite(accel).any():
+            accel = np.gradient(speed, known)  # of Doppler speeds, in files without accelerations
+        columns = (column[at] for column in (position, speed, accel))
+        return Motion(clock, *(np.where(there, column, np.nan) for column in columns))
+
+    return motion
+
+
+def score(tracks: list[Track], motions: list[Motion], truth: Callable[[Track], Motion]) -> dict[str, float | int]:
+    tally = Tally()
+    for track, motion in zip(tracks, motions, strict=True):
+        tally.add(motion, track.time_s, track.position_m)
+        tally.compare(motion, truth(track))
+    return tally.row()
+
+
+def show(name: str, row: dict[str, float | int], note: str = "") -> None:
+    values = " ".join(f"{row[key]:8.{digits}f}" for key, _, digits in SHOWN)
+    print(f"  {name:24s} {values}  {note}")
+
+
+SHOWN = (
+    ("position_error_rate_percent", "rate %", 3), ("accel_mean_mps2", "mean |a|", 2), ("accel_std_mps2", "std |a|", 2),
+    ("implausible_percent", "impl. %", 1), ("position_rmse_m", "x (m)", 3), ("speed_rmse_mps", "v (m/s)", 3),
+    ("accel_rmse_mps2", "a (m/s²)", 3),
+)  # fmt: skip
+HEAD = f"  {'method':24s} " + " ".join(f"{title:>8s}" for _, title, _ in SHOWN)
+
+
+def filtering(data: Path) -> None:
+    truth = truth_of(pl.read_parquet(data / CLEAN), with_run=False)
+    tracks = list(Pieces(read_table(data / RAW)))
+    names = sorted({track.vehicle_id for track in tracks}, key=int)
+    tuned = [t for t in tracks if t.vehicle_id in set(names[::2])]
+    scored = [t for t in tracks if t.vehicle_id in set(names[1::2])]
+    print(f"filtering: tuned on {len(tuned)} tracks, scored on the other {len(scored)}\n{HEAD}")
+    noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
+    ours = recipe(scored, 0.1, noise)
+    show("ours", score(scored, [f.motion for f in ours], truth), f"new overlaps {overlaps(ours)[1]}")
+    show("the paper's recipe", score(scored, [paper.imitate(t).motion for t in scored], truth))
+    for name in baselines.available():
+        values = baselines.BASELINES[name][2] or (None,)
+
+        def motions(of: list[Track], value: float | None, name: str = name) -> list[Motion]:
+            return [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), value) for t in of]
+
+        rows = {value: score(tuned, motions(tuned, value), truth) for value in values}
+        for what in ("speed_rmse_mps", "accel_rmse_mps2"):
+            best = min(rows, key=lambda value: rows[value][what])
+            show(
+                name,
+                score(scored, motions(scored, best), truth),
+                f"{baselines.BASELINES[name][1]} {best} for {what[:5]}",
+            )
+
+
+def thinned(track: Track, seconds: float) -> Track:
+    kept, following = [], track.time_s[0]
+    for i, now in enumerate(track.time_s):
+        if now >= following - 1e-6:
+            kept.append(i)
+            following = now + seconds
+    return track.part(np.array(kept))
+
+
+def reconstruction(data: Path) -> None:
+    for place, (file, count, shortest) in FILES.items():
+        frame = pl.read_parquet(data / file)
+        long = [t for t in Pieces(read_table(data / file)) if t.time_s[-1] - t.time_s[0] >= shortest]
+        # evenly over the file, and at most two minutes of each
+        chosen = [long[i] for i in np.unique(np.linspace(0, len(long) - 1, count).astype(int))]
+        tracks = [t.part(t.time_s <= t.time_s[0] + 120.0) for t in chosen]
+        truth = truth_of(frame, with_run=True)
+        for seconds in SPARSE_S:
+            sparse = [s for s in (thinned(t, seconds) for t in tracks) if len(s) >= 3]
+            noise = fit_noise([(t.time_s, t.position_m) for t in sparse], 0.1)
+            print(f"reconstruction: {place}, {len(sparse)} tracks, a sample every {seconds:g} s\n{HEAD}")
+            ours = recipe(sparse, 0.1, noise, SPARSE)
+            show("ours", score(sparse, [f.motion for f in ours], truth))
+            steps = [paper.imitate(t, paper.RECONSTRUCT_STEP_S).motion for t in sparse]
+            dense = [_dense(m, clock_of(t, 0.1)) for m, t in zip(steps, sparse, strict=True)]
+            show("the paper's recipe", score(sparse, dense, truth))
+            for name in baselines.available():
+                value = {"bounded spline": seconds, "Savitzky–Golay": 10 * seconds + 1}.get(name)
+                motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), value) for t in sparse]
+                show(name, score(sparse, motions, truth))
+
+
+def _dense(motion: Motion, clock: np.ndarray) -> Motion:
+    """Return a coarse motion between its steps: positions and speeds by straight lines, accelerations held."""
+    at = np.clip(np.searchsorted(motion.time_s, clock + 1e-9) - 1, 0, len(motion.time_s) - 1)
+    position, speed = (np.interp(clock, motion.time_s, x) for x in (motion.position_m, motion.speed_mps))
+    return Motion(clock, position, speed, motion.accel_mps2[at])
+
+
+def timing(count: int, seconds: float) -> None:
+    """Time the default recipe, the published one, and the published one written on the published layer, in one run."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from tests.trajectories.direct import direct
+    from tests.trajectories.test_recipe import correlated
+    from tests.trajectories.tracks import swinging, track_of
+
+    rng = np.random.default_rng(0)
+    tracks = []
+    for i in range(count):
+        motion = swinging(seconds, phase=float(rng.uniform(0, 6)))
+        tracks.append(track_of(motion, correlated(rng, len(motion.time_s)), str(i)))
+    data = [(t.time_s, t.position_m) for t in tracks]
+    (
+        fit_noise(data[:2], 0.1, evaluations=2),
+        recipe(tracks[:1], 0.1, fit_noise(data[:2], 0.1)),
+        paper.imitate(tracks[0], iterations=1),
+    )
+    begin = time.perf_counter()
+    recipe(tracks, 0.1, fit_noise(data, 0.1))
+    ours = (time.perf_counter() - begin) / count
+    print(f"time: {count} tracks of {seconds:g} s at 10 Hz, {torch.get_num_threads()} torch threads")
+    print(f"  default recipe, noise fitted: {1e3 * ours:8.2f} ms per trajectory (the paper states 308 ms)")
+    few = tracks[: max(count // 20, 1)]
+    begin = time.perf_counter()
+    for track in few:
+        paper.imitate(track)
+    own = (time.perf_counter() - begin) / len(few)
+    print(f"  published recipe, kernel    : {1e3 * own:8.2f} ms per trajectory, 500 steps")
+    iterations = 5
+    begin = time.perf_counter()
+    direct(tracks, 0.1, iterations)
+    layer = (time.perf_counter() - begin) / count / iterations * paper.ITERATIONS
+    print(f"  published recipe, diffidm   : {1e3 * layer:8.2f} ms per trajectory, {iterations} of 500 steps, one batch")
+    print(f"  ratio                       : {layer / own:8.1f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, help="folder of the measured files")
+    parser.add_argument("--part", choices=("filter", "reconstruct", "time"))
+    parser.add_argument("--tracks", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    options = parser.parse_args()
+    if options.part in (None, "time"):
+        timing(options.tracks, options.seconds)
+    if options.data is None:
+        return
+    if options.part in (None, "filter"):
+        filtering(options.data)
+    if options.part in (None, "reconstruct"):
+        reconstruction(options.data)
+
+
+if __name__ == "__main__":
+    main()
