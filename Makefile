@@ -19,12 +19,13 @@ demo: setup
 	$(BIN)/idm-env demo $(if $(DATA),--data '$(DATA)') --out '$(OUT)'
 
 test: setup
-	$(BIN)/ruff check .
-	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
+
+bench: setup
+	$(BIN)/idm-env bench
 
 clean:
 	rm -rf $(VENV) out build *.egg-info
