@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from idm_env.kernels import recorded_loops as loops
 from idm_env.kernels import threads as pool
@@ -141,6 +142,7 @@ class _Rollout(torch.autograd.Function):
         return out[0], out[1], out[2]
 
     @staticmethod
+    @once_differentiable  # second derivatives need the torch path: an error says so, not a silent zero
     def backward(ctx: Any, *seeds: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         p: _Problem = ctx.problem
         gap, speed = (x.numpy() for x in ctx.saved_tensors)

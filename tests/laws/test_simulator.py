@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from idm_env.effects import ALL, IDM, Brakes, Lag, make
+from idm_env.kernels import dispatch
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.types import FAR, Command, Record, State
@@ -255,3 +258,20 @@ def test_errors_name_value_rule_and_cure() -> None:
         simulator.without("nois")
     with pytest.raises(ValueError, match=r"integration = 'eulr' is unknown. Did you mean 'euler'"):
         Simulator(Lane(), (IDM(),), integration="eulr")  # type: ignore[arg-type]
+
+
+def test_second_derivatives_come_from_the_torch_path_or_not_at_all() -> None:
+    """A kernel has no second derivative: asking for one is an error there, never a silent zero."""
+    simulator = Simulator(Lane(), (IDM(), Brakes()))
+    curvature = []
+    for off in (True, False):
+        params = simulator.defaults(dtype=DTYPE)
+        time_gap = params["idm"]["time_gap"].requires_grad_()
+        with dispatch.off() if off else contextlib.nullcontext():
+            end, _ = simulator.rollout(start(simulator, params), {}, params, 30)
+        (first,) = torch.autograd.grad(end.position.sum(), time_gap, create_graph=True)
+        try:
+            curvature.append(torch.autograd.grad(first, time_gap)[0].item())
+        except RuntimeError:
+            assert not off
+    assert curvature[0] != 0 and all(c == curvature[0] for c in curvature)
