@@ -17,6 +17,7 @@ from idm_env.data import DataError, Repair
 from idm_env.data.clean import NO_LEADER, check_columns, identifiers, natural, numbers, without_empty
 from idm_env.data.load import read
 from idm_env.data.schema import DEFAULT_LENGTH_M, HIGHEST_SPEED_MPS, LONGEST_LENGTH_M
+from idm_env.data.speeds import unwrapped
 
 SMALLEST_JUMP_M = 8.0
 """A change of position is a jump only above this, whatever the time step (m)."""
@@ -107,6 +108,8 @@ def from_frame(frame: pl.DataFrame, source: str = "table", repairs: list[Repair]
         done.append(Repair("time not increasing", unsorted, text))
     frame = frame.sort(natural("run_id"), "run_id", natural("vehicle_id"), "vehicle_id", "time_s", maintain_order=True)
     frame, more = _without_repeats(frame, source)
+    done += more
+    frame, more = unwrapped(frame)
     done += more
     return Table(_with_leaders(frame), tuple(done), source)
 

@@ -78,6 +78,12 @@ def test_a_jump_stays_away_and_an_outlier_comes_back() -> None:
     assert np.flatnonzero(jumps(TIME, x + 50.0 * (np.arange(100) >= 40))).tolist() == [39]
 
 
+def test_laps_go_on_where_the_ring_has_its_start() -> None:
+    frame = rows("a", TIME, (10 * TIME + 50) % 100, ring_length_m=100.0)
+    (track,) = Pieces(from_frame(frame))
+    assert np.allclose(track.position_m, 10 * TIME + 50)
+
+
 def test_measured_file_reads_whole(measured) -> None:  # type: ignore[no-untyped-def]
     pieces = Pieces(read_table(measured("ngsim_i80_rawlike.csv.gz")))
     tracks = list(pieces)
