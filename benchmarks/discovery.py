@@ -27,7 +27,8 @@ import numpy as np  # noqa: E402 (threads are set before numpy starts)
 RESPONSE = {"delay", "lag"}
 TRUE = {
     "delay": ("delay", 1.0), "lag": ("lag", 1.0), "second_leader": ("weight", 1.0),
-    "leader_acceleration": ("gain", 1.0), "brake_light": ("gain", 1.0), "asymmetry": ("strength", 1.0), "power_limit": ("power", 1.0),
+    "leader_acceleration": ("gain", 1.0),
+    "brake_light": ("gain", 1.0), "asymmetry": ("strength", 1.0), "power_limit": ("power", 1.0),
     "drag": ("coefficient", 1.0), "speed_dependent_gap": ("extra_gap", 1.0), "memory": ("strength", 1.0),
     "follower": ("gain", 1.0), "dead_zone": ("threshold", 1.0), "action_point": ("threshold", 1.0),
     "speed_zone": ("factor", 1.0), "regime_shift": ("strength", 1.0), "lateral": ("gain", 1.0),

@@ -63,6 +63,7 @@ def all_of(d: Discovery) -> list[tuple[str, str, str]]:
         "parameters; each point is one 5 s window.",
         added_variable(d),
     )
+    put("Curves that were found", "Estimate and 95 % interval at every knot.", curves(d))
     put(
         "Residual against features, before and after",
         "By how much the measured driver accelerated more than the predicted one (m/s²), second by second in windows "
@@ -178,6 +179,27 @@ def added_variable(d: Discovery) -> Figure | None:
     axes.plot(reach, slope * reach, color=BEFORE, lw=1.2)
     axes.set_xlabel(f"response to {scored.term.label.replace('_', ' ')} (in units of noise)")
     axes.set_ylabel("residual along it")
+    return figure
+
+
+def curves(d: Discovery) -> Figure | None:
+    """Estimate and interval of every added curve over its coordinate."""
+    shown = []
+    for f in d.report["found"]:
+        term = next(t for t in d.chosen.terms if t.label == f["label"])
+        if len(f["parameters"]) > 6:
+            shown.append((term, list(f["parameters"].values())))
+    if not shown:
+        return None
+    figure, axes = plt.subplots(len(shown), 1, figsize=(8.0, 2.6 * len(shown)), squeeze=False, layout="constrained")
+    for axis, (term, knots) in zip(axes[:, 0], shown, strict=True):
+        first, distance, count = term.knots
+        x = first + distance * np.arange(count)
+        axis.plot(x, [k["estimate"] for k in knots], color=AFTER, marker=".")
+        axis.fill_between(x, [k["low"] for k in knots], [k["high"] for k in knots], color=AFTER, alpha=0.15)
+        axis.axhline(0, color=TRUTH, lw=0.5)
+        axis.set_xlabel(term.coordinate)
+        axis.set_ylabel(f"{term.what}" + ("" if knots[0]["unit"] == "1" else f" ({knots[0]['unit']})"))
     return figure
 
 

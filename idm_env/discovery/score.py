@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from idm_env.discovery.solve import BOUNDS, Solution, Task, cost_of, equations, prior_of
+from idm_env.discovery.solve import BOUNDS, Solution, Task, cost_of, equations, prior_of, projected
 
 FLIPS = 4096
 
@@ -25,41 +25,61 @@ def held_out(task: Task, solution: Solution) -> np.ndarray:
     model = solution.model
     linear = solution.linear
     change = _without_own_run(task, solution)
-    shifted = linear.residual + np.einsum("rmq,rq->rm", linear.by_phi, change[rows.group])
+    shifted = linear.residual + np.einsum("rmq,rq->rm", linear.by_phi, change[rows.run])
+    total = np.zeros(len(rows.records.runs))
+    if _spans_runs(task):
+        # Drivers of several runs share θ, which then stays that of all runs: to first order.
+        moved = linear.residual + np.einsum("rmq,rq->rm", projected(solution), change[rows.run])
+        np.add.at(total, rows.run, (moved**2).sum(-1) * task.counts)
+        return total
     part = Task(rows, task.noise, solution.prior, task.counts, task.sigma)
-    moved = type(linear)(shifted, linear.by_theta, linear.by_phi)
-    gradient, matrix, *_ = equations(part, model, solution.theta, solution.values, moved)
+    moved_linear = type(linear)(shifted, linear.by_theta, linear.by_phi)
+    gradient, matrix, *_ = equations(part, model, solution.theta, solution.values, moved_linear)
     step = -np.linalg.solve(matrix + 1e-9 * np.eye(5), gradient[..., None])[..., 0]
     theta = np.clip(solution.theta + np.clip(step, -0.5, 0.5), BOUNDS[:, 0], BOUNDS[:, 1])
-    values = np.repeat((solution.values + change)[None], 2, axis=0)
+    by_group = np.zeros((task.groups, len(solution.values)))
+    by_group[rows.group] = change[rows.run]
+    values = np.repeat((solution.values + by_group)[None], 2, axis=0)
     both = np.stack([theta, solution.theta])
     residual = task.residual(task.errors(both, model, values))
     better = cost_of(part, both, residual).argmin(0)[rows.group]
     square = (residual**2).sum(-1) * task.counts
-    total = np.zeros(len(rows.records.runs))
     np.add.at(total, rows.run, np.where(better == 0, square[0], square[1]))
     return total
 
 
+def _spans_runs(task: Task) -> bool:
+    """Tell whether any group has rows in more than one run."""
+    pairs = np.unique(np.stack([task.rows.group, task.rows.run]), axis=1)
+    return len(np.unique(pairs[0])) < pairs.shape[1]
+
+
+def per_run(task: Task, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """Return φ's gradient [runs, Q] and matrix [runs, Q, Q] of every run, the drivers' own parameters eliminated."""
+    rows = task.rows
+    across = projected(solution) * task.counts[:, None, None]
+    runs, count = len(rows.records.runs), len(solution.values)
+    gradient, matrix = np.zeros((runs, count)), np.zeros((runs, count, count))
+    np.add.at(gradient, rows.run, np.einsum("rmq,rm->rq", across, solution.linear.residual))
+    np.add.at(matrix, rows.run, np.einsum("rmq,rms->rqs", across, across))
+    return gradient, matrix
+
+
 def _without_own_run(task: Task, solution: Solution) -> np.ndarray:
-    """Return by how much φ changes for every group [G, Q] when its own run is left out."""
-    rows, count = task.rows, len(solution.values)
-    change = np.zeros((task.groups, count))
+    """Return by how much φ changes for every run [runs, Q] when that run is left out."""
+    runs, count = len(task.rows.records.runs), len(solution.values)
+    change = np.zeros((runs, count))
     if not count:
         return change
-    run_of_group = np.full(task.groups, -1)
-    run_of_group[rows.group] = rows.run
     low, high = (np.array([getattr(p, side) for p in solution.model.parameters]) for side in ("low", "high"))
     ridge = prior_of(solution.model)
-    s, big = solution.reduced_gradient, solution.reduced_hessian
-    for run in range(len(rows.records.runs)):
-        mine = run_of_group == run
-        if not mine.any():
-            continue
-        rest = big[~mine].sum(0) + np.diag(ridge)
+    s, big = per_run(task, solution)
+    for run in range(runs):
+        rest = big.sum(0) - big[run] + np.diag(ridge)
         rest = rest + np.diag(1e-6 * np.diag(rest) + 1e-12)
-        step = -np.linalg.solve(rest, s[~mine].sum(0) + ridge * solution.values)
-        change[mine] = np.clip(solution.values + step, low, high) - solution.values
+        # At the optimum all runs together pull nowhere, so the others pull against this one.
+        step = np.linalg.solve(rest, s[run])
+        change[run] = np.clip(solution.values + step, low, high) - solution.values
     return change
 
 
@@ -102,16 +122,13 @@ def interval_of(solution: Solution, task: Task) -> np.ndarray:
     count = len(solution.values)
     if not count:
         return np.zeros((0, 3))
-    rows = task.rows
-    runs = len(rows.records.runs)
-    run_of_group = np.full(task.groups, -1)
-    run_of_group[rows.group] = rows.run
-    big = solution.reduced_hessian.sum(0)
+    runs = len(task.rows.records.runs)
+    gradient, matrix = per_run(task, solution)
+    big = matrix.sum(0) + np.diag(prior_of(solution.model))
     big = big + np.diag(1e-9 * np.diag(big) + 1e-12)
     inverse = np.linalg.inv(big)
-    per_run = np.stack([solution.reduced_gradient[run_of_group == r].sum(0) for r in range(runs)])
-    per_run = per_run - per_run.mean(0)
-    sandwich = inverse @ (per_run.T @ per_run * runs / max(runs - 1, 1)) @ inverse
+    spread = gradient - gradient.mean(0)
+    sandwich = inverse @ (spread.T @ spread * runs / max(runs - 1, 1)) @ inverse
     variance = float((solution.linear.residual**2).mean())
     plain = inverse * variance
     width = np.maximum(

@@ -123,6 +123,7 @@ class Solution:
     reduced_hessian: np.ndarray
     prior: Prior
     row_group: np.ndarray
+    follow: np.ndarray
 
 
 def differences(parameters: tuple[Parameter, ...], values: np.ndarray) -> np.ndarray:
@@ -277,7 +278,7 @@ def finish(task: Task, model: Model, theta: np.ndarray, values: np.ndarray, line
     follow = np.linalg.solve(matrix + 1e-9 * np.eye(5), cross)
     s = phi_gradient - np.einsum("giq,gi->gq", follow, gradient)
     big = phi_matrix - np.einsum("giq,gis->gqs", cross, follow)
-    return Solution(model, theta, values, cost, linear, s, big, task.prior, task.rows.group)
+    return Solution(model, theta, values, cost, linear, s, big, task.prior, task.rows.group, follow)
 
 
 def centred(task: Task, theta: np.ndarray) -> Task:
@@ -286,6 +287,12 @@ def centred(task: Task, theta: np.ndarray) -> Task:
     if not task.prior.free or len(seen) < 5:
         return task
     return replace(task, prior=replace(task.prior, centre=theta[seen].mean(0)))
+
+
+def projected(solution: Solution) -> np.ndarray:
+    """Return the response to φ [R, m, Q] after the drivers' own parameters have followed."""
+    linear = solution.linear
+    return linear.by_phi - np.einsum("rmi,riq->rmq", linear.by_theta, solution.follow[solution.row_group])
 
 
 def with_noise(task: Task, noise: Noise) -> Task:

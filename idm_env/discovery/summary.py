@@ -137,6 +137,9 @@ def sentence(verdict: str, found: list[dict[str, Any]], rounds: list[Any]) -> st
             + ("" if v["unit"] == "1" else f" {v['unit']}")
             for k, v in list(f["parameters"].items())[:3]
         )
+        if len(f["parameters"]) > 6:
+            estimates = [v["estimate"] for v in f["parameters"].values()]
+            numbers = f"a curve of {len(estimates)} knots from {min(estimates):.3g} to {max(estimates):.3g}"
         what = f"{name} is missing" if f["effect"] else f"an effect without a name was located: {name}"
         parts.append(f"{what[0].upper()}{what[1:]} ({numbers}; p = {f['p_value']:.2g}).")
         if f["equivalent"]:
