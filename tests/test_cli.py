@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -137,3 +138,35 @@ def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
         assert call("fit", path, *options, out, "--resume").returncode == 0
         whole, resumed = (pl.read_parquet(folder / "parameters.parquet") for folder in (tmp_path / "whole", out))
         assert whole.equals(resumed)
+
+
+def test_the_demo_finds_what_its_generator_hid(tmp_path: Path) -> None:
+    """The README's main job, from the command to a report: the hidden delay is named, and the held-out error falls."""
+    done = call("demo", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "report.html" in done.stderr.replace("\n", "")
+    columns = pl.read_csv(tmp_path / "platoon.csv").columns
+    assert "delay" not in " ".join(columns) and "gap_m" not in columns
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["verdict"] == "named" and report["found"][0]["effect"] == "delay"
+    assert report["found"][0]["parameters"]["delay"]["estimate"] == pytest.approx(0.5, abs=0.05)
+    before, after = (report["error"][when]["gap_rmse_m"] for when in ("before", "after"))
+    assert after < 0.4 * before
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image") >= 5 and 'src="http' not in page
+    again = call("simulate", tmp_path / "platoon.csv", "--model", tmp_path / "model.yaml", "--out", tmp_path / "again")
+    assert again.returncode == 0, again.stderr
+
+
+def test_plot_and_effects(frame: pl.DataFrame, tmp_path: Path) -> None:
+    """A picture of a file and of a rollout, and the catalogue."""
+    path = tmp_path / "good.csv"
+    frame.write_csv(path)
+    ring = Path(__file__).resolve().parents[1] / "configs" / "ring.yaml"
+    for source, options in ((path, ()), (ring, ("--seconds", "20"))):
+        picture = tmp_path / f"{source.stem}.png"
+        done = call("plot", source, "--out", picture, *options)
+        assert done.returncode == 0, done.stderr
+        assert picture.read_bytes().startswith(b"\x89PNG")
+    listed = call("effects", env={**os.environ, "COLUMNS": "200"})
+    assert "second_leader.weight" in listed.stdout
