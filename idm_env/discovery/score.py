@@ -10,6 +10,8 @@ from scipy.stats import t as student
 from idm_env.discovery.solve import BOUNDS, Solution, Task, cost_of, equations, prior_of, projected
 
 FLIPS = 4096
+SYSTEMATIC = 0.01
+"""Error of a strength that averages do not remove: 0.6 % in the median of generated sets without drivers' noise."""
 
 
 def held_out(task: Task, solution: Solution) -> np.ndarray:
@@ -117,7 +119,8 @@ def westfall_young(gains: np.ndarray, seed: int = 0) -> Verdict:
 def interval_of(solution: Solution, task: Task) -> np.ndarray:
     """Return estimate, low and high [Q, 3] of φ: cluster-robust over runs, t with runs − 1 degrees of freedom.
 
-    Where the runs' spread is smaller than the noise allows, the noise decides.
+    Where the runs' spread is smaller than the noise allows, the noise decides. ``SYSTEMATIC`` of the strength is added
+    in squares: what smoothing and steps of 0.1 s do, alike in every run, so that no spread shows it.
     """
     count = len(solution.values)
     if not count:
@@ -135,6 +138,9 @@ def interval_of(solution: Solution, task: Task) -> np.ndarray:
         student.ppf(0.975, max(runs - 1, 1)) * np.sqrt(np.maximum(np.diag(sandwich), 0.0)),
         1.96 * np.sqrt(np.maximum(np.diag(plain), 0.0)),
     )
+    null = np.array([p.null or 0.0 if p.role == "strength" else 0.0 for p in solution.model.parameters])
+    own = np.array([p.role != "place" for p in solution.model.parameters])
+    width = np.sqrt(width**2 + (1.96 * SYSTEMATIC * own * (solution.values - null)) ** 2)
     low, high = (np.array([getattr(p, side) for p in solution.model.parameters]) for side in ("low", "high"))
     return np.stack(
         [solution.values, np.maximum(solution.values - width, low), np.minimum(solution.values + width, high)], axis=1
