@@ -33,7 +33,6 @@ MOST_WINDOWS = 6000
 SAME = 0.15
 """Candidates whose gain is within this share of the best one's are told apart by nothing but their names."""
 CLASSES = ({"delay", "lag"},)
-PAIRS = (("delay", "leader_acceleration"), ("delay", "second_leader"), ("lag", "leader_acceleration"))
 
 
 @dataclass(eq=False)
@@ -190,8 +189,12 @@ def _known_terms(prepared: Records, known: Sequence[str], trajectories: Trajecto
         return []
     if "grade" not in trajectories.table.columns:
         raise ValueError("known effect 'grade' needs a column grade (rise over run), and the data have none.")
-    place = np.concatenate([e.place_m for e in prepared.episodes])
-    slope = np.concatenate([e.columns["grade"] for e in prepared.episodes])
+    # Where a record does not tell, the profile of the others is taken for the same place.
+    told = [e for e in prepared.episodes if "grade" in e.columns]
+    if not told:
+        raise ValueError("known effect 'grade' needs a column grade without holes, and no record has it. Fill it in.")
+    place = np.concatenate([e.place_m for e in told])
+    slope = np.concatenate([e.columns["grade"] for e in told])
     period = prepared.period
     place = np.mod(place, period) if period else place
     low, high = (0.0, period) if period else (float(place.min()), float(place.max()))
