@@ -48,9 +48,10 @@ def test_the_torch_path_says_why_no_kernel_runs(monkeypatch):
 
 @pytest.mark.skipif(not memory._STATUS.exists(), reason="Linux tells the peak of a process")
 def test_memory_is_measured_in_a_process_of_its_own():
-    found = memory.peaks((200_000,), 20)
-    # Six parameters with gradients, four arrays of state and four of results, in float32: 80 B per vehicle at least.
-    assert found["200000"] > 200_000 * 80 / 2**20
+    found = memory.peaks((1_000_000,), 20)
+    # Six parameters with gradients, four arrays of state and four of results, in float32: 80 B per vehicle, of which
+    # memory that the allocator had at hand before is not seen.
+    assert found["1000000"] > 0.6 * 1_000_000 * 80 / 2**20
     assert memory.peaks((2_000,), 20) == {}
 
 

@@ -15,6 +15,7 @@ from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
 from idm_env.discovery import checkpoint, judge, places, records, search, summary
 from idm_env.discovery import model as terms
+from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.score import Verdict, held_out, westfall_young
@@ -119,13 +120,15 @@ def discover(
     saved = checkpoint.Checkpoint(None if out is None else out / "discovery.npz", mark, resume)
     task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
     searching = Search(task, names, located and effects is None, saved, progress)
+    progress("calibration", "idm", 0, 1)
+    theta, calibrated = calibrate(prepared.of_runs(fit_runs), by, task.prior.centre)
     progress("null", "idm", 0, 1)
     base = Model(tuple(_known_terms(prepared, known, trajectories)))
-    null = searching.null(base)
+    null = searching.null(base, theta)
     final, rounds = _rounds(searching, null, len(fit_runs), seed)
     final = _delete(searching, final, len(base.terms))
     saved.done()
-    return _finish(
+    discovery = _finish(
         trajectories,
         prepared,
         fit_runs,
@@ -139,6 +142,8 @@ def discover(
         seed,
         names,
     )
+    discovery.report["calibration"] = calibrated
+    return discovery
 
 
 # -- before the search -----------------------------------------------------------------------------------------------
@@ -229,7 +234,7 @@ def _rounds(searching: Search, null: Solution, runs: int, seed: int) -> tuple[So
             break
         chosen = scored[this.winner].solution
         assert chosen is not None
-        now = searching.null(chosen.model, chosen)
+        now = searching.null(chosen.model, chosen.theta, chosen.values)
     return now, rounds
 
 

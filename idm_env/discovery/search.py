@@ -48,10 +48,9 @@ class Search:
     on_progress: OnProgress
     base: Model = field(default_factory=Model)
 
-    def null(self, model: Model, start: Solution | None = None) -> Solution:
-        """Fit the null (or a model already chosen) and its noise in turn until both stand; updates ``task``."""
-        theta = np.tile(self.task.prior.centre, (self.task.groups, 1)) if start is None else start.theta
-        values = _starting_values(model) if start is None else start.values
+    def null(self, model: Model, theta: np.ndarray, values: np.ndarray | None = None) -> Solution:
+        """Fit a null and its noise in turn until both stand, from log θ [G, 5] and φ [Q]; updates ``task``."""
+        values = _starting_values(model) if values is None else values
         solution = solve(self.task, model, theta, values)
         for _ in range(3):
             self.task = self._renoised(solution)
