@@ -292,8 +292,8 @@ class Simulator:
         """Repeat ``step``; return the last state and what ``keep`` takes of every state after a step, time first.
 
         ``keep`` None keeps nothing, and None is returned in its place. Where a compiled kernel knows this simulator it
-        runs instead of ``step`` (``kernels.dispatch`` says when). It gives first derivatives; inside
-        ``kernels.dispatch.off()`` everything runs on the torch path, second derivatives included.
+        runs instead of ``step`` (``kernels.dispatch`` says when). Second derivatives of a
+        kernel's rollout are recomputed on the torch path; inside ``kernels.dispatch.off()`` everything is.
 
         ``inputs`` carry a leading time dimension of at least ``steps``. ``checkpoint_every`` k > 0 saves the graph's
         tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from idm_env.kernels import lane_adjoint, lane_loops, tiles
 from idm_env.kernels import threads as pool
@@ -166,7 +165,6 @@ class _Rollout(torch.autograd.Function):
         return tuple(out)
 
     @staticmethod
-    @once_differentiable  # second derivatives need the torch path: an error says so, not a silent zero
     def backward(ctx: Any, *seeds: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         saved = ctx.saved_tensors
         if torch.is_grad_enabled():
