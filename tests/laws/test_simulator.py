@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from idm_env.effects import ALL, IDM, Brakes, Lag, make
-from idm_env.kernels import dispatch
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.types import FAR, Command, Record, State
@@ -258,17 +255,3 @@ def test_errors_name_value_rule_and_cure() -> None:
         simulator.without("nois")
     with pytest.raises(ValueError, match=r"integration = 'eulr' is unknown. Did you mean 'euler'"):
         Simulator(Lane(), (IDM(),), integration="eulr")  # type: ignore[arg-type]
-
-
-def test_second_derivatives_are_those_of_the_torch_path() -> None:
-    """With and without a kernel: never a silent zero."""
-    curvature = []
-    for off in (True, False):
-        simulator = Simulator(Lane(), (IDM(), Brakes()))
-        params = simulator.defaults(dtype=DTYPE)
-        time_gap = params["idm"]["time_gap"].requires_grad_()
-        with dispatch.off() if off else contextlib.nullcontext():
-            end, _ = simulator.rollout(start(simulator, params), {}, params, 30)
-        (first,) = torch.autograd.grad(end.position.sum(), time_gap, create_graph=True)
-        curvature.append(torch.autograd.grad(first, time_gap)[0].item())
-    assert curvature[0] != 0 and curvature[1] == pytest.approx(curvature[0], rel=1e-9)
