@@ -30,7 +30,6 @@ LEAST_GAIN = 0.01
 LEAST_SHARE = 0.5
 FEWEST_RUNS = 5
 MOST_ROUNDS = 3
-MOST_WINDOWS = 6000
 SAME = 0.15
 """Candidates whose gain is within this share of the best one's are told apart by nothing but their names."""
 CLASSES = ({"delay", "lag"},)
