@@ -56,6 +56,7 @@ def run(
         result["gradient_error"] = traffic.accuracy() if kernels.available() else {}
         result["fit"] = fits.recorded_leaders(rounds) if kernels.available() else {}
         result["rings"] = fits.rings() if kernels.available() else {}
+        result["discovery"] = fits.discovery() if kernels.available() else {}
         if others:
             result["peers"] = {"sumo": peers.sumo(), "highway": peers.highway()}
         torch.set_num_threads(threads)
@@ -149,7 +150,7 @@ def summary(result: dict[str, Any]) -> list[str]:
         if name in every["times_ms_per_step"]:
             rate = size * BYTES / every["times_ms_per_step"][name]["wall_min_ms"] / 1e6
             lines.append(f"  {name}: {BYTES} B per vehicle-step make {rate:.1f} GB/s, {rate / every['triad_gb_s']:.0%}")
-    for name in ("growth", "memory_mb_100_steps", "gradient_error", "fit", "rings", "peers", "gpu"):
+    for name in ("growth", "memory_mb_100_steps", "gradient_error", "fit", "rings", "discovery", "peers", "gpu"):
         if result.get(name):
             lines.append(f"{name}: {json.dumps(result[name])}")
     return lines

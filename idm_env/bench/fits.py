@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -110,6 +111,36 @@ def _eager(steps: int) -> Any:
         adam.step()
 
     return iteration
+
+
+def discovery() -> dict[str, Any]:
+    """Return CPU ms of one Jacobian of every candidate effect by the compiled twin, and CPU seconds of a discovery.
+
+    A generated set of 10 runs × 3 followers × 180 s without an effect; a Jacobian is a rollout of all windows of 50
+    steps in one copy more than there are parameters, the drivers' five included, at the candidate's first start.
+    """
+    from idm_env.data import synthetic
+    from idm_env.discovery import discover, model, records, search
+    from idm_env.discovery.discover import prepare
+    from idm_env.discovery.solve import Task, linearise
+
+    trajectories, _ = synthetic.generate(0)
+    rows = records.windows(prepare(trajectories, "driver"))
+    task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
+    theta = np.tile(task.prior.centre, (task.groups, 1))
+
+    def jacobian(name: str) -> Case:
+        term = model.simple(name)
+        return Case(lambda: linearise(task, model.Model((term,)), theta, np.array(term.starts[0])))
+
+    times = measure({name: jacobian(name) for name in model.STARTS}, 3)
+    begin = time.process_time()
+    discover(trajectories)
+    return {
+        "windows": len(rows),
+        "jacobian_cpu_ms": {name: t["cpu_min_ms"] for name, t in times.items()},
+        "set_cpu_s": time.process_time() - begin,
+    }
 
 
 def rings(seconds: float = 0.5) -> dict[str, float]:

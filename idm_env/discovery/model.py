@@ -139,19 +139,20 @@ _BOUNDS = {
     # Wider than plausible where the declaration is narrow, narrower where IDM would collide.
     "delay.delay": (0.0, 1.2), "lag.lag": (0.0, 2.0), "power_limit.power": (2.0, 60.0),
 }  # fmt: skip
-_STARTS: dict[str, tuple[tuple[float, ...], ...]] = {
+STARTS: dict[str, tuple[tuple[float, ...], ...]] = {
     "delay": ((0.3,), (0.8,)), "lag": ((0.3,), (0.8,)), "second_leader": ((0.1,),), "leader_acceleration": ((0.1,),),
     "brake_light": ((0.1,),), "asymmetry": ((0.05,),), "power_limit": ((10.0,), (18.0,)), "drag": ((1e-4,),),
     "speed_dependent_gap": ((0.5,),), "memory": ((0.5, 30.0), (0.5, 150.0)), "follower": ((0.03,),),
     "dead_zone": ((0.001,), (0.004,)), "action_point": ((0.15,), (0.4,)), "lateral": ((0.03,),), "gap_bias": ((0.2,),),
 }  # fmt: skip
+"""Effects that need no place, and from which values of their parameters a search starts."""
 
 
 def simple(name: str) -> Term:
     """Return the term of an effect of the catalogue that needs no place."""
     declared = catalogue.ALL[name]().parameters
     parameters = tuple(_narrowed(f"{name}.{p.name}", p) for p in declared)
-    return Term(name, name, parameters, _STARTS[name], what=_WHAT.get(name, "acceleration"), coordinate="state")
+    return Term(name, name, parameters, STARTS[name], what=_WHAT.get(name, "acceleration"), coordinate="state")
 
 
 _WHAT = {

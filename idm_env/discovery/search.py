@@ -66,7 +66,7 @@ class Search:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [runs]."""
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
-        wanted = [terms.simple(n) for n in self.names if n in terms._STARTS and n not in have]
+        wanted = [terms.simple(n) for n in self.names if n in terms.STARTS and n not in have]
         found = []
         responses = places.respond(self.task, solution)
         for i, term in enumerate(wanted):
