@@ -22,8 +22,6 @@ from idm_env.types import Params
 
 STARTS = ("uniform", "wave")
 _LENGTH_STREAM = 1
-_TIME_GAP = 0.8
-"""Below this time gap a vehicle tailgates (s)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -36,14 +34,15 @@ class RingTask(Task):
 
     Observation, per agent: ``v/15, (v_lead − v)/15, headway/270``, headway from front bumper to front bumper.
     Reward, the same for all agents: ``4 mean(v)/20 − 4 mean|u|``, v of all vehicles after the step, u the commands
-    (m/s²); less ``tailgating · max(0, 1 − time gap / 0.8 s)``, each agent's own, and ``fuel · mean fuel rate (mL/s)``.
-    Terminated where vehicles touch.
+    (m/s²); less ``tailgating · max(0, 1 − time gap / tailgating_below)``, each agent's own, and ``fuel · mean fuel
+    rate (mL/s)``. Terminated where vehicles touch.
 
     Args:
         length: Circumference (m), or ``[lowest, highest]`` to be drawn for every episode.
         start: ``"uniform"``: equal gaps, standing. ``"wave"``: gaps and speeds in a wave, for a developed one with less
             warm-up.
         tailgating: Weight of the tailgating term; 0 leaves it out.
+        tailgating_below: Time gap below which it counts (s). An agent holds about that gap: leave a margin.
         fuel: Weight of the fuel term (s/mL); 0 leaves it out.
     """
 
@@ -59,6 +58,7 @@ class RingTask(Task):
     warmup: int = 750
     start: str = "uniform"
     tailgating: float = 0.0
+    tailgating_below: float = 0.8
     fuel: float = 0.0
 
     def __post_init__(self) -> None:
@@ -72,6 +72,7 @@ class RingTask(Task):
         if self.start not in STARTS:
             raise ValueError(f"start = {self.start!r} is unknown.{nearest(str(self.start), STARTS)}")
         at_least("tailgating", self.tailgating, 0.0)
+        at_least("tailgating_below", self.tailgating_below, 0.1, "s")
         at_least("fuel", self.fuel, 0.0)
 
     @property
@@ -135,5 +136,5 @@ class RingTask(Task):
             reward = reward.expand(-1, len(self.agents))
         if self.tailgating:
             time_gap = metrics.time_gap(self.pick(state.gap), self.pick(state.speed))
-            reward = reward - self.tailgating * torch.relu(1.0 - time_gap / _TIME_GAP)
+            reward = reward - self.tailgating * torch.relu(1.0 - time_gap / self.tailgating_below)
         return reward

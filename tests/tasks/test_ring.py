@@ -98,15 +98,17 @@ def test_a_policy_of_constant_speed_calms_the_traffic():
     assert float(world.state.speed.mean()) > 1.03 * waves
 
 
-def test_tailgating_and_fuel_cost():
-    plain, dear = make_task("ring", warmup=30), make_task("ring", warmup=30, tailgating=3.0, fuel=2.0)
+@pytest.mark.parametrize("below", [0.8, 1.1])
+def test_tailgating_and_fuel_cost(below):
+    plain = make_task("ring", warmup=30)
+    dear = make_task("ring", warmup=30, tailgating=3.0, tailgating_below=below, fuel=2.0)
     world, _ = start(plain)
     close = world._replace(state=world.state._replace(gap=torch.full_like(world.state.gap, 0.4)))
     none = torch.zeros(1, 1, dtype=torch.float64)
     difference = plain.reward(close, none, close) - dear.reward(close, none, close)
     fuel = float(metrics.fuel(close.state.speed, close.state.accel).mean())
     assert float(difference) == pytest.approx(
-        3.0 * (1.0 - 0.4 / max(float(close.state.speed[0, 0]), 1.0) / 0.8) + 2.0 * fuel
+        3.0 * (1.0 - 0.4 / max(float(close.state.speed[0, 0]), 1.0) / below) + 2.0 * fuel
     )
 
 

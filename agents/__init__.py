@@ -1,0 +1,1 @@
+"""Agents for the tasks, one readable file per algorithm; run from the checkout: ``python -m agents.apg --help``."""

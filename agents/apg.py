@@ -1,0 +1,78 @@
+"""Analytic policy gradient: the return of a window, differentiated through the simulator, is all there is.
+
+``∇_θ (1/W) Σ_t r_t``, r_t = r(s_t, a_t), a_t = π_θ(o_t), s_{t+1} = f(s_t, a_t): the gradient goes through the policy
+and through the traffic. After W steps the graph is cut and the episodes go on (truncated back-propagation). W must be
+long enough for an action's effect to come round to the vehicle: on a ring of 22 vehicles about a minute. The name is
+that of Freeman et al. 2021 (Brax, arXiv 2106.13281).
+
+``python -m agents.apg --config configs/ring-apg.yaml --seed 1``
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from agents import common
+from agents.monitor import Monitor
+
+
+@dataclass
+class Arguments(common.Arguments):
+    """Arguments of APG.
+
+    Args:
+        count: Environments that run together; their episodes begin at different times.
+        window: Steps through which gradients go.
+    """
+
+    out: Path = Path("runs/apg")
+    learning_rate: float = 1e-3
+    count: int = 64
+    window: int = 600
+
+
+def train(arguments: Arguments) -> list[dict[str, Any]]:
+    """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
+    began = time.process_time()
+    torch.manual_seed(arguments.seed)
+    env = common.make_env(arguments.environment, arguments.count, output="torch")
+    env.reset(seed=common.first_seed(arguments.seed, arguments.count))
+    policy, saved = common.begin(arguments, "apg")
+    optimiser = torch.optim.Adam(policy.parameters(), lr=arguments.learning_rate)
+    if saved:
+        optimiser.load_state_dict(saved["optimiser"])
+        observation = common.restore(env, saved["episodes"])
+    else:
+        observation = common.desynchronise(env)
+    monitor = Monitor("apg", arguments, began, saved)
+    for update in range(saved.get("update", -1) + 1, arguments.updates):
+        rate = common.fall(arguments.learning_rate, update, arguments.updates)
+        optimiser.param_groups[0]["lr"] = rate
+        env.detach()
+        observation, total = observation.detach(), torch.zeros(())
+        for _ in range(arguments.window):
+            observation, reward, *_ = env.step(policy(observation))
+            total = total + reward.mean()
+        loss = -total / arguments.window
+        norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)
+        training = {"optimiser": optimiser.state_dict(), "episodes": common.snapshot(env)}
+        steps = arguments.window * arguments.count
+        if not monitor.after(update, steps, policy, training, loss=-loss.item(), norm=norm, learning_rate=rate):
+            break
+    return monitor.history
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Train as the command line says."""
+    torch.set_num_threads(1)
+    train(common.parse(Arguments, "apg", argv))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,331 @@
+"""What all agents share: arguments from YAML and command line, the policy, checkpoints, and the guard of updates."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import torch
+import tyro
+import yaml
+from torch import Tensor, nn
+
+import idm_env
+from idm_env.config import load_environment, number
+from idm_env.envs.settings import KEYWORDS
+from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.parameters import nearest
+from idm_env.tasks import Task, make_task
+from idm_env.types import State
+
+SCHEMA = 1
+"""Version of the layout of checkpoints."""
+ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
+
+# -- arguments -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Arguments:
+    """What every agent takes; a key of the YAML file and an option of the command line have the same name.
+
+    Args:
+        environment: Keywords of ``gym.make_vec("DiffIDM-v0", …)``; only in YAML. ``config`` names an environment's
+            file beside that YAML file.
+        out: Folder of checkpoints and logs.
+        seed: Of everything random.
+        updates: Updates of the policy; the learning rate falls with their count.
+        cpu_seconds: Training also ends after that many CPU seconds, evaluations not counted; 0 is no limit.
+        evaluate_every: CPU seconds of training between evaluations; 0 evaluates after every update.
+        log: Where figures go: csv, tensorboard, or both with a comma.
+        resume: Go on from the last checkpoint in ``out``.
+        hidden: Widths of the policy's hidden layers.
+        learning_rate: Of Adam, at the first update.
+        clip: Largest global norm of a gradient.
+    """
+
+    environment: Annotated[dict[str, Any], tyro.conf.Suppress] = field(default_factory=lambda: {"task": "ring"})
+    out: Path = Path("runs/agent")
+    seed: int = 0
+    updates: int = 60
+    cpu_seconds: float = 0.0
+    evaluate_every: float = 2.0
+    log: str = "csv"
+    resume: bool = False
+    hidden: tuple[int, ...] = (32, 32)
+    learning_rate: float = 3e-3
+    clip: float = 1.0
+
+
+A = TypeVar("A", bound=Arguments)
+
+
+def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
+    """Return the arguments of ``--config FILE`` and of the other options, which win."""
+    before = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    before.add_argument("--config")
+    known, rest = before.parse_known_args(argv)
+    default = kind() if known.config is None else load_agent(known.config, kind, agent)
+    text = f"{kind.__doc__}\n\n--config FILE reads a YAML file first, such as configs/ring-apg.yaml."
+    return tyro.cli(kind, default=default, args=rest, description=text)
+
+
+def load_agent(path: str | Path, kind: type[A], agent: str) -> A:
+    """Return the arguments of an agent's YAML file; ValueError, in one line, for what does not belong in it."""
+    file = Path(path)
+    if not file.is_file():
+        raise ValueError(f"{path} is not a file. Give the path of a YAML file, such as configs/ring-apg.yaml.")
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    if not isinstance(content, dict) or content.pop("configures", None) != "agent":
+        raise ValueError(f"{path}: no agent is configured here. Write 'configures: agent' in its first line.")
+    if content.pop("agent", None) != agent:
+        raise ValueError(f"{path}: this is not a file for {agent}. Write 'agent: {agent}', or run the agent it names.")
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    default = kind()
+    values: dict[str, Any] = {}
+    for key, value in content.items():
+        if key not in fields:
+            raise ValueError(f"{path}: unknown key '{key}'.{nearest(str(key), fields)}")
+        values[key] = _as(f"{path}: {key}", value, getattr(default, key))
+    if "config" in values.get("environment", {}):
+        own = dict(values["environment"])
+        values["environment"] = {**load_environment(file.parent / own.pop("config")), **own}
+    return kind(**values)
+
+
+def _as(name: str, value: Any, like: Any) -> Any:
+    """Return a value of YAML in the type of the default; YAML reads 3e-3 as text."""
+    if isinstance(like, bool) or isinstance(value, bool):
+        if not (isinstance(value, bool) and isinstance(like, bool)):
+            raise ValueError(f"{name} = {value!r} must be {'true or false' if isinstance(like, bool) else 'no bool'}.")
+        return value
+    if isinstance(like, (int, float)):
+        return type(like)(number(name, value))
+    if isinstance(like, dict) and not isinstance(value, dict):
+        raise ValueError(f"{name} = {value!r} must be a mapping, such as {{task: ring}}.")
+    return value if isinstance(like, dict) else type(like)(value)
+
+
+# -- environments ----------------------------------------------------------------------------------------------------
+
+
+def task_of(environment: Mapping[str, Any]) -> Task:
+    """Return the task of an environment's keywords."""
+    return make_task(**{k: v for k, v in environment.items() if k == "task" or k not in KEYWORDS})
+
+
+def make_env(environment: Mapping[str, Any], count: int, **keywords: Any) -> DiffIDMVectorEnv:
+    """Return a vector of environments that reset within the step (final observations are in the info)."""
+    chosen: dict[str, Any] = {"autoreset_mode": "SameStep", **environment, **keywords}
+    return DiffIDMVectorEnv(count, **chosen)
+
+
+def first_seed(seed: int, count: int) -> int:
+    """Return the seed of the first of ``count`` environments; different seeds of a training share none."""
+    return 10_000 * (seed + 1) + count
+
+
+def desynchronise(env: DiffIDMVectorEnv) -> Tensor:
+    """Set the clocks of the first episodes apart, so that not all end at once; return the observations.
+
+    Environment i of n starts at step ``i · limit / n``; its traffic is as it was at step 0.
+    """
+    batch, state = env.batch, env.state
+    limit = batch.limit or 0
+    step = (torch.arange(env.num_envs) * limit) // env.num_envs
+    batch.episodes -= 1
+    observation: Tensor = env.reset(options={"state": state._replace(step=state.step + step)})[0]
+    return observation
+
+
+def snapshot(env: DiffIDMVectorEnv) -> dict[str, Any]:
+    """Return everything that ``restore`` needs to continue the episodes of a vector exactly."""
+    batch = env.batch
+    state = {k: v for k, v in env.state._asdict().items() if k != "memory"}
+    memory = dict(env.state.memory)
+    return {"state": state, "memory": memory, "seeds": batch.seeds.tolist(), "episodes": batch.episodes.tolist()}
+
+
+def restore(env: DiffIDMVectorEnv, saved: Mapping[str, Any]) -> Tensor:
+    """Continue the episodes of a snapshot; return the observations."""
+    batch = env.batch
+    env.reset(seed=list(saved["seeds"]))
+    batch.episodes[:] = np.asarray(saved["episodes"]) - 1
+    state = State(**saved["state"], memory=saved["memory"])
+    observation: Tensor = env.reset(options={"state": state})[0]
+    return observation
+
+
+def human_moments(
+    environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 500
+) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation of what agents observe while human drivers keep the wheel."""
+    env = make_env(environment, count, output="torch")
+    features = len(env.task.bounds.names)
+    seen = [env.reset(seed=seed)[0]]
+    for _ in range(steps):
+        seen.append(env.step(None)[0])
+    seen_by_one = torch.stack(seen).reshape(-1, features)
+    return seen_by_one.mean(0), seen_by_one.std(0).clamp_min(1e-3)
+
+
+# -- policy ----------------------------------------------------------------------------------------------------------
+
+
+class Policy(nn.Module):
+    """``action = squash(W φ(… φ(W₁ (o − m)/s)))``: one small network, the same for every agent of an environment.
+
+    ``observation`` has shape ``(…, agents · features)``, actions ``(…, agents)`` in [−1, 1]. ``squash`` is ``tanh`` or
+    ``clip``. The normalisation m, s is fixed: that of human drivers.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(
+        self, features: int, hidden: Sequence[int] = (32, 32), activation: str = "tanh", squash: str = "tanh"
+    ) -> None:
+        super().__init__()
+        self.made = {"features": features, "hidden": list(hidden), "activation": activation, "squash": squash}
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("scale", torch.ones(features))
+        widths = [features, *hidden]
+        layers: list[nn.Module] = []
+        for before, after in itertools.pairwise(widths):
+            layers += [nn.Linear(before, after), ACTIVATIONS[activation]()]
+        self.body = nn.Sequential(*layers, nn.Linear(widths[-1], 1))
+        last = self.body[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            # A policy begins by commanding almost nothing.
+            last.weight.mul_(0.01)
+            last.bias.zero_()
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the actions."""
+        one = observation.unflatten(-1, (-1, len(self.mean)))
+        action = self.body((one - self.mean) / self.scale).squeeze(-1)
+        return torch.tanh(action) if self.made["squash"] == "tanh" else action.clamp(-1.0, 1.0)
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, Any]:
+        """Return actions as Stable-Baselines3's ``predict`` does: arrays, and the state of a network without memory."""
+        with torch.no_grad():
+            seen = torch.as_tensor(np.asarray(observation), dtype=torch.float32)
+            return self(seen).numpy().astype(np.float32), state
+
+
+# -- checkpoints -----------------------------------------------------------------------------------------------------
+
+
+def save(path: Path, policy: Policy, agent: str, environment: Mapping[str, Any], training: Mapping[str, Any]) -> None:
+    """Write a checkpoint; a file of that name is replaced only by a whole one."""
+    task = task_of(environment)
+    content = {
+        "schema": SCHEMA,
+        "version": idm_env.__version__,
+        "agent": agent,
+        "task": task.name,
+        "features": list(task.bounds.names),
+        "environment": dict(environment),
+        "policy": {"made": policy.made, "state": policy.state_dict()},
+        "training": dict(training),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(".part")
+    torch.save(content, beside)
+    os.replace(beside, path)
+
+
+def load(path: str | Path, task: str | None = None, agent: str | None = None) -> tuple[Policy, dict[str, Any]]:
+    """Return the policy and everything else of a checkpoint.
+
+    ValueError, in one line, for a file that is none, or of another layout, task, observation or agent than asked for.
+    """
+    if not Path(path).is_file():
+        raise ValueError(f"{path} is not a file. Give the path of a checkpoint, such as runs/ring-apg/last.pt.")
+    try:
+        content = torch.load(path, weights_only=True)
+    except Exception:
+        content = None
+    if not isinstance(content, dict) or "schema" not in content:
+        raise ValueError(f"{path} is not a checkpoint of an agent. Give a file that an agent has written.")
+    if content["schema"] != SCHEMA:
+        raise ValueError(f"{path} has layout {content['schema']}; this version reads layout {SCHEMA}. Train it anew.")
+    for name, wanted in (("task", task), ("agent", agent)):
+        if wanted is not None and content[name] != wanted:
+            raise ValueError(
+                f"{path} is of {name} '{content[name]}', and '{wanted}' is wanted. Give a file of that {name}."
+            )
+    now = list(task_of(content["environment"]).bounds.names)
+    if content["features"] != now:
+        raise ValueError(
+            f"{path} was trained by version {content['version']} on observations {', '.join(content['features'])}; "
+            f"task '{content['task']}' now gives {', '.join(now)}. Train it anew."
+        )
+    policy = Policy(**content["policy"]["made"])
+    policy.load_state_dict(content["policy"]["state"])
+    return policy, content
+
+
+def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[str, Any]]:
+    """Return a new policy and nothing, or those of the last checkpoint with what its training had kept.
+
+    ``made`` are further choices of ``Policy``. ValueError where there is nothing to resume, or something else.
+    """
+    task = task_of(arguments.environment)
+    if arguments.resume:
+        policy, content = load(arguments.out / "last.pt", task.name, agent)
+        return policy, content["training"]
+    policy = Policy(len(task.bounds.names), arguments.hidden, **made)
+    mean, scale = human_moments(arguments.environment, first_seed(arguments.seed, 0))
+    policy.mean.copy_(mean)
+    policy.scale.copy_(scale)
+    return policy, {}
+
+
+# -- updates ---------------------------------------------------------------------------------------------------------
+
+
+class DivergedError(RuntimeError):
+    """A loss or a gradient that is not finite."""
+
+
+def descend(
+    loss: Tensor,
+    parameters: Iterable[nn.Parameter],
+    optimiser: torch.optim.Optimizer,
+    clip: float,
+    update: int,
+    kept: Path,
+) -> float:
+    """Take one step down the gradient, its global norm clipped; return the norm.
+
+    DivergedError where loss or norm is not finite: parameters and the checkpoint ``kept`` stay as they were.
+    """
+    parameters = list(parameters)
+    optimiser.zero_grad()
+    loss.backward()
+    norm = float(nn.utils.clip_grad_norm_(parameters, clip))
+    if not (math.isfinite(float(loss.detach())) and math.isfinite(norm)):
+        raise DivergedError(
+            f"update {update}: loss {float(loss.detach()):g} and gradient norm {norm:g} must be finite. "
+            f"The last good checkpoint is {kept}; resume from it with a lower learning_rate or a shorter window."
+        )
+    optimiser.step()
+    return norm
+
+
+def fall(learning_rate: float, update: int, updates: int, last: float = 0.1) -> float:
+    """Return the learning rate of an update: a half cosine from 1 to ``last`` times the first one."""
+    share = min(update / max(updates - 1, 1), 1.0)
+    return learning_rate * (last + (1.0 - last) * 0.5 * (1.0 + math.cos(math.pi * share)))

@@ -1,0 +1,283 @@
+"""How good a policy is: the same deterministic test for every agent, and pictures of it.
+
+``python -m agents.evaluate runs/ring-apg/last.pt [--video ring.mp4]``. On the ring: six lengths 220–270 m, 75 s of
+human driving, then 300 s with the policy; judged are the last 100 s.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import gymnasium
+import torch
+import tyro
+from torch import Tensor
+
+from agents.common import Policy, load, task_of
+from idm_env import metrics
+from idm_env.envs.advance import advance_of
+from idm_env.tasks import Draw, Task, World
+from idm_env.types import Params
+
+LENGTHS = (220.0, 230.0, 240.0, 250.0, 260.0, 270.0)
+STEPS = 3000
+JUDGED = 1000
+SPEED_RATIO, SPEED_STD, TIME_GAP, IN_A_ROW = 0.95, 0.5, 0.8, 3
+_BLOCK = 250
+_SEED = 900_000
+"""Of evaluations; training uses other seeds."""
+
+Act = Callable[[Tensor], Tensor]
+"""Observations ``(n, agents · features)`` to actions ``(n, agents)``."""
+
+
+class Driven(NamedTuple):
+    """What an evaluation keeps of every step, ``(steps, n, vehicles)``, and the actions ``(steps, n, agents)``."""
+
+    speed: Tensor
+    accel: Tensor
+    gap: Tensor
+    action: Tensor
+    reward: Tensor
+
+
+class Start(NamedTuple):
+    """A task with the worlds in which its evaluation begins."""
+
+    task: Task
+    world: World
+    draw: Draw
+    params: Params
+
+
+def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> Driven:
+    """Roll a policy out from given worlds; ``act`` None leaves everybody to the human drivers."""
+    task, world, draw, params = start
+    like = world.state.speed
+    advance = advance_of(task.simulator, "numpy", like.device, like.dtype)
+    none = like.new_zeros(len(like), len(task.agents))
+    kept: list[tuple[Tensor, ...]] = []
+    with torch.inference_mode():
+        for t in range(steps):
+            if task.noisy and t % _BLOCK == 0:
+                normals = draw.normals(world.state.step, _BLOCK, task.vehicles, like.dtype)
+            action = None if act is None else act(task.observe(world).flatten(1))
+            command = None if action is None else task.command(action)
+            noise = normals[t % _BLOCK] if task.noisy else None
+            after = task.step(world, command, noise, params, advance=advance)
+            reward = task.reward(world, none if command is None else command, after) if rewards else none
+            world = after
+            kept.append(
+                (after.state.speed, after.state.accel, after.state.gap, none if action is None else action, reward)
+            )
+    return Driven(*(torch.stack(column) for column in zip(*kept, strict=True)))
+
+
+# -- the ring --------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def _ring_start(environment: str, lengths: tuple[float, ...]) -> Start:
+    """Return one ring of every length after its warm-up; the keywords of the environment come as JSON."""
+    chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": 750}
+    tasks = [task_of({**chosen, "length": length}) for length in lengths]
+    task = tasks[0]
+    params = task.params(torch.float32, "cpu")
+    advance = advance_of(task.simulator, "numpy", torch.device("cpu"), torch.float32)
+    draws = [Draw.of(torch.tensor([_SEED + i]), torch.tensor([0])) for i in range(len(tasks))]
+    states = [
+        one.reset(draw, params, getattr(advance, "run", None)).state for one, draw in zip(tasks, draws, strict=True)
+    ]
+    memory = {name: torch.cat([s.memory[name] for s in states]) for name in states[0].memory}
+    columns = {
+        k: torch.cat([getattr(s, k) for s in states]) for k in ("position", "speed", "accel", "gap", "length", "step")
+    }
+    world = World(states[0]._replace(**columns, memory=memory), {})
+    return Start(
+        task_of({**chosen, "length": [min(lengths), max(lengths)]}),
+        world,
+        Draw(torch.cat([d.key for d in draws])),
+        params,
+    )
+
+
+def ring_start(environment: Mapping[str, Any], lengths: Sequence[float] = LENGTHS) -> Start:
+    """Return one ring of every length after its warm-up."""
+    return _ring_start(json.dumps(dict(environment), sort_keys=True), tuple(lengths))
+
+
+def uniform_speed(start: Start) -> Tensor:
+    """Return the speed (m/s) at which all vehicles of each ring, as human drivers, keep their gaps for ever.
+
+    Solves ``Σ (s0 + v T)/√(1 − (v/v0)^4) = L − Σ l`` by bisection; drivers may differ.
+    """
+    p = start.params["idm"]
+    free = start.world.state.gap.sum(-1)
+    low, high = torch.zeros_like(free), torch.full_like(free, 0.95) * p["desired_speed"].min()
+    for _ in range(60):
+        v = (0.5 * (low + high)).unsqueeze(-1)
+        gaps = (p["min_gap"] + v * p["time_gap"]) / torch.sqrt(1.0 - (v / p["desired_speed"]) ** 4)
+        fits = gaps.expand_as(start.world.state.gap).sum(-1) < free
+        middle = v.squeeze(-1)
+        low, high = torch.where(fits, middle, low), torch.where(fits, high, middle)
+    return 0.5 * (low + high)
+
+
+def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
+    """Return the figures of the ring: per length, and the worst of them.
+
+    ``speed_ratio``: mean speed of all vehicles in the last 100 s over the uniform speed; ``speed_std``: standard
+    deviation over vehicles and time there (m/s); ``time_gap``: smallest of the controlled vehicles in the whole 300 s
+    (s); ``collisions``: rings in which any two vehicles have touched.
+    """
+    last = driven.speed[-JUDGED:]
+    ratio = last.mean((0, 2)) / uniform_speed(start)
+    std = last.std((0, 2), correction=0)
+    gap = metrics.time_gap(start.task.pick(driven.gap), start.task.pick(driven.speed)).amin((0, 2))
+    crashed = driven.gap.amin((0, 2)) <= 0.0
+    return {
+        "speed_ratio": float(ratio.min()),
+        "speed_std": float(std.max()),
+        "time_gap": float(gap.min()),
+        "collisions": int(crashed.sum()),
+        "passed": bool(ratio.min() >= SPEED_RATIO and std.max() < SPEED_STD and not crashed.any()),
+        "ratios": ratio.tolist(),
+        "stds": std.tolist(),
+    }
+
+
+def evaluate_ring(
+    act: Act | None, environment: Mapping[str, Any], lengths: Sequence[float] = LENGTHS
+) -> dict[str, Any]:
+    """Return the figures of a policy on rings of these lengths."""
+    start = ring_start(environment, lengths)
+    return judge_ring(start, drive(start, act, STEPS))
+
+
+def solved_at(history: Sequence[Mapping[str, Any]]) -> int | None:
+    """Return the index of the evaluation from which on all pass, to the end of training; None if those are too few.
+
+    Solved are three evaluations in a row or more, and kept to the end.
+    """
+    failed = [i for i, row in enumerate(history) if not row["passed"]]
+    first = failed[-1] + 1 if failed else 0
+    return first if len(history) - first >= IN_A_ROW else None
+
+
+# -- following a record ----------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def _follow_start(environment: str, count: int) -> Start:
+    task = task_of(json.loads(environment))
+    params = task.params(torch.float32, "cpu")
+    draw = Draw.of(torch.arange(_SEED, _SEED + count), torch.zeros(count, dtype=torch.int64))
+    return Start(task, task.reset(draw, params), draw, params)
+
+
+def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int = 16) -> dict[str, Any]:
+    """Return the figures of a policy behind ``count`` stretches of the recorded leaders, 100 s each.
+
+    ``reward``: mean per step; ``litres`` and ``litres_behind``: fuel per 100 km of the first controlled vehicle and of
+    all vehicles from it to the last; ``energy``: at its wheels (J/kg per metre); the same of the recorded leader as
+    ``leader_…``; ``time_gap``: its smallest (s); ``collisions``: stretches with one; ``spacing``: its mean gap (m).
+    """
+    start = _follow_start(json.dumps(dict(environment), sort_keys=True), count)
+    task = start.task
+    driven = drive(start, act, task.horizon or STEPS, rewards=True)
+    first = task.agents[0]
+    speed, accel, gap = (x.double() for x in (driven.speed, driven.accel, driven.gap))
+    fuel = metrics.fuel(speed, accel)
+    energy = metrics.traction_energy(speed, accel, task.simulator.dt)
+    way = (speed * task.simulator.dt).sum(0)
+
+    def litres(part: slice) -> float:
+        return float(100.0 * fuel[..., part].sum() / speed[..., part].sum())
+
+    crashed = gap[..., 1:].amin((0, 2)) <= 0.0
+    time_gap = metrics.time_gap(task.pick(gap), task.pick(speed)).amin((0, 2))
+    return {
+        "reward": float(driven.reward.double().mean()),
+        "litres": litres(slice(first, first + 1)),
+        "litres_behind": litres(slice(first, None)),
+        "leader_litres": litres(slice(0, 1)),
+        "energy": float(energy[:, first].sum() / way[:, first].sum()),
+        "leader_energy": float(energy[:, 0].sum() / way[:, 0].sum()),
+        "time_gap": float(time_gap.min()),
+        "spacing": float(gap[..., first].mean()),
+        "collisions": int(crashed.sum()),
+        "passed": bool(not crashed.any()),
+    }
+
+
+# -- any task --------------------------------------------------------------------------------------------------------
+
+
+def evaluate(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures of a policy in its own task; None is the human driver."""
+    tests: dict[str, Callable[..., dict[str, Any]]] = {"ring": evaluate_ring, "follow": evaluate_follow}
+    task = environment.get("task", "ring")
+    if task not in tests:
+        raise ValueError(f"task '{task}' has no test of agents. Tests exist for {' and '.join(tests)}.")
+    return tests[task](act, environment)
+
+
+def score(row: Mapping[str, Any]) -> float:
+    """Return one number by which the best checkpoint is kept, from the figures of an evaluation."""
+    if "reward" in row:
+        return float(row["reward"])
+    tailgating = max(0.0, TIME_GAP - row["time_gap"])
+    return float(min(row["speed_ratio"], 1.0) - row["speed_std"] - tailgating - row["collisions"])
+
+
+def film(path: Path, environment: Mapping[str, Any], policy: Policy, steps: int, seed: int = 0) -> None:
+    """Write a video of one episode; every second step is a picture, at twice real time."""
+    from gymnasium.utils.save_video import save_video
+
+    env = gymnasium.make("DiffIDM-v0", **{**environment, "warmup_pool": 0}, render_mode="rgb_array")
+    observation, _ = env.reset(seed=seed)
+    frames = []
+    for step in range(steps):
+        observation, _, terminated, truncated, _ = env.step(policy.predict(observation)[0])
+        if step % 2 == 0:
+            frames.append(env.render())
+        if terminated or truncated:
+            break
+    save_video(frames, str(path.parent), name_prefix=path.stem, fps=10, episode_trigger=lambda _: True)
+
+
+@dataclass
+class Arguments:
+    """Evaluate a saved policy.
+
+    Args:
+        checkpoint: Such as runs/ring-apg/last.pt.
+        video: Folder and first part of the name of a video, such as pictures/ring.
+        steps: Steps of the video.
+        seed: Of the video's episode.
+    """
+
+    checkpoint: Annotated[Path, tyro.conf.Positional]
+    video: Path | None = None
+    steps: int = 1200
+    seed: int = 0
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Print the figures of a policy beside those of human drivers."""
+    arguments = tyro.cli(Arguments, args=argv)
+    policy, content = load(arguments.checkpoint)
+    environment = content["environment"]
+    for name, act in (("human", None), (content["agent"], policy)):
+        print(name, json.dumps(evaluate(act, environment)))
+    if arguments.video is not None:
+        film(arguments.video, environment, policy, arguments.steps, arguments.seed)
+
+
+if __name__ == "__main__":
+    main()

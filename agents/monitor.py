@@ -1,0 +1,73 @@
+"""The clock of a training: counts its CPU seconds, evaluates, logs, and keeps the last and the best checkpoint."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+from stable_baselines3.common.logger import configure
+from tqdm import tqdm
+
+from agents import common
+from agents.common import Arguments, Policy
+from agents.evaluate import evaluate, score
+
+
+class Monitor:
+    """Told of every update; ``history`` holds one row per evaluation, with updates, steps and CPU seconds.
+
+    CPU seconds count from ``began`` (a ``time.process_time()``): making the environments belongs to training, while
+    evaluations, logs and checkpoints do not. ``best.pt`` is the checkpoint with the
+    highest score (``evaluate.score``), the first of equals.
+    """
+
+    def __init__(self, agent: str, arguments: Arguments, began: float, saved: Mapping[str, Any] | None = None) -> None:
+        self.agent, self.arguments = agent, arguments
+        self.last, self.best = arguments.out / "last.pt", arguments.out / "best.pt"
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.logger = configure(str(arguments.out / "log"), arguments.log.split(","))
+        saved = saved or {}
+        self.history: list[dict[str, Any]] = list(saved.get("history", []))
+        self.steps = int(saved.get("steps", 0))
+        self.before = float(saved.get("cpu_seconds", 0.0))
+        self._begin = began
+        self._aside = 0.0
+        done = int(saved.get("update", -1)) + 1
+        self._bar = tqdm(total=arguments.updates, initial=done, desc=agent, disable=None, dynamic_ncols=True)
+
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU seconds of training so far, those before a resume included."""
+        return self.before + time.process_time() - self._begin - self._aside
+
+    def after(self, update: int, steps: int, policy: Policy, training: Mapping[str, Any], **figures: float) -> bool:
+        """Log an update that made ``steps`` environment steps, keep it, and return whether training goes on."""
+        spent, self.steps = self.cpu_seconds, self.steps + steps
+        over = update + 1 >= self.arguments.updates or 0.0 < self.arguments.cpu_seconds <= spent
+        begin = time.process_time()
+        since = spent - (self.history[-1]["cpu_seconds"] if self.history else 0.0)
+        row: dict[str, Any] = {}
+        if over or since >= self.arguments.evaluate_every:
+            row = {"update": update, "steps": self.steps, "cpu_seconds": spent}
+            row |= evaluate(policy, self.arguments.environment)
+            self.history.append(row)
+        kept = {**training, "update": update, "steps": self.steps, "cpu_seconds": spent, "history": self.history}
+        common.save(self.last, policy, self.agent, self.arguments.environment, kept)
+        if row and score(row) > max((score(r) for r in self.history[:-1]), default=-float("inf")):
+            common.save(self.best, policy, self.agent, self.arguments.environment, kept)
+        logged = {**figures, **row, "update": update, "steps": self.steps, "cpu_seconds": spent}
+        for key, value in logged.items():
+            if isinstance(value, (int, float)):
+                self.logger.record(key, float(value))
+        self.logger.dump(self.steps)
+        self._bar.update()
+        self._bar.set_postfix({k: f"{v:.3g}" for k, v in figures.items()}, refresh=False)
+        self._aside += time.process_time() - begin
+        if over:
+            self._bar.close()
+            self.logger.close()
+        return not over
