@@ -20,7 +20,7 @@ import polars as pl
 import torch
 
 from idm_env.trajectories import baselines, paper
-from idm_env.trajectories.noise import fit_noise
+from idm_env.trajectories.noise import SPARSE_WHITE_M, fit_noise
 from idm_env.trajectories.recipe import clock_of, overlaps, recipe
 from idm_env.trajectories.scores import Motion, Tally
 from idm_env.trajectories.smoother import SPARSE
@@ -33,6 +33,8 @@ FILES = {
     "TGSIM": ("tgsim_pairs.parquet", 60, 20.0),
 }
 SPARSE_S = (1.0, 2.0, 5.0, 10.0)
+ENDS_S = (0.0, 0.5, 1.0)
+"""Ends of tracks that are not scored (s): the clean tracks speed up as they begin and brake as they end."""
 
 
 def truth_of(frame: pl.DataFrame, with_run: bool) -> Callable[[Track], Motion]:
@@ -56,17 +58,24 @@ def truth_of(frame: pl.DataFrame, with_run: bool) -> Callable[[Track], Motion]:
     return motion
 
 
-def score(tracks: list[Track], motions: list[Motion], truth: Callable[[Track], Motion]) -> dict[str, float | int]:
+def score(
+    tracks: list[Track], motions: list[Motion], truth: Callable[[Track], Motion], ends: float = 0.0
+) -> dict[str, float | int]:
+    """Return the row of a method; the first and last ``ends`` seconds of every track are not compared."""
     tally = Tally()
     for track, motion in zip(tracks, motions, strict=True):
         tally.add(motion, track.time_s, track.position_m)
-        tally.compare(motion, truth(track))
+        true = truth(track)
+        inside = np.abs(true.time_s - 0.5 * (true.time_s[0] + true.time_s[-1]))
+        inside = inside <= 0.5 * (true.time_s[-1] - true.time_s[0]) - ends + 1e-6
+        speed, accel = (np.where(inside, x, np.nan) for x in (true.speed_mps, true.accel_mps2))
+        tally.compare(motion, Motion(true.time_s, true.position_m, speed, accel))
     return tally.row()
 
 
 def show(name: str, row: dict[str, float | int], note: str = "") -> None:
     values = " ".join(f"{row[key]:8.{digits}f}" for key, _, digits in SHOWN)
-    print(f"  {name:24s} {values}  {note}")
+    print(f"  {name:24s} {values}  {note}", flush=True)
 
 
 SHOWN = (
@@ -77,31 +86,53 @@ SHOWN = (
 HEAD = f"  {'method':24s} " + " ".join(f"{title:>8s}" for _, title, _ in SHOWN)
 
 
+def best_of(
+    name: str, tuned: list[Track], scored: list[Track], truth: Callable[[Track], Motion], ends: float = 0.0,
+    given: dict[str, float] | None = None,
+) -> None:  # fmt: skip
+    """Tune a baseline on some tracks, for each figure by itself, and show what it does to the others."""
+    rows: list[tuple[dict[str, float], dict[str, float | int]]] = []
+    for choice in baselines.BASELINES[name][1]:
+        whole = {**choice, **(given or {})}
+        rows.append((whole, score(tuned, _motions(name, tuned, whole), truth, ends)))
+    found: dict[tuple, list[str]] = {}
+    for what in ("speed_rmse_mps", "accel_rmse_mps2"):
+        choice, _ = min(rows, key=lambda row: row[1][what])
+        found.setdefault(tuple(choice.items()), []).append(what[:5])
+    for choice, what in found.items():
+        note = ", ".join(f"{key} {value:g}" for key, value in choice)
+        row = score(scored, _motions(name, scored, dict(choice)), truth, ends)
+        show(name, row, f"{note} for {' and '.join(what)}" if note else "")
+
+
+def _motions(name: str, tracks: list[Track], choice: dict[str, float]) -> list[Motion]:
+    return [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), **choice) for t in tracks]
+
+
+def halves(tracks: list[Track]) -> tuple[list[Track], list[Track]]:
+    """Return the tracks of every other vehicle, and of the rest."""
+    names = sorted({(t.run_id, t.vehicle_id) for t in tracks}, key=lambda name: (name[0], len(name[1]), name[1]))
+    first = set(names[::2])
+    return [t for t in tracks if (t.run_id, t.vehicle_id) in first], [
+        t for t in tracks if (t.run_id, t.vehicle_id) not in first
+    ]
+
+
 def filtering(data: Path) -> None:
+    """Score on either half what was tuned on the other, with the ends of the tracks and without."""
     truth = truth_of(pl.read_parquet(data / CLEAN), with_run=False)
-    tracks = list(Pieces(read_table(data / RAW)))
-    names = sorted({track.vehicle_id for track in tracks}, key=int)
-    tuned = [t for t in tracks if t.vehicle_id in set(names[::2])]
-    scored = [t for t in tracks if t.vehicle_id in set(names[1::2])]
-    print(f"filtering: tuned on {len(tuned)} tracks, scored on the other {len(scored)}\n{HEAD}")
-    noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
-    ours = recipe(scored, 0.1, noise)
-    show("ours", score(scored, [f.motion for f in ours], truth), f"new overlaps {overlaps(ours)[1]}")
-    show("the paper's recipe", score(scored, [paper.imitate(t).motion for t in scored], truth))
-    for name in baselines.available():
-        values = baselines.BASELINES[name][2] or (None,)
-
-        def motions(of: list[Track], value: float | None, name: str = name) -> list[Motion]:
-            return [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), value) for t in of]
-
-        rows = {value: score(tuned, motions(tuned, value), truth) for value in values}
-        for what in ("speed_rmse_mps", "accel_rmse_mps2"):
-            best = min(rows, key=lambda value: rows[value][what])
-            show(
-                name,
-                score(scored, motions(scored, best), truth),
-                f"{baselines.BASELINES[name][1]} {best} for {what[:5]}",
-            )
+    first, second = halves(list(Pieces(read_table(data / RAW))))
+    for number, (tuned, scored) in enumerate(((first, second), (second, first)), 1):
+        noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
+        ours = recipe(scored, 0.1, noise)
+        published = [paper.imitate(t).motion for t in scored]
+        for ends in ENDS_S:
+            counts = f"half {number}: tuned on {len(tuned)} tracks, scored on the other {len(scored)}"
+            print(f"filtering, {counts}, without the first and last {ends:g} s\n{HEAD}")
+            show("ours", score(scored, [f.motion for f in ours], truth, ends), f"new overlaps {overlaps(ours)[1]}")
+            show("the paper's recipe", score(scored, published, truth, ends))
+            for name in baselines.available():
+                best_of(name, tuned, scored, truth, ends)
 
 
 def thinned(track: Track, seconds: float) -> Track:
@@ -114,26 +145,26 @@ def thinned(track: Track, seconds: float) -> Track:
 
 
 def reconstruction(data: Path) -> None:
+    """Score every method against what thinning left out; baselines are tuned on every other vehicle."""
     for place, (file, count, shortest) in FILES.items():
         frame = pl.read_parquet(data / file)
         long = [t for t in Pieces(read_table(data / file)) if t.time_s[-1] - t.time_s[0] >= shortest]
         # evenly over the file, and at most two minutes of each
-        chosen = [long[i] for i in np.unique(np.linspace(0, len(long) - 1, count).astype(int))]
-        tracks = [t.part(t.time_s <= t.time_s[0] + 120.0) for t in chosen]
+        chosen = [long[i] for i in np.unique(np.linspace(0, len(long) - 1, 2 * count).astype(int))]
+        parts = halves([t.part(t.time_s <= t.time_s[0] + 120.0) for t in chosen])
         truth = truth_of(frame, with_run=True)
         for seconds in SPARSE_S:
-            sparse = [s for s in (thinned(t, seconds) for t in tracks) if len(s) >= 3]
-            noise = fit_noise([(t.time_s, t.position_m) for t in sparse], 0.1)
-            print(f"reconstruction: {place}, {len(sparse)} tracks, a sample every {seconds:g} s\n{HEAD}")
-            ours = recipe(sparse, 0.1, noise, SPARSE)
-            show("ours", score(sparse, [f.motion for f in ours], truth))
-            steps = [paper.imitate(t, paper.RECONSTRUCT_STEP_S).motion for t in sparse]
-            dense = [_dense(m, clock_of(t, 0.1)) for m, t in zip(steps, sparse, strict=True)]
-            show("the paper's recipe", score(sparse, dense, truth))
+            tuned, scored = ([s for s in (thinned(t, seconds) for t in ts) if len(s) >= 3] for ts in parts)
+            noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
+            print(f"reconstruction: {place}, {len(scored)} tracks, a sample every {seconds:g} s\n{HEAD}")
+            ours = recipe(scored, 0.1, noise, SPARSE)
+            show("ours", score(scored, [f.motion for f in ours], truth))
+            for fixed in (False, True):
+                steps = [paper.imitate(t, paper.RECONSTRUCT_STEP_S, fixed_parameters=fixed).motion for t in scored]
+                dense = [_dense(m, clock_of(t, 0.1)) for m, t in zip(steps, scored, strict=True)]
+                show("  … parameters fixed" if fixed else "the paper's recipe", score(scored, dense, truth))
             for name in baselines.available():
-                value = {"bounded spline": seconds, "Savitzky–Golay": 10 * seconds + 1}.get(name)
-                motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), value) for t in sparse]
-                show(name, score(sparse, motions, truth))
+                best_of(name, tuned, scored, truth, given={"sigma": SPARSE_WHITE_M} if name == "Kalman/RTS" else None)
 
 
 def _dense(motion: Motion, clock: np.ndarray) -> Motion:

@@ -1,12 +1,13 @@
 """The smoothers that ours is compared with: four of the paper and two that it left out.
 
 Each is a function ``(time_s, position_m, clock) -> Motion`` of measured times and positions [N] (times rising, not
-necessarily regular) and the clock [K] on which the result is wanted; its one free number has the paper's default.
+necessarily regular) and the clock [K] on which the result is wanted; free numbers have the paper's defaults where it
+states them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 
 import numpy as np
@@ -177,16 +178,19 @@ def kalman(
 
 
 Smoother = Callable[..., Motion]
+Choice = Mapping[str, float]
 
-BASELINES: dict[str, tuple[Smoother, str, tuple[float, ...]]] = {
-    "linear": (linear, "", ()),
-    "moving average": (moving_average, "window", (5, 9, 15, 21, 31, 41, 51, 61)),
-    "exponential": (exponential, "width", (3, 5, 7, 10, 13, 17, 22)),
-    "bounded spline": (bounded_spline, "spacing", (1.0, 1.5, 2.0, 3.0, 4.0)),
-    "Savitzky–Golay": (savitzky_golay, "window", (31, 41, 51, 61, 71, 81, 91)),
-    "Kalman/RTS": (kalman, "density", (0.01, 0.02, 0.04, 0.08, 0.15, 0.3)),
-}
-"""Name → function, its free number, and the values that a tuning tries."""
+BASELINES: dict[str, tuple[Smoother, tuple[Choice, ...]]] = {
+    "linear": (linear, ({},)),
+    "moving average": (moving_average, tuple({"window": w} for w in (5, 9, 15, 21, 31, 41, 51, 61))),
+    "exponential": (exponential, tuple({"width": w} for w in (3, 4, 5, 6, 7, 8, 10, 13, 17, 22))),
+    "bounded spline": (bounded_spline, tuple({"spacing": s} for s in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0))),
+    "Savitzky–Golay": (
+        savitzky_golay, tuple({"window": w, "order": o} for o in (2, 3, 5) for w in range(31, 122, 10)),
+    ),
+    "Kalman/RTS": (kalman, tuple({"density": q} for q in (0.01, 0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3))),
+}  # fmt: skip
+"""Name → function, and what a tuning tries of its free numbers."""
 
 
 def available() -> list[str]:
@@ -194,9 +198,7 @@ def available() -> list[str]:
     return [name for name in BASELINES if name != "Kalman/RTS" or find_spec("statsmodels") is not None]
 
 
-def run(name: str, time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, value: float | None = None) -> Motion:
-    """Apply a baseline by name; ``value`` replaces the default of its free number."""
-    function, free, _ = BASELINES[name]
-    if value is None or not free:
-        return function(time_s, position_m, clock)
-    return function(time_s, position_m, clock, **{free: int(value) if free == "window" else value})
+def run(name: str, time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, **choice: float) -> Motion:
+    """Apply a baseline by name; ``choice`` replaces the defaults of its free numbers."""
+    whole = {key: int(value) if key in ("window", "order") else value for key, value in choice.items()}
+    return BASELINES[name][0](time_s, position_m, clock, **whole)

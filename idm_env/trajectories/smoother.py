@@ -59,7 +59,7 @@ class Choices:
     rounds: int = 10
     degrees: float | None = 4.0
     jerk_degrees: float | None = 0.5
-    window: float = 1.0
+    window: float = 2.0
     highest: float = 5.0
     lowest: float = -8.0
 

@@ -215,12 +215,13 @@ def test_it_beats_every_tuned_baseline_on_measured_vehicles(measured) -> None:  
     assert row["implausible_percent"] == 0.0
     assert overlaps(ours)[1] == 0
     for name in baselines.available():
-        best = {}
-        for value in baselines.BASELINES[name][2] or (None,):
-            motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), value) for t in first[::3]]
-            best[value] = score(first[::3], motions)
+        choices = baselines.BASELINES[name][1]
+        rows = []
+        for choice in choices:
+            motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), **choice) for t in first[::3]]
+            rows.append(score(first[::3], motions))
         for what in ("speed_rmse_mps", "accel_rmse_mps2"):
             # tuned for each figure by itself, which no single smoother could be
-            value = min(best, key=lambda v: best[v][what])
-            motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), value) for t in second]
-            assert row[what] < score(second, motions)[what], (name, value, what)
+            best = choices[min(range(len(rows)), key=lambda i: rows[i][what])]
+            motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), **best) for t in second]
+            assert row[what] < score(second, motions)[what], (name, best, what)
