@@ -19,6 +19,7 @@ from idm_env.effects import IDM, Brakes, Replay
 from idm_env.fitting.adam import adam
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.levenberg import Normal, Progress, minimise, normal
+from idm_env.fitting.prior import Prior
 from idm_env.fitting.problem import IDM_NAMES, Loss, Objective, Problem, group_of
 from idm_env.fitting.uncertainty import Uncertainty, uncertainty
 from idm_env.roads import Lane
@@ -120,6 +121,9 @@ def fingerprint(problem: Problem, *options: object) -> str:
     digest = hashlib.sha256(repr((problem.simulator, problem.own, problem.shared, problem.groups, options)).encode())
     digest.update(repr((problem.objective, problem.relative, problem.loss, problem.skip)).encode())
     digest.update(repr(sorted(problem.fixed.items())).encode())
+    if problem.prior is not None:
+        digest.update(problem.prior.centre.numpy().tobytes() + problem.prior.deviation.numpy().tobytes())
+        digest.update(repr(problem.prior.noise).encode())
     digest.update(problem.batch.gap.numpy().tobytes() + problem.batch.position.numpy().tobytes())
     return digest.hexdigest()
 
@@ -142,6 +146,7 @@ def fit(
     substeps: int | None = None,
     start: tuple[Tensor, Tensor] | None = None,
     fixed: Mapping[str, float] | None = None,
+    prior: Prior | None = None,
     checkpoint: Path | None = None,
     resume: bool = False,
     on_progress: OnProgress | None = None,
@@ -151,18 +156,23 @@ def fit(
     ``by`` is ``driver``, ``all`` or a column. ``method`` is ``lm`` (Levenberg–Marquardt with exact forward-mode
     Jacobians, from ``starts`` starts per group, the pooled optimum among them) or ``adam`` (500 steps of reverse
     mode, learning rate 0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead;
-    ``fixed`` gives parameters that are not free another value than their default.
+    ``fixed`` gives parameters that are not free another value than their default. ``prior`` makes it a maximum
+    a posteriori, from the prior's centre unless ``start`` is given.
     ``checkpoint`` names the file that makes an interrupted fit resumable with the same result. ValueError and
     DataError for what cannot be fitted.
     """
     if method not in ("lm", "adam"):
         raise ValueError(f"method = '{method}' is unknown. Use 'lm' or 'adam'.")
+    if prior is not None and method != "lm":
+        raise ValueError(f"method = '{method}' knows no prior. Use 'lm'.")
+    if prior is not None and start is None:
+        start = prior.centre, torch.empty(0, dtype=prior.centre.dtype)
     batch = Batch.of(episodes, substeps=substeps)
     group, names = group_of(batch.episodes, by)
     simulator = dataclasses.replace(simulator or base_simulator(), dt=batch.step)
     problem = Problem(
         simulator, batch, tuple(free), tuple(shared), group, names,
-        objective=objective, relative=relative, loss=loss, skip=skip, fixed=dict(fixed or {}),
+        objective=objective, relative=relative, loss=loss, skip=skip, fixed=dict(fixed or {}), prior=prior,
     )  # fmt: skip
     saved = Checkpoint(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)
     begin = start or (_defaults(problem, problem.own).expand(len(names), -1), _defaults(problem, problem.shared))

@@ -60,9 +60,16 @@ def row_equations(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Normal
 
 
 def normal(problem: Problem, own: Tensor, shared: Tensor) -> Normal:
-    """Linearise at these values and sum the normal equations over the rows of every group."""
+    """Linearise at these values and sum the normal equations over the rows of every group, and the prior's."""
     rows, _ = row_equations(problem, own, shared)
-    return Normal(*(sum_groups(problem, x) for x in (rows.cost, rows.gradient, rows.hessian)))
+    total = Normal(*(sum_groups(problem, x) for x in (rows.cost, rows.gradient, rows.hessian)))
+    if problem.prior is not None:
+        count = len(problem.own)
+        cost, gradient, hessian = problem.prior.equations(own)
+        total.gradient[..., :count] += gradient
+        total.hessian[..., :count, :count] += hessian
+        total = dataclasses.replace(total, cost=total.cost + cost)
+    return total
 
 
 def sum_groups(problem: Problem, x: Tensor) -> Tensor:

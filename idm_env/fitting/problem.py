@@ -17,6 +17,7 @@ from torch import Tensor
 from idm_env.data import DataError, Episode
 from idm_env.fitting import fast
 from idm_env.fitting.batch import Batch
+from idm_env.fitting.prior import Prior
 from idm_env.fitting.tangent import TangentStep, linearised_rollout
 from idm_env.parameters import Parameter, catalogue, nearest
 from idm_env.simulator import Simulator
@@ -43,7 +44,8 @@ class Problem:
     measured value. Samples of the first ``skip`` seconds do not count. ``loss`` says how episodes of a group add up:
     ``mse`` sums squared residuals, ``rmse`` sums every episode's root mean square, so that a few bad episodes do not
     decide for all. ``kernels=False`` keeps to the torch path where fused kernels would fit. ``fixed`` gives parameters
-    that are not free another value than their default.
+    that are not free another value than their default. ``prior`` is what is known of the own parameters beforehand;
+    it asks for ``loss="mse"``.
     """
 
     simulator: Simulator
@@ -60,12 +62,15 @@ class Problem:
     kernels: bool = True
     seed: int = 0
     fixed: Mapping[str, float] = field(default_factory=dict)
+    prior: Prior | None = None
 
     def __post_init__(self) -> None:
         known = catalogue(self.simulator.effects)
         for name in (*self.own, *self.shared, *self.fixed):
             if name not in known:
                 raise ValueError(f"unknown parameter '{name}'.{nearest(name, known)}")
+        if self.prior is not None and self.loss != "mse":
+            raise ValueError(f"a prior weighs squared residuals; loss = '{self.loss}' has none. Use 'mse'.")
         if abs(self.simulator.dt - self.batch.step) > 1e-9:
             raise ValueError(
                 f"the simulator steps by {self.simulator.dt:g} s, the batch by {self.batch.step:g} s. Give both one dt."

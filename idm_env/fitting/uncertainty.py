@@ -53,7 +53,8 @@ def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
 
     A parameter is *not identified* when its standard error exceeds half of its value (a quarter of the width of its
     bounds for a strength, whose value may be near 0); it is *at a bound* within 0.1 % of the width. Standard errors
-    are of the interior: at a bound they say how flat the loss is, not how far the truth may lie.
+    are of the interior: at a bound they say how flat the loss is, not how far the truth may lie. With a prior the
+    covariance is that of the posterior around its mode, ``noise² H⁻¹`` with the prior in H.
     """
     rows, row_weight = row_equations(problem, own[None], shared[None])
     with torch.no_grad():
@@ -71,10 +72,12 @@ def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
     spread = rows.gradient[0][:, :, None] * rows.gradient[0][:, None, :]
     many = per_group >= ENOUGH_ROWS
     meat = torch.where(many[:, None, None], sum_groups(problem, spread[None])[0], sum_groups(problem, by_row[None])[0])
-    bread = _inverse(sum_groups(problem, rows.hessian)[0])
-    covariance = bread @ meat @ bread
-    drift = integration_error(problem, own, shared)
-    covariance = covariance + drift[:, :, None] * drift[:, None, :]
+    if problem.prior is not None:
+        covariance = problem.prior.noise**2 * _inverse(normal(problem, own[None], shared[None]).hessian[0])
+    else:
+        bread = _inverse(sum_groups(problem, rows.hessian)[0])
+        drift = integration_error(problem, own, shared)
+        covariance = bread @ meat @ bread + drift[:, :, None] * drift[:, None, :]
     if problem.shared and groups > 1:
         covariance = _share(covariance, len(problem.own))
     error = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
