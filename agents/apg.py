@@ -63,7 +63,8 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)
         training = {"optimiser": optimiser.state_dict(), "episodes": common.snapshot(env)}
         steps = arguments.window * arguments.count
-        if not monitor.after(update, steps, policy, training, loss=-loss.item(), norm=norm, learning_rate=rate):
+        figures = {"reward": -loss.item(), "norm": norm, "learning_rate": rate}
+        if not monitor.after(update, steps, policy, training, figures):
             break
     return monitor.history
 

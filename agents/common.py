@@ -165,15 +165,14 @@ def restore(env: DiffIDMVectorEnv, saved: Mapping[str, Any]) -> Tensor:
 
 
 def human_moments(
-    environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 500
+    environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 1500
 ) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation of what agents observe while human drivers keep the wheel."""
-    env = make_env(environment, count, output="torch")
-    features = len(env.task.bounds.names)
+    env = make_env(environment, count, output="numpy")
     seen = [env.reset(seed=seed)[0]]
     for _ in range(steps):
         seen.append(env.step(None)[0])
-    seen_by_one = torch.stack(seen).reshape(-1, features)
+    seen_by_one = torch.as_tensor(np.stack(seen)).reshape(-1, len(env.task.bounds.names)).float()
     return seen_by_one.mean(0), seen_by_one.std(0).clamp_min(1e-3)
 
 

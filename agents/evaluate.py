@@ -169,6 +169,41 @@ def solved_at(history: Sequence[Mapping[str, Any]]) -> int | None:
     return first if len(history) - first >= IN_A_ROW else None
 
 
+def held_out(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures on ring lengths and drivers that training has not seen, without any tuning.
+
+    ``lengths``: 200–300 m in steps of 10. ``drivers``: the six lengths of the test with one IDM parameter of all human
+    drivers 20 % lower or higher, ten cases; the worst of each figure. ``mixed``: every driver's every parameter drawn
+    from ±20 %. Ratios are to the uniform speed of those drivers.
+    """
+    result = {"lengths": evaluate_ring(act, environment, tuple(range(200, 301, 10)))}
+    idm = {**task_of(environment).own_parameters["idm"], **environment.get("parameters", {}).get("idm", {})}
+    generator = torch.Generator().manual_seed(_SEED)
+    vehicles = task_of(environment).vehicles
+    mixed = {
+        name: (value * (0.8 + 0.4 * torch.rand(vehicles, generator=generator))).tolist() for name, value in idm.items()
+    }
+    cases = {
+        f"{name} {sign}20 %": {name: idm[name] * factor} for name in idm for sign, factor in (("−", 0.8), ("+", 1.2))
+    }
+    for name, change in {**cases, "mixed": mixed}.items():
+        changed = {**environment, "parameters": {"idm": {**idm, **change}}}
+        result[name] = evaluate_ring(act, changed)
+    result["drivers"] = worst([result[name] for name in cases])
+    return result
+
+
+def worst(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the worst of every figure of the ring."""
+    return {
+        "speed_ratio": min(r["speed_ratio"] for r in rows),
+        "speed_std": max(r["speed_std"] for r in rows),
+        "time_gap": min(r["time_gap"] for r in rows),
+        "collisions": sum(r["collisions"] for r in rows),
+        "passed": all(r["passed"] for r in rows),
+    }
+
+
 # -- following a record ----------------------------------------------------------------------------------------------
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from stable_baselines3.common.logger import configure
@@ -44,8 +44,19 @@ class Monitor:
         """CPU seconds of training so far, those before a resume included."""
         return self.before + time.process_time() - self._begin - self._aside
 
-    def after(self, update: int, steps: int, policy: Policy, training: Mapping[str, Any], **figures: float) -> bool:
-        """Log an update that made ``steps`` environment steps, keep it, and return whether training goes on."""
+    def after(
+        self,
+        update: int,
+        steps: int,
+        policy: Policy,
+        training: Mapping[str, Any],
+        figures: Mapping[str, float],
+        keep: Callable[[], None] | None = None,
+    ) -> bool:
+        """Log an update that made ``steps`` environment steps, keep it, and return whether training goes on.
+
+        ``training`` is kept in the checkpoint, and ``keep`` writes what an agent keeps beside it.
+        """
         spent, self.steps = self.cpu_seconds, self.steps + steps
         over = update + 1 >= self.arguments.updates or 0.0 < self.arguments.cpu_seconds <= spent
         begin = time.process_time()
@@ -56,6 +67,8 @@ class Monitor:
             row |= evaluate(policy, self.arguments.environment)
             self.history.append(row)
         kept = {**training, "update": update, "steps": self.steps, "cpu_seconds": spent, "history": self.history}
+        if keep is not None:
+            keep()
         common.save(self.last, policy, self.agent, self.arguments.environment, kept)
         if row and score(row) > max((score(r) for r in self.history[:-1]), default=-float("inf")):
             common.save(self.best, policy, self.agent, self.arguments.environment, kept)

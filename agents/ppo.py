@@ -1,0 +1,177 @@
+"""Model-free baselines: Stable-Baselines3's PPO and SAC through ``idm_env.envs.sb3``.
+
+They see the same observations in the same fixed normalisation, get the same reward, are stopped by the same clock and
+judged by the same test as the agents that differentiate. After every chunk of learning the actor is copied into a
+``Policy``, so that all agents leave the same files; ``model.zip`` beside them is SB3's own, for ``resume`` (the replay
+buffer of SAC is not kept: it fills anew).
+
+``python -m agents.ppo --config configs/ring-ppo.yaml --seed 1``
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import torch
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from torch import Tensor, nn
+
+from agents import common
+from agents.common import ACTIVATIONS, DivergedError, Policy
+from agents.monitor import Monitor
+from idm_env.envs.sb3 import SB3VecEnv
+
+
+@dataclass
+class Arguments(common.Arguments):
+    """Arguments of PPO and SAC; names are those of Stable-Baselines3.
+
+    Args:
+        algorithm: ppo or sac.
+        count: Environments that run together.
+        n_steps: Steps of each environment between updates (PPO), or in a chunk of learning (SAC).
+        gamma: Discount per step.
+        activation: tanh or relu.
+        batch_size: Samples of a gradient step.
+        gae_lambda: Of PPO's advantages.
+        n_epochs: Passes of PPO over its samples.
+        clip_range: Of PPO's ratio.
+        ent_coef: Weight of entropy: a number, or auto for SAC.
+        log_std_init: Logarithm of PPO's first standard deviation of actions.
+        use_sde: Exploration that depends on the state instead of white noise.
+        gradient_steps: Gradient steps of SAC per step of all environments.
+        learning_starts: Samples that SAC collects before it learns.
+    """
+
+    out: Path = Path("runs/ppo")
+    learning_rate: float = 1e-3
+    clip: float = 0.5
+    algorithm: Literal["ppo", "sac"] = "ppo"
+    count: int = 64
+    n_steps: int = 300
+    gamma: float = 0.999
+    activation: str = "tanh"
+    batch_size: int = 4800
+    gae_lambda: float = 0.95
+    n_epochs: int = 10
+    clip_range: float = 0.2
+    ent_coef: str = "0.0"
+    log_std_init: float = -1.0
+    use_sde: bool = False
+    gradient_steps: int = 1
+    learning_starts: int = 6400
+
+
+class Normalised(BaseFeaturesExtractor):
+    """Observations in the fixed normalisation of a ``Policy``."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, space: gymnasium.spaces.Box, mean: Sequence[float], scale: Sequence[float]) -> None:
+        super().__init__(space, space.shape[0])
+        self.register_buffer("mean", torch.tensor(mean))
+        self.register_buffer("scale", torch.tensor(scale))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return ``(o − m) / s``."""
+        return (observation - self.mean) / self.scale
+
+
+def make_model(arguments: Arguments, env: VecEnv, policy: Policy) -> BaseAlgorithm:
+    """Return SB3's algorithm, its actor of the size and the normalisation of ``policy``."""
+    net: dict[str, Any] = {
+        "net_arch": list(arguments.hidden),
+        "activation_fn": ACTIVATIONS[arguments.activation],
+        "features_extractor_class": Normalised,
+        "features_extractor_kwargs": {"mean": policy.mean.tolist(), "scale": policy.scale.tolist()},
+    }
+    same: dict[str, Any] = {
+        "learning_rate": arguments.learning_rate, "gamma": arguments.gamma, "batch_size": arguments.batch_size,
+        "use_sde": arguments.use_sde, "seed": common.first_seed(arguments.seed, 0), "device": "cpu",
+    }  # fmt: skip
+    entropy: Any = arguments.ent_coef if arguments.ent_coef.startswith("auto") else float(arguments.ent_coef)
+    if arguments.algorithm == "sac":
+        return SAC(
+            "MlpPolicy", env, policy_kwargs=net, ent_coef=entropy, gradient_steps=arguments.gradient_steps,
+            learning_starts=arguments.learning_starts, **same,
+        )  # fmt: skip
+    net["log_std_init"] = arguments.log_std_init
+    return PPO(
+        "MlpPolicy", env, policy_kwargs=net, ent_coef=entropy, n_steps=arguments.n_steps, n_epochs=arguments.n_epochs,
+        gae_lambda=arguments.gae_lambda, clip_range=arguments.clip_range, max_grad_norm=arguments.clip, **same,
+    )  # fmt: skip
+
+
+def copy_actor(model: BaseAlgorithm, policy: Policy, update: int, kept: Path) -> None:
+    """Copy the actor of an SB3 model into a policy; DivergedError where a weight is not finite."""
+    parts: list[nn.Module]
+    if isinstance(model, SAC):
+        parts = [*model.actor.latent_pi, model.actor.mu]
+    else:
+        actor: Any = model.policy
+        parts = [*actor.mlp_extractor.policy_net, actor.action_net]
+    bad = [name for name, value in model.policy.named_parameters() if not bool(torch.isfinite(value).all())]
+    if bad:
+        raise DivergedError(
+            f"update {update}: weights of {bad[0]} must be finite. The last good checkpoint is {kept}; resume from it "
+            "with a lower learning_rate."
+        )
+    theirs = [p for p in parts if isinstance(p, nn.Linear)]
+    ours = [p for p in policy.body if isinstance(p, nn.Linear)]
+    for mine, other in zip(ours, theirs, strict=True):
+        mine.load_state_dict(other.state_dict())
+
+
+def train(arguments: Arguments) -> list[dict[str, Any]]:
+    """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
+    began = time.process_time()
+    torch.manual_seed(arguments.seed)
+    name = arguments.algorithm
+    squash = "tanh" if name == "sac" else "clip"
+    policy, saved = common.begin(arguments, name, activation=arguments.activation, squash=squash)
+    vector = SB3VecEnv(common.make_env(arguments.environment, arguments.count, output="numpy"))
+    vector.seed(common.first_seed(arguments.seed, arguments.count))
+    # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
+    env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
+    file, moments = arguments.out / "model.zip", arguments.out / "returns.pkl"
+    if saved:
+        env = VecNormalize.load(str(moments), vector)
+        model: BaseAlgorithm = (SAC if name == "sac" else PPO).load(file, env=env, device="cpu")
+    else:
+        model = make_model(arguments, env, policy)
+    monitor = Monitor(name, arguments, began, saved)
+
+    def keep() -> None:
+        model.save(file)
+        env.save(str(moments))
+
+    chunk = arguments.n_steps * arguments.count
+    for update in range(saved.get("update", -1) + 1, arguments.updates):
+        rate = common.fall(arguments.learning_rate, update, arguments.updates)
+        model.lr_schedule = FloatSchedule(rate)
+        model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
+        copy_actor(model, policy, update, monitor.last)
+        figures = {k: float(v) for k, v in model.logger.name_to_value.items() if "loss" in k or "std" in k}
+        if not monitor.after(update, chunk, policy, {}, {**figures, "learning_rate": rate}, keep):
+            break
+    return monitor.history
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Train as the command line says."""
+    torch.set_num_threads(1)
+    train(common.parse(Arguments, "ppo", argv))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""Agents side by side: equal searches, ten seeds of the best, held-out rings and drivers.
+
+    python benchmarks/agents.py run [--only ring-ppo] [--out runs/benchmark]
+    python benchmarks/agents.py table [--out runs/benchmark]
+
+Every training is one process with one thread and one file of results; what is done is skipped, what another process
+works on is left to it, so the command may be interrupted, repeated, and started several times. CPU seconds are those of
+training; evaluations every 3 s are not counted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+BUDGET, EVERY = 45.0, 3.0
+SEARCH_SEEDS, SEEDS = (100, 101), tuple(range(10))
+
+Options = dict[str, Any]
+SEARCH: dict[str, list[Options]] = {
+    "ring-apg": [
+        {"learning_rate": 1e-3},
+        {"learning_rate": 3e-3},
+        {"learning_rate": 5e-4},
+        {"learning_rate": 1e-3, "window": 300, "updates": 72},
+        {"learning_rate": 1e-3, "count": 32, "updates": 44},
+    ],
+    "ring-ppo": [
+        {"learning_rate": 1e-3, "log_std_init": -2.5},
+        {"learning_rate": 3e-3, "log_std_init": -2.5},
+        {"learning_rate": 1e-3, "log_std_init": -2.5, "gamma": 0.99},
+        {"learning_rate": 1e-3, "log_std_init": -2.0, "use_sde": True},
+        {"learning_rate": 3e-3, "log_std_init": -3.0, "n_steps": 600, "batch_size": 9600, "updates": 50},
+    ],
+    "ring-sac": [
+        {"learning_rate": 1e-3},
+        {"learning_rate": 1e-3, "gamma": 0.99},
+        {"learning_rate": 3e-4, "gamma": 0.999, "batch_size": 1024},
+        {"learning_rate": 1e-3, "count": 16, "n_steps": 400, "learning_starts": 1600},
+        {"learning_rate": 1e-3, "ent_coef": "0.002", "gradient_steps": 2},
+    ],
+}
+"""Five trials of each algorithm; what a trial does not name is as in its configuration file."""
+MODULES = {"apg": "agents.apg", "ppo": "agents.ppo", "sac": "agents.ppo", "shac": "agents.shac"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One training: a configuration, the number of its trial, what the trial changes, and a seed."""
+
+    config: str
+    trial: int
+    options: Options
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """The folder of its results."""
+        return f"{self.config}/trial{self.trial}/seed{self.seed}"
+
+    def command(self, out: Path) -> list[str]:
+        """Return the command that trains."""
+        module = MODULES[self.config.split("-")[1]]
+        words = [sys.executable, "-m", module, "--config", f"configs/{self.config}.yaml", "--seed", str(self.seed)]
+        words += ["--out", str(out), "--cpu-seconds", str(BUDGET), "--evaluate-every", str(EVERY)]
+        for key, value in self.options.items():
+            option = "--" + key.replace("_", "-")
+            words += [option] if value is True else [option, str(value)]
+        return words
+
+
+def perform(job: Job, out: Path) -> dict[str, Any] | None:
+    """Return the results of a job, trained now if they are not there; None where another process works on it."""
+    folder = out / job.name
+    result = folder / "result.json"
+    folder.mkdir(parents=True, exist_ok=True)
+    # The lock goes with its process: whatever was interrupted is begun again.
+    with (folder / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return None
+        if not result.exists():
+            training = folder / "training"
+            shutil.rmtree(training, ignore_errors=True)
+            done = subprocess.run(job.command(training), cwd=ROOT, capture_output=True, text=True, check=False)
+            row = {**dataclasses.asdict(job), **outcome(training, done)}
+            beside = result.with_suffix(".part")
+            beside.write_text(json.dumps(row, indent=1))
+            os.replace(beside, result)
+            print(f"{job.name}: {json.dumps(row['summary'])}", flush=True)
+    content: dict[str, Any] = json.loads(result.read_text())
+    return content
+
+
+def outcome(training: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    """Return what a training came to: evaluations, the last and the best checkpoint, and both on held-out traffic."""
+    from agents.common import load
+    from agents.evaluate import held_out, solved_at
+
+    if not (training / "last.pt").exists():
+        return {"error": done.stderr[-2000:], "history": [], "summary": {"solved": False, "error": True}}
+    policy, content = load(training / "last.pt")
+    best, at_best = load(training / "best.pt")
+    history = content["training"]["history"]
+    first = solved_at(history)
+    summary = {
+        "solved": first is not None,
+        "cpu_seconds": None if first is None else history[first]["cpu_seconds"],
+        "steps": None if first is None else history[first]["steps"],
+        "ever": any(row["passed"] for row in history),
+        "error": done.returncode != 0,
+    }
+    test = content["task"] == "ring"
+    return {
+        "error": done.stderr[-2000:] if done.returncode else "",
+        "summary": summary,
+        "history": history,
+        "last": history[-1],
+        "best": at_best["training"]["history"][-1],
+        "held_out": held_out(policy, content["environment"]) if test else {},
+        "held_out_best": held_out(best, at_best["environment"]) if test else {},
+    }
+
+
+def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
+    """Return the best trial of a search (-1 while it is not finished) and the results of all its runs.
+
+    The best has most seeds solved, then the highest mean score of the last evaluation.
+    """
+    from agents.evaluate import score
+
+    rows, ranks = [], []
+    for trial, options in enumerate(SEARCH[config]):
+        found = [perform(Job(config, trial, options, seed), out) for seed in SEARCH_SEEDS]
+        done = [row for row in found if row is not None]
+        if len(done) < len(found):
+            return -1, rows
+        rows += done
+        ends = [score(row["last"]) if row["history"] else -1e9 for row in done]
+        ranks.append((sum(row["summary"]["solved"] for row in done), sum(ends) / len(ends)))
+    return ranks.index(max(ranks)), rows
+
+
+def run(configs: list[str], out: Path) -> None:
+    """Do every search and the ten seeds of its best trial."""
+    for config in configs:
+        trial, _ = chosen(config, out)
+        if trial < 0:
+            print(f"{config}: another process is still searching.")
+            continue
+        for seed in SEEDS:
+            perform(Job(config, trial, SEARCH[config][trial], seed), out)
+
+
+def main() -> None:
+    """Run or show."""
+    import argparse
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["run", "table"])
+    parser.add_argument("--only", nargs="*", default=list(SEARCH))
+    parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
+    options = parser.parse_args()
+    if options.what == "run":
+        run(options.only, options.out.resolve())
+
+
+if __name__ == "__main__":
+    main()
