@@ -39,6 +39,31 @@ def leaders(random: np.random.Generator, runs: int, steps: int, step: float, cru
     return Scripted(position, speed, np.gradient(speed, step, axis=0))
 
 
+LAP_M = 900.0
+BENDS_M = (150.0, 380.0, 640.0)
+
+
+def lapping(random: np.random.Generator, runs: int, steps: int, step: float, cruise: float) -> Scripted:
+    """Return leaders that drive laps of `LAP_M` and brake for the same bends every time, each a little differently."""
+    position, speed = np.empty((2, steps, runs))
+    x, v = random.uniform(0.0, LAP_M, runs), np.full(runs, 0.6 * cruise)
+    pace = random.uniform(0.85, 1.0, runs)
+    moods = ornstein_uhlenbeck(random, (steps, runs), 0.06, 8.0, step)
+    for k in range(steps):
+        position[k], speed[k] = x, v
+        place = np.mod(x, LAP_M)[:, None]
+        slow = np.exp(-(((place - BENDS_M) / 45.0) ** 2)).max(1)
+        target = cruise * pace * (1.0 + moods[k]) * (1.0 - 0.65 * slow)
+        accel = np.clip((target - v) / 1.5, -3.0, 1.5)
+        x = x + step * v + 0.5 * step**2 * accel
+        v = np.maximum(v + step * accel, 0.0)
+    speed = gaussian_filter1d(speed, 0.4 / step, axis=0, mode="nearest")
+    position = position[0] + np.concatenate(
+        [np.zeros((1, runs)), np.cumsum((speed[1:] + speed[:-1]) * (step / 2), axis=0)]
+    )
+    return Scripted(position, speed, np.gradient(speed, step, axis=0))
+
+
 def beside(leader: Scripted) -> Scripted:
     """Return a slower queue in the adjacent lane, long enough to have somebody beside each follower all the time."""
     start = leader.position[0][None, :, None]

@@ -57,6 +57,7 @@ def generate(
     spread: float = 0.2,
     gap_column: bool = False,
     grade_column: bool = False,
+    laps: bool = False,
     dt: float = 0.1,
 ) -> tuple[Trajectories, Truth]:
     """Return platoons that look measured, and the truth about them; the same seed gives the same data.
@@ -76,6 +77,7 @@ def generate(
         spread: Log-standard deviation of the drivers' parameters, half of it for the desired speed.
         gap_column: Whether the table has a measured gap_m.
         grade_column: Whether the table tells the slope of the road.
+        laps: Whether leaders drive laps and brake for the same bends every time; the place is column track_s_m.
         dt: Time step of the table in s.
 
     Raises:
@@ -87,7 +89,8 @@ def generate(
     steps = round(seconds / dt) * SUBSTEPS + 1
     shape = (runs, followers)
     drivers = _drivers(random, shape, spread)
-    leader = scripted.leaders(random, runs, steps, step, 0.8 * drivers.desired_speed.min())
+    script = scripted.lapping if laps else scripted.leaders
+    leader = script(random, runs, steps, step, 0.8 * drivers.desired_speed.min())
     platoon = Platoon(
         leader=leader,
         beside=scripted.beside(leader) if "lateral" in on else None,
@@ -102,6 +105,8 @@ def generate(
     table = _measured(random, truth, noise, correlated_noise, speed_noise, dt)
     if gap_column or "gap_bias" in on:
         table = _with_gap(random, truth, table, noise, on.get("gap_bias", 0.0))
+    if laps:
+        table = table.with_columns(track_s_m=pl.col("position_m") % scripted.LAP_M)
     if grade_column:
         slopes = hidden.slope(truth.motion["position_m"].to_numpy(), on.get("grade", 0.0))
         table = table.with_columns(pl.Series("grade", slopes))

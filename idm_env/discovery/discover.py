@@ -5,7 +5,7 @@ much better is the corrected model on runs that had no part in it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,38 +16,13 @@ from idm_env.data import Trajectories, episodes
 from idm_env.discovery import checkpoint, judge, places, records, search, summary
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
+from idm_env.discovery.decide import Round, decide
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
-from idm_env.discovery.score import Verdict, held_out, westfall_young
-from idm_env.discovery.search import OnProgress, Scored, Search
-from idm_env.discovery.solve import NAMES, Solution, Task, solve
+from idm_env.discovery.search import OnProgress, Search
+from idm_env.discovery.solve import NAMES, Solution, Task
 from idm_env.effects import CANDIDATES, IDM, Brakes
 from idm_env.parameters import nearest
-
-ALPHA = 0.05
-LEAST_GAIN = 0.01
-"""Least gain in the logarithm of the whitened 5 s prediction error, on held-out runs."""
-LEAST_SHARE = 0.5
-FEWEST_RUNS = 5
-MOST_ROUNDS = 3
-SAME = 0.15
-"""Candidates whose gain is within this share of the best one's are told apart by nothing but their names."""
-CLASSES = ({"delay", "lag"},)
-
-
-@dataclass(eq=False)
-class Round:
-    """What one round of the search saw, for the report."""
-
-    scored: list[Scored]
-    verdict: Verdict
-    before: np.ndarray
-    left: np.ndarray
-    winner: int | None
-    equivalent: list[int] = field(default_factory=list)
-    share: float = float("nan")
-    why_not: str = ""
-    partial: int | None = None
 
 
 @dataclass(eq=False)
@@ -124,8 +99,7 @@ def discover(
     progress("null", "idm", 0, 1)
     base = Model(tuple(_known_terms(prepared, known, trajectories)))
     null = searching.null(base, theta)
-    final, rounds = _rounds(searching, null, len(fit_runs), seed)
-    final = _delete(searching, final, len(base.terms))
+    steps, rounds = decide(searching, null, seed)
     saved.done()
     discovery = _finish(
         trajectories,
@@ -134,7 +108,7 @@ def discover(
         kept_runs,
         searching,
         null,
-        final,
+        steps,
         rounds,
         refused,
         by,
@@ -211,132 +185,41 @@ def _known_terms(prepared: Records, known: Sequence[str], trajectories: Trajecto
     return [terms.known_grade(low, distance, profile.tolist(), period)]
 
 
-# -- the search ------------------------------------------------------------------------------------------------------
-
-
-def _rounds(searching: Search, null: Solution, runs: int, seed: int) -> tuple[Solution, list[Round]]:
-    now, rounds = null, []
-    for number in range(1, MOST_ROUNDS + 1):
-        scored, before = searching.round(now, number)
-        scored = [s for s in scored if not _same_class(s.term, now.model)]
-        verdict = westfall_young(np.array([s.gains for s in scored]), seed)
-        order = np.argsort(-verdict.gain)
-        fitted = [i for i in order if scored[i].solution is not None and verdict.p_value[i] < 2 * ALPHA]
-        if fitted and verdict.gain[fitted[0]] > 0.3 * LEAST_GAIN:
-            now, scored = searching.again(now, scored[fitted[0]], scored)
-            verdict = westfall_young(np.array([s.gains for s in scored]), seed)
-        left = judge.ceiling(places.respond(searching.task, now))
-        this = Round(scored, verdict, before, left, None)
-        rounds.append(this)
-        _choose(searching, now, this, runs)
-        if this.winner is None:
-            break
-        chosen = scored[this.winner].solution
-        assert chosen is not None
-        now = searching.null(chosen.model, chosen.theta, chosen.values)
-    return now, rounds
-
-
-def _same_class(term: Term, model: Model) -> bool:
-    """Tell whether the model has an effect already that only sharp inputs tell from this one."""
-    return any({term.effect, other.effect} in CLASSES for other in model.terms)
-
-
-def _choose(searching: Search, now: Solution, this: Round, runs: int) -> None:
-    """Set the winner of a round, or say why there is none."""
-    if runs < FEWEST_RUNS:
-        this.why_not = f"only {runs} runs are left to choose on: the smallest p-value is {2.0**-runs:.2g}"
-        return
-    verdict, scored = this.verdict, this.scored
-    able = [
-        i for i, s in enumerate(scored)
-        if s.solution is not None and verdict.p_value[i] < ALPHA and verdict.gain[i] >= LEAST_GAIN
-    ]  # fmt: skip
-    if not able:
-        this.why_not = "no candidate gains enough on held-out runs"
-        return
-    best = max(able, key=lambda i: verdict.gain[i])
-    same = [i for i in able if verdict.gain[i] >= (1.0 - SAME) * verdict.gain[best]]
-    same += [
-        i for i in able
-        if i not in same and {scored[i].term.label, scored[best].term.label} in CLASSES
-        and verdict.gain[i] >= 0.7 * verdict.gain[best]
-    ]  # fmt: skip
-    named = [i for i in same if scored[i].term.effect is not None]
-    # What has a name goes before what is only located, where both explain the same.
-    winner = max(named, key=lambda i: verdict.gain[i]) if named else best
-    chosen = scored[winner].solution
-    assert chosen is not None
-    after = judge.ceiling(places.respond(searching.task, chosen))
-    gained, rest = float(verdict.gain[winner]), max(float(after.mean()), 0.0)
-    explained = 1.0 - np.exp(-2 * gained)
-    this.share = float(explained / max(explained + np.exp(-2 * gained) * (1.0 - np.exp(-2 * rest)), 1e-12))
-    this.partial = winner
-    if this.share < LEAST_SHARE:
-        this.why_not = f"{scored[winner].term.label} explains only {this.share:.0%} of what can be explained"
-        return
-    if not _free_run_holds(searching, now, chosen):
-        this.why_not = f"{scored[winner].term.label} makes free simulation worse"
-        return
-    this.winner = winner
-    this.equivalent = [i for i in same if i != winner]
-
-
-def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
-    prepared = searching.task.rows.records
-    before, after = (judge.free_run_rmse(prepared, s) for s in (now, chosen))
-    return after <= 1.02 * before
-
-
-def _delete(searching: Search, final: Solution, base: int) -> Solution:
-    """Take back every added term whose loss costs less than an addition must gain."""
-    while len(final.model.terms) > base + 1:
-        now = held_out(searching.task, final)
-        losses = []
-        for index in range(base, len(final.model.terms)):
-            begin = sum(t.size for t in final.model.terms[:index])
-            keep = np.delete(final.values, np.arange(begin, begin + final.model.terms[index].size))
-            less = solve(searching.task, final.model.without(index), final.theta, keep)
-            losses.append((float(0.5 * np.log(held_out(searching.task, less) / now).mean()), index, less))
-        loss, _, less = min(losses, key=lambda x: x[0])
-        if loss >= LEAST_GAIN:
-            break
-        final = less
-    return final
-
-
 # -- after the search ------------------------------------------------------------------------------------------------
 
 
 def _finish(
     trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], searching: Search,
-    null: Solution, final: Solution, rounds: list[Round], refused: dict[str, str], by: str,
+    null: Solution, steps: list[Solution], rounds: list[Round], refused: dict[str, str], by: str,
     seed: int, names: list[str],
 ) -> Discovery:  # fmt: skip
     adapt = by == "driver"
     base = len(null.model.terms)
     fit_records = prepared.of_runs(fit_runs)
-    thetas = []
-    for s in (null, final):
-        thetas.append(judge.calibrate(prepared if adapt else fit_records, s.model, s.values, s.prior, start=s.theta))
-    before = after = None
-    if kept_runs:
-        kept = prepared.of_runs(kept_runs)
-        before, after = (
-            judge.judge(kept, s.model, s.values, s.prior, None if adapt else th.theta, adapt)
-            for s, th in zip((null, final), thetas, strict=True)
-        )
-    if len(final.model.terms) == base:
-        after, thetas[1] = before, thetas[0]
-    elif kept_runs and judge.confirmed(prepared.of_runs(kept_runs), searching.task, null, final) <= 0:
-        rounds[-1].why_not = "the lockbox does not confirm the finding"
-        final, after, thetas[1] = null, before, thetas[0]
+    kept = prepared.of_runs(kept_runs) if kept_runs else None
+    final = null
+    if kept is not None:
+        # The lockbox is looked into once for every addition, and only to end there.
+        for s in steps:
+            if judge.confirmed(kept, searching.task, final, s) <= 0:
+                rounds[-1].why_not = "the lockbox does not confirm the finding"
+                break
+            final = s
+
+    def judged(s: Solution) -> tuple[Solution, judge.Judged | None]:
+        theta = judge.calibrate(prepared if adapt else fit_records, s.model, s.values, s.prior, start=s.theta)
+        if kept is None:
+            return theta, None
+        return theta, judge.judge(kept, s.model, s.values, s.prior, None if adapt else theta.theta, adapt)
+
+    first, before = judged(null)
+    last, after = (first, before) if final is null else judged(final)
+    thetas = [first, last]
     partial = None
     if kept_runs and len(final.model.terms) == base and rounds[0].partial is not None:
         best = rounds[0].scored[rounds[0].partial].solution
         assert best is not None
-        pooled = None if adapt else judge.calibrate(fit_records, best.model, best.values, best.prior).theta
-        partial = judge.judge(prepared.of_runs(kept_runs), best.model, best.values, best.prior, pooled, adapt)
+        _, partial = judged(best)
     responses = places.respond(searching.task, final)
     report = summary.report(
         trajectories, prepared, fit_runs, kept_runs, searching.task, null, final, rounds, refused, before, after,

@@ -71,14 +71,16 @@ def calibrate(
     return solve(replace(task, sigma=sigma), frozen, theta, empty, iterations=25, tolerance=1e-5)
 
 
-def free_run_rmse(records: Records, s: Solution) -> float:
-    """Return the pooled gap RMSE (m) of free simulation with θ fitted to it; one error counts as 30 m at most."""
+def free_run_squares(records: Records, s: Solution) -> np.ndarray:
+    """Return every run's squared gap errors (m²) of free simulation with θ fitted to it; one counts as 30 m at most."""
     model, values, prior = s.model, s.values, s.prior
     fitted = calibrate(records, model, values, prior, start=s.theta)
     rows = whole(records)
     task = Task(rows, None, prior, np.ones(len(rows)))
     errors = task.errors(fitted.theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
-    return float(np.sqrt((np.clip(errors, -30.0, 30.0) ** 2).sum() / rows.valid.sum()))
+    squares = np.zeros(len(records.runs))
+    np.add.at(squares, rows.run, (np.clip(errors, -30.0, 30.0) ** 2).sum(1))
+    return squares
 
 
 def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> float:

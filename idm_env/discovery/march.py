@@ -175,7 +175,7 @@ def _row(
         # The scene half a step ahead: own speed, gap, speed and acceleration of the leader, gap and speed of the second
         # leader, gap and speed of the vehicle behind; then what the driver sees of it.
         _ahead(signals, i, x, v, accel, length, half, seen)
-        true_speed = seen[0]
+        true_speed, pull = seen[0], seen[3]
         if tau > 0.0:
             if k >= 0:
                 history[k] = seen
@@ -271,7 +271,7 @@ def _row(
         want = a * (1.0 - free * free - term) + added
         if p[2] != 0.0 and signals[i, 6] > 0.0:
             want += a * p[2] * (term - _interaction(s0, headway, brake, extra, sv, 0.5 * seen[4], seen[5]))
-        want += p[3] * seen[3] + p[4] * min(seen[3], 0.0)
+        want += p[3] * pull + p[4] * min(seen[3], 0.0)
         if p[11] != 0.0 and signals[i, 10] > 0.0:
             pressure = (s0 + sv * headway) / max(seen[6], 0.1)
             want += p[11] * a * min(pressure * pressure, 4.0)

@@ -81,6 +81,12 @@ class Model:
         """Return the model without a term."""
         return Model(self.terms[:index] + self.terms[index + 1 :])
 
+    def where(self, label: str) -> slice:
+        """Return which entries are those of the term ``label``."""
+        index = [t.label for t in self.terms].index(label)
+        begin = sum(t.size for t in self.terms[:index])
+        return slice(begin, begin + self.terms[index].size)
+
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Declarations of all entries."""

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from idm_env.discovery import march as twin
 
 if TYPE_CHECKING:
-    from idm_env.discovery.discover import Discovery, Round
+    from idm_env.discovery.decide import Round
+    from idm_env.discovery.discover import Discovery
 
 BEFORE, AFTER, TRUTH, GREY = "#c0392b", "#1f6fb2", "#222222", "#9aa5b1"
 plt.rcParams.update(
@@ -117,11 +118,11 @@ def _projected(d: Discovery, scored: Any) -> np.ndarray | None:
     if solution is None or not solution.linear.by_phi.shape[-1]:
         return None
     linear = solution.linear
-    column = linear.by_phi[..., -scored.term.size :].mean(-1)
+    mine = solution.model.where(scored.term.label)
     if scored.term.size > 4:
-        column = np.einsum("rmq,q->rm", linear.by_phi[..., -scored.term.size :], solution.values[-scored.term.size :])
+        column = np.einsum("rmq,q->rm", linear.by_phi[..., mine], solution.values[mine])
     else:
-        column = linear.by_phi[..., -scored.term.size]
+        column = linear.by_phi[..., mine.start]
     return _off(d, linear.by_theta, column)
 
 

@@ -94,8 +94,23 @@ class Search:
             result.append(Scored(s.term, fresh, gains if s.honest is None else np.where(s.honest, gains, s.gains)))
         return null, result
 
+    def pair(self, solution: Solution, names: tuple[str, str], before: np.ndarray, number: int) -> Scored:
+        """Score two effects of the catalogue at once; the term that is named is the second."""
+        first, second = (terms.simple(n) for n in names)
+        self.on_progress(f"round {number}", f"{first.label} + {second.label}", 0, 1)
+        base = replace(solution, model=solution.model.adding(first))
+        # Strong starts: along the direction in which they cancel, weak ones see nothing to improve.
+        starts = [np.concatenate([solution.values, a, [0.3]]) for a in first.starts]
+        return self._nested(base, second, before, f"{number}/{first.label} + {second.label}", starts, 12)
+
     def _nested(
-        self, solution: Solution, term: Term, before: np.ndarray, key: str, start: np.ndarray | None = None
+        self,
+        solution: Solution,
+        term: Term,
+        before: np.ndarray,
+        key: str,
+        starts: Sequence[np.ndarray] | None = None,
+        iterations: int = 8,
     ) -> Scored:
         model = solution.model.adding(term)
         kept = self.saved.get(key)
@@ -105,12 +120,10 @@ class Search:
             linear = linearise(task, model, theta, values)
             best = finish(task, model, theta, values, linear, float(kept["cost"]))
         else:
-            starts = [np.array(s) for s in term.starts] if start is None else [start]
-            first = [
-                solve(self.task, model, solution.theta, np.append(solution.values, s), iterations=5) for s in starts
-            ]
+            starts = starts or [np.append(solution.values, s) for s in term.starts]
+            first = [solve(self.task, model, solution.theta, s, iterations=5) for s in starts]
             best = min(first, key=lambda s: s.cost)
-            best = solve(self.task, model, best.theta, best.values, iterations=8)
+            best = solve(self.task, model, best.theta, best.values, iterations=iterations)
             self.saved.put(key, theta=best.theta, values=best.values, cost=np.array(best.cost))
         gains = 0.5 * np.log(before / held_out(self.task, best))
         return Scored(term, best, gains)
@@ -155,7 +168,11 @@ class Search:
             low, high = term.parameters[0].low, term.parameters[0].high
             result.append(
                 self._nested(
-                    solution, term, before, f"{number}/{term.label}", np.clip(start / scale, 0.9 * low, 0.9 * high)
+                    solution,
+                    term,
+                    before,
+                    f"{number}/{term.label}",
+                    [np.append(solution.values, np.clip(start / scale, 0.9 * low, 0.9 * high))],
                 )
             )
 
@@ -189,7 +206,8 @@ class Search:
             if gains.mean() < WORTH:
                 result.append(Scored(term, None, gains))
             else:
-                one = self._nested(solution, term, before, f"{number}/{term.label}", np.zeros(8))
+                start = np.append(solution.values, np.zeros(8))
+                one = self._nested(solution, term, before, f"{number}/{term.label}", [start])
                 result.append(Scored(term, one.solution, np.minimum(one.gains, gains + 0.5 * np.abs(gains))))
         return result
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import judge
+from idm_env.discovery.decide import ALPHA, LEAST_GAIN
 from idm_env.discovery.model import Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.score import interval_of
@@ -51,7 +52,7 @@ def report(
     content = {
         "schema": 1,
         "verdict": verdict,
-        "sentence": sentence(verdict, found, rounds),
+        "sentence": " ".join([sentence(verdict, found, rounds), *_soberly(found, before, after)]),
         "found": found,
         "known": _known(final, interval_of(final, task), base),
         "error": {
@@ -78,7 +79,7 @@ def _partial(first: Any, after: judge.Judged | None, before: judge.Judged | None
     if after is None or before is None or first.partial is None:
         return None
     s = first.scored[first.partial]
-    values = s.solution.values[-s.term.size :]
+    values = s.solution.values[s.solution.model.where(s.term.label)]
     ok = before.scored.any(1)
     return {
         "effect": s.term.effect or s.term.label,
@@ -106,7 +107,7 @@ def _verdict(found: list[dict[str, Any]], rounds: list[Any]) -> str:
     first = rounds[0]
     if first.why_not.startswith("only"):
         return "cannot_tell"
-    structured = bool(((first.verdict.p_value < 0.05) & (first.verdict.gain >= 0.01)).any())
+    structured = bool(((first.verdict.p_value < ALPHA) & (first.verdict.gain >= LEAST_GAIN)).any())
     left = first.left
     error = left.std(ddof=1) / np.sqrt(len(left)) if len(left) > 1 else np.inf
     return "unexplained" if structured or left.mean() > max(0.02, 3.0 * error) else "none"
@@ -151,6 +152,19 @@ def sentence(verdict: str, found: list[dict[str, Any]], rounds: list[Any]) -> st
     return " ".join(parts)
 
 
+def _soberly(found: list[dict[str, Any]], before: judge.Judged | None, after: judge.Judged | None) -> list[str]:
+    """Say what the finding does not do for long simulation, if so."""
+    if not found or before is None or after is None:
+        return []
+    was, now = (x.summary()["gap_rmse_m"] for x in (before, after))
+    if now < was:
+        return []
+    return [
+        f"It shows in predictions over some seconds; free simulation of the runs kept back does not get better by it "
+        f"(gap RMSE {was:.2f} to {now:.2f} m)."
+    ]
+
+
 def _where(term: Term, values: dict[str, float]) -> dict[str, Any]:
     if term.effect == "speed_zone" or (term.effect is None and "begin" in values):
         return {"coordinate": term.coordinate, "interval": [values["begin"], values["end"]]}
@@ -169,7 +183,11 @@ def _found(
     result = []
     at = sum(t.size for t in final.model.terms[:base])
     for term in final.model.terms[base:]:
-        this = next(r for r in rounds if r.winner is not None and r.scored[r.winner].term.label == term.label)
+        this, winner = next(
+            (r, i)
+            for r in rounds for i in (r.winner, r.partner)
+            if i is not None and r.scored[i].term.label == term.label
+        )  # fmt: skip
         mine = intervals[at : at + term.size]
         values = {p.name: float(x[0]) for p, x in zip(term.parameters, mine, strict=True)}
         parameters = {
@@ -191,8 +209,8 @@ def _found(
                 "parameters": parameters,
                 "what": term.what if term.what != "slope" else "acceleration",
                 "where": where,
-                "p_value": float(this.verdict.p_value[this.winner]),
-                "held_out_gain": float(1.0 - np.exp(-this.verdict.gain[this.winner])),
+                "p_value": float(this.verdict.p_value[winner]),
+                "held_out_gain": float(1.0 - np.exp(-this.verdict.gain[winner])),
                 "explained_share": this.share,
             }
         )
@@ -215,13 +233,8 @@ def _candidates(rounds: list[Any], refused: dict[str, str]) -> list[dict[str, An
         for i in np.argsort(-this.verdict.gain):
             s = this.scored[i]
             solution = s.solution
-            values = (
-                {}
-                if solution is None
-                else dict(
-                    zip((p.name for p in s.term.parameters), solution.values[-s.term.size :].tolist(), strict=True)
-                )
-            )
+            found = np.zeros(0) if solution is None else solution.values[solution.model.where(s.term.label)]
+            values = dict(zip((p.name for p in s.term.parameters), found.tolist(), strict=False))
             rows.append(
                 {
                     "round": number,
@@ -245,9 +258,10 @@ def absorbed(solution: Solution | None, term: Term) -> float | None:
     """Return which share of the candidate's response re-calibrated drivers absorb, in its first parameter."""
     if solution is None or not solution.linear.by_phi.shape[-1]:
         return None
-    j = solution.linear.by_phi[..., -term.size]
+    first = solution.model.where(term.label).start
+    j = solution.linear.by_phi[..., first]
     alone = float((j**2).sum())
-    projected = float(np.einsum("gqq->gq", solution.reduced_hessian)[:, -term.size].sum())
+    projected = float(np.einsum("gqq->gq", solution.reduced_hessian)[:, first].sum())
     return None if alone <= 0 else float(np.clip(1.0 - projected / alone, 0.0, 1.0))
 
 

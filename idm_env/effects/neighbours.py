@@ -39,9 +39,13 @@ class SecondLeader(Effect):
 
 @dataclass(frozen=True)
 class LeaderAcceleration(Effect):
-    """Feed-forward of the leader's acceleration, ``+ c a_lead``, as in adaptive and cooperative cruise control."""
+    """Feed-forward of the leader's acceleration, ``+ c a_lead``, as in adaptive and cooperative cruise control.
+
+    It is measured or sent, not perceived: a driver's delay does not hold it up.
+    """
 
     kind: ClassVar[str] = "leader_acceleration"
+    sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.4, -1.0, 1.5, null=0.0),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
