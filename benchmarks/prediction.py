@@ -16,7 +16,8 @@ import numpy as np
 from idm_env.data.womd import Scenario, scenarios
 from idm_env.prediction.files import case_of
 from idm_env.prediction.metrics import Case, summary
-from idm_env.prediction.predict import METHODS, Scene
+from idm_env.prediction.predict import METHODS
+from idm_env.prediction.scene import Scene
 
 
 def moving(scenario: Scenario) -> list[int]:

@@ -53,6 +53,26 @@ class Lane:
 
 
 @dataclass(frozen=True, eq=False)
+class Control:
+    """A stop sign or a signal at ``point`` [2]: what it shows at the present step, and the lanes that it is for.
+
+    ``shows`` is ``sign``, or a signal's ``stop``, ``caution``, ``go`` or ``unknown``; a flashing stop is a sign, a
+    flashing caution is go. ``lanes`` is empty where the file does not tell them (signs in JSON).
+    """
+
+    shows: str
+    point: np.ndarray
+    lanes: tuple[int, ...] = ()
+
+
+SHOWN = ("unknown", "stop", "caution", "go", "stop", "caution", "go", "sign", "go")
+"""What the states 0 to 8 of a signal in the official files mean here."""
+_STATES = (
+    "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
 class Scenario:
     """A scene: who, where and on which lanes. ``present`` is the step up to which the past is known."""
 
@@ -61,7 +81,7 @@ class Scenario:
     lanes: tuple[Lane, ...]
     to_predict: tuple[int, ...]
     present: int = PRESENT
-    stop_signs: tuple[np.ndarray, ...] = ()
+    controls: tuple[Control, ...] = ()
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -111,7 +131,7 @@ def read_json(path: str | Path) -> Scenario:
 
 def _scenario(content: dict[str, Any], source: str) -> Scenario:
     agents = tuple(_agent(item, number) for number, item in enumerate(content["objects"]))
-    lanes, signs, notes = [], [], []
+    lanes, controls, notes = [], [], []
     for number, road in enumerate(content.get("roads", ())):
         points = road.get("geometry", ())
         line = _xy(points if isinstance(points, list) else [points])
@@ -119,7 +139,8 @@ def _scenario(content: dict[str, Any], source: str) -> Scenario:
             bike = road.get("map_element_id") == 3
             lanes.append(Lane(int(road.get("id", number)), line, bike=bike))
         elif road.get("type") == "stop_sign" and len(line):
-            signs.append(line[0])
+            controls.append(Control("sign", line[0]))
+    controls += _signals(content.get("tl_states"))
     metadata = content.get("metadata") or {}
     chosen = metadata.get("tracks_to_predict")
     if chosen is None:
@@ -129,7 +150,24 @@ def _scenario(content: dict[str, Any], source: str) -> Scenario:
         wanted = tuple(int(item["track_index"]) if isinstance(item, dict) else int(item) for item in chosen)
     check_scenario(agents, wanted, PRESENT, source)
     name = str(content.get("scenario_id") or content.get("name") or source)
-    return Scenario(name, agents, tuple(lanes), wanted, PRESENT, tuple(signs), tuple(notes))
+    return Scenario(name, agents, tuple(lanes), wanted, PRESENT, tuple(controls), tuple(notes))
+
+
+def _signals(lights: Any) -> list[Control]:
+    """Return the signals of ``tl_states``, lane → states over time, as they are at the present and not later."""
+    found = []
+    for key, light in (lights or {}).items():
+        steps = [int(step) for step in light.get("time_index", range(len(light["state"])))]
+        seen = [i for i, step in enumerate(steps) if step <= PRESENT]
+        if not seen:
+            continue
+        last = max(seen, key=lambda i: steps[i])
+        name = str(light["state"][last]).lower()
+        shows = SHOWN[_STATES.index(name)] if name in _STATES else "unknown"
+        lane = light.get("lane_id", key)
+        lanes = (int(lane),) if str(lane).lstrip("-").isdigit() else ()
+        found.append(Control(shows, np.array([float(light["x"][last]), float(light["y"][last])]), lanes))
+    return found
 
 
 def check_scenario(agents: tuple[Agent, ...], wanted: tuple[int, ...], present: int, source: str) -> None:

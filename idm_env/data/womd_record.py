@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.data.errors import DataError
-from idm_env.data.womd import Agent, Lane, Scenario, check_scenario
+from idm_env.data.womd import SHOWN, Agent, Control, Lane, Scenario, check_scenario
 
 MILE_PER_HOUR = 0.44704
 _KIND = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}
@@ -32,13 +32,15 @@ MESSAGES: dict[str, tuple[tuple[str, int, str], ...]] = {
         ("speed_limit_mph", 1, "double"), ("type", 2, "int32"), ("polyline", 8, "*MapPoint"),
         ("exit_lanes", 10, "*int64"),
     ),
-    "StopSign": (("position", 2, "MapPoint"),),
+    "StopSign": (("lane", 1, "*int64"), ("position", 2, "MapPoint")),
+    "TrafficSignalLaneState": (("lane", 1, "int64"), ("state", 2, "int32"), ("stop_point", 3, "MapPoint")),
+    "DynamicMapState": (("lane_states", 1, "*TrafficSignalLaneState"),),
     "MapFeature": (("id", 1, "int64"), ("lane", 3, "LaneCenter"), ("stop_sign", 7, "StopSign")),
     "RequiredPrediction": (("track_index", 1, "int32"), ("difficulty", 2, "int32")),
     "Scenario": (
         ("timestamps_seconds", 1, "*double"), ("tracks", 2, "*Track"), ("scenario_id", 5, "string"),
-        ("map_features", 8, "*MapFeature"), ("current_time_index", 10, "int32"),
-        ("tracks_to_predict", 11, "*RequiredPrediction"),
+        ("dynamic_map_states", 7, "*DynamicMapState"), ("map_features", 8, "*MapFeature"),
+        ("current_time_index", 10, "int32"), ("tracks_to_predict", 11, "*RequiredPrediction"),
     ),
 }  # fmt: skip
 """Message → fields (name, number, type); ``*`` repeats."""
@@ -142,7 +144,7 @@ def _scenario(message: Any, source: str) -> Scenario:
     if not message.tracks:
         raise DataError(f"{source}: the scenario has no tracks; is it a file of scenarios?")
     agents = tuple(_agent(track) for track in message.tracks)
-    lanes, signs = [], []
+    lanes, controls = [], []
     for feature in message.map_features:
         if feature.HasField("lane") and len(feature.lane.polyline) >= 2:
             lane = feature.lane
@@ -150,15 +152,20 @@ def _scenario(message: Any, source: str) -> Scenario:
             line = np.array([[p.x, p.y] for p in lane.polyline])
             lanes.append(Lane(int(feature.id), line, tuple(lane.exit_lanes), limit, lane.type == 3))
         elif feature.HasField("stop_sign"):
-            signs.append(np.array([feature.stop_sign.position.x, feature.stop_sign.position.y]))
+            sign = feature.stop_sign
+            controls.append(Control("sign", np.array([sign.position.x, sign.position.y]), tuple(sign.lane)))
     wanted = tuple(int(item.track_index) for item in message.tracks_to_predict)
     present = int(message.current_time_index)
+    # only the state at the present: later ones are the future
+    for light in message.dynamic_map_states[present].lane_states if len(message.dynamic_map_states) > present else ():
+        shows = SHOWN[light.state] if light.state < len(SHOWN) else "unknown"
+        controls.append(Control(shows, np.array([light.stop_point.x, light.stop_point.y]), (int(light.lane),)))
     notes: tuple[str, ...] = ()
     if not wanted:
         wanted = tuple(i for i, agent in enumerate(agents) if agent.valid[present])
         notes = ("the record names no tracks_to_predict: every agent valid at the present step is predicted",)
     check_scenario(agents, wanted, present, source)
-    return Scenario(message.scenario_id or source, agents, tuple(lanes), wanted, present, tuple(signs), notes)
+    return Scenario(message.scenario_id or source, agents, tuple(lanes), wanted, present, tuple(controls), notes)
 
 
 def _agent(track: Any) -> Agent:

@@ -1,94 +1,214 @@
-"""Drivers on routes: prior, likelihood of one second of history, and rollouts of eight seconds, all by the simulator.
+"""Who drives on a route: hypotheses of what a driver is up to, each fitted to the last second by the project's ``fit``.
 
-One second barely identifies five parameters. So drivers are drawn from a prior of urban driving and weighted by how
-well they drive the history; what the second does not tell stays as spread in the futures.
+One second barely identifies five parameters. So each hypothesis (goes for the limit, keeps the speed, stops somewhere)
+brings a log-normal prior of urban driving; ``fit`` behind the real leader finds the posterior's mode and covariance,
+from which drivers are drawn, and the evidence of the second tells how likely the hypothesis is. What the second does
+not tell stays as spread in the futures.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
 from scipy.stats import norm, qmc
-from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Replay
+from idm_env.data import Episode
+from idm_env.data import Record as Recorded
+from idm_env.fitting.fit import fit
+from idm_env.fitting.levenberg import normal
+from idm_env.fitting.prior import Prior
 from idm_env.prediction.lanes import Route
-from idm_env.roads import Lane as Road
-from idm_env.simulator import Simulator
-from idm_env.types import Record
+from idm_env.prediction.rollout import DT, Ahead, Drivers, bend_speed
+from idm_env.prediction.stops import Stop
 
-DRAWS = 128
-DT = 0.1
 URBAN_LIMIT = 13.4
 """Speed limit where the map tells none (m/s): 30 miles per hour."""
-STOPPING = 0.25
-"""Share of drivers who are about to stop for something that is not on the map (a signal, a crossing, a turn)."""
+CENTRE = {"max_accel": 1.6, "comfort_decel": 2.0, "time_gap": 1.3, "min_gap": 2.0}
+DEVIATION = {"max_accel": 0.4, "comfort_decel": 0.3, "time_gap": 0.3, "min_gap": 0.3}
+"""Medians (SI) and log-deviations of urban drivers; the desired speed's are those of the hypothesis."""
+LATERAL_MPS2, LATERAL_DEVIATION = 2.5, 0.4
+"""Lateral acceleration that is accepted in bends: median (m/s²) and log-deviation."""
+SURPRISE = 0.25
+"""Share of drivers who are about to stop for something that is not on the map (a crossing, a turn, a parking space)."""
 CRUISING = 0.25
 """Share of drivers who already go at the speed that they want."""
+OBEYING = {"sign": 0.8, "red": 0.9}
+"""Share of drivers who stop at a stop line that the map or a signal tells."""
+WAIT_S, WAIT_DEVIATION = 1.0, 0.8
+"""Time at a stop sign from the halt on: median (s) and log-deviation."""
+LONGEST_RED_S = 16.0
+"""A red light ends at some time up to this from now (s)."""
 SPEED_SIGMA = 0.4
 """How far an observed speed may be from a driver's (m/s): tracking noise, and driving that IDM does not have."""
 INDEPENDENT = 3.0
 """One second of correlated residuals is worth this many independent ones."""
-FAR_AWAY_M = 500.0
+SURPRISES = 8
+DRAWS = {"limit": 48, "cruise": 24, "surprise": 4, "line": 32}
+"""Drivers drawn of each hypothesis."""
+NAMES = (*CENTRE, "desired_speed")
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What a driver may be up to: its share of drivers beforehand, the speed wanted, and where it stops.
+
+    ``speed`` and ``deviation`` are median (m/s) and log-deviation of the speed wanted here and now; ``bend`` tells that
+    it is a bend's and says nothing of the speed wanted behind it. ``stop`` is a distance from the front bumper (m).
+    """
+
+    kind: str
+    share: float
+    speed: float
+    deviation: float
+    bend: bool
+    stop: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
-class Drivers:
-    """Drivers [N]: IDM's five, lateral acceleration accepted in bends (m/s²), distance to a stop (m, inf for none).
+class Second:
+    """The last second of an agent on one of its routes: speeds [T] (m/s), what was ahead, and the distance driven.
 
-    ``passing`` in [0, 1] decides who goes around a standing vehicle: those below the share that does.
+    ``ahead`` is on the same T samples, relative to the route's arc length. ``stop`` is the stop line ahead.
     """
 
-    max_accel: np.ndarray
-    comfort_decel: np.ndarray
-    time_gap: np.ndarray
-    min_gap: np.ndarray
-    desired_speed: np.ndarray
-    lateral: np.ndarray
-    stop: np.ndarray
-    passing: np.ndarray
+    route: Route
+    speeds: np.ndarray
+    ahead: Ahead
+    front: float
+    stop: Stop | None
+
+    @property
+    def driven(self) -> np.ndarray:
+        """Distance to the present at every sample (m), falling to 0."""
+        mean = 0.5 * (self.speeds[1:] + self.speeds[:-1]) * DT
+        return np.asarray(np.concatenate([np.cumsum(mean[::-1])[::-1], [0.0]]))
 
 
-@lru_cache(maxsize=1)
-def _quantiles() -> np.ndarray:
-    """Return evenly spread points [DRAWS, 10] of the unit cube, the same at every call."""
-    return np.asarray(qmc.Sobol(10, seed=0).random(DRAWS))
+@lru_cache(maxsize=8)
+def quantiles(count: int, dimensions: int = 10) -> np.ndarray:
+    """Return evenly spread points [count, dimensions] of the unit cube, the same at every call."""
+    power = max(1, int(np.ceil(np.log2(count))))
+    points = qmc.Sobol(dimensions, seed=0).random_base2(power)[:count]
+    return np.clip(points, 1e-3, 1 - 1e-3)
 
 
-def prior(speed: float, limit: float) -> Drivers:
-    """Return drivers of urban traffic; medians a 1.6, b 2 m/s², T 1.3 s, s0 2 m, v0 the limit ± 20 %, bends 2.5 m/s².
-
-    Some want the speed that they have; some stop, at the earliest where 3.5 m/s² suffices and at most 60 m ahead.
-    """
-    u = _quantiles()
-
-    def lognormal(column: int, median: float, spread: float) -> np.ndarray:
-        return np.asarray(median * np.exp(spread * norm.ppf(np.clip(u[:, column], 1e-3, 1 - 1e-3))))
-
-    limit = limit if np.isfinite(limit) else URBAN_LIMIT
-    wanted = lognormal(4, limit, 0.2)
-    wanted = np.where(u[:, 7] < CRUISING, np.maximum(speed, 0.5) * (0.9 + 0.2 * u[:, 8]), wanted)
+def hypotheses(second: Second) -> list[Hypothesis]:
+    """Return what the driver may be up to on this route; the shares sum to 1."""
+    route, speed = second.route, float(second.speeds[-1])
+    limit = route.limit if np.isfinite(route.limit) else URBAN_LIMIT
+    bends = bend_speed(route, np.array([LATERAL_MPS2]), np.array([CENTRE["comfort_decel"]]))[0]
+    bend = float(np.interp(route.begin, route.length, bends))
+    obeying = OBEYING[second.stop.kind] if second.stop is not None else 0.0
+    rest = 1.0 - obeying
+    here = (bend, 0.25, True) if bend < limit else (limit, 0.2, False)
+    found = [
+        Hypothesis("limit", rest * (1.0 - CRUISING - SURPRISE), *here),
+        Hypothesis("cruise", rest * CRUISING, max(speed, 0.5), 0.07, False),
+    ]
     nearest = speed * speed / (2 * 3.5) + 2.0
-    stop = np.where(u[:, 7] > 1.0 - STOPPING, nearest + u[:, 6] * max(60.0 - nearest, 10.0), np.inf)
-    return Drivers(
-        lognormal(0, 1.6, 0.4), lognormal(1, 2.0, 0.3), lognormal(2, 1.3, 0.3), lognormal(3, 2.0, 0.3), wanted,
-        lognormal(5, 2.5, 0.4), stop, u[:, 9],
+    reach = max(60.0 - nearest, 10.0)
+    for k in range(SURPRISES):
+        stop = nearest + (k + 0.5) / SURPRISES * reach
+        found.append(Hypothesis("surprise", rest * SURPRISE / SURPRISES, *here, stop=stop))
+    if second.stop is not None:
+        # who halts at a line has its front there, so that the leader stands the smallest gap beyond it
+        found.append(Hypothesis("line", obeying, *here, stop=second.stop.distance + CENTRE["min_gap"]))
+    return found
+
+
+def posterior(seconds: Sequence[Second]) -> list[tuple[Drivers, np.ndarray]]:
+    """Return, for every route, drivers drawn around the fits of its hypotheses, and the weight of each.
+
+    Weights are share × evidence / number drawn, with the evidence by Laplace's method: what the mode costs, and how
+    much narrower than the prior the posterior is.
+    """
+    cases = [(second, h) for second in seconds for h in hypotheses(second)]
+    log_mode, spread, evidence = _fitted(cases)
+    evidence = evidence - evidence.max()
+    drawn: list[tuple[Drivers, np.ndarray]] = []
+    for second in seconds:
+        parts = [_draw(h, second, log_mode[i], spread[i], evidence[i]) for i, (s, h) in enumerate(cases) if s is second]
+        drawn.append((Drivers.joined([one for one, _ in parts]), np.concatenate([weight for _, weight in parts])))
+    return drawn
+
+
+def _fitted(cases: Sequence[tuple[Second, Hypothesis]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return log-modes [G, 5], factors L of their covariances L Lᵀ [G, 5, 5], and log-evidences [G] of all cases."""
+    centre = torch.tensor([[*CENTRE.values(), h.speed] for _, h in cases], dtype=torch.float64)
+    deviation = torch.tensor([[*DEVIATION.values(), h.deviation] for _, h in cases], dtype=torch.float64)
+    samples = len(cases[0][0].speeds) - 1
+    if samples < 3:
+        # too short to tell anything: the prior itself
+        return centre.log().numpy(), torch.diag_embed(deviation).numpy(), np.zeros(len(cases))
+    noise = SPEED_SIGMA * np.sqrt(samples / INDEPENDENT)
+    episodes = [_episode(i, second, h) for i, (second, h) in enumerate(cases)]
+    found = fit(
+        episodes, objective="speed", loss="mse", prior=Prior(centre, deviation, noise), iterations=12, substeps=1
+    )  # fmt: skip
+    own = found.own
+    covariance = found.uncertainty.covariance / (own[:, :, None] * own[:, None, :])
+    factor = torch.linalg.cholesky(covariance + 1e-10 * torch.eye(len(NAMES), dtype=torch.float64))
+    cost = normal(found.problem, own[None], found.shared[None]).cost[0]
+    narrower = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) - deviation.log().sum(-1)
+    return own.log().numpy(), factor.numpy(), (-0.5 * cost / noise**2 + narrower).numpy()
+
+
+def _episode(number: int, second: Second, h: Hypothesis) -> Episode:
+    """Return the second as an episode behind the real leader, or behind the hypothesis' stop if that is nearer."""
+    count = len(second.speeds)
+    position = second.route.begin + second.front - second.driven
+    stop = second.route.begin + second.front + h.stop
+    nearer = stop < second.ahead.rear
+    rear = np.minimum(second.ahead.rear, stop)
+    # an overlap is taken as bumper to bumper
+    rear = rear + max(0.2 - float((rear - position).min()), 0.0)
+    pace, everywhere = np.where(nearer, 0.0, second.ahead.speed), np.ones(count, bool)
+    leader = Recorded(rear, pace, np.zeros(count), 0.0, everywhere)
+    nobody = Recorded(position + 1e3, second.speeds, np.zeros(count), 0.0, ~everywhere)
+    name = str(number)
+    return Episode(
+        "", name, "", name, DT, DT * np.arange(count), position, second.speeds, rear - position, 2 * second.front,
+        leader, nobody, nobody, nobody, position, {}, {},
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Ahead:
-    """The vehicle ahead on a route: rear bumper (m of arc length) and speed (m/s) per step [S + 1].
+def _draw(
+    h: Hypothesis, second: Second, log_mode: np.ndarray, factor: np.ndarray, evidence: float
+) -> tuple[Drivers, np.ndarray]:
+    """Return drivers around one fit, and their weights."""
+    count = DRAWS[h.kind]
+    u = quantiles(count)
+    values = np.exp(log_mode + norm.ppf(u[:, :5]) @ factor.T)
+    wanted, lateral = values[:, 4], LATERAL_MPS2 * np.exp(LATERAL_DEVIATION * norm.ppf(u[:, 5]))
+    if h.bend:
+        # the speed in the bend tells which lateral acceleration is accepted; the one wanted behind it is unknown
+        limit = second.route.limit if np.isfinite(second.route.limit) else URBAN_LIMIT
+        wanted, lateral = limit * np.exp(0.2 * norm.ppf(u[:, 5])), LATERAL_MPS2 * (wanted / h.speed) ** 2
+    spread = (u[:, 6] - 0.5) * max(60.0 / SURPRISES, 1.0) if h.kind == "surprise" else 0.0
+    wait, opens = np.full(count, np.inf), np.full(count, np.inf)
+    if h.kind == "line" and second.stop is not None and second.stop.kind == "sign":
+        wait = WAIT_S * np.exp(WAIT_DEVIATION * norm.ppf(u[:, 7]))
+    elif h.kind == "line":
+        opens = LONGEST_RED_S * u[:, 7]
+    stop = np.maximum(np.full(count, h.stop) + spread, 0.5)
+    a, b, time_gap, min_gap = np.maximum(values[:, :4].T, 0.05)
+    drivers = Drivers(a, b, time_gap, min_gap, wanted, lateral, stop, wait, opens, u[:, 9])
+    return drivers, np.full(count, h.share / count * np.exp(evidence))
 
-    ``passed`` is the share of drivers who go around it, which only standing vehicles are.
-    """
 
-    rear: np.ndarray
-    speed: np.ndarray
-    passed: float = 0.0
+def middle(speed: float, limit: float, stop: Stop | None) -> Drivers:
+    """Return the one driver of the prior's medians who keeps about his speed and stops where he must."""
+    known = limit if np.isfinite(limit) else URBAN_LIMIT
+    halts = stop.distance + CENTRE["min_gap"] if stop is not None else np.inf
+    wait = WAIT_S if stop is not None and stop.kind == "sign" else np.inf
+    opens = 0.5 * LONGEST_RED_S if stop is not None and stop.kind == "red" else np.inf
+    wanted = 0.5 * (max(speed, 1.0) + known)
+    values = {**CENTRE, "desired_speed": wanted, "lateral": LATERAL_MPS2, "stop": halts, "wait": wait, "opens": opens}
+    return Drivers(**{name: np.array([value]) for name, value in values.items()}, passing=np.array([0.5]))
 
 
 def passing(lateral: float) -> float:
@@ -97,74 +217,3 @@ def passing(lateral: float) -> float:
     Whether it waits or is parked is not known; the farther from the middle, the likelier it is parked.
     """
     return float(np.interp(abs(lateral), [0.4, 1.2], [0.2, 0.9]))
-
-
-def nobody(steps: int) -> Ahead:
-    """Return what stands for an empty road ahead: something that is far away and keeps away."""
-    return Ahead(np.full(steps + 1, 1e5), np.full(steps + 1, 30.0))
-
-
-def bend_speed(route: Route, lateral: np.ndarray, comfort: np.ndarray) -> np.ndarray:
-    """Return the speed [N, M] from which every bend ahead can be taken: √(v_bend² + 2 b d), at every metre (m/s)."""
-    bend = np.sqrt(lateral[:, None] / np.maximum(np.abs(route.curvature), 1e-4))
-    step = float(route.length[1] - route.length[0])
-    speed = np.minimum(bend, 60.0)
-    for k in range(speed.shape[1] - 2, -1, -1):
-        speed[:, k] = np.minimum(speed[:, k], np.sqrt(speed[:, k + 1] ** 2 + 2 * comfort * step))
-    return speed
-
-
-def roll(route: Route, drivers: Drivers, start: float, speed: float, ahead: Ahead, steps: int, front: float) -> Tensor:
-    """Drive all drivers [N] from arc length ``start`` (m, centre) and ``speed``; return arc length and speed [2, S, N].
-
-    ``front`` (m) is from the centre to the front bumper. Speeds wanted fall before bends; the leader, or a stop if it
-    is nearer, is replayed.
-    """
-    count = len(drivers.stop)
-    sim = Simulator(Road(), (IDM(), Replay(), Brakes()), dt=DT)
-    params = sim.defaults(dtype=torch.float64)
-    names = ("max_accel", "comfort_decel", "time_gap", "min_gap")
-    idm = {name: torch.as_tensor(getattr(drivers, name))[:, None] for name in names}
-    stop = (start + front + drivers.stop)[None, :]
-    empty = nobody(steps)
-    passes = (drivers.passing < ahead.passed)[None, :]
-    rear_ahead = np.where(passes, empty.rear[:, None], ahead.rear[:, None])
-    nearer = stop < rear_ahead
-    rear = torch.as_tensor(np.where(nearer, stop, rear_ahead))
-    speed_ahead = np.where(passes, empty.speed[:, None], ahead.speed[:, None])
-    lead_speed = torch.as_tensor(np.where(nearer, 0.0, speed_ahead))
-    limits = torch.as_tensor(bend_speed(route, drivers.lateral, drivers.comfort_decel))
-    wanted = torch.as_tensor(drivers.desired_speed)
-    # an overlap at the start is taken as bumper to bumper
-    own = torch.minimum(torch.full((count,), start + front, dtype=torch.float64), rear[0] - 0.2)
-    shift = start + front - own
-    state = sim.state(
-        torch.stack([rear[0], own], dim=-1), torch.stack([lead_speed[0], torch.full_like(own, speed)], dim=-1),
-        params | {"idm": {**params["idm"], **idm}}, length=torch.tensor([0.0, 2 * front], dtype=torch.float64),
-    )  # fmt: skip
-    active = torch.tensor([True, False]).expand(count, 2)
-    spacing = float(route.length[1] - route.length[0])
-    kept = torch.empty(2, steps, count, dtype=torch.float64)
-    rows = torch.arange(count)
-    with torch.no_grad():
-        for k in range(steps):
-            at = ((state.position[:, 1] - front) / spacing).round().long().clamp(0, limits.shape[1] - 1)
-            now = state.speed[:, 1]
-            # IDM brakes without measure above its desired speed: there it is kept to comfortable braking
-            gentle = now / (1.0 + idm["comfort_decel"][:, 0] / idm["max_accel"][:, 0]) ** 0.25
-            target = torch.maximum(torch.minimum(wanted, limits[rows, at]), gentle).clamp_min(0.5)
-            step_params = params | {"idm": {**idm, "desired_speed": target[:, None]}}
-            place = torch.stack([rear[k + 1], torch.zeros_like(own)], dim=-1)
-            pace = torch.stack([lead_speed[k + 1], torch.zeros_like(own)], dim=-1)
-            record = Record(place, pace, torch.zeros_like(pace), active)
-            state = sim.step(state, {"replay": record}, step_params)
-            kept[0, k], kept[1, k] = state.position[:, 1] - front + shift, state.speed[:, 1]
-    return kept
-
-
-def likelihood(simulated: np.ndarray, observed: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return log-likelihoods [N] of observed speeds [S] under simulated ones [S, N]."""
-    if not valid.any():
-        return np.zeros(simulated.shape[1])
-    square = ((simulated[valid] - observed[valid, None]) / SPEED_SIGMA) ** 2
-    return np.asarray(-0.5 * INDEPENDENT * square.mean(0))

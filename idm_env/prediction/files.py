@@ -15,7 +15,8 @@ from idm_env.data import DataError
 from idm_env.data.womd import Scenario, scenarios
 from idm_env.prediction.metrics import HORIZONS, Case, shape_of, summary
 from idm_env.prediction.pictures import scene_picture
-from idm_env.prediction.predict import METHODS, Prediction, Scene
+from idm_env.prediction.predict import METHODS, Prediction
+from idm_env.prediction.scene import Scene
 from idm_env.trajectories.report import embedded, finite, shown_number
 
 OnProgress = Callable[[int, int], None]

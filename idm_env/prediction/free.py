@@ -15,17 +15,24 @@ WANDER = {"pedestrian": 0.35, "cyclist": 0.2, "vehicle": 0.25}
 STOPPING = 0.15
 FADE_S = 2.0
 """Time in which the present acceleration and yaw rate fade (s)."""
+WALKING = 0.45
+"""Share of pedestrians who go over to the speed at which people like to walk."""
+WALK_MPS, WALK_DEVIATION = 1.34, 0.26
+"""That speed: mean and deviation (m/s), Weidmann 1993."""
+WALK_S = (0.5, 4.0)
+"""Time in which they do (s), from starters to runners who fall back."""
 
 
 @lru_cache(maxsize=1)
 def _quantiles() -> np.ndarray:
-    return np.asarray(qmc.Sobol(3, seed=1).random(DRAWS))
+    return np.asarray(qmc.Sobol(4, seed=1).random(DRAWS))
 
 
 def motion_now(agent: Agent, present: int, dt: float = 0.1) -> tuple[float, float, float, float]:
     """Return speed (m/s), direction (rad), acceleration (m/s²) and yaw rate (rad/s) from the last second.
 
-    Slopes of least squares; a direction is that of the velocity where it moves, else that of the body.
+    Straight lines of least squares over the second, at its end: a single velocity is noisy. A direction is that of the
+    velocity where it moves, else that of the body.
     """
     steps = np.arange(max(0, present - 10), present + 1)
     steps = steps[agent.valid[steps]]
@@ -36,7 +43,8 @@ def motion_now(agent: Agent, present: int, dt: float = 0.1) -> tuple[float, floa
     if len(steps) < 4:
         return speed, direction, 0.0, 0.0
     time = (steps - steps[-1]) * dt
-    accel = float(np.clip(np.polyfit(time, speeds, 1)[0], -4.0, 3.0))
+    slope, level = np.polyfit(time, speeds, 1)
+    speed, accel = max(float(level), 0.0), float(np.clip(slope, -4.0, 3.0))
     turning = float(np.clip(np.polyfit(time, np.unwrap(agent.heading[steps]), 1)[0], -0.6, 0.6))
     return speed, direction, accel, turning if speed > 0.5 else 0.0
 
@@ -45,7 +53,8 @@ def free_futures(agent: Agent, present: int, steps: int, dt: float = 0.1) -> np.
     """Return futures [DRAWS, S, 2]: speed and direction go on, fading trends and a random change in each.
 
     ``v(t) = max(0, v + (a/2 + ξ) τ (1 − e^(−t/τ)))`` with ξ normal of 0.2 + 0.04 v m/s²; the direction likewise, with
-    the yaw rate and a wandering of 0.2 to 0.35 rad; 15 % brake to a stop with 1 m/s².
+    the yaw rate and a wandering of 0.2 to 0.35 rad; 15 % brake to a stop with 1 m/s². Of the pedestrians, 45 % go over
+    to walking, ``v(t) = w + (v − w) e^(−t/τ)``.
     """
     u = np.clip(_quantiles(), 1e-3, 1 - 1e-3)
     speed, direction, accel, turning = motion_now(agent, present, dt)
@@ -55,6 +64,11 @@ def free_futures(agent: Agent, present: int, steps: int, dt: float = 0.1) -> np.
     speeds = np.maximum(speed + push[:, None] * faded, 0.0)
     stopping = u[:, 2] < STOPPING
     speeds[stopping] = np.maximum(speed - (0.5 + u[stopping, 0])[:, None] * time, 0.0)
+    if agent.kind == "pedestrian":
+        walking = u[:, 2] > 1.0 - WALKING
+        wanted = (WALK_MPS + WALK_DEVIATION * norm.ppf(u[walking, 0]))[:, None]
+        slowness = (WALK_S[0] + (WALK_S[1] - WALK_S[0]) * u[walking, 3])[:, None]
+        speeds[walking] = np.maximum(wanted + (speed - wanted) * np.exp(-time / slowness), 0.0)
     wander = WANDER.get(agent.kind, 0.3) * norm.ppf(u[:, 1])
     angle = direction + turning * faded + wander[:, None] * (1 - np.exp(-time / 3.0))
     step = dt * speeds[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -32,7 +32,8 @@ class Route:
     """A centre line [M, 2] about every metre, its arc length [M] (m), heading and curvature [M] (rad, 1/m).
 
     ``begin`` is the arc length at which the agent is, ``lateral`` its distance to the left of the line (m), ``weight``
-    how plausible the route is before any speed is looked at, ``limit`` the speed limit (m/s, NaN where unknown).
+    how plausible the route is before any speed is looked at, ``limit`` the speed limit (m/s, NaN where unknown),
+    ``chain`` the lanes that it follows.
     """
 
     line: np.ndarray
@@ -43,6 +44,7 @@ class Route:
     lateral: float
     weight: float
     limit: float
+    chain: tuple[int, ...] = ()
 
     def lift(self, along: np.ndarray, lateral: np.ndarray) -> np.ndarray:
         """Return the points [..., 2] at arc lengths and lateral distances; straight on beyond the line's end."""
@@ -56,10 +58,11 @@ class Route:
 
     def locate(self, point: np.ndarray) -> tuple[float, float, float]:
         """Return arc length, lateral distance (m) and heading (rad) of the line where it is nearest to a point."""
-        return _nearest(self.line, self.length, point)
+        return nearest(self.line, self.length, point)
 
 
-def _nearest(line: np.ndarray, length: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
+def nearest(line: np.ndarray, length: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
+    """Return arc length, distance to the left (m) and heading (rad) of a line where it is nearest to a point."""
     begin, step = line[:-1], np.diff(line, axis=0)
     square = np.maximum((step * step).sum(1), 1e-12)
     share = np.clip(((point - begin) * step).sum(1) / square, 0.0, 1.0)
@@ -107,7 +110,7 @@ class LaneGraph:
         for key, lane in self.lanes.items():
             if lane.bike and not bike:
                 continue
-            along, lateral, direction = _nearest(lane.line, self.lengths[key], point)
+            along, lateral, direction = nearest(lane.line, self.lengths[key], point)
             off = abs(float(turn(direction - heading)))
             # beyond an end of the line the lateral distance is no measure: there the point is off the lane
             place = lane.line[0] if along <= 0.0 else lane.line[-1] if along >= self.lengths[key][-1] else None
@@ -171,7 +174,7 @@ class LaneGraph:
         padded = np.pad(np.gradient(heading, ticks), width // 2, mode="edge")
         curvature = np.convolve(padded, np.full(width, 1 / width), mode="valid")[: len(ticks)]
         limit = self.lanes[chain[0]].speed_limit
-        return Route(smooth, ticks, heading, curvature, along, lateral, weight, limit)
+        return Route(smooth, ticks, heading, curvature, along, lateral, weight, limit, chain)
 
 
 def _same(one: Route, other: Route, reach: float) -> bool:

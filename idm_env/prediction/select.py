@@ -1,4 +1,4 @@
-"""From many weighted futures to six: those that leave the least expected miss and distance."""
+"""From many weighted futures to six: those that leave the least expected miss and distance, with their chances."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ MOST_SAMPLES = 320
 def select(
     futures: np.ndarray, weight: np.ndarray, speed: float, most: int = MOST
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return up to six futures [F, S, 2] and their confidences [F], which sum to 1, from samples [N, S, 2].
+    """Return up to six futures [F, S, 2] and their confidences [F] from samples [N, S, 2].
 
     Greedy: each choice lowers most the expected loss over the samples, were one of them to come true. Half of the loss
     of a sample is its distance d to the nearest choice in units of the benchmark's box, at most 1, so that what is
     missed anyway does not pull; the other half is ``d / (d + c)`` with c the mean distance between samples, so that a
-    choice also comes near what it cannot hit. A confidence is the weight of the samples that a choice is nearest to.
+    choice also comes near what it cannot hit. For confidences see ``chances``.
     """
     if len(futures) > MOST_SAMPLES:
         keep = np.argsort(-weight, kind="stable")[:MOST_SAMPLES]
@@ -35,10 +35,47 @@ def select(
         chosen.append(pick)
         best = np.minimum(best, loss[:, pick])
     chosen = chosen or [int(np.argmax(weight))]
-    nearest = np.argmin(loss[:, chosen], axis=1)
-    confidence = np.bincount(nearest, weight, minlength=len(chosen))
-    order = np.argsort(-confidence, kind="stable")
-    return futures[np.array(chosen)[order]], confidence[order]
+    return chances(futures, weight, futures[chosen], speed)
+
+
+def chances(
+    samples: np.ndarray, weight: np.ndarray, chosen: np.ndarray, speed: float
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the chosen futures in the order of their confidence, and the confidences.
+
+    The first is the one likeliest to hit, in the sense of the benchmark's box and on average over its horizons, were
+    one of the samples to come true; each next one the likeliest to hit what those before it miss. That is what the
+    confidence says, so that confidences compare between agents and what they leave to 1 is the chance of a miss.
+    """
+    hit = _hits(samples, chosen, speed)
+    left = np.broadcast_to(weight, hit.shape[:2]).copy()
+    order: list[int] = []
+    confidence = []
+    for _ in range(len(chosen)):
+        mass = np.einsum("hn,hnf->f", left, hit) / len(hit)
+        mass[order] = -1.0
+        order.append(int(np.argmax(mass)))
+        confidence.append(mass[order[-1]])
+        left *= 1.0 - hit[:, :, order[-1]]
+    return chosen[order], np.array(confidence)
+
+
+def _hits(samples: np.ndarray, chosen: np.ndarray, speed: float) -> np.ndarray:
+    """Return 1.0 where a chosen future ends within the box around a sample, [horizons, N, F]."""
+    found = []
+    for seconds in HORIZONS:
+        end = min(seconds * 10, samples.shape[1]) - 1
+        moved = samples[:, end] - samples[:, max(end - 10, 0)]
+        size = np.maximum(np.hypot(*moved.T), 1e-9)[:, None]
+        # who has hardly moved in the last second has no direction: the tighter bound holds both ways
+        along = np.where(size > 0.3, moved / size, np.array([1.0, 0.0]))
+        apart = chosen[None, :, end] - samples[:, None, end]
+        ahead = np.einsum("nfd,nd->nf", apart, along)
+        left = along[:, :1] * apart[..., 1] - along[:, 1:] * apart[..., 0]
+        lateral, longitudinal = (bound * speed_scale(speed) for bound in MISS_M[seconds])
+        reach = np.where(size > 0.3, longitudinal, lateral)
+        found.append((np.abs(ahead) <= reach) & (np.abs(left) <= lateral))
+    return np.stack(found).astype(float)
 
 
 def _loss(futures: np.ndarray, speed: float) -> np.ndarray:

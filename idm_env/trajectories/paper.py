@@ -28,6 +28,8 @@ MAX_DECEL = 10.0
 ITERATIONS = 500
 RATES = (0.1, 0.01)
 FILTER_STEP_S, RECONSTRUCT_STEP_S = 0.1, 1.0
+NOBODY = np.empty(0)
+"""No real leader: an imagined one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +59,34 @@ def imitate(
     values, gap, closing = START.copy(), np.full(len(clock), 10.0), np.zeros(len(clock))
     position, speed, accel = (np.empty(len(clock)) for _ in range(3))
     loss = loops.optimise(
-        at, target, speed0, values, gap, closing, LOW, HIGH, GAP_BOUNDS, CLOSING_BOUNDS, dt, MAX_DECEL,
+        at, target, speed0, values, gap, closing, NOBODY, NOBODY, LOW, HIGH, GAP_BOUNDS, CLOSING_BOUNDS, dt, MAX_DECEL,
         iterations, RATES[0], RATES[1], fixed_parameters, position, speed, accel,
     )  # fmt: skip
     return Imitated(Motion(clock, position + track.position_m[0], speed, accel), values, gap, closing, float(loss))
+
+
+def follow(position_m: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
+    """Return the five values fitted behind a real leader to positions [K] every ``dt`` (s), by the same optimisation.
+
+    This is the recipe of prediction: nothing is imagined. ``rear_m`` and ``pace`` [K] are the leader's rear bumper (m)
+    and speed (m/s), ``speed0`` the first speed (m/s).
+    """
+    from idm_env.trajectories import paper_loops as loops
+
+    count = len(position_m)
+    values, origin = START.copy(), position_m[0]
+    gap, closing, position, speed, accel = (np.empty(count) for _ in range(5))
+    loops.optimise(
+        np.arange(count), position_m - origin, speed0, values, gap, closing, rear_m - origin, pace, LOW, HIGH,
+        GAP_BOUNDS, CLOSING_BOUNDS, dt, MAX_DECEL, ITERATIONS, RATES[0], RATES[1], False, position, speed, accel,
+    )  # fmt: skip
+    return values
+
+
+def drive(values: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
+    """Return the distances [K] that the five values drive from 0 at ``speed0``, behind a leader as in ``follow``."""
+    from idm_env.trajectories import paper_loops as loops
+
+    gap, closing, position, speed, accel = (np.empty(len(rear_m)) for _ in range(5))
+    loops.forward(speed0, values, gap, closing, rear_m, pace, dt, MAX_DECEL, position, speed, accel)
+    return position

@@ -1,7 +1,7 @@
 """The paper's optimisation of one trajectory, compiled: rollout, exact gradient and Adam in one loop.
 
-Equation by equation the smooth IDM of ``effects.idm`` and ``effects.limits`` with sharpness 1, explicit Euler and an
-imagined leader; tests hold it to the torch simulator and to the published layer.
+Equation by equation the smooth IDM of ``effects.idm`` and ``effects.limits`` with sharpness 1 and explicit Euler,
+behind an imagined leader or a real one; tests hold it to the torch simulator and to the published layer.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -12,6 +12,8 @@ import numpy as np
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 FIVE = 5
+NEAREST_M = 0.1
+"""A real leader is never nearer than this (m)."""
 
 
 @compiled
@@ -24,13 +26,19 @@ def _softplus(x):
 
 
 @compiled
-def forward(speed0, values, gap, closing, dt, max_decel, position, speed, accel):
-    """Fill position (from 0), speed and acceleration [K]; the acceleration of a step starts at its own speed."""
+def forward(speed0, values, gap, closing, rear, pace, dt, max_decel, position, speed, accel):
+    """Fill position (from 0), speed and acceleration [K]; the acceleration of a step starts at its own speed.
+
+    ``rear`` (m) and ``pace`` (m/s) [K] are a real leader's, from which ``gap`` and ``closing`` are then filled; empty
+    arrays leave these as imagined.
+    """
     a, b, time_gap, min_gap, v0 = values[0], values[1], values[2], values[3], values[4]
     brake = 2.0 * np.sqrt(a * b)
     x, v = 0.0, speed0
     for k in range(len(position)):
         position[k], speed[k] = x, v
+        if len(rear) > 0:
+            gap[k], closing[k] = max(rear[k] - x, NEAREST_M), v - pace[k]
         wanted, _ = _softplus(min_gap + v * time_gap + v * closing[k] / brake)
         term, ratio = wanted / gap[k], v / v0
         square = ratio * ratio
@@ -42,8 +50,11 @@ def forward(speed0, values, gap, closing, dt, max_decel, position, speed, accel)
 
 
 @compiled
-def backward(values, gap, closing, dt, max_decel, speed, on_position, on_values, on_gap, on_closing):
-    """Fill the gradients by the five values, gaps and closing speeds [K], from those by positions [K]."""
+def backward(values, gap, closing, real, dt, max_decel, speed, on_position, on_values, on_gap, on_closing):
+    """Fill the gradients by the five values, gaps and closing speeds [K], from those by positions [K].
+
+    Behind a real leader gaps and closing speeds follow the own motion.
+    """
     a, b, time_gap, min_gap, v0 = values[0], values[1], values[2], values[3], values[4]
     root = np.sqrt(a * b)
     brake = 2.0 * root
@@ -76,8 +87,13 @@ def backward(values, gap, closing, dt, max_decel, speed, on_position, on_values,
         by_speed = -4.0 * a * cube / v0 * on_raw + on_wanted * (time_gap + closing[k] / brake)
         if stop > -max_decel:
             by_speed -= on_floor / dt
+        by_position = on_position[k]
+        if real:
+            by_speed += on_closing[k]
+            if gap[k] > NEAREST_M:
+                by_position -= on_gap[k]
         on_v = on_v + on_x * dt + by_speed
-        on_x = on_x + on_position[k]
+        on_x = on_x + by_position
 
 
 @compiled
@@ -92,13 +108,15 @@ def _adam(value, gradient, mean, square, rate, first, second, low, high):
 
 @compiled
 def optimise(
-    at, target, speed0, values, gap, closing, low, high, gap_bounds, closing_bounds, dt, max_decel,
+    at, target, speed0, values, gap, closing, rear, pace, low, high, gap_bounds, closing_bounds, dt, max_decel,
     iterations, rate_first, rate_last, fixed, position, speed, accel,
 ):  # fmt: skip
     """Minimise the mean absolute error at the steps ``at``, in place; return the loss after the last step.
 
-    ``values`` [5], ``gap`` and ``closing`` [K] are the start and become the result; ``fixed`` keeps the five.
+    ``values`` [5], ``gap`` and ``closing`` [K] are the start and become the result; ``fixed`` keeps the five. With a
+    real leader (``rear`` and ``pace``, [K] instead of empty) only the five are free.
     """
+    real = len(rear) > 0
     steps = len(gap)
     on_values, on_gap, on_closing, on_position = np.empty(FIVE), np.empty(steps), np.empty(steps), np.empty(steps)
     mean_v, square_v = np.zeros(FIVE), np.zeros(FIVE)
@@ -106,18 +124,19 @@ def optimise(
     low_g, high_g = np.full(steps, gap_bounds[0]), np.full(steps, gap_bounds[1])
     low_c, high_c = np.full(steps, closing_bounds[0]), np.full(steps, closing_bounds[1])
     for turn in range(iterations):
-        forward(speed0, values, gap, closing, dt, max_decel, position, speed, accel)
+        forward(speed0, values, gap, closing, rear, pace, dt, max_decel, position, speed, accel)
         on_position[:] = 0.0
         for o in range(len(at)):
             on_position[at[o]] += np.sign(position[at[o]] - target[o]) / len(at)
-        backward(values, gap, closing, dt, max_decel, speed, on_position, on_values, on_gap, on_closing)
+        backward(values, gap, closing, real, dt, max_decel, speed, on_position, on_values, on_gap, on_closing)
         rate = rate_first + (rate_last - rate_first) * turn / iterations
         first, second = 1.0 - 0.9 ** (turn + 1), 1.0 - 0.999 ** (turn + 1)
         if not fixed:
             _adam(values, on_values, mean_v, square_v, rate, first, second, low, high)
-        _adam(gap, on_gap, mean_g, square_g, rate, first, second, low_g, high_g)
-        _adam(closing, on_closing, mean_c, square_c, rate, first, second, low_c, high_c)
-    forward(speed0, values, gap, closing, dt, max_decel, position, speed, accel)
+        if not real:
+            _adam(gap, on_gap, mean_g, square_g, rate, first, second, low_g, high_g)
+            _adam(closing, on_closing, mean_c, square_c, rate, first, second, low_c, high_c)
+    forward(speed0, values, gap, closing, rear, pace, dt, max_decel, position, speed, accel)
     loss = 0.0
     for o in range(len(at)):
         loss += abs(position[at[o]] - target[o])

@@ -48,7 +48,9 @@ def agents() -> list[tuple[str, dict[str, np.ndarray]]]:
     ]
 
 
-def as_json(wanted: list[int] | None = None, *, lanes: bool = True, invalid: int | None = None) -> dict[str, Any]:
+def as_json(
+    wanted: list[int] | None = None, *, lanes: bool = True, invalid: int | None = None, signal: bool = False
+) -> dict[str, Any]:
     """The scenario in the layout of Nocturne; without ``wanted`` there is no metadata, as in older files."""
     objects = []
     for number, (kind, motion) in enumerate(agents()):
@@ -71,7 +73,12 @@ def as_json(wanted: list[int] | None = None, *, lanes: bool = True, invalid: int
         "scenario_id": "fork",
         "objects": objects,
         "roads": roads,
-        "tl_states": {},
+        # red when the present ends, green afterwards, which nobody may know
+        "tl_states": {
+            "2": {"state": ["go", "arrow_stop", "go"], "x": [0.0] * 3, "y": [0.0] * 3, "time_index": [0, PRESENT, 50]}
+        }
+        if signal
+        else {},
     }
     if wanted is not None:
         scene["metadata"] = {"sdc_track_index": 0, "tracks_to_predict": [{"track_index": i} for i in wanted]}
@@ -101,6 +108,10 @@ def as_record(wanted: list[int]) -> bytes:
             feature.lane.polyline.add(x=x, y=y)
     sign = message.map_features.add(id=50)
     sign.stop_sign.position.x, sign.stop_sign.position.y = 0.0, 3.0
+    sign.stop_sign.lane.append(1)
+    for k in range(STEPS):
+        light = message.dynamic_map_states.add().lane_states.add(lane=2, state=1 if k == PRESENT else 6)
+        light.stop_point.x, light.stop_point.y = 0.0, 0.0
     for index in wanted:
         message.tracks_to_predict.add(track_index=index)
     return bytes(message.SerializeToString())

@@ -10,13 +10,23 @@ import polars as pl
 import pytest
 
 from idm_env.data import DataError
-from idm_env.data.womd import Scenario, read_json, scenarios
-from idm_env.prediction import drivers as behaviour
+from idm_env.data.womd import Control, Scenario, read_json, scenarios
+from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
 from idm_env.prediction.files import case_of, predict_files
-from idm_env.prediction.lanes import LaneGraph
+from idm_env.prediction.lanes import LaneGraph, Route
 from idm_env.prediction.metrics import summary
-from idm_env.prediction.predict import METHODS, STEPS, Scene, along_lane, predict, straight_on
-from idm_env.prediction.select import select
+from idm_env.prediction.predict import (
+    METHODS,
+    along_lane,
+    as_published,
+    predict,
+    published_distance,
+    straight_on,
+)  # fmt: skip
+from idm_env.prediction.rollout import Ahead, Course, Drivers, nobody, roll
+from idm_env.prediction.scene import STEPS, Scene
+from idm_env.prediction.select import chances, select
+from idm_env.prediction.stops import Stop, StopLines
 from tests.prediction import scenes
 from tests.prediction.test_womd import write_json
 
@@ -45,29 +55,105 @@ def test_routes_follow_every_branch_and_lift_back(fork: Scenario) -> None:
     assert LaneGraph(fork.lanes).routes(np.array([-40.0, 9.0]), 0.0, 100.0) == []  # beside the road
 
 
+def second_of(route: Route, speeds: np.ndarray, ahead: Ahead | None = None, stop: Stop | None = None) -> Second:
+    """A last second at these speeds (m/s), 11 samples, behind nobody unless told."""
+    return Second(route, speeds, ahead or nobody(len(speeds) - 1), 2.25, stop)
+
+
+def drawn_at(route: Route, speed: float) -> Drivers:
+    return posterior([second_of(route, np.full(11, speed))])[0][0]
+
+
 def test_the_bend_is_taken_slowly_and_the_straight_is_not(fork: Scenario) -> None:
     straight, bend = LaneGraph(fork.lanes).routes(np.array([-40.0, 0.0]), 0.0, 100.0)
-    drawn = behaviour.prior(12.0, 12.0)
-    speeds = {}
-    for name, route in (("straight", straight), ("bend", bend)):
-        along, speed = behaviour.roll(route, drawn, route.begin, 12.0, behaviour.nobody(STEPS), STEPS, 2.25).numpy()
-        going = ~np.isfinite(drawn.stop)
-        inside = (along > 124) & (along < 138) & going[None]
-        speeds[name] = np.median(speed[inside])
-    assert speeds["bend"] < 7.5 < 10.0 < speeds["straight"]  # √(2.5 m/s² · 15 m) = 6.1 m/s
+    courses = [Course(route, drawn_at(route, 12.0), nobody(STEPS), route.begin) for route in (straight, bend)]
+    medians = []
+    for course, (along, speed) in zip(courses, roll(courses, 12.0, STEPS, 2.25), strict=True):
+        going = ~np.isfinite(course.drivers.stop)
+        medians.append(np.median(speed[(along > 124) & (along < 138) & going[None]]))
+    assert medians[1] < 7.5 < 10.0 < medians[0]  # √(2.5 m/s² · 15 m) = 6.1 m/s
+
+
+def test_courses_rolled_together_are_those_rolled_alone(fork: Scenario) -> None:
+    routes = LaneGraph(fork.lanes).routes(np.array([-40.0, 0.0]), 0.0, 100.0)
+    courses = [Course(route, drawn_at(route, 9.0), nobody(STEPS), route.begin) for route in routes]
+    together = roll(courses, 9.0, STEPS, 2.25)
+    for course, both in zip(courses, together, strict=True):
+        assert np.allclose(roll([course], 9.0, STEPS, 2.25)[0], both, atol=1e-9)
 
 
 def test_nobody_drives_into_a_standing_leader_or_past_his_own_stop(fork: Scenario) -> None:
     (route, *_) = LaneGraph(fork.lanes).routes(np.array([-40.0, 0.0]), 0.0, 100.0)
-    drawn = behaviour.prior(12.0, 13.4)
-    wall = behaviour.Ahead(np.full(STEPS + 1, route.begin + 60.0), np.zeros(STEPS + 1))
-    along, speed = behaviour.roll(route, drawn, route.begin, 12.0, wall, STEPS, 2.25).numpy()
+    drawn = drawn_at(route, 12.0)
+    wall = Ahead(np.full(STEPS + 1, route.begin + 60.0), np.zeros(STEPS + 1))
+    ((along, speed),) = roll([Course(route, drawn, wall, route.begin)], 12.0, STEPS, 2.25)
     assert (along + 2.25 <= route.begin + 60.0).all()
     assert (along - route.begin <= drawn.stop + 1e-6).all()
     assert (speed >= 0).all() and (np.diff(along, axis=0) >= -1e-9).all()
-    passed = behaviour.Ahead(wall.rear, wall.speed, passed=1.0)
-    free = behaviour.roll(route, drawn, route.begin, 12.0, passed, STEPS, 2.25).numpy()[0]
+    passed = Ahead(wall.rear, wall.speed, passed=1.0)
+    free = roll([Course(route, drawn, passed, route.begin)], 12.0, STEPS, 2.25)[0][0]
     assert (free[-1][~np.isfinite(drawn.stop)] > route.begin + 60.0).mean() > 0.8
+
+
+def test_stop_signs_are_for_the_lane_at_whose_end_they_stand_and_lights_for_theirs(fork: Scenario) -> None:
+    graph = LaneGraph(fork.lanes)
+    end = graph.lanes[1].line[-1]
+    (route, *_) = graph.routes(np.array([-40.0, 0.0]), 0.0, 100.0)
+    away = float(end[0] + 40.0 - 2.25)
+
+    def stop(*controls: Control) -> Stop | None:
+        return StopLines(graph, controls).ahead(route, 2.25, 10.0)
+
+    assert stop(Control("sign", end + np.array([-3.0, -4.0]))) == Stop(pytest.approx(away, abs=0.2), "sign")
+    assert stop(Control("sign", end + np.array([-3.0, 4.0]))) is None  # on the left: for those who come towards us
+    assert stop(Control("sign", end + np.array([-40.0, -4.0]))) is None  # not at a junction
+    assert stop(Control("sign", end + np.array([5.0, 30.0]), lanes=(1,))) == Stop(pytest.approx(away, abs=0.2), "sign")
+    assert stop(Control("stop", end, lanes=(route.chain[1],))) == Stop(pytest.approx(away, abs=0.2), "red")
+    assert stop(Control("stop", end, lanes=(99,))) is None and stop(Control("go", end, lanes=(1,))) is None
+    assert stop(Control("caution", end, lanes=(1,))) is not None
+    near = graph.routes(np.array([-12.0, 0.0]), 0.0, 100.0)[0]
+    assert StopLines(graph, [Control("caution", end, lanes=(1,))]).ahead(near, 2.25, 12.0) is None  # too late to brake
+
+
+def test_a_sign_is_stopped_at_and_left_and_a_red_light_is_waited_for(fork: Scenario) -> None:
+    (route, *_) = LaneGraph(fork.lanes).routes(np.array([-40.0, 0.0]), 0.0, 100.0)
+    ends = {}
+    for kind in ("sign", "red"):
+        one = middle(10.0, 13.4, Stop(25.0, kind))
+        ((along, speed),) = roll([Course(route, one, nobody(200), route.begin)], 10.0, 200, 2.25)
+        halt = int(np.argmax(speed[:, 0] < 0.5))
+        assert along[halt, 0] - route.begin == pytest.approx(25.0, abs=1.5)
+        ends[kind] = (halt, int(np.argmax((speed[:, 0] > 1.0) & (np.arange(200) > halt))))
+    assert ends["sign"][1] - ends["sign"][0] < 25  # 1 s of waiting and the start
+    assert ends["red"][1] >= 80  # it opens after 8 s
+
+
+def test_a_stop_line_ahead_makes_stopping_likely_unless_the_second_says_otherwise(fork: Scenario) -> None:
+    (route, *_) = LaneGraph(fork.lanes).routes(np.array([-40.0, 0.0]), 0.0, 100.0)
+    line = Stop(20.0, "sign")
+
+    def shares(speeds: np.ndarray) -> tuple[float, float]:
+        """Those who stop at the line, and those who stop anywhere."""
+        drawn, weight = posterior([second_of(route, speeds, stop=line)])[0]
+        at_line, anywhere = np.isfinite(drawn.wait), np.isfinite(drawn.stop)
+        return float(weight[at_line].sum() / weight.sum()), float(weight[anywhere].sum() / weight.sum())
+
+    steady, braking, faster = np.full(11, 10.0), np.linspace(12.5, 10.0, 11), np.linspace(8.5, 10.0, 11)
+    assert shares(braking)[0] > 0.7 > 0.4 > shares(steady)[0] > 2.0 * shares(faster)[0]
+    assert shares(braking)[1] > 0.95
+    assert sum(h.share for h in hypotheses(second_of(route, steady, stop=line))) == pytest.approx(1.0)
+
+
+def test_drivers_are_fitted_to_the_second_by_the_projects_fit(fork: Scenario) -> None:
+    """Strong acceleration shifts max_accel up, and what the second does not tell keeps the prior's spread."""
+    (route, *_) = LaneGraph(fork.lanes).routes(np.array([-40.0, 0.0]), 0.0, 100.0)
+    medians = {}
+    for name, rate in (("gentle", 0.6), ("strong", 2.6)):
+        drawn, weight = posterior([second_of(route, 3.0 + rate * 0.1 * np.arange(11))])[0]
+        going = ~np.isfinite(drawn.stop) & (weight > 0.1 * weight.max())
+        medians[name] = float(np.median(drawn.max_accel[going]))
+        assert np.std(np.log(drawn.time_gap)) == pytest.approx(0.3, rel=0.25)
+    assert medians["gentle"] < 1.6 < medians["strong"]
 
 
 def test_one_second_of_braking_shifts_the_weight_to_those_who_stop(fork: Scenario) -> None:
@@ -84,17 +170,17 @@ def test_one_second_of_braking_shifts_the_weight_to_those_who_stop(fork: Scenari
         scene = Scene(Scenario("s", (changed,), fork.lanes, (0,)))
         found = predict(scene, 0)
         near = found.futures[:, -1, 0] < -5.0
-        shares.append(found.confidence[near].sum())
+        shares.append(found.confidence[near].sum() / found.confidence.sum())
     assert shares[1] > shares[0] + 0.2
 
 
-def test_each_kind_gets_its_method_and_six_futures_that_sum_to_one(fork: Scenario) -> None:
+def test_each_kind_gets_its_method_and_six_futures(fork: Scenario) -> None:
     scene = Scene(fork)
     found = [predict(scene, index) for index in range(4)]
     assert [prediction.source for prediction in found] == ["lane", "free", "lane", "free"]
     for prediction in found:
         assert prediction.futures.shape[1:] == (STEPS, 2) and 1 <= len(prediction.futures) <= 6
-        assert prediction.confidence.sum() == pytest.approx(1.0)
+        assert 0.0 < prediction.confidence.sum() <= 1.0 + 1e-9
         assert (np.diff(prediction.confidence) <= 0).all()
     ends = found[0].futures[:, -1]
     assert (ends[:, 1] > 15).any() and (np.abs(ends[:, 1]) < 2).any()  # both branches
@@ -121,6 +207,27 @@ def test_selection_covers_groups_in_order_of_their_weight() -> None:
     futures, confidence = select(np.concatenate(groups), np.concatenate(weights), 10.0, most=3)
     assert np.allclose(futures[:, -1], centres, atol=1.0)
     assert np.allclose(confidence, share, atol=1e-9)
+
+
+def test_confidence_is_the_chance_to_hit_what_the_others_miss() -> None:
+    time = np.linspace(0.1, 1.0, STEPS)[:, None]
+    far, side = time * [80.0, 0.0], time * [0.0, 80.0]
+    samples = np.stack([far, far, far, side, side, time * [-80.0, 0.0]])
+    chosen = np.stack([side, far, far])
+    futures, confidence = chances(samples, np.full(6, 1 / 6), chosen, 10.0)
+    assert np.allclose(futures, np.stack([far, side, far]))
+    assert np.allclose(confidence, [0.5, 1 / 3, 0.0])
+
+
+def test_a_fit_by_the_paper_s_recipe_drives_the_paper_s_row(fork: Scenario) -> None:
+    """Its bounds ask for 5 m/s² and 20 m/s at least, so that a free road is taken at once; leaders are yielded to."""
+    scene = Scene(fork)
+    alone = as_published(scene, 0).futures[0]
+    assert alone.shape == (STEPS, 2) and abs(alone[-1, 1]) < 0.1  # straight on
+    assert alone[-1, 0] > straight_on(scene, 0).futures[0, -1, 0] + 20.0
+    behind = published_distance(scene, 2, {})
+    gap = 80.0 + published_distance(scene, 0, {}) - behind - 4.5
+    assert (np.diff(behind) >= 0).all() and gap.min() > 0.0
 
 
 def test_baselines_are_what_they_say(fork: Scenario) -> None:

@@ -26,7 +26,7 @@ def write_json(path: Path, **choices: object) -> Path:
 def test_json_and_tfrecord_give_the_same_scene(tmp_path: Path) -> None:
     (tmp_path / "fork.tfrecord").write_bytes(2 * womd_record.frame(scenes.as_record([0, 1])))
     with gzip.open(tmp_path / "fork.json.gz", "wt") as file:
-        json.dump(scenes.as_json([0, 1]), file)
+        json.dump(scenes.as_json([0, 1], signal=True), file)
     (one,) = scenarios(tmp_path / "fork.json.gz")
     two, again = scenarios(tmp_path / "fork.tfrecord")
     assert two.id == one.id == again.id == "fork"
@@ -38,7 +38,9 @@ def test_json_and_tfrecord_give_the_same_scene(tmp_path: Path) -> None:
     assert [lane.id for lane in one.lanes] == [lane.id for lane in two.lanes] == [1, 2, 3]
     assert two.lanes[0].exits == (2, 3) and one.lanes[0].exits is None
     assert two.lanes[0].speed_limit == pytest.approx(13.41, abs=0.01) and np.isnan(one.lanes[0].speed_limit)
-    assert np.allclose(one.stop_signs[0], two.stop_signs[0])
+    for a, b in zip(one.controls, two.controls, strict=True):
+        assert a.shows == b.shows and np.allclose(a.point, b.point)
+    assert [(c.shows, c.lanes) for c in two.controls] == [("sign", (1,)), ("stop", (2,))]
 
 
 def test_checksums_are_those_of_tensorflow() -> None:

@@ -35,7 +35,7 @@ def inputs(steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_kernel_is_the_simulator_in_the_paper_s_form() -> None:
     values, gap, closing = inputs(80)
     position, speed, accel = (np.empty(80) for _ in range(3))
-    loops.forward(8.0, values, gap, closing, 0.1, 10.0, position, speed, accel)
+    loops.forward(8.0, values, gap, closing, paper.NOBODY, paper.NOBODY, 0.1, 10.0, position, speed, accel)
     sim = Simulator(Lane(), (IDM(sharpness=1.0), ImaginedLeader(), Brakes(sharpness=1.0)), 0.1, "euler")
     params = sim.defaults(dtype=torch.float64)
     params["idm"] = dict(zip(paper.NAMES, torch.as_tensor(values), strict=True))
@@ -48,21 +48,25 @@ def test_kernel_is_the_simulator_in_the_paper_s_form() -> None:
     assert accel.min() < -5  # the floor is felt
 
 
-def test_gradient_is_exact() -> None:
+@pytest.mark.parametrize("real", [False, True])
+def test_gradient_is_exact(real: bool) -> None:
     values, gap, closing = inputs(30)
     closing = np.abs(closing)
+    rear = 12.0 + 0.7 * np.arange(30) if real else paper.NOBODY
+    pace = np.linspace(7.0, 4.0, 30) if real else paper.NOBODY
     seeds = np.linspace(-1, 1, 30)
     position, speed, accel = (np.empty(30) for _ in range(3))
 
     def loss(v: np.ndarray, g: np.ndarray, c: np.ndarray) -> float:
-        loops.forward(8.0, v, g, c, 0.1, 10.0, position, speed, accel)
+        loops.forward(8.0, v, g, c, rear, pace, 0.1, 10.0, position, speed, accel)
         return float(seeds @ position)
 
     loss(values, gap, closing)
     on = np.empty(5), np.empty(30), np.empty(30)
-    loops.backward(values, gap, closing, 0.1, 10.0, speed.copy(), seeds, *on)
-    for which, (point, gradient) in enumerate(zip((values, gap, closing), on, strict=True)):
-        for i in range(0, len(point), 3):
+    loops.backward(values, gap, closing, real, 0.1, 10.0, speed.copy(), seeds, *on)
+    points = (values,) if real else (values, gap, closing)
+    for which, (point, gradient) in enumerate(zip(points, on, strict=False)):
+        for i in range(0, len(point), 1 if which == 0 else 3):
             sides = []
             for sign in (1, -1):
                 moved = [values.copy(), gap.copy(), closing.copy()]
@@ -99,3 +103,15 @@ def test_ablation_keeps_the_five_and_reconstruction_steps_by_one_second() -> Non
     assert free.values.tolist() != paper.START.tolist()
     assert len(fixed.motion.time_s) == 61
     assert fixed.loss < 2.0 and free.loss < 2.0
+
+
+def test_prediction_s_fit_finds_the_driver_behind_a_real_leader() -> None:
+    """Driven by known values behind a braking leader, ten seconds give the motion back."""
+    pace = np.linspace(12.0, 6.0, 101)
+    rear = 20.0 + np.concatenate([[0.0], np.cumsum(pace[:-1] * 0.1)])
+    truth = paper.drive(np.array([6.0, 2.5, 1.4, 3.0, 40.0]), 12.0, rear, pace, 0.1)
+    found = paper.follow(truth, 12.0, rear, pace, 0.1)
+    assert (found >= paper.LOW).all() and (found <= paper.HIGH).all()
+    again = paper.drive(found, 12.0, rear, pace, 0.1)
+    first = paper.drive(paper.START, 12.0, rear, pace, 0.1)
+    assert np.abs(again - truth).mean() < 0.1 * np.abs(first - truth).mean()
