@@ -50,6 +50,7 @@ class Arguments:
         hidden: Widths of the policy's hidden layers.
         learning_rate: Of Adam, at the first update.
         clip: Largest global norm of a gradient.
+        clone: Steps of behaviour cloning of the human drivers before training; 0 begins with no command.
     """
 
     environment: Annotated[dict[str, Any], tyro.conf.Suppress] = field(default_factory=lambda: {"task": "ring"})
@@ -63,6 +64,7 @@ class Arguments:
     hidden: tuple[int, ...] = (32, 32)
     learning_rate: float = 3e-3
     clip: float = 1.0
+    clone: int = 0
 
 
 A = TypeVar("A", bound=Arguments)
@@ -136,44 +138,65 @@ def first_seed(seed: int, count: int) -> int:
 def desynchronise(env: DiffIDMVectorEnv) -> Tensor:
     """Set the clocks of the first episodes apart, so that not all end at once; return the observations.
 
-    Environment i of n starts at step ``i · limit / n``; its traffic is as it was at step 0.
+    Environment i of n starts at step ``i · limit / n``; traffic and records are as they were at step 0.
     """
     batch, state = env.batch, env.state
-    limit = batch.limit or 0
-    step = (torch.arange(env.num_envs) * limit) // env.num_envs
+    step = (torch.arange(env.num_envs) * (batch.limit or 0)) // env.num_envs
     batch.episodes -= 1
     observation: Tensor = env.reset(options={"state": state._replace(step=state.step + step)})[0]
+    assert batch.world is not None
+    episode = dict(batch.world.episode)
+    if "start" in episode:
+        episode["start"] = episode["start"] - step
+        batch.world = batch.world._replace(episode=episode)
     return observation
 
 
 def snapshot(env: DiffIDMVectorEnv) -> dict[str, Any]:
     """Return everything that ``restore`` needs to continue the episodes of a vector exactly."""
-    batch = env.batch
-    state = {k: v for k, v in env.state._asdict().items() if k != "memory"}
-    memory = dict(env.state.memory)
-    return {"state": state, "memory": memory, "seeds": batch.seeds.tolist(), "episodes": batch.episodes.tolist()}
+    batch, world = env.batch, env.batch.world
+    assert world is not None
+    state = {k: v for k, v in world.state._asdict().items() if k != "memory"}
+    return {
+        "state": state,
+        "memory": dict(world.state.memory),
+        "episode": dict(world.episode),
+        "seeds": batch.seeds.tolist(),
+        "numbers": batch.episodes.tolist(),
+    }
 
 
 def restore(env: DiffIDMVectorEnv, saved: Mapping[str, Any]) -> Tensor:
     """Continue the episodes of a snapshot; return the observations."""
     batch = env.batch
     env.reset(seed=list(saved["seeds"]))
-    batch.episodes[:] = np.asarray(saved["episodes"]) - 1
+    batch.episodes[:] = np.asarray(saved["numbers"]) - 1
     state = State(**saved["state"], memory=saved["memory"])
-    observation: Tensor = env.reset(options={"state": state})[0]
-    return observation
+    env.reset(options={"state": state})
+    assert batch.world is not None
+    batch.world = batch.world._replace(episode=saved["episode"])
+    return env.task.observe(batch.world).flatten(1)
 
 
-def human_moments(
+def human_driving(
     environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 1500
 ) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation of what agents observe while human drivers keep the wheel."""
+    """Return what agents observe while human drivers keep the wheel, and the actions that would do what they do.
+
+    Shapes ``(samples, features)`` and ``(samples,)``; actions are accelerations over ``max_command``, clipped.
+    """
     env = make_env(environment, count, output="numpy")
-    seen = [env.reset(seed=seed)[0]]
+    seen, done = [env.reset(seed=seed)[0]], []
     for _ in range(steps):
-        seen.append(env.step(None)[0])
-    seen_by_one = torch.as_tensor(np.stack(seen)).reshape(-1, len(env.task.bounds.names)).float()
-    return seen_by_one.mean(0), seen_by_one.std(0).clamp_min(1e-3)
+        observation, _, terminated, truncated, _ = env.step(None)
+        seen.append(observation)
+        # The first step of a new episode has no acceleration yet.
+        over = torch.as_tensor(terminated | truncated).unsqueeze(-1)
+        done.append(torch.where(over, torch.nan, env.task.pick(env.state.accel)))
+    observations = torch.as_tensor(np.stack(seen[:-1])).float().reshape(-1, len(env.task.bounds.names))
+    actions = (torch.stack(done).float() / env.task.max_command).clamp(-1.0, 1.0).flatten()
+    known = actions.isfinite()
+    return observations[known], actions[known]
 
 
 # -- policy ----------------------------------------------------------------------------------------------------------
@@ -286,10 +309,26 @@ def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[s
         policy, content = load(arguments.out / "last.pt", task.name, agent)
         return policy, content["training"]
     policy = Policy(len(task.bounds.names), arguments.hidden, **made)
-    mean, scale = human_moments(arguments.environment, first_seed(arguments.seed, 0))
-    policy.mean.copy_(mean)
-    policy.scale.copy_(scale)
+    observations, actions = human_driving(arguments.environment, first_seed(arguments.seed, 0))
+    policy.mean.copy_(observations.mean(0))
+    policy.scale.copy_(observations.std(0).clamp_min(1e-3))
+    if arguments.clone:
+        clone(policy, observations, actions, arguments.clone)
     return policy, {}
+
+
+def clone(policy: Policy, observations: Tensor, actions: Tensor, steps: int) -> float:
+    """Fit a policy to actions by least squares (behaviour cloning); return the last mean squared error."""
+    optimiser = torch.optim.Adam(policy.parameters(), lr=1e-2)
+    error = torch.zeros(())
+    for step in range(steps):
+        optimiser.param_groups[0]["lr"] = fall(1e-2, step, steps, 0.01)
+        rows = torch.randint(len(actions), (min(2048, len(actions)),))
+        error = (policy(observations[rows]).squeeze(-1) - actions[rows]).square().mean()
+        optimiser.zero_grad()
+        error.backward()
+        optimiser.step()
+    return float(error.detach())
 
 
 # -- updates ---------------------------------------------------------------------------------------------------------

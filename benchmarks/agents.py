@@ -97,7 +97,7 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
             training = folder / "training"
             shutil.rmtree(training, ignore_errors=True)
             done = subprocess.run(job.command(training), cwd=ROOT, capture_output=True, text=True, check=False)
-            row = {**dataclasses.asdict(job), **outcome(training, done)}
+            row = {**dataclasses.asdict(job), **outcome(training, done, unseen=job.seed in SEEDS)}
             beside = result.with_suffix(".part")
             beside.write_text(json.dumps(row, indent=1))
             os.replace(beside, result)
@@ -106,15 +106,15 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
     return content
 
 
-def outcome(training: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
-    """Return what a training came to: evaluations, the last and the best checkpoint, and both on held-out traffic."""
+def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool) -> dict[str, Any]:
+    """Return what a training came to: evaluations, last and best checkpoint, the last one on held-out traffic too."""
     from agents.common import load
     from agents.evaluate import held_out, solved_at
 
     if not (training / "last.pt").exists():
         return {"error": done.stderr[-2000:], "history": [], "summary": {"solved": False, "error": True}}
     policy, content = load(training / "last.pt")
-    best, at_best = load(training / "best.pt")
+    _, at_best = load(training / "best.pt")
     history = content["training"]["history"]
     first = solved_at(history)
     summary = {
@@ -124,15 +124,14 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str]) -> dict[str,
         "ever": any(row["passed"] for row in history),
         "error": done.returncode != 0,
     }
-    test = content["task"] == "ring"
+    unseen = unseen and content["task"] == "ring"
     return {
         "error": done.stderr[-2000:] if done.returncode else "",
         "summary": summary,
         "history": history,
         "last": history[-1],
         "best": at_best["training"]["history"][-1],
-        "held_out": held_out(policy, content["environment"]) if test else {},
-        "held_out_best": held_out(best, at_best["environment"]) if test else {},
+        "held_out": held_out(policy, content["environment"]) if unseen else {},
     }
 
 

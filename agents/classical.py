@@ -1,0 +1,162 @@
+"""Classical controllers of one vehicle on the ring, as rows beside what is learned; nothing is trained here.
+
+Both are of Stern, Cui, Delle Monache, Bhadani, Bunting, Churchill, Hamilton, Haulcy, Pohlmann, Wu, Piccoli, Seibold,
+Sprinkle, Work 2018, "Dissipation of stop-and-go waves via control of autonomous vehicles: field experiments", Transp.
+Res. C 89, 205 (arXiv 1705.01693). They command a speed; the acceleration is the one that reaches it in a step, clipped
+to what an agent may command.
+
+``python -m agents.classical [--config configs/ring-apg.yaml]``
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+import tyro
+from torch import Tensor
+
+from agents import apg
+from agents.common import load_agent, task_of
+from agents.evaluate import LENGTHS, Act, evaluate_ring, ring_start, uniform_speed
+
+
+class Seen(NamedTuple):
+    """The observation of the ring in SI units, each ``(n, 1)``: speed, leader's speed (m/s), gap (m)."""
+
+    speed: Tensor
+    lead_speed: Tensor
+    gap: Tensor
+
+
+def seen(observation: Tensor, vehicle_length: float) -> Seen:
+    """Return what ``RingTask.observe`` packs into an observation ``(n, 3)``."""
+    speed, relative, headway = observation.unbind(-1)
+    return Seen(*(x.unsqueeze(-1) for x in (15.0 * speed, 15.0 * (speed + relative), 270.0 * headway - vehicle_length)))
+
+
+@dataclass
+class Controller:
+    """A commanded speed, turned into actions in [−1, 1]; one object drives one batch of rings once."""
+
+    dt: float
+    max_command: float
+    vehicle_length: float
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        """Return actions ``(n, 1)``."""
+        view = seen(observation, self.vehicle_length)
+        return ((self.wanted(view) - view.speed) / (self.dt * self.max_command)).clamp(-1.0, 1.0)
+
+    def wanted(self, view: Seen) -> Tensor:
+        """Return the commanded speed (m/s)."""
+        raise NotImplementedError
+
+
+@dataclass
+class FollowerStopper(Controller):
+    """A desired speed U, given up in three parabolic zones of gap and closing speed.
+
+    With ``Δv₋ = min(v_lead − v, 0)`` the zones begin at ``Δx_k = Δx_k⁰ + Δv₋² / (2 d_k)``; ``v* = min(v_lead, U)``. The
+    command is 0, then rises linearly to v*, then to U.
+
+    Args:
+        desired: U (m/s), one number or one per ring ``(n, 1)``: the controller cannot find it by itself.
+    """
+
+    desired: Tensor | float
+
+    def wanted(self, view: Seen) -> Tensor:
+        """Return the commanded speed (m/s)."""
+        closing = (view.lead_speed - view.speed).clamp_max(0.0)
+        zones = ((4.5, 1.5), (5.25, 1.0), (6.0, 0.5))
+        first, second, third = (start + closing.square() / (2.0 * decel) for start, decel in zones)
+        top = torch.as_tensor(self.desired).expand_as(view.speed)
+        calm = torch.minimum(view.lead_speed.clamp_min(0.0), top)
+        adapting = calm * (view.gap - first) / (second - first)
+        leaving = calm + (top - calm) * (view.gap - second) / (third - second)
+        result = torch.where(view.gap <= first, 0.0, torch.where(view.gap <= second, adapting, leaving))
+        return torch.where(view.gap > third, top, result)
+
+
+@dataclass
+class PISaturation(Controller):
+    """Follows the mean of its own speed over 38 s, and less of it the shorter the gap.
+
+    ``v_target = U + v_catch sat((Δx − g_l)/(g_u − g_l))``; ``α = sat((Δx − Δx_s)/γ)``, ``Δx_s = max(2 s (v_lead − v), 4
+    m)``, ``β = 1 − α/2``; ``v_cmd ← β (α v_target + (1 − α) v_lead) + (1 − β) v_cmd``, sat clipping to [0, 1], with
+    v_catch = 1 m/s, g_l = 7 m, g_u = 30 m, γ = 2 m.
+    """
+
+    seconds: float = 38.0
+
+    def __post_init__(self) -> None:
+        self._past: deque[Tensor] = deque(maxlen=round(self.seconds / self.dt))
+        self._command: Tensor | None = None
+
+    def wanted(self, view: Seen) -> Tensor:
+        """Return the commanded speed (m/s), and remember it."""
+        self._past.append(view.speed)
+        mean = torch.stack(tuple(self._past)).mean(0)
+        target = mean + ((view.gap - 7.0) / 23.0).clamp(0.0, 1.0)
+        safe = (2.0 * (view.lead_speed - view.speed)).clamp_min(4.0)
+        alpha = ((view.gap - safe) / 2.0).clamp(0.0, 1.0)
+        beta = 1.0 - 0.5 * alpha
+        before = view.speed if self._command is None else self._command
+        self._command = beta * (alpha * target + (1.0 - alpha) * view.lead_speed) + (1.0 - beta) * before
+        return self._command
+
+
+def controllers(environment: Mapping[str, Any], lengths: Sequence[float]) -> dict[str, Callable[[], Act | None]]:
+    """Return what makes each controller for rings of these lengths, by the name of its row."""
+    task = task_of(environment)
+    vehicle = {"dt": task.simulator.dt, "max_command": task.max_command, "vehicle_length": task.vehicle_length}
+    uniform = uniform_speed(ring_start(environment, lengths)).unsqueeze(-1)
+    middle = float(uniform.median())
+    return {
+        "IDM for all": lambda: None,
+        f"FollowerStopper, U = {middle:.2f} m/s": lambda: FollowerStopper(**vehicle, desired=middle),
+        "FollowerStopper, told each ring's uniform speed": lambda: FollowerStopper(**vehicle, desired=uniform),
+        "PI with saturation": lambda: PISaturation(**vehicle),
+    }
+
+
+@dataclass
+class Arguments:
+    """Judge the classical controllers as agents are judged.
+
+    Args:
+        config: An agent's file, of which the environment is taken.
+    """
+
+    config: str = "configs/ring-apg.yaml"
+
+
+def rows(environment: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the figures of every controller, on the test and on unseen lengths."""
+    unseen = tuple(range(200, 301, 10))
+    known, other = controllers(environment, LENGTHS), controllers(environment, unseen)
+    return {
+        name: {"test": evaluate_ring(make(), environment), "lengths": evaluate_ring(make_other(), environment, unseen)}
+        for (name, make), make_other in zip(known.items(), other.values(), strict=True)
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Print one row per controller."""
+    torch.set_num_threads(1)
+    environment = load_agent(tyro.cli(Arguments, args=argv).config, apg.Arguments, "apg").environment
+    print("controller | worst speed ratio | worst std (m/s) | smallest time gap (s) | collisions")
+    for name, figures in rows(environment).items():
+        r = figures["test"]
+        print(
+            f"{name} | {r['speed_ratio']:.3f} | {r['speed_std']:.2f} | {r['time_gap']:.2f} | {r['collisions']}"
+            f" | {[round(x, 3) for x in r['ratios']]}"
+        )
+
+
+if __name__ == "__main__":
+    main()
