@@ -15,7 +15,7 @@ import numpy as np
 
 from idm_env.data.womd import Scenario, scenarios
 from idm_env.prediction.files import case_of
-from idm_env.prediction.metrics import Case, summary
+from idm_env.prediction.metrics import Score, score, summary
 from idm_env.prediction.predict import METHODS
 from idm_env.prediction.scene import Scene
 
@@ -30,7 +30,7 @@ def moving(scenario: Scenario) -> list[int]:
     return sorted(chosen)
 
 
-def show(title: str, cases: dict[str, list[Case]]) -> None:
+def show(title: str, cases: dict[str, list[Score]]) -> None:
     print(f"{title}: {len(next(iter(cases.values())))} agents")
     print(f"  {'method':24s} {'minADE 3/5/8 s (m)':>24s} {'minFDE 3/5/8 s (m)':>24s} {'miss 3/5/8 s':>18s} {'mAP':>6s}")
     for name, items in cases.items():
@@ -47,17 +47,17 @@ def main() -> None:
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--all-moving", action="store_true")
     options = parser.parse_args()
-    every: dict[str, list[Case]] = {name: [] for name in METHODS}
+    every: dict[str, list[Score]] = {name: [] for name in METHODS}
     spent = dict.fromkeys(METHODS, 0.0)
     for path in options.files:
         for scenario in scenarios(path):
             scene = Scene(scenario)
-            here: dict[str, list[Case]] = {name: [] for name in METHODS}
+            here: dict[str, list[Score]] = {name: [] for name in METHODS}
             wanted = moving(scenario) if options.all_moving else scenario.to_predict
             for index in (i for i in wanted if scenario.agents[i].valid[scenario.present]):
                 for name, method in METHODS.items():
                     begin = time.perf_counter()
-                    here[name].append(case_of(scenario, method(scene, index)))
+                    here[name].append(score(case_of(scenario, method(scene, index))))
                     spent[name] += time.perf_counter() - begin
             show(scenario.id, here)
             for name, cases in here.items():

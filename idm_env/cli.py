@@ -347,12 +347,13 @@ def reconstruct(
 def predict(
     scenarios: Annotated[list[Path], typer.Argument(help="Waymo Open Motion scenarios: JSON, json.gz or TFRecord.")],
     out: Out = Path("out/predict"),
+    resume: Resume = False,
 ) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
     from idm_env.prediction.files import predict_files
 
     with progress() as report:
-        predict_files(scenarios, out, on_progress=lambda done, total: report("predict", done, total, ""))
+        predict_files(scenarios, out, resume=resume, on_progress=lambda done, total: report("predict", done, total, ""))
     _done(out)
 
 

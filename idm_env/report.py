@@ -27,7 +27,9 @@ p.lead { font-size: 1.1rem; } figure { margin: 1rem 0; } figure img { max-width:
 figcaption, .note { color: #566; font-size: .92rem; }
 table { border-collapse: collapse; margin: .8rem 0; font-size: .92rem; display: block; overflow-x: auto; }
 th, td { padding: .25rem .8rem .25rem 0; text-align: left; border-bottom: 1px solid #dde; vertical-align: top; }
-td.number { text-align: right; font-variant-numeric: tabular-nums; }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
+table.first tbody tr:first-child { font-weight: 600; background: #eef5fb; }
+.gallery { display: flex; flex-wrap: wrap; gap: 1rem; } .gallery figure { flex: 1 1 26rem; margin: 0; }
 </style></head><body>
 <h1>{{ title }}</h1>
 {% for block in blocks %}
@@ -38,8 +40,11 @@ td.number { text-align: right; font-variant-numeric: tabular-nums; }
 {% elif block.kind == "list" %}<ul>{% for item in block.rows %}<li>{{ item }}</li>{% endfor %}</ul>
 {% elif block.kind == "figure" %}<figure><img alt="{{ block.text }}" src="{{ block.image }}">
 <figcaption>{{ block.text }}</figcaption></figure>
-{% elif block.kind == "table" %}<table>
-<thead><tr>{% for name in block.columns %}<th>{{ name }}</th>{% endfor %}</tr></thead>
+{% elif block.kind == "gallery" %}<div class="gallery">{% for item in block.rows %}<figure>
+<img alt="{{ item.text }}" src="{{ item.image }}"><figcaption>{{ item.text }}</figcaption></figure>{% endfor %}</div>
+{% elif block.kind == "table" %}<table{% if block.text %} class="{{ block.text }}"{% endif %}>
+<thead><tr>{% for name in block.columns %}<th{% if block.rows and block.rows[0][loop.index0].number %} class="number"{%
+endif %}>{{ name }}</th>{% endfor %}</tr></thead>
 <tbody>{% for row in block.rows %}<tr>{% for cell in row %}<td{% if cell.number %} class="number"{% endif %}>{{
 cell.text }} </td>{% endfor %}</tr>{% endfor %}</tbody></table>
 {% endif %}{% endfor %}
@@ -49,7 +54,7 @@ cell.text }} </td>{% endfor %}</tr>{% endfor %}</tbody></table>
 
 @dataclass(frozen=True)
 class Block:
-    """One piece of a page: a heading, a paragraph, a list, a figure or a table."""
+    """One piece of a page: a heading, a paragraph, a list, a figure, a gallery of figures or a table."""
 
     kind: str
     text: str = ""
@@ -83,19 +88,35 @@ def bullets(items: Iterable[str]) -> Block:
     return Block("list", rows=tuple(items))
 
 
-def table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> Block:
-    """Return a table of rows by column name; floats with four significant digits."""
+def table(
+    rows: Sequence[Mapping[str, Any]],
+    columns: Sequence[str] | None = None,
+    *,
+    digits: Mapping[str, int] | None = None,
+    first: bool = False,
+) -> Block:
+    """Return a table of rows by column name; floats with four significant digits, or ``digits`` behind the point.
+
+    ``first`` sets the first row off from the others.
+    """
     names = tuple(columns or (rows[0] if rows else ()))
-    cells = tuple(tuple(_cell(row.get(name)) for name in names) for row in rows)
-    return Block("table", columns=names, rows=cells)
+    cells = tuple(tuple(_cell(row.get(name), (digits or {}).get(name)) for name in names) for row in rows)
+    return Block("table", "first" if first else "", columns=names, rows=cells)
 
 
-def _cell(value: Any) -> dict[str, Any]:
+def _cell(value: Any, digits: int | None = None) -> dict[str, Any]:
     if isinstance(value, bool):
         return {"text": "yes" if value else "no", "number": False}
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        return {"text": "–", "number": True}
     if isinstance(value, float):
-        return {"text": f"{value:.4g}", "number": True}
+        return {"text": f"{value:.4g}" if digits is None else f"{value:.{digits}f}", "number": True}
     return {"text": "" if value is None else str(value), "number": isinstance(value, int)}
+
+
+def gallery(figures: Iterable[Block]) -> Block:
+    """Return figures side by side, as many in a row as there is room for."""
+    return Block("gallery", rows=tuple(figures))
 
 
 def picture(figure: Figure, caption: str) -> Block:

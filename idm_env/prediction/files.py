@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import json
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
-from jinja2 import Environment, PackageLoader, select_autoescape
 
+from idm_env import report as page
 from idm_env.data import DataError
 from idm_env.data.womd import Scenario, scenarios
-from idm_env.prediction.metrics import HORIZONS, Case, shape_of, summary
+from idm_env.parts import Parts
+from idm_env.prediction import report as written
+from idm_env.prediction.metrics import Case, Score, score, shape_of, summary
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import METHODS, Prediction
 from idm_env.prediction.scene import Scene
-from idm_env.trajectories.report import embedded, finite, shown_number
 
 OnProgress = Callable[[int, int], None]
 """Called with files done and files in all."""
@@ -27,57 +29,97 @@ SCHEMA = {
     "scenario_id": pl.String, "agent_id": pl.Int64, "kind": pl.String, "source": pl.String, "future": pl.Int32,
     "confidence": pl.Float64, "time_s": pl.Float64, "x_m": pl.Float64, "y_m": pl.Float64,
 }  # fmt: skip
+PARAMETERS = {
+    "scenario_id": pl.String, "agent_id": pl.Int64, "source": pl.String,
+    **{
+        f"{name}{end}": pl.Float64
+        for name in ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed") for end in ("", "_deviation")
+    },
+}  # fmt: skip
 
 
 def predict_files(
-    paths: Sequence[str | Path], out: str | Path, *, baselines: bool = True, on_progress: OnProgress | None = None
+    paths: Sequence[str | Path],
+    out: str | Path,
+    *,
+    baselines: bool = True,
+    resume: bool = False,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Predict the agents of scenario files (JSON or TFRecord) and return the report, also written to ``out``.
 
     Writes ``predictions.parquet`` (one row per future and step), ``parameters.parquet`` (mean and deviation of each
     driver's five), ``report.json`` and ``report.html`` with the benchmark's metrics where the future is known, over
     all agents, per scene and per kind, against the single futures of ``METHODS``. A file or an agent that cannot be
-    used is left out and counted; the others are done.
+    used is left out and counted; the others are done. ``resume`` goes on after the last finished file.
 
     Raises:
-        DataError: If no file holds a scenario that can be used.
+        DataError: If no file holds a scenario that can be used, or ``resume`` finds a run on other files or settings.
     """
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
+    out = page.output_folder(Path(out))
+    files = [Path(path) for path in paths]
+    parts = Parts(out, _fingerprint(files, baselines), resume)
+    for number, path in enumerate(files):
+        if not parts.done(number):
+            _file(parts, number, path, [name for name in METHODS if baselines or name == OURS])
+        if on_progress is not None:
+            on_progress(number + 1, len(files))
+    report, pictures = _report(parts.summaries())
+    if not report["scenarios"]:
+        first = report["left_out"][0]["reason"] if report["left_out"] else "no file was given"
+        parts.remove()
+        raise DataError(f"no scenario can be used: {first}")
+    parts.join("predictions", out / "predictions.parquet")
+    parts.join("parameters", out / "parameters.parquet")
+    written.write(out, report, pictures)
+    parts.remove()
+    return report
+
+
+def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
+    """Return a digest of names, sizes and times of the files, and of the settings."""
+    stats = [
+        (path.name, path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else path.name for path in files
+    ]
+    return hashlib.sha256(repr((stats, baselines)).encode()).hexdigest()
+
+
+def _file(parts: Parts, number: int, path: Path, methods: Sequence[str]) -> None:
+    """Predict the scenarios of one file and write its part."""
     left_out: list[dict[str, str]] = []
     notes: list[dict[str, str]] = []
-    cases: dict[str, list[tuple[str, Case]]] = {name: [] for name in METHODS if baselines or name == OURS}
+    scores: list[dict[str, Any]] = []
     tables: list[pl.DataFrame] = []
-    parameters: list[dict[str, Any]] = []
-    pictures: list[str] = []
+    rows: list[dict[str, Any]] = []
+    pictures: list[dict[str, str]] = []
     found = 0
-    for number, path in enumerate(paths):
-        for scenario in _readable(path, left_out):
-            found += 1
-            scene = Scene(scenario)
-            notes += [{"scenario": scenario.id, "note": note} for note in _notes(scenario)]
-            for index in scenario.to_predict:
-                done = _agent(scene, index, cases, left_out)
-                if done is not None:
-                    tables.append(_rows(scenario, done))
-                    parameters.append(_parameters(scenario, done))
-                    if len(pictures) < MOST_PICTURES:
-                        pictures.append(embedded(scene_picture(scenario, done, f"{scenario.id}: ")))
-        if on_progress is not None:
-            on_progress(number + 1, len(paths))
-    if not found:
-        first = left_out[0]["reason"] if left_out else "no file was given"
-        raise DataError(f"no scenario can be used: {first}")
-    pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]).write_parquet(out / "predictions.parquet")
-    pl.DataFrame(parameters, infer_schema_length=None).write_parquet(out / "parameters.parquet")
-    report = _report(found, len(tables), cases, left_out, notes)
-    (out / "report.json").write_text(json.dumps(finite(report), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    environment = Environment(loader=PackageLoader("idm_env.prediction", "."), autoescape=select_autoescape())
-    page = environment.get_template("report.html").render(
-        report=report, horizons=HORIZONS, pictures=pictures, number=shown_number
-    )
-    (out / "report.html").write_text(page)
-    return report
+    for scenario in _readable(path, left_out):
+        found += 1
+        scene = Scene(scenario)
+        notes += [{"scenario": scenario.id, "note": note} for note in _notes(scenario)]
+        for index in scenario.to_predict:
+            done = _agent(scene, index, methods, left_out)
+            if done is None:
+                continue
+            ours = done[OURS]
+            tables.append(_rows(scenario, ours))
+            rows.append(_parameters(scenario, ours))
+            cases = {name: case_of(scenario, prediction) for name, prediction in done.items()}
+            if cases[OURS].valid.any():
+                kept = {name: asdict(score(case)) for name, case in cases.items()}
+                scores.append({"scene": scenario.id, "methods": kept})
+            if len(pictures) < MOST_PICTURES:
+                block = page.picture(*scene_picture(scenario, ours))
+                pictures.append({"text": block.text, "image": block.image})
+    pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]).write_parquet(parts.path(number, "predictions"))
+    pl.DataFrame(rows, schema=PARAMETERS).write_parquet(parts.path(number, "parameters"))
+    parts.finish(
+        number,
+        {
+            "scenarios": found, "agents": len(tables), "scores": scores, "left_out": left_out, "notes": notes,
+            "pictures": pictures,
+        },
+    )  # fmt: skip
 
 
 def _readable(path: str | Path, left_out: list[dict[str, str]]) -> Iterator[Scenario]:
@@ -98,22 +140,14 @@ def _notes(scenario: Scenario) -> list[str]:
 
 
 def _agent(
-    scene: Scene, index: int, cases: dict[str, list[tuple[str, Case]]], left_out: list[dict[str, str]]
-) -> Prediction | None:
-    """Predict one agent by every method and keep the cases; None, and counted, where it cannot be."""
-    scenario = scene.scenario
-    predictions = {}
+    scene: Scene, index: int, methods: Sequence[str], left_out: list[dict[str, str]]
+) -> dict[str, Prediction] | None:  # fmt: skip
+    """Predict one agent by every method; None, and counted, where it cannot be."""
     try:
-        for name in cases:
-            predictions[name] = METHODS[name](scene, index)
+        return {name: METHODS[name](scene, index) for name in methods}
     except ValueError as error:
-        left_out.append({"what": f"{scenario.id}, track {index}", "reason": str(error)})
+        left_out.append({"what": f"{scene.scenario.id}, track {index}", "reason": str(error)})
         return None
-    for name, prediction in predictions.items():
-        case = case_of(scenario, prediction)
-        if case.valid.any():
-            cases[name].append((scenario.id, case))
-    return predictions[OURS]
 
 
 def case_of(scenario: Scenario, prediction: Prediction) -> Case:
@@ -153,28 +187,27 @@ def _parameters(scenario: Scenario, prediction: Prediction) -> dict[str, Any]:
     return row
 
 
-def _report(
-    found: int,
-    predicted: int,
-    cases: dict[str, list[tuple[str, Case]]],
-    left_out: list[dict[str, str]],
-    notes: list[dict[str, str]],
-) -> dict[str, Any]:
-    def rows(scene: str | None = None, kind: str | None = None) -> list[dict[str, Any]]:
-        chosen = {
-            name: [case for where, case in items if scene in (None, where) and kind in (None, case.kind)]
-            for name, items in cases.items()
-        }
-        return [{"method": name, **summary(items)} for name, items in chosen.items()]
+def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.Block]]:
+    """Return the report of all parts, and the pictures."""
+    scored = [item for part in parts for item in part["scores"]]
+    scores = [(item["scene"], {name: Score(**kept) for name, kept in item["methods"].items()}) for item in scored]
+    names = list(scores[0][1]) if scores else [OURS]
 
-    ours = cases[OURS]
+    def rows(scene: str | None = None, kind: str | None = None) -> list[dict[str, Any]]:
+        chosen = [
+            kept for where, kept in scores if scene in (None, where) and kind in (None, kept[OURS].kind)
+        ]  # fmt: skip
+        return [{"method": name, **summary([kept[name] for kept in chosen])} for name in names]
+
+    pictures = [page.Block("figure", **item) for part in parts for item in part["pictures"]]
     return {
-        "scenarios": found,
-        "agents": predicted,
-        "agents_with_known_future": len(ours),
+        "scenarios": sum(part["scenarios"] for part in parts),
+        "agents": sum(part["agents"] for part in parts),
+        "agents_with_known_future": len(scores),
         "methods": rows(),
-        "scenes": {name: rows(scene=name) for name in sorted({s for s, _ in ours})},
-        "kinds": {kind: rows(kind=kind) for kind in sorted({c.kind for _, c in ours})},
-        "left_out": left_out,
-        "notes": notes,
-    }
+        "scenes": {name: rows(scene=name) for name in sorted({where for where, _ in scores})},
+        "kinds": {kind: rows(kind=kind) for kind in sorted({kept[OURS].kind for _, kept in scores})},
+        "left_out": [item for part in parts for item in part["left_out"]],
+        "notes": [item for part in parts for item in part["notes"]],
+        "versions": page.versions(),
+    }, pictures[:MOST_PICTURES]

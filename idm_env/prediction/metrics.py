@@ -99,19 +99,40 @@ def shape_of(
     return "left U-turn" if ahead < -5.0 else "left"
 
 
-def average_precision(cases: Sequence[Case], seconds: int) -> float:
+@dataclass(frozen=True)
+class Score:
+    """What is kept of a case: per horizon minADE and minFDE (m, None without truth) and which futures hit (or None)."""
+
+    kind: str
+    shape: str
+    confidence: list[float]
+    ade: list[float | None]
+    fde: list[float | None]
+    hit: list[list[bool] | None]
+
+
+def score(case: Case) -> Score:
+    """Return the score of one case."""
+    both = [displacement(case, seconds) for seconds in HORIZONS]
+    best = [[float(x.min()) if np.isfinite(x).any() else None for x in column] for column in zip(*both, strict=True)]
+    reached = [hits(case, seconds) for seconds in HORIZONS]
+    found = [None if hit is None else [bool(x) for x in hit] for hit in reached]
+    return Score(case.kind, case.shape, [float(x) for x in case.confidence], best[0], best[1], found)
+
+
+def average_precision(scores: Sequence[Score], seconds: int) -> float:
     """Return the area under the interpolated precision-recall curve of these agents; NaN without truth."""
     confidence, correct, agents = [], [], 0
-    for case in cases:
-        hit = hits(case, seconds)
+    for item in scores:
+        hit = item.hit[HORIZONS.index(seconds)]
         if hit is None:
             continue
         agents += 1
         # of several futures that hit, only the most confident is a true positive
-        order = np.argsort(-case.confidence, kind="stable")
+        order = np.argsort(-np.array(item.confidence), kind="stable")
         first = next((i for i in order if hit[i]), None)
         for i in order:
-            confidence.append(case.confidence[i])
+            confidence.append(item.confidence[i])
             correct.append(i == first)
     if agents == 0:
         return float("nan")
@@ -122,23 +143,23 @@ def average_precision(cases: Sequence[Case], seconds: int) -> float:
     return float(np.sum(np.diff(np.concatenate([[0.0], recall])) * best))
 
 
-def summary(cases: Sequence[Case]) -> dict[str, float | int]:
+def summary(scores: Sequence[Score]) -> dict[str, float | int]:
     """Return agents and, per horizon, minADE and minFDE (m), miss rate and mAP; NaN where there is no truth."""
-    row: dict[str, float | int] = {"agents": len(cases)}
-    for seconds in HORIZONS:
-        both = [displacement(case, seconds) for case in cases]
-        reached = [hits(case, seconds) for case in cases]
-        row[f"minADE_{seconds}s"] = _mean([mean.min() for mean, _ in both])
-        row[f"minFDE_{seconds}s"] = _mean([end.min() for _, end in both])
-        row[f"miss_rate_{seconds}s"] = _mean([0.0 if hit.any() else 1.0 for hit in reached if hit is not None])
-        shapes = {case.shape for case in cases}
-        precisions = [average_precision([c for c in cases if c.shape == shape], seconds) for shape in sorted(shapes)]
+    row: dict[str, float | int] = {"agents": len(scores)}
+    for i, seconds in enumerate(HORIZONS):
+        row[f"minADE_{seconds}s"] = _mean([item.ade[i] for item in scores])
+        row[f"minFDE_{seconds}s"] = _mean([item.fde[i] for item in scores])
+        row[f"miss_rate_{seconds}s"] = _mean(
+            [0.0 if any(h) else 1.0 for item in scores if (h := item.hit[i]) is not None]
+        )
+        shapes = sorted({item.shape for item in scores})
+        precisions = [average_precision([s for s in scores if s.shape == shape], seconds) for shape in shapes]
         row[f"mAP_{seconds}s"] = _mean(precisions)
     for name in ("minADE", "minFDE", "miss_rate", "mAP"):
         row[name] = _mean([float(row[f"{name}_{seconds}s"]) for seconds in HORIZONS])
     return row
 
 
-def _mean(values: Sequence[float]) -> float:
-    known = [float(v) for v in values if np.isfinite(v)]
+def _mean(values: Sequence[float | None]) -> float:
+    known = [float(v) for v in values if v is not None and np.isfinite(v)]
     return float(np.mean(known)) if known else float("nan")

@@ -19,8 +19,8 @@ def body(agent: Agent, step: int) -> np.ndarray:
     return np.asarray(agent.position[step] + half @ np.array([[c, s], [-s, c]]))
 
 
-def scene_picture(scenario: Scenario, prediction: Prediction, source: str = "") -> Figure:
-    """Return the picture of one agent's prediction; wider lines are more probable futures."""
+def scene_picture(scenario: Scenario, prediction: Prediction) -> tuple[Figure, str]:
+    """Return the picture of one agent's prediction and its caption; wider lines are more probable futures."""
     present = scenario.present
     agent = scenario.agents[prediction.agent]
     past = np.flatnonzero(agent.valid[: present + 1])
@@ -48,7 +48,8 @@ def scene_picture(scenario: Scenario, prediction: Prediction, source: str = "") 
         axis.plot(*agent.position[later].T, "--", color=TRUTH, lw=1.8, zorder=5, label="what it did")
         axis.plot(*agent.position[later[-1]], "x", color=TRUTH, ms=7, mew=2, zorder=5)
     axis.set(xlim=(here[0] - reach, here[0] + reach), ylim=(here[1] - reach, here[1] + reach), aspect="equal")
-    axis.set(xlabel="x (m)", ylabel="y (m)", title=f"{source}{agent.kind} {agent.id}, by {prediction.source}")
+    axis.set(xlabel="x (m)", ylabel="y (m)")
     axis.ticklabel_format(useOffset=False)
     axis.legend(loc="upper right", fontsize=8, framealpha=0.9)
-    return figure
+    how = "on lanes" if prediction.source == "lane" else "off the lanes"
+    return figure, f"{scenario.id}: {agent.kind} {agent.id}, predicted {how}"

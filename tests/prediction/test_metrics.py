@@ -12,6 +12,7 @@ from idm_env.prediction.metrics import (
     average_precision,
     displacement,
     hits,
+    score,
     shape_of,
     speed_scale,
     summary,
@@ -35,7 +36,7 @@ def test_samples_are_taken_at_two_hertz() -> None:
 
 
 def test_distances_are_those_of_the_best_future() -> None:
-    row = summary([case((3.0, 4.0), (0.0, 2.0))])
+    row = summary([score(case((3.0, 4.0), (0.0, 2.0)))])
     assert row["minADE_3s"] == row["minADE_8s"] == row["minFDE_5s"] == pytest.approx(2.0)
 
 
@@ -64,7 +65,7 @@ def test_what_has_no_truth_does_not_count() -> None:
     assert hits(lost, 8) is None and hits(lost, 3) is not None
     mean, end = displacement(lost, 8)
     assert mean.tolist() == [0.0] and np.isnan(end).all()
-    row = summary([lost, case((9.0, 0.0))])
+    row = summary([score(lost), score(case((9.0, 0.0)))])
     assert row["miss_rate_8s"] == 1.0 and row["miss_rate_3s"] == 0.5
 
 
@@ -72,10 +73,10 @@ def test_average_precision_by_hand() -> None:
     good = case((0.0, 0.0), (50.0, 0.0), confidence=[0.9, 0.1])
     late = case((50.0, 0.0), (0.0, 0.0), confidence=[0.8, 0.2])
     # in order of confidence: hit, miss, hit, miss; recall ½ at precision 1, recall 1 at precision 2/3
-    assert average_precision([good, late], 3) == pytest.approx(0.5 + 0.5 * 2 / 3)
+    assert average_precision([score(good), score(late)], 3) == pytest.approx(0.5 + 0.5 * 2 / 3)
     twice = case((0.0, 0.0), (0.1, 0.0), confidence=[0.6, 0.4])  # the second hit is a false positive
-    assert average_precision([twice], 3) == 1.0
-    assert average_precision([case((50.0, 0.0))], 3) == 0.0
+    assert average_precision([score(twice)], 3) == 1.0
+    assert average_precision([score(case((50.0, 0.0)))], 3) == 0.0
 
 
 def path(turn: float, length: float = 40.0) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from idm_env.data.womd import Control, Scenario, read_json, scenarios
 from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
 from idm_env.prediction.files import case_of, predict_files
 from idm_env.prediction.lanes import LaneGraph, Route
-from idm_env.prediction.metrics import summary
+from idm_env.prediction.metrics import score, summary
 from idm_env.prediction.predict import (
     METHODS,
     along_lane,
@@ -265,6 +265,31 @@ def test_files_report_and_bad_input(tmp_path: Path) -> None:
         predict_files([tmp_path / "broken.json"], tmp_path / "none")
 
 
+def test_an_interrupted_run_goes_on_after_the_last_file(tmp_path: Path) -> None:
+    paths = [write_json(tmp_path / f"{i}.json", wanted=[i]) for i in range(3)]
+    whole = predict_files(paths, tmp_path / "whole")
+
+    def stop(done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        predict_files(paths, tmp_path / "out", on_progress=stop)
+    assert (tmp_path / "out" / "parts" / "000001.json").exists()
+    with pytest.raises(DataError, match="other data or settings; leave out resume"):
+        predict_files(paths[:2], tmp_path / "out", resume=True)
+    paths[0].write_text(paths[0].read_text())  # as new: another file by its time
+    with pytest.raises(DataError, match="other data or settings"):
+        predict_files(paths, tmp_path / "out", resume=True)
+    with pytest.raises(KeyboardInterrupt):
+        predict_files(paths, tmp_path / "out", on_progress=stop)
+    seen: list[int] = []
+    report = predict_files(paths, tmp_path / "out", resume=True, on_progress=lambda done, total: seen.append(done))
+    assert report["methods"] == whole["methods"] and seen == [1, 2, 3]
+    tables = [pl.read_parquet(tmp_path / name / "predictions.parquet") for name in ("whole", "out")]
+    assert tables[0].equals(tables[1]) and not (tmp_path / "out" / "parts").exists()
+
+
 def test_better_than_all_three_single_futures_on_measured_scenes(measured) -> None:  # type: ignore[no-untyped-def]
     folder = measured("womd_json")
     cases = {name: [] for name in METHODS}
@@ -273,7 +298,7 @@ def test_better_than_all_three_single_futures_on_measured_scenes(measured) -> No
             scene = Scene(scenario)
             for index in scenario.to_predict:
                 for name, method in METHODS.items():
-                    cases[name].append(case_of(scenario, method(scene, index)))
+                    cases[name].append(score(case_of(scenario, method(scene, index))))
     rows = {name: summary(items) for name, items in cases.items()}
     ours = rows.pop("drivers on routes")
     assert ours["agents"] == 12
