@@ -45,9 +45,12 @@ class Round:
     partial: int | None = None
 
 
-def decide(searching: Search, null: Solution, seed: int) -> tuple[list[Solution], list[Round]]:
-    """Return the models after every addition, the last one with what is not needed taken back, and what was seen."""
-    steps, rounds = _rounds(searching, null, seed)
+def decide(searching: Search, null: Solution, seed: int) -> tuple[Solution, list[Solution], list[Round]]:
+    """Return the null, the models after every addition (the last without what is not needed), and what was seen.
+
+    A latency shorter than a step of the data becomes part of the null: it is how they were integrated or recorded.
+    """
+    null, steps, rounds = _rounds(searching, null, seed)
     if len(steps) == len(rounds) - 1:
         pair = _pairs(searching, steps[-1] if steps else null, rounds[-1], seed)
         if pair is not None:
@@ -57,13 +60,15 @@ def decide(searching: Search, null: Solution, seed: int) -> tuple[list[Solution]
             steps.append(searching.null(chosen.model, chosen.theta, chosen.values))
     if steps:
         steps[-1] = _delete(searching, steps[-1], len(null.model.terms))
-    return steps, rounds
+    return null, steps, rounds
 
 
-def _rounds(searching: Search, null: Solution, seed: int) -> tuple[list[Solution], list[Round]]:
-    now, steps, rounds = null, [], []
-    for number in range(1, MOST_ROUNDS + 1):
-        if steps and _at_floor(searching, now):
+def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, list[Solution], list[Round]]:
+    now = null
+    steps: list[Solution] = []
+    rounds: list[Round] = []
+    for number in range(1, MOST_ROUNDS + 2):
+        if len(steps) == MOST_ROUNDS or (steps and _at_floor(searching, now)):
             break
         scored, before = searching.round(now, number)
         scored = [s for s in scored if not _same_class(s.term, now.model)]
@@ -82,8 +87,18 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[list[Solution
         chosen = scored[this.winner].solution
         assert chosen is not None
         now = searching.null(chosen.model, chosen.theta, chosen.values)
-        steps.append(now)
-    return steps, rounds
+        if not steps and _is_a_step(now, searching.task.rows.records.dt):
+            null = now
+            rounds.pop()
+        else:
+            steps.append(now)
+    return null, steps, rounds
+
+
+def _is_a_step(now: Solution, dt: float) -> bool:
+    """Tell whether the last term is a latency below one step."""
+    last = now.model.terms[-1]
+    return last.effect in {"delay", "lag"} and abs(float(now.values[-1])) < dt
 
 
 def _at_floor(searching: Search, now: Solution) -> bool:

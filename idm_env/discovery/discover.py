@@ -99,7 +99,7 @@ def discover(
     progress("null", "idm", 0, 1)
     base = Model(tuple(_known_terms(prepared, known, trajectories)))
     null = searching.null(base, theta)
-    steps, rounds = decide(searching, null, seed)
+    null, steps, rounds = decide(searching, null, seed)
     saved.done()
     discovery = _finish(
         trajectories,
