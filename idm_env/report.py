@@ -114,6 +114,12 @@ def _cell(value: Any, digits: int | None = None) -> dict[str, Any]:
     return {"text": "" if value is None else str(value), "number": isinstance(value, int)}
 
 
+def shortened(items: Sequence[str], most: int = 100) -> list[str]:
+    """Return the first ``most`` items, and how many there are more."""
+    more = len(items) - most
+    return [*items[:most], *([f"… and {more} more, in report.json."] if more > 0 else [])]
+
+
 def gallery(figures: Iterable[Block]) -> Block:
     """Return figures side by side, as many in a row as there is room for."""
     return Block("gallery", rows=tuple(figures))

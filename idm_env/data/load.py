@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import polars as pl
@@ -13,6 +15,9 @@ from idm_env.data.trajectories import Trajectories
 
 LAYOUTS = ("auto", "tidy", "ngsim", "openacc")
 EXTENSIONS = (".csv", ".csv.gz", ".parquet")
+BATCH_BYTES, BATCH_ROWS = 16_000_000, 200_000
+"""Text and rows that ``batches`` holds at a time."""
+_MISSING = ["", "NA", "N/A", "NaN", "nan", "null", "None"]
 _UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, EOFError, UnicodeError, ValueError)
 
 
@@ -61,6 +66,59 @@ def read(path: str | Path, *, layout: str = "auto") -> tuple[pl.DataFrame, list[
         raise _unreadable(path, error) from error
 
 
+def batches(path: str | Path, *, layout: str = "auto") -> Iterator[tuple[pl.DataFrame, list[Repair]]]:
+    """Yield what ``read`` returns piece by piece, so that a file of any size needs little memory.
+
+    OpenACC files, and NGSIM files of several places or periods, whose rows explain each other, come as one piece.
+    """
+    path = Path(path)
+    if layout not in LAYOUTS:
+        raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
+    extension = _checked(path)
+    lines = [] if extension == ".parquet" else _first_lines(path, openacc.SEARCHED_LINES)
+    if layout == "openacc" or (layout == "auto" and openacc.header_line(lines) is not None):
+        yield read(path, layout=layout)
+        return
+    try:
+        for number, table in enumerate(_pieces(path, extension)):
+            names = [name.strip().lower() for name in table.columns]
+            if number == 0 and ngsim.matches(names) and ("location" in names or "frame_id" not in names):
+                yield read(path, layout=layout)
+                return
+            yield _plain_layout(table, layout, path.name)
+    except pl.exceptions.PolarsError as error:
+        raise _unreadable(path, error) from error
+
+
+def _pieces(path: Path, extension: str) -> Iterator[pl.DataFrame]:
+    """Yield the table of a file in pieces, at least one."""
+    try:
+        if extension == ".parquet":
+            from pyarrow import parquet
+
+            with parquet.ParquetFile(path) as file:
+                empty = pl.DataFrame(pl.from_arrow(file.schema_arrow.empty_table()))
+                found = False
+                for piece in file.iter_batches(BATCH_ROWS):
+                    found = True
+                    yield pl.DataFrame(pl.from_arrow(piece))
+                if not found:
+                    yield empty
+            return
+        opener = gzip.open if extension == ".csv.gz" else open
+        with opener(path, "rb") as file:
+            head = file.readline()
+            rows = file.readlines(BATCH_BYTES)
+            while True:
+                text = io.BytesIO(head + b"".join(rows))
+                yield pl.read_csv(text, infer_schema_length=None, null_values=_MISSING)
+                rows = file.readlines(BATCH_BYTES)
+                if not rows:
+                    return
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
 def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     table = table.rename({name: name.strip() for name in table.columns})
     if layout == "ngsim" or (layout == "auto" and ngsim.matches(table.columns)):
@@ -100,9 +158,7 @@ def _table(path: Path, extension: str, skip: int = 0) -> pl.DataFrame:
     try:
         if extension == ".parquet":
             return pl.read_parquet(path)
-        return pl.read_csv(
-            path, skip_rows=skip, infer_schema_length=None, null_values=["", "NA", "N/A", "NaN", "nan", "null", "None"]
-        )
+        return pl.read_csv(path, skip_rows=skip, infer_schema_length=None, null_values=_MISSING)
     except _UNREADABLE as error:
         raise _unreadable(path, error) from None
 

@@ -6,12 +6,34 @@ import polars as pl
 
 from idm_env.data.errors import Repair
 
+FOOT_M, MILE_M = 0.3048, 1609.344
+NAMED: dict[str, tuple[tuple[str, float], ...]] = {
+    "time_s": (("time_ms", 1e-3),),
+    "position_m": (("position_ft", FOOT_M), ("position_feet", FOOT_M), ("position_km", 1000.0)),
+    "speed_mps": (
+        ("speed_kmh", 1 / 3.6), ("speed_kph", 1 / 3.6), ("speed_mph", MILE_M / 3600), ("speed_ftps", FOOT_M),
+        ("speed_fps", FOOT_M),
+    ),
+    "accel_mps2": (("accel_ftps2", FOOT_M), ("accel_fps2", FOOT_M)),
+    "length_m": (("length_ft", FOOT_M), ("length_feet", FOOT_M)),
+    "gap_m": (("gap_ft", FOOT_M), ("gap_feet", FOOT_M)),
+}  # fmt: skip
+"""Columns that name another unit, and what they are multiplied by."""
+_OTHER_UNITS = {other for others in NAMED.values() for other, _ in others}
+
 
 def matches(columns: list[str]) -> bool:
     """Say whether the header is that of a tidy table; also true for one with a column missing, to name it."""
-    return bool({"time_s", "position_m", "speed_mps", "run_id"} & set(columns))
+    return bool(({"time_s", "position_m", "speed_mps", "run_id"} | _OTHER_UNITS) & set(columns))
 
 
 def read(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
-    """Return the frame as it is."""
-    return frame, []
+    """Return the frame with columns that name another unit (``position_ft``, ``speed_kmh``, …) converted to SI."""
+    repairs = []
+    for name, others in NAMED.items():
+        for other, factor in others:
+            if name not in frame.columns and other in frame.columns:
+                values = pl.col(other).cast(pl.Float64, strict=False) * factor
+                frame = frame.with_columns(values.alias(name)).drop(other)
+                repairs.append(Repair("unit converted", 1, f"{other} was converted to {name} (× {factor:.6g})."))
+    return frame, repairs

@@ -22,8 +22,10 @@ _MISTAKES = (
 )
 
 
-def check(frame: pl.DataFrame, source: str) -> None:
+def check(frame: pl.DataFrame, source: str, longest_step: float = LONGEST_STEP_S) -> None:
     """Raise DataError if lengths, speeds, steps of time or their ratio are not those of SI units.
+
+    ``longest_step`` (s) is what samples may be apart: more for tracks that are meant to be sparse.
 
     Speeds are checked where the file gives them; a speed that is a fixed multiple of the change of position is the
     surest sign of a wrong unit, so that it is looked for first.
@@ -31,7 +33,7 @@ def check(frame: pl.DataFrame, source: str) -> None:
     step = frame.select(pl.col("time_s").diff().over(TRACK).median()).item()
     if "speed_mps" in frame.columns:
         _check_ratio(frame, source, step)
-    if step is not None and step > LONGEST_STEP_S:
+    if step is not None and step > longest_step:
         raise DataError(
             f"{source}: time_s rises by {step:g} s from row to row; is it in milliseconds or frames? Use seconds."
         )

@@ -10,7 +10,6 @@ from idm_env import report as page
 from idm_env.prediction.metrics import HORIZONS
 
 WHAT = (("minADE", "minADE (m)"), ("minFDE", "minFDE (m)"), ("miss_rate", "miss rate"), ("mAP", "mAP"))
-MOST_LISTED = 100
 
 
 def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> None:
@@ -36,10 +35,10 @@ def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> 
     blocks += [page.heading("From above"), page.gallery(pictures)]
     if left_out:
         items = [f"{item['what']}: {item['reason']}" for item in left_out]
-        blocks += [page.heading("Left out"), page.bullets(shortened(items))]
+        blocks += [page.heading("Left out"), page.bullets(page.shortened(items))]
     if report["notes"]:
         items = [f"{item['scenario']}: {item['note']}" for item in report["notes"]]
-        blocks += [page.heading("Notes"), page.bullets(shortened(items))]
+        blocks += [page.heading("Notes"), page.bullets(page.shortened(items))]
     title = f"Predictions of {report['agents']} agents in {report['scenarios']} scenarios"
     page.write_page(out / "report.html", title, blocks)
 
@@ -55,9 +54,3 @@ def metrics(rows: Sequence[dict[str, Any]]) -> page.Block:
             cells[column] = " · ".join(f"{v:.2f}" if v == v else "–" for v in values)
         table.append(cells)
     return page.table(table, first=True)
-
-
-def shortened(items: Sequence[str]) -> list[str]:
-    """Return the first hundred items, and how many there are more."""
-    more = len(items) - MOST_LISTED
-    return [*items[:MOST_LISTED], *([f"… and {more} more, in report.json."] if more > 0 else [])]

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import base64
-import io
-import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
-from jinja2 import Environment, PackageLoader, select_autoescape
 from matplotlib.figure import Figure
 
+from idm_env import report as page
 from idm_env.effects import IDM
 from idm_env.trajectories.scores import Motion
 from idm_env.trajectories.tracks import Track
@@ -27,6 +23,7 @@ COLUMNS = (
     ("implausible_percent", "implausible, |a| > 10 m/s² (%)", 1),
     ("milliseconds_per_trajectory", "time per trajectory (ms)", 2),
 )
+MOST_LISTED = 100
 
 
 def write_report(
@@ -36,44 +33,61 @@ def write_report(
 
     Numbers that are not finite become null in JSON, which knows none.
     """
-    (out / "report.json").write_text(json.dumps(finite(report), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    pictures = [(track.key, embedded(before_and_after(track, motion))) for track, motion in shown]
-    environment = Environment(loader=PackageLoader("idm_env.trajectories", "."), autoescape=select_autoescape())
-    histograms = parameter_histograms(parameters)
-    page = environment.get_template("report.html").render(
-        report=report,
-        columns=[(key, title) for key, title, _ in COLUMNS],
-        rows=[_cells(row) for row in report["methods"]],
-        pictures=pictures,
-        histograms=embedded(histograms) if histograms is not None else None,
-        parameters=_parameter_lines(parameters),
-    )  # fmt: skip
-    (out / "report.html").write_text(page)
+    page.write_json(out / "report.json", report)
+    how = "filtered" if report["settings"]["task"] == "filter" else "reconstructed"
+    blocks = [page.lead(_lead(report))]
+    if report["noise"]:
+        blocks.append(page.text(_noise(report["noise"])))
+    blocks += [page.heading("Methods on these data"), methods(report["methods"])]
+    blocks.append(
+        page.note(
+            "The position error rate is the mean distance to the data over the length of the track. It measures "
+            "closeness to noisy data, not to the truth: straight lines between samples have 0. Plausible "
+            "accelerations at a small rate are what is wanted."
+        )
+    )
+    blocks.append(
+        page.text(
+            f"Vehicles overlap their leader in {report['overlapping_rows']} rows; "
+            f"{report['overlapping_rows_that_did_not_overlap_before']} of them did not in the data."
+        )
+    )
+    blocks += _parameters(parameters)
+    blocks.append(page.heading("Before and after"))
+    blocks += [page.picture(before_and_after(track, motion), f"Track {track.key}") for track, motion in shown]
+    left_out = [f"{item['track']}: {item['reason']}" for item in report["left_out"]]
+    repaired = [item["text"] for item in report["repairs"]]
+    repaired += [f"{item['vehicle']}: {item['note']}" for item in report["divided"]]
+    for title, items in (("Left out", left_out), ("Repaired", repaired)):
+        if items:
+            blocks += [page.heading(title), page.bullets(page.shortened(items, MOST_LISTED))]
+    page.write_page(out / "report.html", f"{report['source']}: {how} trajectories", blocks)
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
-    return [row["method"], *(shown_number(row[key], digits) for key, _, digits in COLUMNS)]
+def _lead(report: dict[str, Any]) -> str:
+    lost = len(report["left_out"])
+    words = (
+        f"{report['tracks']} tracks of {report['vehicles']} vehicles, one result every {report['settings']['dt']} s. "
+    )
+    words += f"{lost} tracks were left out (below)." if lost else "No track was left out."
+    if report["calibration_milliseconds_per_trajectory"] > 0:
+        took = report["calibration_milliseconds_per_trajectory"]
+        words += f" Calibration of drivers behind their leaders took a further {took:.1f} ms per trajectory."
+    return words
 
 
-def finite(value: Any) -> Any:
-    """Return a copy in which every number that is not finite is None."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _noise(noise: dict[str, float]) -> str:
+    words = (
+        f"Fitted to this file: white noise {noise['white']:.3f} m, correlated noise {noise['sigma']:.3f} m over "
+        f"{noise['time']:.2f} s, jerk density {noise['jerk']:.3g} m²/s⁵"
+    )
+    return words + (f", accelerations fade in {noise['accel_time']:.2f} s." if noise["accel_time"] else ".")
 
 
-def shown_number(value: float, digits: int) -> str:
-    """Return a number for a table, a dash where there is none."""
-    return f"{value:.{digits}f}" if math.isfinite(value) else "–"
-
-
-def embedded(figure: Figure) -> str:
-    """Return a figure as a data address for an HTML page."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+def methods(rows: Sequence[dict[str, Any]]) -> page.Block:
+    """Return the table of methods, ours first."""
+    table = [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in rows]
+    return page.table(table, digits={title: digits for _, title, digits in COLUMNS}, first=True)
 
 
 def before_and_after(track: Track, motion: Motion) -> Figure:
@@ -102,35 +116,41 @@ def before_and_after(track: Track, motion: Motion) -> Figure:
     return figure
 
 
-def parameter_histograms(parameters: pl.DataFrame) -> Figure | None:
-    """Return histograms of the inferred parameters, those that the data tell in blue; None where there are none."""
+def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
+    """Return the table and the histograms of the inferred parameters; nothing where there are none."""
     if "max_accel" not in parameters.columns or parameters["max_accel"].drop_nulls().is_empty():
-        return None
+        return []
+    rows = []
+    for p in IDM.declared:
+        known = parameters.filter(pl.col(p.name).is_not_null())
+        low, middle, high = np.percentile(known[p.name].to_numpy(), [25, 50, 75])
+        told = known[f"{p.name}_identified"].drop_nulls()
+        rows.append(
+            {
+                "parameter": f"{p.symbol} {p.name}", "unit": p.unit, "median": float(middle),
+                "quartiles": f"{low:.2f} – {high:.2f}",
+                "told by the data": f"{100 * told.to_numpy().mean():.0f} %" if len(told) else "–",
+            }
+        )  # fmt: skip
+    words = f"Driver parameters of {known.height} tracks. Dark: the data tell the value to within a half of itself."
+    return [
+        page.heading("Driver parameters"),
+        page.table(rows, digits={"median": 2}),
+        page.picture(parameter_histograms(parameters), words),
+    ]
+
+
+def parameter_histograms(parameters: pl.DataFrame) -> Figure:
+    """Return histograms of the inferred parameters, those that the data tell in blue."""
     figure = Figure(figsize=(12, 2.8), layout="constrained")
     for axis, p in zip(figure.subplots(1, 5), IDM.declared, strict=True):
         values = parameters[p.name].drop_nulls().to_numpy()
         bins = np.linspace(values.min(), max(values.max(), values.min() + 1e-6), 25)
         axis.hist(values, bins, color=BEFORE, label="all")
-        if f"{p.name}_identified" in parameters.columns:
-            told = parameters.filter(pl.col(f"{p.name}_identified") & pl.col(p.name).is_not_null())[p.name].to_numpy()
+        told = parameters.filter(pl.col(f"{p.name}_identified") & pl.col(p.name).is_not_null())[p.name].to_numpy()
+        if len(told):
             axis.hist(told, bins, color=AFTER, label="told by the data")
         axis.set_xlabel(f"{p.symbol}: {p.name} ({p.unit})")
     figure.axes[0].set_ylabel("tracks")
     figure.axes[0].legend(frameon=False, fontsize=8)
     return figure
-
-
-def _parameter_lines(parameters: pl.DataFrame) -> list[list[str]]:
-    """Return name, median, quartiles and share identified of every parameter."""
-    lines = []
-    for p in IDM.declared:
-        if p.name not in parameters.columns or parameters[p.name].drop_nulls().is_empty():
-            continue
-        values = parameters[p.name].drop_nulls().to_numpy()
-        low, middle, high = np.percentile(values, [25, 50, 75])
-        flags = f"{p.name}_identified"
-        share = "–"
-        if flags in parameters.columns:
-            share = f"{100 * parameters.filter(pl.col(p.name).is_not_null())[flags].to_numpy().mean():.0f} %"
-        lines.append([f"{p.symbol} {p.name}", p.unit, f"{middle:.2f}", f"{low:.2f} – {high:.2f}", share])
-    return lines

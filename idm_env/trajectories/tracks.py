@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from idm_env.data import DataError, Repair
+from idm_env.data import DataError, Repair, units
 from idm_env.data.clean import NO_LEADER, check_columns, identifiers, natural, numbers, without_empty
 from idm_env.data.load import read
 from idm_env.data.schema import DEFAULT_LENGTH_M, HIGHEST_SPEED_MPS, LONGEST_LENGTH_M
@@ -102,27 +102,41 @@ def from_frame(frame: pl.DataFrame, source: str = "table", repairs: list[Repair]
         done.append(Repair("no position", lost, f"{lost} rows without a position were left out."))
     if frame.height == 0:
         raise DataError(f"{source}: position_m is empty in every row; it must hold positions in metres.")
+    check_units(frame, source)
     unsorted = int(frame.select((pl.col("time_s").diff().over("run_id", "vehicle_id") < 0).sum()).item() or 0)
     if unsorted:
         text = f"Time runs backward at {unsorted} rows; the rows were sorted by time."
         done.append(Repair("time not increasing", unsorted, text))
-    frame = frame.sort(natural("run_id"), "run_id", natural("vehicle_id"), "vehicle_id", "time_s", maintain_order=True)
-    frame, more = _without_repeats(frame, source)
-    done += more
-    frame, more = unwrapped(frame)
-    done += more
-    return Table(_with_leaders(frame), tuple(done), source)
+    order = (natural("run_id"), "run_id", natural("vehicle_id"), "vehicle_id")
+    frame, more = prepared(frame.sort(*order, maintain_order=True))
+    return Table(with_leaders(frame), (*done, *more), source)
 
 
-def _without_repeats(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+def check_units(frame: pl.DataFrame, source: str) -> None:
+    """Raise DataError if positions, speeds or lengths look like feet or km/h, by the vehicles that drive forwards."""
+    forwards = (pl.col("position_m").last() > pl.col("position_m").first()).over("run_id", "vehicle_id")
+    rising = frame.filter(forwards)
+    if rising.height:
+        units.check(rising, source, longest_step=float("inf"))
+
+
+def prepared(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the rows of vehicles sorted by time within each, without repeats, laps of a ring unwrapped.
+
+    Vehicles stay in the order in which they come.
+    """
+    appearance = pl.col("row").min().over("run_id", "vehicle_id").alias("appearance")
+    frame = frame.with_row_index("row").with_columns(appearance)
+    frame = frame.sort("appearance", "time_s", maintain_order=True).drop("row", "appearance")
     before = frame.height
     frame = frame.unique(["run_id", "vehicle_id", "time_s"], keep="first", maintain_order=True)
     count = before - frame.height
     text = f"{count} rows repeat a time of their vehicle and were left out; the first of each was kept."
-    return frame, [Repair("duplicated time", count, text)] if count else []
+    frame, repairs = unwrapped(frame)
+    return frame, [*([Repair("duplicated time", count, text)] if count else []), *repairs]
 
 
-def _with_leaders(frame: pl.DataFrame) -> pl.DataFrame:
+def with_leaders(frame: pl.DataFrame) -> pl.DataFrame:
     """Return the frame with ``leader_id`` ("" for none), derived from lane and position where the column is absent."""
     if "leader_id" in frame.columns:
         none = pl.col("leader_id").is_null() | pl.col("leader_id").str.to_lowercase().is_in(NO_LEADER)
@@ -132,6 +146,7 @@ def _with_leaders(frame: pl.DataFrame) -> pl.DataFrame:
         return frame.with_columns(pl.lit("").alias("leader_id"))
     order = frame.with_row_index("row").sort("run_id", "lane", "time_s", "position_m")
     ahead = pl.col("vehicle_id").shift(-1).over("run_id", "lane", "time_s")
+    ahead = pl.when(pl.col("lane").is_not_null()).then(ahead)
     return order.with_columns(ahead.fill_null("").alias("leader_id")).sort("row").drop("row")
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from pathlib import Path
+
 import numpy as np
 import polars as pl
 import pytest
 
 from idm_env.data import DataError
+from idm_env.trajectories import spool as spool_module
+from idm_env.trajectories.spool import Spool
 from idm_env.trajectories.tracks import Pieces, from_frame, jumps, read_table
 
 
@@ -90,3 +95,68 @@ def test_measured_file_reads_whole(measured) -> None:  # type: ignore[no-untyped
     assert len({track.vehicle_id for track in tracks}) == 222
     assert len(pieces.left_out) == 0
     assert all((np.diff(track.time_s) > 0).all() for track in tracks)
+
+
+def spooled(tmp_path: Path, frame: pl.DataFrame, chunk: int = 2, name: str = "x.csv") -> Spool:
+    (frame.write_csv if name.endswith("csv") else frame.write_parquet)(tmp_path / name)
+    return Spool(tmp_path / name, tmp_path / "spool", "auto", chunk)
+
+
+@pytest.mark.parametrize("name", ["x.csv", "x.parquet"])
+@pytest.mark.parametrize("laned", [False, True])
+def test_a_spool_holds_what_the_whole_table_holds(
+    tmp_path: Path, name: str, laned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In pieces of a few rows and chunks of two vehicles, shuffled in time, with repeats and empty cells."""
+    monkeypatch.setattr(import_module("idm_env.data.load"), "BATCH_BYTES", 1500)
+    monkeypatch.setattr(import_module("idm_env.data.load"), "BATCH_ROWS", 70)
+    monkeypatch.setattr(spool_module, "BUCKET_ROWS", 60)
+    rng = np.random.default_rng(0)
+    parts = [rows(str(i), TIME + 0.5 * i, 10 * TIME + 200 - 30 * i) for i in range(5)]
+    frame = pl.concat(parts).with_columns(lane=pl.lit(1)) if laned else pl.concat(parts)
+    frame = pl.concat([frame, frame[17:20]])[rng.permutation(frame.height + 3)]
+    frame = frame.with_columns(pl.when(pl.int_range(pl.len()) != 11).then(pl.col("position_m")).alias("position_m"))
+    spool = spooled(tmp_path, frame, name=name)
+    assert spool.chunks == 3 and [vehicle for _, vehicle in spool.vehicles] == list("01234")
+    whole = {track.key: track for track in Pieces(from_frame(frame))}
+    found = {t.key: t for number in range(3) for t in Pieces(spool.table(number))}
+    assert list(found) == list(whole)
+    for key, track in whole.items():
+        assert np.allclose(found[key].time_s, track.time_s) and np.allclose(found[key].position_m, track.position_m)
+        assert found[key].leader.tolist() == track.leader.tolist()
+    assert any(track.leader.any() for track in whole.values()) == laned
+    counts = {repair.kind: repair.count for repair in spool.repairs}
+    assert counts["duplicated time"] == 3 and counts["no position"] == 1 and counts["time not increasing"] > 50
+    (table,) = spool.picked([3])
+    assert table.frame["vehicle_id"].unique().to_list() == ["3"]
+
+
+def test_units_that_are_named_are_converted(tmp_path: Path) -> None:
+    frame = pl.DataFrame(
+        {"vehicle_id": "a", "time_ms": 1e3 * TIME, "position_ft": 10 * TIME / 0.3048, "length_ft": 15.0}
+    )
+    spool = spooled(tmp_path, frame)
+    (track,) = Pieces(spool.table(0))
+    assert np.allclose(track.time_s, TIME) and np.allclose(track.position_m, 10 * TIME)
+    assert track.length_m == pytest.approx(4.572)
+    assert sorted(r.text.split()[0] for r in spool.repairs) == ["length_ft", "position_ft", "time_ms"]
+
+
+@pytest.mark.parametrize(
+    ("position", "speed", "cure"),
+    [
+        (1 / 0.3048, 1.0, "position_m looks like feet; multiply it by 0.3048"),
+        (1.0, 3.6, "speed_mps looks like km/h; divide it by 3.6"),
+        (1.0, 1 / 0.3048, "speed_mps looks like feet per second"),
+    ],
+)
+def test_units_that_disagree_are_refused_with_their_cure(
+    tmp_path: Path, position: float, speed: float, cure: str
+) -> None:
+    frame = rows("a", TIME, 10 * TIME * position, speed_mps=10.0 * speed)
+    for read in (from_frame, lambda f: spooled(tmp_path, f)):
+        with pytest.raises(DataError, match=cure):
+            read(frame)
+    sparse = rows("a", 10 * TIME, 100 * TIME, speed_mps=10.0)
+    backwards = rows("b", 10 * TIME, -100 * TIME, speed_mps=10.0)
+    assert len(list(Pieces(from_frame(pl.concat([sparse, backwards])), bridge=None))) == 1

@@ -1,0 +1,162 @@
+"""One chunk of tracks: filtered or imitated, compared with the baselines, and written as a part."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import polars as pl
+
+from idm_env.parts import Parts
+from idm_env.trajectories import baselines, paper
+from idm_env.trajectories.drivers import parameter_rows
+from idm_env.trajectories.recipe import Filtered, clock_of, nearest, overlaps, recipe
+from idm_env.trajectories.scores import Motion, Tally
+from idm_env.trajectories.smoother import SPARSE, Choices, Noise
+from idm_env.trajectories.tracks import Track
+
+Recipe = Literal["default", "paper"]
+CHUNK = 200
+OURS = {"default": "simulator, imagined leader", "paper": "the paper's recipe"}
+TRAJECTORIES, PARAMETERS = "trajectories", "parameters"
+SCHEMA: dict[str, Any] = {
+    "run_id": pl.String, "vehicle_id": pl.String, "piece": pl.Int32, "leader_id": pl.String, "lane": pl.Int64,
+    "time_s": pl.Float64, "position_m": pl.Float64, "speed_mps": pl.Float64, "accel_mps2": pl.Float64,
+    "length_m": pl.Float64, "gap_m": pl.Float64, "imagined_gap_m": pl.Float64, "position_sigma_m": pl.Float64,
+    "speed_sigma_mps": pl.Float64, "accel_sigma_mps2": pl.Float64,
+}  # fmt: skip
+PARAMETER_SCHEMA: dict[str, Any] = {
+    "run_id": pl.String, "vehicle_id": pl.String, "piece": pl.Int64, "source": pl.String,
+    **dict.fromkeys(paper.NAMES, pl.Float64),
+    **{f"{name}_error": pl.Float64 for name in paper.NAMES},
+    **{f"{name}_identified": pl.Boolean for name in paper.NAMES},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What determines a run: task, step (s; None takes the file's), recipe, ablation, baselines, vehicles per chunk."""
+
+    task: Literal["filter", "reconstruct"]
+    dt: float | None = None
+    recipe: Recipe = "default"
+    fixed_parameters: bool = False
+    baselines: bool = True
+    chunk: int = CHUNK
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is decided for the whole file: step (s), noise, and whether samples are dense; ``seconds`` it took."""
+
+    dt: float
+    noise: Noise | None
+    dense: bool
+    seconds: float
+
+    @property
+    def choices(self) -> Choices:
+        """Dense samples are reweighted for outliers and bursts, sparse ones are not."""
+        return Choices() if self.dense else SPARSE
+
+
+def done(
+    parts: Parts, number: int, tracks: list[Track], settings: Settings, plan: Plan, recent: Sequence[Filtered]
+) -> list[Filtered]:
+    """Do one chunk and write its part: the table, the parameters, and last the tallies, which mark it done."""
+    tallies: dict[str, Tally] = {}
+    begin = time.perf_counter()
+    rows: list[dict[str, Any]]
+    if settings.recipe == "paper":
+        filtered, rows = _imitated(tracks, plan.dt, settings.fixed_parameters)
+        seconds, calibration = time.perf_counter() - begin, 0.0
+    else:
+        assert plan.noise is not None
+        filtered = recipe(tracks, plan.dt, plan.noise, plan.choices, recent) if tracks else []
+        seconds = time.perf_counter() - begin
+        rows = [] if settings.fixed_parameters else parameter_rows(filtered, recent)
+        calibration = time.perf_counter() - begin - seconds
+    tallies[OURS[settings.recipe]] = _tally([f.motion for f in filtered], tracks, seconds)
+    for name in baselines.available() if settings.baselines else ():
+        begin = time.perf_counter()
+        motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in tracks]
+        tallies[name] = _tally(motions, tracks, time.perf_counter() - begin)
+    total, new = overlaps(filtered, recent)
+    _table(filtered).write_parquet(parts.path(number, TRAJECTORIES))
+    pl.DataFrame(rows, schema=PARAMETER_SCHEMA).write_parquet(parts.path(number, PARAMETERS))
+    parts.finish(
+        number,
+        {
+            "tallies": {name: vars(tally) for name, tally in tallies.items()},
+            "overlaps": total,
+            "new_overlaps": new,
+            "calibration_seconds": calibration,
+        },
+    )
+    return filtered
+
+
+def _tally(motions: Sequence[Motion], tracks: Sequence[Track], seconds: float) -> Tally:
+    tally = Tally(seconds=seconds)
+    for motion, track in zip(motions, tracks, strict=True):
+        tally.add(motion, track.time_s, track.position_m)
+    return tally
+
+
+def _imitated(tracks: Sequence[Track], dt: float, fixed: bool) -> tuple[list[Filtered], list[dict[str, Any]]]:
+    filtered, rows = [], []
+    for track in tracks:
+        found = paper.imitate(track, dt, fixed_parameters=fixed)
+        clock = found.motion.time_s
+        unknown = np.full((len(clock), 3), np.nan)
+        at = nearest(track, clock)
+        gap = np.full(len(clock), np.nan)
+        filtered.append(Filtered(track, found.motion, found.gap, unknown, track.leader[at], track.lane[at], gap))
+        names = {"run_id": track.run_id, "vehicle_id": track.vehicle_id, "piece": track.piece, "source": "imagined"}
+        rows.append(names | dict(zip(paper.NAMES, found.values.tolist(), strict=True)))
+    return filtered, rows
+
+
+def _table(filtered: Sequence[Filtered]) -> pl.DataFrame:
+    """Return the tidy table of filtered tracks."""
+    frames = []
+    for f in filtered:
+        count = len(f.motion.time_s)
+        columns: dict[str, Any] = {
+            "run_id": [f.track.run_id] * count, "vehicle_id": [f.track.vehicle_id] * count,
+            "piece": np.full(count, f.track.piece), "leader_id": f.leader.tolist(), "lane": f.lane.astype(np.int64),
+            "time_s": f.motion.time_s, "position_m": f.motion.position_m, "speed_mps": f.motion.speed_mps,
+            "accel_mps2": f.motion.accel_mps2, "length_m": np.full(count, f.track.length_m), "gap_m": f.gap,
+            "imagined_gap_m": f.imagined_gap, "position_sigma_m": f.sigma[:, 0], "speed_sigma_mps": f.sigma[:, 1],
+            "accel_sigma_mps2": f.sigma[:, 2],
+        }  # fmt: skip
+        frames.append(pl.DataFrame(columns, schema=SCHEMA))
+    table = pl.concat(frames) if frames else pl.DataFrame(schema=SCHEMA)
+    floats = [name for name, kind in SCHEMA.items() if kind == pl.Float64]
+    return table.with_columns(
+        pl.col(floats).fill_nan(None),
+        pl.when(pl.col("leader_id") != "").then(pl.col("leader_id")).alias("leader_id"),
+        pl.when(pl.col("lane") >= 0).then(pl.col("lane")).alias("lane"),
+    )
+
+
+def restored(parts: Parts, number: int, tracks: Sequence[Track]) -> list[Filtered]:
+    """Return the filtered tracks of a finished part, so that the next chunk meets the same neighbours."""
+    table = pl.read_parquet(parts.path(number, TRAJECTORIES))
+    by_key = dict(iter(table.group_by(["run_id", "vehicle_id", "piece"], maintain_order=True)))
+    filtered = []
+    for track in tracks:
+        rows = by_key[(track.run_id, track.vehicle_id, track.piece)]
+        names = ("time_s", "position_m", "speed_mps", "accel_mps2")
+        motion = Motion(*(rows[name].to_numpy() for name in names))
+        sigma = rows.select("position_sigma_m", "speed_sigma_mps", "accel_sigma_mps2").to_numpy()
+        filtered.append(
+            Filtered(
+                track, motion, rows["imagined_gap_m"].to_numpy(), sigma, rows["leader_id"].fill_null("").to_numpy(),
+                rows["lane"].fill_null(-1).to_numpy(), rows["gap_m"].to_numpy(),
+            )
+        )  # fmt: skip
+    return filtered
