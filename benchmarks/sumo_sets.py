@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from idm_env.bench.peers import straight_lane
 from idm_env.data import Trajectories, scripted
 
 STEP = 0.1
@@ -98,18 +99,11 @@ def _drive(libsumo: Any, speed: np.ndarray, followers: int, steps: int, run: str
 
 def _files(folder: Path, random: np.random.Generator, case: Case, followers: int) -> list[str]:
     net, routes = folder / "net.xml", folder / "routes.xml"
-    x = np.arange(0.0, 8001.0, 25.0)
+    x = np.linspace(0.0, 8000.0, 321)
     height = case.slope * 730.0 / (2 * np.pi) * (1.0 - np.cos(2 * np.pi * x / 730.0))
-    shape = " ".join(f"{a:.2f},-1.60,{h:.3f}" for a, h in zip(x, height, strict=True))
     # Speed factors act on the limit of the lane, which otherwise nobody reaches.
     limit, top = (28.0, 60.0) if case.speed_spread else (60.0, 30.0)
-    net.write_text(
-        '<net version="1.20"><location netOffset="0,0" convBoundary="0,0,8000,0" origBoundary="0,0,8000,0"'
-        f' projParameter="!"/><edge id="ab" from="a" to="b" priority="-1"><lane id="ab_0" index="0" speed="{limit}"'
-        f' length="8000" shape="{shape}"/></edge>'
-        '<junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0 0,-3.2"/>'
-        '<junction id="b" type="dead_end" x="8000" y="0" incLanes="ab_0" intLanes="" shape="8000,-3.2 8000,0"/></net>'
-    )
+    straight_lane(net, float(x[-1]), limit, height.tolist())
     more = "".join(f' {k}="{v}"' for k, v in case.attributes.items())
     types = [f'<vType id="t0" length="{LENGTH}" accel="10" decel="10" maxSpeed="60" minGap="0" tau="0.1"/>']
     cars = ['<vehicle id="v0" type="t0" route="r" depart="0" departPos="200" departSpeed="10"/>']

@@ -1,0 +1,76 @@
+"""Discoveries that are easily false: responses that look like places, pairs that cancel, what no candidate explains."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks import discovery as sets
+from idm_env.data import synthetic
+from idm_env.discovery import discover
+
+
+@pytest.mark.parametrize("hidden", ["lag", "leader_acceleration"])
+def test_a_response_at_the_same_bends_is_no_place(hidden: str) -> None:
+    laps, _ = synthetic.generate(1, effect=hidden, laps=True, runs=8, followers=2, seconds=120.0)
+    found = discover(laps, seed=1, place="track_s_m")
+    assert [f["effect"] for f in found.report["found"]] == [hidden]
+    # The trap is there: alone, a profile of slopes over the lap explains something, too.
+    grade = next(c for c in found.report["candidates"] if c["effect"] == "grade")
+    assert grade["held_out_gain"] > 0.03
+
+
+def test_nothing_is_found_on_laps_with_nothing_hidden() -> None:
+    laps, _ = synthetic.generate(2, laps=True, runs=8, followers=2, seconds=120.0, ou=0.1)
+    assert discover(laps, seed=1, place="track_s_m").verdict == "none"
+
+
+def test_a_pair_that_cancels_is_named() -> None:
+    true = {"delay": 0.5, "leader_acceleration": 0.4}
+    data, _ = synthetic.generate(77, effect=true)
+    found = discover(data, effects=["delay", "leader_acceleration", "second_leader", "drag"], seed=1).report
+    assert {f["effect"] for f in found["found"]} == set(true)
+    estimates = {f["effect"]: next(iter(f["parameters"].values()))["estimate"] for f in found["found"]}
+    assert estimates == pytest.approx(true, rel=0.15)
+    assert found["error"]["after"]["gap_rmse_m"] < 0.5 * found["error"]["before"]["gap_rmse_m"]
+
+
+def test_what_no_candidate_explains_is_said_to_be_there() -> None:
+    data, _ = synthetic.generate(21, effect="leader_acceleration", runs=12, followers=2, seconds=120.0)
+    found = discover(data, effects=["drag", "memory"])
+    assert found.verdict == "unexplained"
+    assert found.report["found"] == [] and "no candidate explains" in found.report["sentence"]
+
+
+def test_an_effect_without_a_name_is_located() -> None:
+    job = sets.Job("outside", "time_gap over places", "", 0.0, 90_400)
+    found = discover(sets.generated(job)[0], seed=1)
+    assert found.verdict == "located"
+    (entry,) = found.report["found"]
+    assert entry["effect"] is None and entry["what"] == "time_gap" and entry["where"]["coordinate"] == "position"
+    assert entry["where"]["interval"] == pytest.approx([700.0, 1000.0], abs=40.0)
+    assert entry["parameters"]["amount"]["estimate"] == pytest.approx(0.6, rel=0.25)
+
+
+class TestSumo:
+    """Data from a simulator that nobody here wrote."""
+
+    @pytest.fixture(autouse=True)
+    def _installed(self) -> None:
+        pytest.importorskip("libsumo", reason="SUMO is not installed: pip install libsumo")
+
+    def test_its_idm_lacks_nothing_but_half_a_step(self) -> None:
+        from benchmarks.sumo_sets import CASES, platoons
+
+        for name in ("IDM", "IDM on slopes"):
+            found = discover(platoons(5, CASES[name], runs=8, followers=2, seconds=120.0))
+            assert found.verdict == "none"
+            (known,) = found.report["known"]
+            assert known["effect"] in ("lag", "delay") and 0.02 < known["estimate"] < 0.1
+
+    def test_drivers_that_decide_once_a_second_are_late(self) -> None:
+        from benchmarks.sumo_sets import CASES, platoons
+
+        found = discover(platoons(5, CASES["IDM, decides every 1 s"], runs=8, followers=2, seconds=120.0))
+        first = found.report["found"][0]
+        assert first["effect"] in ("delay", "lag")
+        assert next(iter(first["parameters"].values()))["estimate"] == pytest.approx(0.5, abs=0.2)
