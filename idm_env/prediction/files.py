@@ -18,7 +18,7 @@ from idm_env.parts import Parts
 from idm_env.prediction import report as written
 from idm_env.prediction.metrics import Case, Score, score, shape_of, summary
 from idm_env.prediction.pictures import scene_picture
-from idm_env.prediction.predict import METHODS, Prediction
+from idm_env.prediction.predict import METHODS, Prediction, available
 from idm_env.prediction.scene import Scene
 
 OnProgress = Callable[[int, int], None]
@@ -51,7 +51,8 @@ def predict_files(
     Writes ``predictions.parquet`` (one row per future and step), ``parameters.parquet`` (mean and deviation of each
     driver's five), ``report.json`` and ``report.html`` with the benchmark's metrics where the future is known, over
     all agents, per scene and per kind, against the single futures of ``METHODS``. A file or an agent that cannot be
-    used is left out and counted; the others are done. ``resume`` goes on after the last finished file.
+    used is left out and counted; the others are done. Without numba the paper's row is absent. ``resume`` goes on after
+    the last finished file.
 
     Raises:
         DataError: If no file holds a scenario that can be used, or ``resume`` finds a run on other files or settings.
@@ -61,7 +62,7 @@ def predict_files(
     parts = Parts(out, _fingerprint(files, baselines), resume)
     for number, path in enumerate(files):
         if not parts.done(number):
-            _file(parts, number, path, [name for name in METHODS if baselines or name == OURS])
+            _file(parts, number, path, [name for name in available() if baselines or name == OURS])
         if on_progress is not None:
             on_progress(number + 1, len(files))
     report, pictures = _report(parts.summaries())

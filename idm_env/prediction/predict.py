@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -143,3 +144,8 @@ METHODS = {
     "the paper's recipe": as_published,
 }
 """Name → function of a scene and an agent's index."""
+
+
+def available() -> list[str]:
+    """Return the names of the methods that can run here: the paper's recipe is compiled and needs numba."""
+    return [name for name in METHODS if METHODS[name] is not as_published or find_spec("numba") is not None]

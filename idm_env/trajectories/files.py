@@ -99,7 +99,6 @@ def run(
     """Do what ``filter_file`` and ``reconstruct_file`` say."""
     if settings.recipe not in OURS:
         raise DataError(f"recipe = {settings.recipe!r} is unknown; use 'default' or 'paper'.")
-    require_kernels()
     out = output_folder(Path(out))
     parts = Parts(out, _fingerprint(Path(path), settings, layout), resume)
     try:
@@ -130,17 +129,6 @@ def run(
     write_report(out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet"))
     parts.remove()
     return report
-
-
-def require_kernels() -> None:
-    """Raise ImportError, in one line, where numba is not installed: both recipes are compiled loops."""
-    try:
-        import numba  # noqa: F401
-    except ImportError:
-        raise ImportError(
-            "filtering and reconstruction run compiled loops, which need numba. Install it with: "
-            "pip install 'idm-env[kernels]'"
-        ) from None
 
 
 def _fingerprint(path: Path, settings: Settings, layout: str) -> str:

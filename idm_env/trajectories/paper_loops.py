@@ -7,10 +7,10 @@ behind an imagined leader or a real one; tests hold it to the torch simulator an
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+from idm_env.trajectories.compiled import compiled
+
 FIVE = 5
 NEAREST_M = 0.1
 """A real leader is never nearer than this (m)."""

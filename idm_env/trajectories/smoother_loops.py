@@ -7,13 +7,12 @@ acceleration, which the next step changes by a jerk, and the correlated part of 
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from idm_env.trajectories.compiled import compiled
 
 N = 4
 LOG_TWO_PI = float(np.log(2.0 * np.pi))
-
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @compiled

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -160,3 +162,30 @@ def test_units_that_disagree_are_refused_with_their_cure(
     sparse = rows("a", 10 * TIME, 100 * TIME, speed_mps=10.0)
     backwards = rows("b", 10 * TIME, -100 * TIME, speed_mps=10.0)
     assert len(list(Pieces(from_frame(pl.concat([sparse, backwards])), bridge=None))) == 1
+
+
+SPOOLING = """
+import resource, sys
+from pathlib import Path
+from idm_env.trajectories.spool import Spool
+spool = Spool(sys.argv[1], Path(sys.argv[2]), "auto", 100)
+rows = sum(spool.table(number).frame.height for number in range(spool.chunks))
+print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
+    """Ten times the rows, which would be 300 MB as a sorted table: the peak rises by less than half of that."""
+    peaks = []
+    for count in (400, 4000):
+        time = np.round(np.arange(500) * 0.1, 1)
+        vehicle = np.repeat(np.arange(count), 500)
+        start = np.tile(time, count) + vehicle * 0.5
+        frame = pl.DataFrame({"vehicle_id": vehicle, "lane": vehicle % 4, "time_s": np.round(start, 1)})
+        path = tmp_path / f"{count}.parquet"
+        frame.with_columns(position_m=10 * pl.Series(np.tile(time, count))).write_parquet(path)
+        command = [sys.executable, "-c", SPOOLING, str(path), str(tmp_path / "spool")]
+        rows, peak = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+        assert int(rows) == 500 * count
+        peaks.append(float(peak))
+    assert peaks[1] < peaks[0] + 150.0, peaks

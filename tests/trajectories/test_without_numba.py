@@ -1,0 +1,46 @@
+"""Where numba is not installed: filtering says so in one line, prediction does without the paper's row."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.prediction.test_womd import write_json
+from tests.trajectories.test_files import lane
+
+ABSENT = """
+import sys, importlib.util as u
+sys.modules["numba"] = None
+real = u.find_spec
+u.find_spec = lambda name, *more: None if name == "numba" else real(name, *more)
+sys.argv = ["idm-env", *sys.argv[1:]]
+from idm_env.cli import run
+run()
+"""
+
+
+def command(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", ABSENT, *map(str, arguments)], capture_output=True, text=True, check=False
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["filter", "reconstruct"])
+def test_filtering_names_the_extra(tmp_path: Path, name: str) -> None:
+    done = command(name, lane(tmp_path / "lane.csv", vehicles=1, seconds=5.0), "--out", tmp_path / "out")
+    assert done.returncode == 1
+    line = done.stderr.strip().splitlines()[-1]
+    assert line.startswith("error: filtering, reconstruction") and "pip install 'idm-env[kernels]'" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_prediction_goes_on_without_the_paper_s_row(tmp_path: Path) -> None:
+    pytest.importorskip("google.protobuf", reason="protobuf is not installed")
+    done = command("predict", write_json(tmp_path / "fork.json", wanted=[0, 1]), "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "out" / "report.json").read_text())["methods"]
+    assert [row["method"] for row in rows] == ["drivers on routes", "constant velocity", "lane, constant speed"]
