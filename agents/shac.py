@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +45,8 @@ class Arguments(common.Arguments):
         critic_hidden: Widths of the critic's hidden layers.
         follow: Share of the critic that the target critic keeps of itself in an update.
         critic_first: Windows in which only the critic learns.
+        explore: Standard deviation of what is added to the actions of each environment throughout a window. Without it
+            the critic never sees what a little more or less gap is worth.
     """
 
     out: Path = Path("runs/shac")
@@ -59,21 +61,50 @@ class Arguments(common.Arguments):
     critic_hidden: tuple[int, ...] = (64, 64)
     follow: float = 0.8
     critic_first: int = 5
+    explore: float = 0.02
 
 
 def scene(env: DiffIDMVectorEnv, observation: Tensor) -> Tensor:
-    """Return what the critic sees: the observation, all speeds (15 m/s) and all gaps (15 m, at most 150 m)."""
+    """Return what the critic sees: the observation, and mean and deviation of all speeds (15 m/s) and gaps (15 m)."""
     state = env.state
-    return torch.cat((observation, state.speed / 15.0, state.gap.clamp_max(150.0) / 15.0), dim=-1)
+    columns = []
+    for x in (state.speed / 15.0, state.gap.clamp_max(150.0) / 15.0):
+        mean = x.mean(-1, keepdim=True)
+        columns += [mean, ((x - mean).square().mean(-1, keepdim=True) + 1e-6).sqrt()]
+    return torch.cat((observation, *columns), dim=-1)
 
 
-def make_critic(inputs: int, hidden: Sequence[int]) -> nn.Sequential:
-    """Return a network of one value, smooth so that its gradient is."""
-    widths = [inputs, *hidden]
-    layers: list[nn.Module] = []
-    for before, after in itertools.pairwise(widths):
-        layers += [nn.Linear(before, after), nn.Tanh()]
-    return nn.Sequential(*layers, nn.Linear(widths[-1], 1))
+class Critic(nn.Module):
+    """The value of scenes: a smooth network, over inputs in the fixed normalisation of human driving."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, scenes: Tensor, hidden: Sequence[int]) -> None:
+        super().__init__()
+        self.register_buffer("mean", scenes.mean(0))
+        self.register_buffer("scale", scenes.std(0).clamp_min(1e-3))
+        widths = [scenes.shape[-1], *hidden]
+        layers: list[nn.Module] = []
+        for before, after in itertools.pairwise(widths):
+            layers += [nn.Linear(before, after), nn.Tanh()]
+        self.body = nn.Sequential(*layers, nn.Linear(widths[-1], 1))
+
+    def forward(self, scenes: Tensor) -> Tensor:
+        """Return the values, without the last dimension."""
+        value: Tensor = self.body((scenes - self.mean) / self.scale).squeeze(-1)
+        return value
+
+
+def human_scenes(environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 1500) -> Tensor:
+    """Return what the critic sees, every tenth step, while human drivers keep the wheel."""
+    env = common.make_env(environment, count, output="numpy")
+    seen = [scene(env, torch.as_tensor(env.reset(seed=seed)[0]))]
+    for step in range(steps):
+        observation = env.step(None)[0]
+        if step % 10 == 0:
+            seen.append(scene(env, torch.as_tensor(observation)))
+    return torch.cat(seen)
 
 
 @dataclass
@@ -93,13 +124,14 @@ def roll(
     """Drive one window; return the observation after it and the window, its gain with the graph."""
     n = env.num_envs
     discount, gain = torch.ones(n), torch.zeros(n)
+    push = a.explore * torch.randn(n, 1)
     kept: list[tuple[Tensor, ...]] = []
     for t in range(a.window):
         before = scene(env, observation).detach()
-        observation, reward, terminated, truncated, _ = env.step(policy(observation))
+        observation, reward, terminated, truncated, _ = env.step(policy(observation) + push)
         gain = gain + (1.0 - a.gamma) * discount * reward
         ended = terminated | truncated
-        value = torch.where(terminated, 0.0, target(scene(env, observation)).squeeze(-1))
+        value = torch.where(terminated, 0.0, target(scene(env, observation)))
         discount = discount * a.gamma
         last = torch.ones_like(ended) if t == a.window - 1 else ended
         gain = gain + torch.where(last, discount * value, 0.0)
@@ -131,7 +163,7 @@ def learn_values(critic: nn.Module, optimiser: torch.optim.Optimizer, window: Wi
     error = torch.zeros(())
     for _ in range(a.critic_epochs):
         for part in torch.randperm(len(wanted)).chunk(4):
-            error = (critic(scenes[part]).squeeze(-1) - wanted[part]).square().mean()
+            error = (critic(scenes[part]) - wanted[part]).square().mean()
             optimiser.zero_grad()
             error.backward()
             nn.utils.clip_grad_norm_(critic.parameters(), a.clip)
@@ -147,7 +179,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
     env.reset(seed=common.first_seed(a.seed, a.count))
     policy, saved = common.begin(a, "shac")
     observation = common.restore(env, saved["episodes"]) if saved else common.desynchronise(env)
-    critic = make_critic(scene(env, observation).shape[-1], a.critic_hidden)
+    critic = Critic(human_scenes(a.environment, common.first_seed(a.seed, 0)), a.critic_hidden)
     target = deepcopy(critic)
     target.requires_grad_(False)
     actor_steps = torch.optim.Adam(policy.parameters(), lr=a.learning_rate)

@@ -1,0 +1,106 @@
+"""Does closing the loop pay in control? Policies trained on a plain and on a corrected model, judged in the truth.
+
+    python benchmarks/agents_transfer.py [--out runs/transfer] [--seeds 3]
+
+Platoons are generated whose drivers react with a hidden delay. From the same data come plain IDM, calibrated, and the
+model of ``discover``, which has the effect that it found; both are saved as ``model.yaml``. One APG policy per model and
+seed is trained on a ring of that model, and a third kind on the truth itself. All are judged on rings of the generated
+drivers, whose parameters and delay are known. What is done is kept and skipped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
+    os.environ.setdefault(variable, "1")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import torch  # noqa: E402 (threads are set before torch starts)
+
+from agents import apg, common  # noqa: E402
+from agents.classical import PISaturation  # noqa: E402
+from agents.evaluate import evaluate_ring  # noqa: E402
+
+EFFECT, STRENGTH, DATA_SEED = "delay", 0.8, 5
+NAMES = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
+RING = {
+    "task": "ring", "dt": 0.1, "integration": "ballistic", "noise": 0.2, "warmup": 750, "warmup_pool": 256,
+    "tailgating": 5.0, "tailgating_below": 1.0,
+}  # fmt: skip
+
+
+def models(out: Path) -> dict[str, Any]:
+    """Return the environments of plain, corrected and true drivers; models are written to ``out`` once."""
+    from idm_env.config import save_model
+    from idm_env.data import episodes, synthetic
+    from idm_env.discovery import discover, write_report
+    from idm_env.fitting.fit import fit
+    from idm_env.fitting.job import model_of
+
+    trajectories, truth = synthetic.generate(DATA_SEED, effect=EFFECT, strength=STRENGTH)
+    plain, corrected = out / "plain.yaml", out / "corrected" / "model.yaml"
+    out.mkdir(parents=True, exist_ok=True)
+    if not plain.exists():
+        save_model(plain, model_of(fit(episodes(trajectories, max_gap=None, smooth=True), by="all")))
+    if not corrected.exists():
+        write_report(discover(trajectories, seed=DATA_SEED), corrected.parent)
+    drivers = truth.drivers[:22]
+    return {
+        "plain IDM": {**RING, "effects": str(plain)},
+        "corrected model": {**RING, "effects": str(corrected)},
+        "the truth": {
+            **RING,
+            "effects": [EFFECT],
+            "parameters": {"idm": {name: drivers[name].to_list() for name in NAMES}, EFFECT: {EFFECT: STRENGTH}},
+        },
+    }
+
+
+def trained(environment: dict[str, Any], out: Path, seed: int) -> common.Policy:
+    """Return a policy that was trained there, now if it is not there."""
+    chosen = apg.Arguments(environment=environment, out=out, seed=seed, updates=20, evaluate_every=1e9)
+    if not (out / "done").exists():
+        apg.train(chosen)
+        (out / "done").touch()
+    return common.load(out / "last.pt", "ring", "apg")[0]
+
+
+def main() -> None:
+    """Train what is missing, judge all in the truth, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/transfer"))
+    parser.add_argument("--seeds", type=int, default=3)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    environments = models(options.out.resolve())
+    truth = environments["the truth"]
+    print(
+        "trained on | seed | worst speed ratio | worst std (m/s) | smallest time gap (s) | collisions | in its own model"
+    )
+    print("--- | --- | --- | --- | --- | --- | ---")
+    show("human drivers", "", evaluate_ring(None, truth), {})
+    show("PI with saturation", "", evaluate_ring(PISaturation(0.1, 1.0, 5.0), truth), {})
+    for name, environment in environments.items():
+        for seed in range(options.seeds):
+            policy = trained(environment, options.out / name.replace(" ", "-") / f"seed{seed}", seed)
+            show(name, str(seed), evaluate_ring(policy, truth), evaluate_ring(policy, environment))
+    print(json.dumps({"effect": EFFECT, "strength": STRENGTH, "data_seed": DATA_SEED}))
+
+
+def show(name: str, seed: str, r: dict[str, Any], own: dict[str, Any]) -> None:
+    """Print one row."""
+    there = f"{own['speed_ratio']:.3f}, {own['speed_std']:.2f}" if own else "–"
+    print(
+        f"{name} | {seed} | {r['speed_ratio']:.3f} | {r['speed_std']:.2f} | {r['time_gap']:.2f} | {r['collisions']} | {there}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()
