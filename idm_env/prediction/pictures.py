@@ -9,6 +9,7 @@ from matplotlib.patches import Polygon
 from idm_env.data.womd import Agent, Scenario
 from idm_env.prediction.predict import Prediction
 
+STOP, CAUTION = "#c1121f", "#e09f3e"
 LANE, OTHERS, OWN, FUTURE, TRUTH = "#cfcfcf", "#9a9a9a", "#111111", "#0b5fa5", "#d1495b"
 
 
@@ -20,7 +21,10 @@ def body(agent: Agent, step: int) -> np.ndarray:
 
 
 def scene_picture(scenario: Scenario, prediction: Prediction) -> tuple[Figure, str]:
-    """Return the picture of one agent's prediction and its caption; wider lines are more probable futures."""
+    """Return the picture of one agent's prediction and its caption; wider lines are more probable futures.
+
+    Stop signs are red octagons, lights that are red or yellow are squares.
+    """
     present = scenario.present
     agent = scenario.agents[prediction.agent]
     past = np.flatnonzero(agent.valid[: present + 1])
@@ -36,13 +40,21 @@ def scene_picture(scenario: Scenario, prediction: Prediction) -> tuple[Figure, s
         if other.valid[present]:
             mine = other is agent
             axis.add_patch(Polygon(body(other, present), color=OWN if mine else OTHERS, zorder=3 if mine else 1, lw=0))
+    labelled: list[np.ndarray] = []
     for number, (future, confidence) in enumerate(zip(prediction.futures, prediction.confidence, strict=True)):
         line = np.concatenate([here[None], future])
         axis.plot(
-            *line.T, color=FUTURE, lw=1 + 4 * confidence, alpha=0.75, zorder=2, label=None if number else "futures"
+            *line.T, color=FUTURE, lw=1.2 + 3 * confidence, alpha=0.8, zorder=2, label=None if number else "futures"
         )
         axis.plot(*future[-1], "o", color=FUTURE, ms=4, zorder=4)
-        axis.annotate(f"{100 * confidence:.0f} %", future[-1], (4, 4), textcoords="offset points", fontsize=7)
+        if all(np.hypot(*(future[-1] - other)) > 0.05 * reach for other in labelled):
+            labelled.append(future[-1])
+            axis.annotate(f"{100 * confidence:.0f} %", future[-1], (4, 4), textcoords="offset points", fontsize=8)
+    for control in scenario.controls:
+        stops = control.shows in ("sign", "stop")
+        if stops or control.shows == "caution":
+            mark, colour = ("8", STOP) if control.shows == "sign" else ("s", STOP if stops else CAUTION)
+            axis.plot(*control.point, mark, color=colour, ms=6, mec="white", zorder=3)
     axis.plot(*agent.position[past].T, color=OWN, lw=2, zorder=4, label="last second")
     if len(later) > 1:
         axis.plot(*agent.position[later].T, "--", color=TRUTH, lw=1.8, zorder=5, label="what it did")

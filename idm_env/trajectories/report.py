@@ -93,7 +93,7 @@ def methods(rows: Sequence[dict[str, Any]]) -> page.Block:
 def before_and_after(track: Track, motion: Motion) -> Figure:
     """Return position against the data, speed and acceleration over time: grey differences of the data, blue ours."""
     figure = Figure(figsize=(10, 5.6), layout="constrained")
-    axes = figure.subplots(3, 1, sharex=True)
+    axes = figure.subplots(3, 1, sharex=True, height_ratios=(2, 3, 3))
     begin = track.time_s[0]
     step = np.diff(track.time_s)
     middle = track.time_s[:-1] + step / 2 - begin
@@ -105,9 +105,10 @@ def before_and_after(track: Track, motion: Motion) -> Figure:
     axes[1].plot(middle, speed, color=BEFORE, lw=0.8, label="differences of the data")
     axes[1].plot(clock, motion.speed_mps, color=AFTER, lw=1.5, label="ours")
     axes[1].set_ylabel("speed (m/s)")
-    axes[1].legend(loc="upper right", frameon=False, ncols=2)
+    axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, ncols=2, borderaxespad=0.1)
     if len(speed) > 1:
-        axes[2].plot(middle[:-1] + step[1:] / 2, np.diff(speed) / step[1:], color=BEFORE, lw=0.8)
+        # differences of noisy data go far beyond the picture: thin, so that they stay behind
+        axes[2].plot(middle[:-1] + step[1:] / 2, np.diff(speed) / step[1:], color=BEFORE, lw=0.4, alpha=0.5)
     axes[2].plot(clock, motion.accel_mps2, color=AFTER, lw=1.5)
     low, high = min(-4.0, motion.accel_mps2.min() - 1), max(4.0, motion.accel_mps2.max() + 1)
     axes[2].set(ylabel="acceleration (m/s²)", xlabel="time (s)", ylim=(low, high))
@@ -142,7 +143,7 @@ def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
 
 def parameter_histograms(parameters: pl.DataFrame) -> Figure:
     """Return histograms of the inferred parameters, those that the data tell in blue."""
-    figure = Figure(figsize=(12, 2.8), layout="constrained")
+    figure = Figure(figsize=(10, 2.6), layout="constrained")
     for axis, p in zip(figure.subplots(1, 5), IDM.declared, strict=True):
         values = parameters[p.name].drop_nulls().to_numpy()
         bins = np.linspace(values.min(), max(values.max(), values.min() + 1e-6), 25)
@@ -150,7 +151,11 @@ def parameter_histograms(parameters: pl.DataFrame) -> Figure:
         told = parameters.filter(pl.col(f"{p.name}_identified") & pl.col(p.name).is_not_null())[p.name].to_numpy()
         if len(told):
             axis.hist(told, bins, color=AFTER, label="told by the data")
-        axis.set_xlabel(f"{p.symbol}: {p.name} ({p.unit})")
-    figure.axes[0].set_ylabel("tracks")
-    figure.axes[0].legend(frameon=False, fontsize=8)
+        axis.set_xlabel(f"{p.symbol}: {p.name.replace('_', ' ')} ({p.unit})", fontsize=9)
+        axis.tick_params(labelsize=8)
+    figure.axes[0].set_ylabel("tracks", fontsize=9)
+    handles = {
+        label: handle for axis in figure.axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles.keys(), loc="outside upper right", frameon=False, fontsize=9, ncols=2)
     return figure
