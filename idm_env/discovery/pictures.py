@@ -1,9 +1,7 @@
-"""Pictures of a discovery as SVG or PNG data, to be put into one HTML file."""
+"""Pictures of a discovery, as blocks of its page."""
 
 from __future__ import annotations
 
-import base64
-import io
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
@@ -14,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from idm_env.discovery import march as twin
+from idm_env.report import Block, picture
 
 if TYPE_CHECKING:
     from idm_env.discovery.decide import Round
@@ -25,21 +24,13 @@ plt.rcParams.update(
 )
 
 
-def encode(figure: Figure) -> str:
-    """Return a figure as a PNG data URI and close it."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", bbox_inches="tight")
-    plt.close(figure)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
-
-
-def all_of(d: Discovery) -> list[tuple[str, str, str]]:
-    """Return title, caption and data URI of every picture that this discovery has."""
-    made: list[tuple[str, str, str]] = []
+def all_of(d: Discovery) -> list[tuple[str, Block]]:
+    """Return title and picture of everything that this discovery has."""
+    made: list[tuple[str, Block]] = []
 
     def put(title: str, caption: str, figure: Figure | None) -> None:
         if figure is not None:
-            made.append((title, caption, encode(figure)))
+            made.append((title, picture(figure, caption)))
 
     put(
         "What each candidate gains",

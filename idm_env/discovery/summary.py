@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import platform
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -15,6 +13,7 @@ from idm_env.discovery.model import Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.score import interval_of
 from idm_env.discovery.solve import BOUNDS, NAMES, Solution, Task
+from idm_env.report import versions
 
 LOOK_ALIKES = {
     "delay": ["lag", "leader_acceleration (negative)"], "lag": ["delay", "leader_acceleration (negative)"],
@@ -69,7 +68,7 @@ def report(
         "parameters": _parameters(thetas, prepared),
         "data": _data(trajectories, prepared, fit_runs, task, null, by, rounds),
         "seed": seed,
-        "versions": _versions(),
+        "versions": versions(),
     }
     return _plain(content)
 
@@ -341,16 +340,6 @@ def at_bounds(solution: Solution) -> dict[str, int]:
         low, high = BOUNDS[i]
         out[name] = int(((solution.theta[:, i] < low + 1e-3) | (solution.theta[:, i] > high - 1e-3)).sum())
     return out
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in ("idm-env", "torch", "numpy", "scipy", "numba", "polars"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "absent"
-    return found
 
 
 def _plain(x: Any) -> Any:

@@ -1,0 +1,146 @@
+"""What discovery says of measured traffic: ZalaZone per car model and pooled, with and without the grade, and the rest.
+
+    python -m benchmarks.measured --data ../shared/data --out measured.jsonl [--only zalazone]
+
+One line of JSON per case is kept, so that a run goes on where it stopped; at the end the table. The columns grade and
+altitude_m are taken out of ZalaZone unless the case says that the grade is known.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+import numpy as np  # noqa: E402 (threads are set before numpy starts)
+import polars as pl  # noqa: E402
+
+from idm_env.data import load  # noqa: E402
+from idm_env.discovery import Discovery, discover  # noqa: E402
+
+FEWEST_RUNS = 7
+
+
+def cases(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return all cases: file, conditions, and what discovery is told."""
+    zalazone = {"file": "openacc_zalazone.parquet", "where": ["layout=handling"], "place": "track_s_m"}
+    table = pl.read_parquet(folder / zalazone["file"]).filter(pl.col("layout") == "handling")
+    followers = table.filter(pl.col("leader_id").is_not_null())
+    runs = followers.group_by("vehicle_name").agg(pl.col("run_id").n_unique()).sort("vehicle_name")
+    models = [name for name, number in runs.rows() if number >= FEWEST_RUNS]
+    found: dict[str, dict[str, Any]] = {
+        "I-80 pairs": {"file": "ngsim_i80_pairs.parquet"},
+        "ZalaZone, all": zalazone,
+        "ZalaZone, all, grade known": {**zalazone, "known": ("grade",)},
+    }
+    for name in models:
+        part = {**zalazone, "where": [*zalazone["where"], f"vehicle_name={name}"]}
+        found[f"ZalaZone, {name}"] = part
+        found[f"ZalaZone, {name}, grade known"] = {**part, "known": ("grade",)}
+    found["TGSIM"] = {"file": "tgsim_pairs.parquet"}
+    found["AstaZero"] = {"file": "openacc_astazero.parquet"}
+    found["I-80 lanes"] = {"file": "ngsim_i80_lanes.parquet"}
+    return found
+
+
+def run(folder: Path, case: dict[str, Any]) -> Discovery:
+    trajectories = load(folder / case["file"])
+    if not case.get("known"):
+        hidden = [c for c in ("grade", "altitude_m") if c in trajectories.table.columns]
+        trajectories = dataclasses.replace(trajectories, table=trajectories.table.drop(hidden))
+    for condition in case.get("where", ()):
+        trajectories = trajectories.where(condition)
+    return discover(trajectories, place=case.get("place"), known=case.get("known", ()))
+
+
+def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
+    report = found.report
+    drivers = report["error"]["held_out_drivers"]
+    return {
+        "case": name,
+        "drivers": report["data"]["drivers"],
+        "runs_to_choose_on": report["data"]["runs_to_choose_on"],
+        "verdict": report["verdict"],
+        "found": [
+            {
+                "name": f["effect"] or f["label"],
+                "equivalent": f["equivalent"],
+                "p": f["p_value"],
+                "gain": f["held_out_gain"],
+                "parameters": dict(list(f["parameters"].items())[:3]) if len(f["parameters"]) < 6 else "curve",
+            }
+            for f in report["found"]
+        ],
+        "known": report["known"],
+        "why": found.rounds[-1].why_not,
+        "partial": report["partial"],
+        "before": report["error"]["before"],
+        "after": report["error"]["after"],
+        "held_out_drivers": len(drivers),
+        "improved": float(np.mean([d["after_m"] < d["before_m"] for d in drivers])) if report["found"] else None,
+        "best_places": [
+            (c["effect"], c["p_value"], c["held_out_gain"])
+            for c in report["candidates"]
+            if c["round"] == 1 and ("position" in c["effect"] or c["effect"] in ("grade", "speed_zone"))
+        ][:2],
+        "cpu_s": cpu_s,
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        "case | drivers | found | gap RMSE m: pooled, median driver, before → after | held-out drivers improved",
+        "--- | --- | --- | --- | ---",
+    ]
+    for r in rows:
+        names = []
+        for f in r["found"]:
+            first = "" if f["parameters"] == "curve" else next(iter(f["parameters"].values()))
+            number = f" {first['estimate']:.2f} ({first['low']:.2f} … {first['high']:.2f})" if first else ""
+            names.append(f"{f['name']}{number}")
+        said = ", ".join(names) or r["verdict"]
+        known = "".join(
+            f"; grade acts by {-9.81 * k['estimate']:.1f} ({-9.81 * k['high']:.1f} … {-9.81 * k['low']:.1f}) m/s² per unit"
+            for k in r["known"] if k["effect"] == "grade"
+        )  # fmt: skip
+        b, a = r["before"], r["after"] if r["found"] else {}
+        errors = " – "
+        if b:
+            errors = f"{b['gap_rmse_m']:.2f}, {b['gap_rmse_median_driver_m']:.2f}"
+            errors += f" → {a['gap_rmse_m']:.2f}, {a['gap_rmse_median_driver_m']:.2f}" if a else ""
+        improved = "–" if r["improved"] is None else f"{100 * r['improved']:.0f} % of {r['held_out_drivers']}"
+        lines.append(f"{r['case']} | {r['drivers']} | {said}{known} | {errors} | {improved}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("IDM_ENV_DATA", "../shared/data")))
+    parser.add_argument("--out", type=Path, default=Path("measured.jsonl"))
+    parser.add_argument("--only", default="", help="part of the names of the cases to run")
+    arguments = parser.parse_args()
+    done = {}
+    if arguments.out.exists():
+        done = {r["case"]: r for r in map(json.loads, arguments.out.read_text().splitlines())}
+    wanted = {n: c for n, c in cases(arguments.data).items() if arguments.only in n}
+    for name, case in wanted.items():
+        if name in done:
+            continue
+        begin = time.process_time()
+        done[name] = row(name, run(arguments.data, case), time.process_time() - begin)
+        with arguments.out.open("a") as file:
+            file.write(json.dumps(done[name]) + "\n")
+        print(f"{name}: {done[name]['verdict']}", file=sys.stderr)
+    print(table([done[n] for n in wanted if n in done]))
+
+
+if __name__ == "__main__":
+    main()
