@@ -71,8 +71,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
-    torch.set_num_threads(1)
-    train(common.parse(Arguments, "apg", argv))
+    common.command_line(train, Arguments, "apg", argv)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import dataclasses
 import itertools
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -68,6 +68,7 @@ class Arguments:
 
 
 A = TypeVar("A", bound=Arguments)
+R = TypeVar("R")
 
 
 def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
@@ -80,12 +81,24 @@ def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
     return tyro.cli(kind, default=default, args=rest, description=text)
 
 
+def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Sequence[str] | None = None) -> R:
+    """Train as the command line says, on one thread; what is wrong is told in one line."""
+    torch.set_num_threads(1)
+    try:
+        return train(parse(kind, agent, argv))
+    except (ValueError, DivergedError) as error:
+        raise SystemExit(f"error: {error}") from None
+
+
 def load_agent(path: str | Path, kind: type[A], agent: str) -> A:
     """Return the arguments of an agent's YAML file; ValueError, in one line, for what does not belong in it."""
     file = Path(path)
     if not file.is_file():
         raise ValueError(f"{path} is not a file. Give the path of a YAML file, such as configs/ring-apg.yaml.")
-    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict) or content.pop("configures", None) != "agent":
         raise ValueError(f"{path}: no agent is configured here. Write 'configures: agent' in its first line.")
     if content.pop("agent", None) != agent:

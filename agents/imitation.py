@@ -194,9 +194,9 @@ def train(a: Arguments) -> list[dict[str, Any]]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says, and print the table."""
-    torch.set_num_threads(1)
+    rows = common.command_line(train, Arguments, "imitation", argv)
     print("model | held-out spacing RMSE (m): mean | median | speed RMSE (m/s) | collisions | pairs")
-    for r in train(common.parse(Arguments, "imitation", argv)):
+    for r in rows:
         print(
             f"{r['model']} | {r['gap_rmse_m']:.3f} | {r['gap_rmse_median_m']:.3f} | {r['speed_rmse_mps']:.3f} "
             f"| {r['collisions']} | {r['episodes']}"

@@ -217,8 +217,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
-    torch.set_num_threads(1)
-    train(common.parse(Arguments, "shac", argv))
+    common.command_line(train, Arguments, "shac", argv)
 
 
 if __name__ == "__main__":

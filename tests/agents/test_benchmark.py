@@ -1,0 +1,72 @@
+"""The benchmark of agents skips what is done and leaves what another process works on; its tables say what was run."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import subprocess
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def benchmark(monkeypatch) -> ModuleType:
+    """The script, with a training that only leaves a mark."""
+    import importlib
+
+    monkeypatch.syspath_prepend(str(ROOT))
+    module = importlib.import_module("benchmarks.agents")
+    trained = []
+
+    def outcome(training, done, unseen):
+        return {"summary": {"solved": True}, "history": [{"passed": True}], "last": LAST, "error": ""}
+
+    def run(command, **keywords):
+        trained.append(command)
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(module, "outcome", outcome)
+    monkeypatch.setattr(module.subprocess, "run", run)
+    module.trained = trained
+    return module
+
+
+LAST = {"speed_ratio": 1.0, "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}
+
+
+def test_every_trial_is_trained_once(benchmark, tmp_path):
+    benchmark.run(["ring-apg"], tmp_path, 3)
+    assert len(benchmark.trained) == 5 * 2 + 3
+    seeds = [int(c[c.index("--seed") + 1]) for c in benchmark.trained]
+    assert seeds == [100, 101] * 5 + [0, 1, 2]
+    benchmark.run(["ring-apg"], tmp_path, 4)
+    assert len(benchmark.trained) == 5 * 2 + 4
+
+
+def test_what_another_process_works_on_is_left_to_it(benchmark, tmp_path):
+    job = benchmark.Job("ring-apg", 0, {}, 1)
+    folder = tmp_path / job.name
+    folder.mkdir(parents=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        # A lock belongs to the open file, so this stands for another process.
+        assert benchmark.perform(job, tmp_path) is None and not benchmark.trained
+    assert benchmark.perform(job, tmp_path)["summary"]["solved"]
+    assert json.loads((folder / "result.json").read_text())["seed"] == 1
+
+
+def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
+    compared = ("ring-apg", "ring-ppo", "ring-sac")
+    assert {len(benchmark.SEARCH[c]) for c in compared} == {5}
+    assert not set(compared) & set(benchmark.BUDGET)
+    from agents import apg, ppo, shac
+
+    kinds = {"apg": apg.Arguments, "ppo": ppo.Arguments, "sac": ppo.Arguments, "shac": shac.Arguments}
+    for config, trials in benchmark.SEARCH.items():
+        assert (ROOT / "configs" / f"{config}.yaml").exists()
+        for options in trials:
+            assert set(options) <= set(kinds[config.split("-")[1]].__dataclass_fields__)

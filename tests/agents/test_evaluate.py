@@ -1,0 +1,168 @@
+"""The test that judges agents, the classical controllers in it, and pictures."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from agents import common, evaluate
+from agents.classical import FollowerStopper, PISaturation, Seen, controllers, seen
+from agents.common import Policy
+from agents.evaluate import Driven, solved_at
+from idm_env import metrics
+
+RING = {"task": "ring"}
+VEHICLE: dict[str, float] = {"dt": 0.1, "max_command": 1.0, "vehicle_length": 5.0}
+
+
+def test_uniform_speed_is_the_equilibrium_of_equal_drivers():
+    start = evaluate.ring_start(RING, (220.0, 260.0))
+    p = start.params["idm"]
+    gap = start.world.state.gap.mean(-1)
+    assert torch.allclose(evaluate.uniform_speed(start), metrics.equilibrium_speed(gap, dict(p)), atol=1e-4)
+
+
+def test_uniform_speed_of_unequal_drivers_fills_the_ring():
+    time_gap = [1.0 + 0.02 * i for i in range(22)]
+    start = evaluate.ring_start({**RING, "parameters": {"idm": {"time_gap": time_gap}}}, (250.0,))
+    v = float(evaluate.uniform_speed(start))
+    gaps = [(2.0 + v * t) / (1.0 - (v / 30.0) ** 4) ** 0.5 for t in time_gap]
+    assert sum(gaps) == pytest.approx(250.0 - 22 * 5.0, rel=1e-4)
+
+
+def drives(start, speed, gap):
+    steps = evaluate.JUDGED + 10
+    shape = (steps, len(start.world.state.speed), 22)
+    speeds = torch.full(shape, 1.0) * speed
+    none = torch.zeros(steps, shape[1], 1)
+    return Driven(speeds, torch.zeros(shape), torch.full(shape, gap), none, none)
+
+
+def test_the_figures_of_the_ring_are_the_worst_of_all_lengths():
+    start = evaluate.ring_start(RING, (220.0, 260.0))
+    uniform = evaluate.uniform_speed(start)
+    calm = drives(start, uniform[None, :, None], 4.0)
+    found = evaluate.judge_ring(start, calm)
+    assert found["passed"] and found["speed_ratio"] == pytest.approx(1.0, rel=1e-4) and found["speed_std"] < 1e-5
+    assert found["time_gap"] == pytest.approx(4.0 / float(uniform.max()))
+    slow = calm._replace(speed=calm.speed * torch.tensor([0.94, 1.0])[None, :, None])
+    found = evaluate.judge_ring(start, slow)
+    assert not found["passed"] and found["speed_ratio"] == pytest.approx(0.94, rel=1e-4)
+    waves = calm.speed + torch.tensor([0.0, 0.6])[None, :, None] * (-1.0) ** torch.arange(22)
+    found = evaluate.judge_ring(start, calm._replace(speed=waves))
+    assert not found["passed"] and found["speed_std"] == pytest.approx(0.6, rel=1e-3)
+    crash = calm.gap.clone()
+    crash[0, 1, 3] = -0.1  # long before the last 100 s
+    found = evaluate.judge_ring(start, calm._replace(gap=crash))
+    assert not found["passed"] and found["collisions"] == 1
+
+
+@pytest.mark.parametrize(
+    ("passed", "first"),
+    [("", None), ("0111", 1), ("111", 0), ("0011", None), ("1110", None), ("11101111", 4), ("0000", None)],
+)
+def test_solved_means_three_in_a_row_and_kept(passed, first):
+    assert solved_at([{"passed": x == "1"} for x in passed]) == first
+
+
+def test_a_better_evaluation_has_a_higher_score():
+    row = {"speed_ratio": 0.9, "speed_std": 0.2, "time_gap": 1.0, "collisions": 0}
+    better = ({"speed_ratio": 0.95}, {"speed_std": 0.1})
+    worse = ({"time_gap": 0.5}, {"collisions": 1})
+    assert all(evaluate.score({**row, **x}) > evaluate.score(row) for x in better)
+    assert all(evaluate.score({**row, **x}) < evaluate.score(row) for x in worse)
+    assert evaluate.score({"reward": 0.3, "speed_ratio": 9.0}) == 0.3
+
+
+def test_humans_make_waves_and_pi_with_saturation_dissolves_them():
+    human = evaluate.evaluate_ring(None, RING, (230.0,))
+    calm = evaluate.evaluate_ring(PISaturation(**VEHICLE), RING, (230.0,))
+    assert not human["passed"] and human["speed_ratio"] < 0.8 and human["speed_std"] > 2.0
+    assert calm["passed"] and calm["time_gap"] > 0.8
+    assert calm == evaluate.evaluate_ring(PISaturation(**VEHICLE), RING, (230.0,))  # repeatable
+
+
+def test_observations_of_the_ring_are_unpacked():
+    start = evaluate.ring_start(RING, (240.0,))
+    view, state = seen(start.task.observe(start.world).flatten(1), 5.0), start.world.state
+    assert torch.allclose(view.speed, state.speed[:, :1], atol=1e-4)
+    assert torch.allclose(view.lead_speed, state.speed[:, -1:], atol=1e-4)
+    assert torch.allclose(view.gap, state.gap[:, :1], atol=1e-3)
+
+
+def view_of(speed, lead_speed, gap):
+    return Seen(*(torch.tensor([[float(x)]]) for x in (speed, lead_speed, gap)))
+
+
+@pytest.mark.parametrize(
+    ("speed", "lead", "gap", "command"),
+    [
+        (5.0, 5.0, 4.0, 0.0),  # too near
+        (5.0, 3.0, 5.0, 0.0),  # the first zone grows by Δv²/(2 · 1.5) = 1.33 m
+        (2.0, 2.0, 4.875, 1.0),  # half way through the second zone: half of v*
+        (2.0, 2.0, 5.625, 3.0),  # half way through the third: between v* = 2 and U = 4
+        (5.0, 5.0, 5.25, 4.0),  # v* is at most U
+        (1.0, 9.0, 7.0, 4.0),  # free
+    ],
+)
+def test_follower_stopper_in_its_zones(speed, lead, gap, command):
+    controller = FollowerStopper(**VEHICLE, desired=4.0)
+    assert float(controller.wanted(view_of(speed, lead, gap))) == pytest.approx(command, abs=1e-5)
+
+
+def test_pi_follows_the_mean_of_its_own_speed():
+    controller = PISaturation(**VEHICLE, seconds=1.0)
+    for speed in [2.0] * 10 + [4.0] * 5:
+        controller.wanted(view_of(speed, speed, 7.0))
+    before = float(controller._command)
+    found = controller.wanted(view_of(4.0, 4.0, 7.0))
+    # Of the last ten speeds six are 4 m/s; a gap of 7 m adds nothing, α = 1 and β = ½.
+    assert float(found) == pytest.approx(0.5 * (4 * 2.0 + 6 * 4.0) / 10 + 0.5 * before, abs=1e-5)
+
+
+def test_every_controller_is_made_and_commands_within_bounds():
+    start = evaluate.ring_start(RING, (220.0, 270.0))
+    observation = start.task.observe(start.world).flatten(1)
+    made = controllers(RING, (220.0, 270.0))
+    assert next(iter(made)) == "IDM for all" and made["IDM for all"]() is None
+    for name, make in made.items():
+        if name != "IDM for all":
+            action = make()(observation)
+            assert action.shape == (2, 1) and bool((action.abs() <= 1.0).all())
+
+
+def test_following_is_judged_against_leader_and_human():
+    follow = {"task": "follow", "max_command": 3.0}
+    human = evaluate.evaluate_follow(None, follow, count=2)
+    assert human["collisions"] == 0 and human["litres"] > 0.0 and human["time_gap"] > 0.8
+    assert human["leader_litres"] == pytest.approx(human["litres"], rel=0.2)
+    stopping = evaluate.evaluate_follow(lambda o: -torch.ones(len(o), 1), follow, count=2)
+    assert stopping["reward"] < human["reward"] and stopping["spacing"] > human["spacing"]
+
+
+def test_a_task_without_a_test_is_told():
+    with pytest.raises(ValueError, match="task 'platoon' has no test of agents"):
+        evaluate.evaluate(None, {"task": "platoon"})
+
+
+def test_held_out_covers_lengths_and_drivers(monkeypatch):
+    monkeypatch.setattr(evaluate, "STEPS", 12)
+    monkeypatch.setattr(evaluate, "JUDGED", 10)
+    found = evaluate.held_out(None, RING)
+    assert len(found["lengths"]["ratios"]) == 11
+    cases = [name for name in found if name.endswith("20 %")]
+    assert len(cases) == 10 and "mixed" in found
+    assert found["drivers"]["speed_ratio"] == min(found[name]["speed_ratio"] for name in cases)
+    assert found["drivers"]["time_gap"] == min(found[name]["time_gap"] for name in cases)
+
+
+def test_a_saved_policy_is_evaluated_and_filmed(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("moviepy")
+    monkeypatch.setattr(evaluate, "STEPS", 20)
+    monkeypatch.setattr(evaluate, "JUDGED", 10)
+    common.save(tmp_path / "a.pt", Policy(3, (4,)), "apg", {**RING, "warmup": 5}, {})
+    evaluate.main([str(tmp_path / "a.pt"), "--video", str(tmp_path / "film"), "--steps", "12"])
+    printed = capsys.readouterr().out
+    assert "human {" in printed and "apg {" in printed
+    film = next(tmp_path.glob("film*.mp4"))
+    assert film.stat().st_size > 1000

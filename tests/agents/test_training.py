@@ -1,0 +1,241 @@
+"""Trainings: repeatable, resumable, stopped by NaN with the last good checkpoint, and by their clock."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from agents import apg, common, ppo, shac
+from agents.common import DivergedError, Policy
+from idm_env.tasks.ring import RingTask
+
+SMALL = {"count": 4, "window": 20}
+AGENTS = {
+    "apg": (apg, apg.Arguments, SMALL),
+    "shac": (shac, shac.Arguments, {**SMALL, "critic_first": 1, "critic_epochs": 2}),
+    "ppo": (ppo, ppo.Arguments, {"count": 4, "n_steps": 16, "batch_size": 32, "n_epochs": 2}),
+    "sac": (ppo, ppo.Arguments, {
+        "count": 4, "n_steps": 16, "batch_size": 32, "algorithm": "sac", "learning_starts": 16, "ent_coef": "auto",
+    }),
+}  # fmt: skip
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return torch.load(path, weights_only=True)["policy"]["state"]
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(a[k], b[k]) for k in a)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_same_seed_gives_the_same_policy_and_another_seed_another(name, quick, tmp_path):
+    module, kind, small = AGENTS[name]
+    for out, seed in (("a", 1), ("b", 1), ("c", 2)):
+        history = module.train(kind(**{**quick, "out": tmp_path / out, "seed": seed, "updates": 2}, **small))
+        assert [row["update"] for row in history] == [0, 1]
+    a, b, c = (weights(tmp_path / out / "last.pt") for out in "abc")
+    assert same(a, b) and not same(a, c)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_a_resumed_training_goes_on_where_it_was(name, quick):
+    module, kind, small = AGENTS[name]
+    whole = kind(**quick, **small)
+    first = module.train(dataclasses.replace(whole, cpu_seconds=1e-9))
+    assert len(first) == 1  # the clock stops it after the first update
+    history = module.train(dataclasses.replace(whole, resume=True))
+    assert [row["update"] for row in history] == [0, 1, 2, 3]
+    assert [row["steps"] for row in history] == [first[0]["steps"] * k for k in (1, 2, 3, 4)]
+    assert history[1]["cpu_seconds"] > history[0]["cpu_seconds"] == first[0]["cpu_seconds"]
+    assert (whole.out / "log" / "progress.csv").exists()
+
+
+def test_apg_resumes_exactly(quick, tmp_path):
+    whole = apg.Arguments(**quick, **SMALL)
+    apg.train(dataclasses.replace(whole, out=tmp_path / "whole"))
+    apg.train(dataclasses.replace(whole, cpu_seconds=1e-9))
+    apg.train(dataclasses.replace(whole, resume=True))
+    assert same(weights(tmp_path / "whole" / "last.pt"), weights(whole.out / "last.pt"))
+
+
+def test_nothing_to_resume_is_told(quick):
+    with pytest.raises(ValueError, match=r"last\.pt is not a file"):
+        apg.train(apg.Arguments(**quick, **SMALL, resume=True))
+
+
+def test_resuming_another_agents_or_tasks_training_is_refused(quick):
+    apg.train(apg.Arguments(**{**quick, "updates": 1}, **SMALL))
+    with pytest.raises(ValueError, match="of agent 'apg', and 'shac' is wanted"):
+        shac.train(shac.Arguments(**quick, **SMALL, resume=True))
+    other = {**quick, "environment": {"task": "follow", "vehicles": 4}}
+    with pytest.raises(ValueError, match="of task 'ring', and 'follow' is wanted"):
+        apg.train(apg.Arguments(**other, **SMALL, resume=True))
+
+
+def break_rewards(monkeypatch, after: int) -> None:
+    plain, calls = RingTask.reward, [0]
+
+    def reward(self, before, command, world):
+        calls[0] += 1
+        result = plain(self, before, command, world)
+        return result * torch.nan if calls[0] > after else result
+
+    monkeypatch.setattr(RingTask, "reward", reward)
+
+
+@pytest.mark.parametrize("name", ["apg", "shac"])
+def test_nan_stops_with_update_norm_and_the_last_good_checkpoint(name, quick, monkeypatch):
+    module, kind, small = AGENTS[name]
+    human = 1500  # steps of human driving before training, in which rewards are computed too
+    break_rewards(monkeypatch, after=human * (2 if name == "shac" else 1) + 45)
+    with pytest.raises(DivergedError, match=r"update 2: loss nan and gradient norm nan.*last\.pt") as told:
+        module.train(kind(**quick, **small))
+    assert "\n" not in str(told.value)
+    policy, content = common.load(quick["out"] / "last.pt")
+    assert content["training"]["update"] == 1
+    assert all(bool(torch.isfinite(p).all()) for p in policy.parameters())
+
+
+def test_nan_in_the_weights_of_a_baseline_stops_it(quick):
+    arguments = ppo.Arguments(**quick, **AGENTS["ppo"][2])
+    env = common.make_env(arguments.environment, 4, output="numpy")
+    policy = Policy(3, arguments.hidden)
+    model = ppo.make_model(arguments, ppo.SB3VecEnv(env), policy)
+    with torch.no_grad():
+        next(iter(model.policy.parameters())).fill_(torch.nan)
+    with pytest.raises(DivergedError, match=r"update 7: weights of .* must be finite.*kept"):
+        ppo.copy_actor(model, policy, 7, Path("kept"))
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_the_copied_actor_is_the_baselines(name, quick):
+    arguments = ppo.Arguments(**quick, **AGENTS[name][2])
+    policy, _ = common.begin(arguments, name, activation="tanh", squash="tanh" if name == "sac" else "clip")
+    model = ppo.make_model(arguments, ppo.SB3VecEnv(common.make_env(arguments.environment, 4, output="numpy")), policy)
+    model.learn(64)
+    ppo.copy_actor(model, policy, 0, Path("kept"))
+    seen = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32) * 0.1
+    assert np.allclose(policy.predict(seen)[0], model.predict(seen, deterministic=True)[0], atol=1e-6)
+
+
+def test_the_best_checkpoint_has_the_best_score(quick, monkeypatch):
+    ratios = iter([0.5, 0.9, 0.7, 0.9])
+
+    def evaluate(policy, environment):
+        return {"speed_ratio": next(ratios), "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}
+
+    monkeypatch.setattr("agents.monitor.evaluate", evaluate)
+    apg.train(apg.Arguments(**quick, **SMALL))
+    content = common.load(quick["out"] / "best.pt")[1]
+    assert content["training"]["update"] == 1  # the first of equals
+
+
+def test_the_command_line_tells_errors_in_one_line(tmp_path):
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("configures: agent\nagent: apg\nwindw: 3\n")
+    with pytest.raises(SystemExit, match=r"error: .*unknown key 'windw'. Did you mean 'window'"):
+        apg.main(["--config", str(bad)])
+
+
+def test_apg_follows_the_gradient_of_the_return(ring):
+    """The slope of a window's mean reward along a direction in the weights, against a difference, in float64."""
+    torch.manual_seed(0)
+    ring |= {"start": "wave", "warmup": 0, "warmup_pool": 0, "dtype": "float64"}
+    policy = Policy(3, (6,)).double()
+    policy.scale.fill_(0.1)
+    with torch.no_grad():
+        policy.body[-1].weight.mul_(50.0)
+    weights = dict(policy.named_parameters())
+    along = {k: torch.randn_like(v) for k, v in weights.items()}
+
+    def mean_reward(shift: torch.Tensor) -> torch.Tensor:
+        shifted = {k: v + shift * along[k] for k, v in weights.items()}
+        env = common.make_env(ring, 3, output="torch")
+        observation, total = env.reset(seed=0)[0], torch.zeros((), dtype=torch.float64)
+        for _ in range(25):
+            observation, reward, *_ = env.step(torch.func.functional_call(policy, shifted, (observation,)))
+            total = total + reward.mean()
+        return total / 25
+
+    shift = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(mean_reward(shift), shift)
+    step = torch.tensor(1e-6, dtype=torch.float64)
+    difference = (mean_reward(step) - mean_reward(-step)) / (2 * step)
+    assert float(slope) == pytest.approx(float(difference.detach()), rel=1e-4) and abs(float(slope)) > 1e-4
+
+
+# -- the returns of SHAC ---------------------------------------------------------------------------------------------
+
+
+def test_returns_are_bootstrapped_at_the_end_and_where_episodes_end():
+    rewards = torch.tensor([[1.0], [2.0], [3.0]])
+    following = torch.tensor([[10.0], [20.0], [30.0]])
+    going = shac.Window(rewards, rewards, following, torch.zeros(3, 1, dtype=torch.bool), rewards)
+    g, lam = 0.5, 0.25
+    third = (1 - g) * 3.0 + g * 30.0
+    second = (1 - g) * 2.0 + g * ((1 - lam) * 20.0 + lam * third)
+    first = (1 - g) * 1.0 + g * ((1 - lam) * 10.0 + lam * second)
+    assert shac.returns(going, g, lam).flatten().tolist() == pytest.approx([first, second, third])
+    ended = torch.tensor([[False], [True], [False]])
+    cut = dataclasses.replace(going, ended=ended)
+    second = (1 - g) * 2.0 + g * 20.0  # nothing of the episode after it
+    first = (1 - g) * 1.0 + g * ((1 - lam) * 10.0 + lam * second)
+    assert shac.returns(cut, g, lam).flatten().tolist() == pytest.approx([first, second, third])
+
+
+def test_a_constant_reward_is_its_own_value():
+    ones = torch.ones(40, 2)
+    window = shac.Window(ones, 3.0 * ones, 3.0 * ones, torch.zeros(40, 2, dtype=torch.bool), ones)
+    assert torch.allclose(shac.returns(window, 0.99, 0.9), 3.0 * ones)
+
+
+class Ends(torch.nn.Module):
+    """A value that is 1 plus the scene's own speed, so that its gradient is known."""
+
+    def forward(self, scenes: torch.Tensor) -> torch.Tensor:
+        return 1.0 + scenes[..., 0]
+
+
+def test_the_gain_values_last_scenes_and_cuts_gradients_at_resets(ring):
+    """With zero rewards the gain is γ^k V'(last scene) of every episode in the window, truncated ones included."""
+    ring |= {"max_episode_steps": 6, "warmup_pool": 0}
+    env = common.make_env(ring, 2, output="torch", autoreset_mode="Disabled")
+    env.reset(seed=0)
+    a = shac.Arguments(window=8, gamma=0.9, explore=0.0)
+    pushes = []
+
+    class Push(torch.nn.Module):
+        def forward(self, observation: torch.Tensor) -> torch.Tensor:
+            pushes.append(torch.full((2, 1), 0.2, requires_grad=True))
+            return pushes[-1]
+
+    plain = env.batch.task.reward
+    object.__setattr__(env.batch.task, "reward", lambda *x: 0.0 * plain(*x))
+    observation, window = shac.roll(env, Push(), Ends(), env.task.observe(env.batch.world).flatten(1), a)
+    assert window.ended[:, 0].tolist() == [t == 5 for t in range(8)]
+    expected = 0.9**6 * window.following[5] + 0.9**2 * window.following[7]
+    assert torch.allclose(window.gain, expected)
+    assert not torch.allclose(window.following[5], window.following[7])
+    before, after = torch.autograd.grad(window.gain.sum(), [pushes[0], pushes[7]], retain_graph=True)
+    assert bool((before != 0).all()) and bool((after != 0).all())
+    # What came before the reset has no influence on the observation after it.
+    assert torch.autograd.grad(observation.sum(), pushes[0], allow_unused=True)[0] is None
+
+
+def test_a_collision_is_worth_nothing(ring):
+    env = common.make_env(ring, 2, output="torch", autoreset_mode="Disabled")
+    env.reset(seed=0)
+    world = env.batch.world
+    gap = world.state.gap.clone()
+    gap[1, 0] = -1.0
+    env.batch.world = world._replace(state=world.state._replace(gap=gap))
+    a = shac.Arguments(window=1, gamma=0.9, explore=0.0)
+    policy = Policy(3, (4,))
+    _, window = shac.roll(env, policy, Ends(), env.task.observe(env.batch.world).flatten(1), a)
+    assert window.ended[0].tolist() == [False, True]
+    assert float(window.following[0, 0]) > 1.0 and float(window.following[0, 1]) == 0.0
