@@ -20,8 +20,10 @@ MOST_TRACKS = 32
 MOST_SAMPLES = 400
 DENSE_S = 0.25
 """Up to this sampling interval correlated noise can be told from white noise (s)."""
-SPARSE_WHITE_M = 0.02
-"""White noise assumed of sparse samples (m)."""
+TELLING_S = 3.0
+"""Up to this sampling interval white noise can be told from driving (s)."""
+SPARSE_WHITE_M = (0.02, 0.7)
+"""White noise of sparse samples that a search starts from (m): of a survey's tracks, and of navigation satellites."""
 BOUNDS = {
     "white": (2e-3, 5.0),
     "sigma": (2e-3, 10.0),
@@ -38,9 +40,14 @@ def sample(tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[tuple[np.nda
     return [(time[:MOST_SAMPLES], position[:MOST_SAMPLES]) for time, position in chosen]
 
 
+def interval(times: Sequence[np.ndarray]) -> float:
+    """Return the usual time between samples (s)."""
+    return float(np.median(np.concatenate([np.diff(time) for time in times])))
+
+
 def is_dense(times: Sequence[np.ndarray]) -> bool:
-    """Tell whether samples are dense enough to tell noise from driving."""
-    return float(np.median(np.concatenate([np.diff(time) for time in times]))) <= DENSE_S
+    """Tell whether samples are dense enough to tell correlated noise from driving."""
+    return interval(times) <= DENSE_S
 
 
 def outlying(position: np.ndarray) -> np.ndarray:
@@ -57,15 +64,23 @@ def fit_noise(
 ) -> Noise:
     """Return the noise model under which the tracks (times, positions) are most likely.
 
-    Four numbers for dense data (white, correlated, its time, jerk), two for sparse (jerk and the time in which an
-    acceleration fades), by a simplex search over their logarithms. ValueError if no track has three samples.
+    Four numbers for dense data (white, correlated, its time, jerk), three for sparse (white, jerk, and the time in which
+    an acceleration fades), by simplex searches over their logarithms; above ``TELLING_S`` white noise is taken as
+    small. ValueError if no track has three samples.
     """
     parts = [part for part in sample(tracks) if len(part[0]) >= 3]
     if not parts:
         raise ValueError("no track has three samples to fit the noise to. Give noise=Noise(…).")
-    dense = is_dense([time for time, _ in parts])
-    begin = start or (Noise(0.1, 0.2, 0.3, 0.5) if dense else Noise(SPARSE_WHITE_M, 0.0, 0.3, 0.5, 5.0))
-    names = ("white", "sigma", "time", "jerk") if dense else ("jerk", "accel_time")
+    usual = interval([time for time, _ in parts])
+    dense, telling = usual <= DENSE_S, usual <= TELLING_S
+    if start is not None:
+        begins = [start]
+    elif dense:
+        begins = [Noise(0.1, 0.2, 0.3, 0.5)]
+    else:
+        begins = [Noise(white, 0.0, 0.3, 0.5, 5.0) for white in SPARSE_WHITE_M[: 1 + telling]]
+    names: tuple[str, ...] = ("white", "sigma", "time", "jerk") if dense else ("white", "jerk", "accel_time")
+    names = names if telling else names[1:]
     observed = [Observed.of(time, position, dt) for time, position in parts]
     inflated = [outlying(position) if dense else np.zeros(len(position)) for _, position in parts]
 
@@ -73,7 +88,7 @@ def fit_noise(
         values = {
             name: min(max(math.exp(x), BOUNDS[name][0]), BOUNDS[name][1]) for name, x in zip(names, point, strict=True)
         }
-        return dataclasses.replace(begin, **values)
+        return dataclasses.replace(begins[0], **values)
 
     def cost(point: np.ndarray) -> float:
         model = noise(point)
@@ -81,10 +96,14 @@ def fit_noise(
         low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
         return total + float((np.maximum(low - point, 0) ** 2 + np.maximum(point - high, 0) ** 2).sum())
 
-    first = np.log([getattr(begin, name) for name in names])
-    simplex = np.vstack([first, first + 0.7 * np.eye(len(names))])
-    found = minimize(
-        cost, first, method="Nelder-Mead",
-        options={"maxfev": evaluations, "xatol": 0.03, "fatol": 0.3, "initial_simplex": simplex},
-    )  # fmt: skip
-    return noise(found.x)
+    found = []
+    for begin in begins:
+        first = np.log([getattr(begin, name) for name in names])
+        simplex = np.vstack([first, first + 0.7 * np.eye(len(names))])
+        found.append(
+            minimize(
+                cost, first, method="Nelder-Mead",
+                options={"maxfev": evaluations, "xatol": 0.03, "fatol": 0.3, "initial_simplex": simplex},
+            )
+        )  # fmt: skip
+    return noise(min(found, key=lambda result: float(result.fun)).x)

@@ -13,7 +13,7 @@ from idm_env.trajectories.imagined import CAPABLE, drive, imagined_gap
 from idm_env.trajectories.noise import fit_noise
 from idm_env.trajectories.recipe import Filtered, clock_of, overlaps, recipe
 from idm_env.trajectories.scores import Motion, Tally
-from idm_env.trajectories.smoother import Choices, Noise, Observed, log_likelihood, smooth
+from idm_env.trajectories.smoother import SPARSE, Choices, Noise, Observed, log_likelihood, smooth
 from idm_env.trajectories.tracks import Pieces, Track, read_table
 from idm_env.types import Driver
 from tests.trajectories.tracks import swinging, track_of
@@ -78,6 +78,23 @@ def test_noise_is_found_from_the_data_alone() -> None:
     assert found.time == pytest.approx(0.28, rel=0.4)
     sparse = fit_noise([(time[::20], position[::20]) for time, position in tracks], 0.1)
     assert sparse.sigma == 0.0
+
+
+@pytest.mark.parametrize("every", [10, 20])
+def test_noise_of_sparse_data_is_found_too_and_taken_away(every: int) -> None:
+    """Positions of a satellite receiver, 1 m of white noise every 1 or 2 s: taken as exact they would swing wildly."""
+    rng = np.random.default_rng(0)
+    motions = [swinging(120.0, phase=p) for p in rng.uniform(0, 6, 12)]
+    tracks = [track_of(m, rng.normal(size=len(m.time_s)), str(i)) for i, m in enumerate(motions)]
+    sparse = [track.part(slice(None, None, every)) for track in tracks]
+    noise = fit_noise([(t.time_s, t.position_m) for t in sparse], 0.1)
+    assert noise.white == pytest.approx(1.0, rel=0.25)
+    errors = [
+        f.motion.speed_mps - m.speed_mps for f, m in zip(recipe(sparse, 0.1, noise, SPARSE), motions, strict=True)
+    ]
+    assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.6
+    clean = fit_noise([(t.time_s, m.at(t.time_s)) for t, m in zip(sparse, motions, strict=True)], 0.1)
+    assert clean.white < 0.1
 
 
 def test_every_acceleration_has_its_imagined_gap_and_the_simulator_does_it() -> None:
