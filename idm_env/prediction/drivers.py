@@ -1,9 +1,9 @@
 """Who drives on a route: hypotheses of what a driver is up to, each fitted to the last second by the project's ``fit``.
 
-One second barely identifies five parameters. So each hypothesis (goes for the limit, keeps the speed, stops somewhere)
-brings a log-normal prior of urban driving; ``fit`` behind the real leader finds the posterior's mode and covariance,
-from which drivers are drawn, and the evidence of the second tells how likely the hypothesis is. What the second does
-not tell stays as spread in the futures.
+One second barely identifies five parameters. So each hypothesis (goes for the limit, keeps the speed, stops somewhere,
+stays) brings a log-normal prior of urban driving; ``fit`` behind the real leader finds the posterior's mode and
+covariance, from which drivers are drawn, and the evidence of the second tells how likely the hypothesis is. What the
+second does not tell stays as spread in the futures.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ SURPRISE = 0.25
 """Share of drivers who are about to stop for something that is not on the map (a crossing, a turn, a parking space)."""
 CRUISING = 0.25
 """Share of drivers who already go at the speed that they want."""
+STAYING, STANDING_MPS = 0.4, 0.5
+"""Share of standing vehicles (slower than this, m/s) that stay for the time being: parked, loading, waiting."""
 OBEYING = {"sign": 0.8, "red": 0.9}
 """Share of drivers who stop at a stop line that the map or a signal tells."""
 WAIT_S, WAIT_DEVIATION = 1.0, 0.8
@@ -47,7 +49,7 @@ SPEED_SIGMA = 0.4
 INDEPENDENT = 3.0
 """One second of correlated residuals is worth this many independent ones."""
 SURPRISES = 8
-DRAWS = {"limit": 48, "cruise": 24, "surprise": 4, "line": 32}
+DRAWS = {"limit": 48, "cruise": 24, "surprise": 4, "line": 32, "stays": 8}
 """Drivers drawn of each hypothesis."""
 NAMES = (*CENTRE, "desired_speed")
 
@@ -103,7 +105,8 @@ def hypotheses(second: Second) -> list[Hypothesis]:
     bends = bend_speed(route, np.array([LATERAL_MPS2]), np.array([CENTRE["comfort_decel"]]))[0]
     bend = float(np.interp(route.begin, route.length, bends))
     obeying = OBEYING[second.stop.kind] if second.stop is not None else 0.0
-    rest = 1.0 - obeying
+    staying = STAYING * (1.0 - obeying) if speed < STANDING_MPS else 0.0
+    rest = 1.0 - obeying - staying
     here = (bend, 0.25, True) if bend < limit else (limit, 0.2, False)
     found = [
         Hypothesis("limit", rest * (1.0 - CRUISING - SURPRISE), *here),
@@ -114,6 +117,8 @@ def hypotheses(second: Second) -> list[Hypothesis]:
     for k in range(SURPRISES):
         stop = nearest + (k + 0.5) / SURPRISES * reach
         found.append(Hypothesis("surprise", rest * SURPRISE / SURPRISES, *here, stop=stop))
+    if staying:
+        found.append(Hypothesis("stays", staying, *here, stop=CENTRE["min_gap"]))
     if second.stop is not None:
         # who halts at a line has its front there, so that the leader stands the smallest gap beyond it
         found.append(Hypothesis("line", obeying, *here, stop=second.stop.distance + CENTRE["min_gap"]))

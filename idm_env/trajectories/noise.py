@@ -64,9 +64,9 @@ def fit_noise(
 ) -> Noise:
     """Return the noise model under which the tracks (times, positions) are most likely.
 
-    Four numbers for dense data (white, correlated, its time, jerk), three for sparse (white, jerk, and the time in which
-    an acceleration fades), by simplex searches over their logarithms; above ``TELLING_S`` white noise is taken as
-    small. ValueError if no track has three samples.
+    Four numbers for dense data (white, correlated, its time, jerk), three for sparse (white, jerk, and the time in
+    which an acceleration fades), by simplex searches over their logarithms; above ``TELLING_S`` white noise is taken
+    as small. ValueError if no track has three samples.
     """
     parts = [part for part in sample(tracks) if len(part[0]) >= 3]
     if not parts:

@@ -174,6 +174,18 @@ def test_one_second_of_braking_shifts_the_weight_to_those_who_stop(fork: Scenari
     assert shares[1] > shares[0] + 0.2
 
 
+def test_who_stands_may_stay(fork: Scenario) -> None:
+    agent = fork.agents[0]
+    still = np.zeros_like(agent.velocity)
+    parked = agent.__class__(
+        agent.id, agent.kind, agent.length, agent.width, np.broadcast_to(agent.position[0], agent.position.shape),
+        agent.heading, still, agent.valid,
+    )  # fmt: skip
+    found = predict(Scene(Scenario("s", (parked,), fork.lanes, (0,))), 0)
+    moved = np.hypot(*(found.futures[:, -1] - agent.position[0]).T)
+    assert found.confidence[moved < 2.0].sum() > 0.3 and (moved > 20.0).any()
+
+
 def test_each_kind_gets_its_method_and_six_futures(fork: Scenario) -> None:
     scene = Scene(fork)
     found = [predict(scene, index) for index in range(4)]
