@@ -31,7 +31,8 @@ def scene_picture(scenario: Scenario, prediction: Prediction) -> tuple[Figure, s
     later = present + np.flatnonzero(agent.valid[present:])
     here = agent.position[present]
     shown = np.concatenate([prediction.futures.reshape(-1, 2), agent.position[later], here[None]])
-    reach = max(25.0, float(np.abs(shown - here).max()) + 8.0)
+    middle = 0.5 * (shown.min(0) + shown.max(0))
+    reach = max(25.0, 0.5 * float(np.ptp(shown, axis=0).max()) + 8.0)
     figure = Figure(figsize=(6.5, 6.5), layout="constrained")
     axis = figure.subplots()
     for lane in scenario.lanes:
@@ -59,7 +60,7 @@ def scene_picture(scenario: Scenario, prediction: Prediction) -> tuple[Figure, s
     if len(later) > 1:
         axis.plot(*agent.position[later].T, "--", color=TRUTH, lw=1.8, zorder=5, label="what it did")
         axis.plot(*agent.position[later[-1]], "x", color=TRUTH, ms=7, mew=2, zorder=5)
-    axis.set(xlim=(here[0] - reach, here[0] + reach), ylim=(here[1] - reach, here[1] + reach), aspect="equal")
+    axis.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach), aspect="equal")
     axis.set(xlabel="x (m)", ylabel="y (m)")
     axis.ticklabel_format(useOffset=False)
     axis.legend(loc="upper right", fontsize=8, framealpha=0.9)

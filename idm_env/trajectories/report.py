@@ -99,7 +99,10 @@ def before_and_after(track: Track, motion: Motion) -> Figure:
     middle = track.time_s[:-1] + step / 2 - begin
     speed = np.diff(track.position_m) / step
     clock = motion.time_s - begin
-    axes[0].plot(track.time_s - begin, track.position_m - motion.at(track.time_s), ".", color=BEFORE, ms=3)
+    apart = track.position_m - motion.at(track.time_s)
+    axes[0].plot(track.time_s - begin, apart, ".", color=BEFORE, ms=3)
+    reach = max(0.05, 1.1 * float(np.abs(apart).max()))
+    axes[0].set_ylim(-reach, reach)
     axes[0].axhline(0, color=AFTER, lw=1.2)
     axes[0].set_ylabel("data − ours (m)")
     axes[1].plot(middle, speed, color=BEFORE, lw=0.8, label="differences of the data")
@@ -107,8 +110,12 @@ def before_and_after(track: Track, motion: Motion) -> Figure:
     axes[1].set_ylabel("speed (m/s)")
     axes[1].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, ncols=2, borderaxespad=0.1)
     if len(speed) > 1:
+        change = np.diff(speed) / step[1:]
         # differences of noisy data go far beyond the picture: thin, so that they stay behind
-        axes[2].plot(middle[:-1] + step[1:] / 2, np.diff(speed) / step[1:], color=BEFORE, lw=0.4, alpha=0.5)
+        thin = float(np.median(np.abs(change))) > 4.0
+        axes[2].plot(
+            middle[:-1] + step[1:] / 2, change, color=BEFORE, lw=0.4 if thin else 1.0, alpha=0.5 if thin else 1.0
+        )  # fmt: skip
     axes[2].plot(clock, motion.accel_mps2, color=AFTER, lw=1.5)
     low, high = min(-4.0, motion.accel_mps2.min() - 1), max(4.0, motion.accel_mps2.max() + 1)
     axes[2].set(ylabel="acceleration (m/s²)", xlabel="time (s)", ylim=(low, high))
