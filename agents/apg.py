@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from agents import common
+from agents import common, environments
 from agents.monitor import Monitor
 
 
@@ -41,15 +41,15 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
     began = time.process_time()
     torch.manual_seed(arguments.seed)
-    env = common.make_env(arguments.environment, arguments.count, output="torch")
-    env.reset(seed=common.first_seed(arguments.seed, arguments.count))
+    env = environments.make_env(arguments.environment, arguments.count, output="torch")
+    env.reset(seed=environments.first_seed(arguments.seed, arguments.count))
     policy, saved = common.begin(arguments, "apg")
     optimiser = torch.optim.Adam(policy.parameters(), lr=arguments.learning_rate)
     if saved:
         optimiser.load_state_dict(saved["optimiser"])
-        observation = common.restore(env, saved["episodes"])
+        observation = environments.restore(env, saved["episodes"])
     else:
-        observation = common.desynchronise(env)
+        observation = environments.desynchronise(env)
     monitor = Monitor("apg", arguments, began, saved)
     for update in range(saved.get("update", -1) + 1, arguments.updates):
         rate = common.fall(arguments.learning_rate, update, arguments.updates)
@@ -61,7 +61,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             total = total + reward.mean()
         loss = -total / arguments.window
         norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)
-        training = {"optimiser": optimiser.state_dict(), "episodes": common.snapshot(env)}
+        training = {"optimiser": optimiser.state_dict(), "episodes": environments.snapshot(env)}
         steps = arguments.window * arguments.count
         figures = {"reward": -loss.item(), "norm": norm, "learning_rate": rate}
         if not monitor.after(update, steps, policy, training, figures):

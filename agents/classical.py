@@ -20,8 +20,10 @@ import tyro
 from torch import Tensor
 
 from agents import apg
-from agents.common import load_agent, task_of
-from agents.evaluate import LENGTHS, Act, evaluate_ring, ring_start, uniform_speed
+from agents.common import load_agent
+from agents.environments import task_of
+from agents.evaluate import evaluate_ring
+from agents.rollout import LENGTHS, Act, ring_start, uniform_speed
 
 
 class Seen(NamedTuple):

@@ -19,12 +19,9 @@ import yaml
 from torch import Tensor, nn
 
 import idm_env
+from agents.environments import first_seed, human_driving, task_of
 from idm_env.config import load_environment, number
-from idm_env.envs.settings import KEYWORDS
-from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.parameters import nearest
-from idm_env.tasks import Task, make_task
-from idm_env.types import State
 
 SCHEMA = 1
 """Version of the layout of checkpoints."""
@@ -127,89 +124,6 @@ def _as(name: str, value: Any, like: Any) -> Any:
     if isinstance(like, dict) and not isinstance(value, dict):
         raise ValueError(f"{name} = {value!r} must be a mapping, such as {{task: ring}}.")
     return value if isinstance(like, dict) else type(like)(value)
-
-
-# -- environments ----------------------------------------------------------------------------------------------------
-
-
-def task_of(environment: Mapping[str, Any]) -> Task:
-    """Return the task of an environment's keywords."""
-    return make_task(**{k: v for k, v in environment.items() if k == "task" or k not in KEYWORDS})
-
-
-def make_env(environment: Mapping[str, Any], count: int, **keywords: Any) -> DiffIDMVectorEnv:
-    """Return a vector of environments that reset within the step (final observations are in the info)."""
-    chosen: dict[str, Any] = {"autoreset_mode": "SameStep", **environment, **keywords}
-    return DiffIDMVectorEnv(count, **chosen)
-
-
-def first_seed(seed: int, count: int) -> int:
-    """Return the seed of the first of ``count`` environments; different seeds of a training share none."""
-    return 10_000 * (seed + 1) + count
-
-
-def desynchronise(env: DiffIDMVectorEnv) -> Tensor:
-    """Set the clocks of the first episodes apart, so that not all end at once; return the observations.
-
-    Environment i of n starts at step ``i · limit / n``; traffic and records are as they were at step 0.
-    """
-    batch, state = env.batch, env.state
-    step = (torch.arange(env.num_envs) * (batch.limit or 0)) // env.num_envs
-    batch.episodes -= 1
-    observation: Tensor = env.reset(options={"state": state._replace(step=state.step + step)})[0]
-    assert batch.world is not None
-    episode = dict(batch.world.episode)
-    if "start" in episode:
-        episode["start"] = episode["start"] - step
-        batch.world = batch.world._replace(episode=episode)
-    return observation
-
-
-def snapshot(env: DiffIDMVectorEnv) -> dict[str, Any]:
-    """Return everything that ``restore`` needs to continue the episodes of a vector exactly."""
-    batch, world = env.batch, env.batch.world
-    assert world is not None
-    state = {k: v for k, v in world.state._asdict().items() if k != "memory"}
-    return {
-        "state": state,
-        "memory": dict(world.state.memory),
-        "episode": dict(world.episode),
-        "seeds": batch.seeds.tolist(),
-        "numbers": batch.episodes.tolist(),
-    }
-
-
-def restore(env: DiffIDMVectorEnv, saved: Mapping[str, Any]) -> Tensor:
-    """Continue the episodes of a snapshot; return the observations."""
-    batch = env.batch
-    env.reset(seed=list(saved["seeds"]))
-    batch.episodes[:] = np.asarray(saved["numbers"]) - 1
-    state = State(**saved["state"], memory=saved["memory"])
-    env.reset(options={"state": state})
-    assert batch.world is not None
-    batch.world = batch.world._replace(episode=saved["episode"])
-    return env.task.observe(batch.world).flatten(1)
-
-
-def human_driving(
-    environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 1500
-) -> tuple[Tensor, Tensor]:
-    """Return what agents observe while human drivers keep the wheel, and the actions that would do what they do.
-
-    Shapes ``(samples, features)`` and ``(samples,)``; actions are accelerations over ``max_command``, clipped.
-    """
-    env = make_env(environment, count, output="numpy")
-    seen, done = [env.reset(seed=seed)[0]], []
-    for _ in range(steps):
-        observation, _, terminated, truncated, _ = env.step(None)
-        seen.append(observation)
-        # The first step of a new episode has no acceleration yet.
-        over = torch.as_tensor(terminated | truncated).unsqueeze(-1)
-        done.append(torch.where(over, torch.nan, env.task.pick(env.state.accel)))
-    observations = torch.as_tensor(np.stack(seen[:-1])).float().reshape(-1, len(env.task.bounds.names))
-    actions = (torch.stack(done).float() / env.task.max_command).clamp(-1.0, 1.0).flatten()
-    known = actions.isfinite()
-    return observations[known], actions[known]
 
 
 # -- policy ----------------------------------------------------------------------------------------------------------

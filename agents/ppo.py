@@ -25,7 +25,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
 
-from agents import common
+from agents import common, environments
 from agents.common import ACTIVATIONS, DivergedError, Policy
 from agents.monitor import Monitor
 from idm_env.envs.sb3 import SB3VecEnv
@@ -97,7 +97,7 @@ def make_model(arguments: Arguments, env: VecEnv, policy: Policy) -> BaseAlgorit
     }
     same: dict[str, Any] = {
         "learning_rate": arguments.learning_rate, "gamma": arguments.gamma, "batch_size": arguments.batch_size,
-        "use_sde": arguments.use_sde, "seed": common.first_seed(arguments.seed, 0), "device": "cpu",
+        "use_sde": arguments.use_sde, "seed": environments.first_seed(arguments.seed, 0), "device": "cpu",
     }  # fmt: skip
     entropy: Any = arguments.ent_coef if arguments.ent_coef.startswith("auto") else float(arguments.ent_coef)
     if arguments.algorithm == "sac":
@@ -139,8 +139,8 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     name = arguments.algorithm
     squash = "tanh" if name == "sac" else "clip"
     policy, saved = common.begin(arguments, name, activation=arguments.activation, squash=squash)
-    vector = SB3VecEnv(common.make_env(arguments.environment, arguments.count, output="numpy"))
-    vector.seed(common.first_seed(arguments.seed, arguments.count))
+    vector = SB3VecEnv(environments.make_env(arguments.environment, arguments.count, output="numpy"))
+    vector.seed(environments.first_seed(arguments.seed, arguments.count))
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
     file, moments = arguments.out / "model.zip", arguments.out / "returns.pkl"

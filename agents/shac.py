@@ -26,7 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from agents import common
+from agents import common, environments
 from agents.monitor import Monitor
 from idm_env.envs.vector import DiffIDMVectorEnv
 
@@ -98,7 +98,7 @@ class Critic(nn.Module):
 
 def human_scenes(environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 1500) -> Tensor:
     """Return what the critic sees, every tenth step, while human drivers keep the wheel."""
-    env = common.make_env(environment, count, output="numpy")
+    env = environments.make_env(environment, count, output="numpy")
     seen = [scene(env, torch.as_tensor(env.reset(seed=seed)[0]))]
     for step in range(steps):
         observation = env.step(None)[0]
@@ -175,11 +175,11 @@ def train(a: Arguments) -> list[dict[str, Any]]:
     """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
     began = time.process_time()
     torch.manual_seed(a.seed)
-    env = common.make_env(a.environment, a.count, output="torch", autoreset_mode="Disabled")
-    env.reset(seed=common.first_seed(a.seed, a.count))
+    env = environments.make_env(a.environment, a.count, output="torch", autoreset_mode="Disabled")
+    env.reset(seed=environments.first_seed(a.seed, a.count))
     policy, saved = common.begin(a, "shac")
-    observation = common.restore(env, saved["episodes"]) if saved else common.desynchronise(env)
-    critic = Critic(human_scenes(a.environment, common.first_seed(a.seed, 0)), a.critic_hidden)
+    observation = environments.restore(env, saved["episodes"]) if saved else environments.desynchronise(env)
+    critic = Critic(human_scenes(a.environment, environments.first_seed(a.seed, 0)), a.critic_hidden)
     target = deepcopy(critic)
     target.requires_grad_(False)
     actor_steps = torch.optim.Adam(policy.parameters(), lr=a.learning_rate)
@@ -208,7 +208,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
         with torch.no_grad():
             for mine, theirs in zip(target.parameters(), critic.parameters(), strict=True):
                 mine.lerp_(theirs, 1.0 - a.follow)
-        training = {name: part.state_dict() for name, part in parts.items()} | {"episodes": common.snapshot(env)}
+        training = {name: part.state_dict() for name, part in parts.items()} | {"episodes": environments.snapshot(env)}
         figures = {"reward": float(window.rewards.mean()), "value_error": error, "norm": norm, "learning_rate": rate}
         if not monitor.after(update, a.window * a.count, policy, training, figures):
             break

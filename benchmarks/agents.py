@@ -183,7 +183,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train no more seeds than that")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
     options = parser.parse_args()
-    if options.what == "run":
+    if options.what == "table":
+        from agents.imitation import default_data
+        from benchmarks.agents_tables import show
+
+        show(options.out, SEARCH, SEARCH_SEEDS, SEEDS, default_data())
+    else:
         run(options.only, options.out.resolve(), options.seeds)
 
 

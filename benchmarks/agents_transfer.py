@@ -3,9 +3,9 @@
     python benchmarks/agents_transfer.py [--out runs/transfer] [--seeds 3]
 
 Platoons are generated whose drivers react with a hidden delay. From the same data come plain IDM, calibrated, and the
-model of ``discover``, which has the effect that it found; both are saved as ``model.yaml``. One APG policy per model and
-seed is trained on a ring of that model, and a third kind on the truth itself. All are judged on rings of the generated
-drivers, whose parameters and delay are known. What is done is kept and skipped.
+model of ``discover``, which has the effect that it found; both are saved as ``model.yaml``. One APG policy per model
+and seed is trained on a ring of that model, and a third kind on the truth itself. All are judged on rings of the
+generated drivers, whose parameters and delay are known. What is done is kept and skipped.
 """
 
 from __future__ import annotations
@@ -96,10 +96,8 @@ def main() -> None:
 def show(name: str, seed: str, r: dict[str, Any], own: dict[str, Any]) -> None:
     """Print one row."""
     there = f"{own['speed_ratio']:.3f}, {own['speed_std']:.2f}" if own else "–"
-    print(
-        f"{name} | {seed} | {r['speed_ratio']:.3f} | {r['speed_std']:.2f} | {r['time_gap']:.2f} | {r['collisions']} | {there}",
-        flush=True,
-    )
+    figures = f"{r['speed_ratio']:.3f} | {r['speed_std']:.2f} | {r['time_gap']:.2f} | {r['collisions']}"
+    print(f"| {name} | {seed} | {figures} | {there} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents import apg, common, imitation, ppo, shac
+from agents import apg, common, environments, imitation, ppo, shac
 from agents.common import DivergedError, Policy
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -24,7 +24,7 @@ def kind_of(path: Path) -> str:
 def test_every_configuration_is_read_and_makes_its_task(path):
     agent = kind_of(path)
     found = common.load_agent(path, KINDS[agent], agent)
-    task = common.task_of(found.environment)
+    task = environments.task_of(found.environment)
     assert task.name == path.stem.split("-")[0].replace("i80", "follow")
     assert isinstance(found.learning_rate, float)  # YAML reads 1e-3 as text
 
@@ -152,16 +152,16 @@ def driven(env, steps):
     return torch.stack(seen)
 
 
-def environments(ring):
+def both(ring):
     return [ring, {"task": "follow", "vehicles": 4, "max_episode_steps": 60}]
 
 
 def test_episodes_end_one_after_the_other(ring):
-    for keywords in environments(ring):
-        env = common.make_env(keywords, 6, output="torch")
+    for keywords in both(ring):
+        env = environments.make_env(keywords, 6, output="torch")
         env.reset(seed=0)
         plain = env.state
-        common.desynchronise(env)
+        environments.desynchronise(env)
         assert torch.equal(env.state.position, plain.position)
         ends = []
         for t in range(60):
@@ -172,9 +172,9 @@ def test_episodes_end_one_after_the_other(ring):
 
 
 def test_the_record_does_not_jump_when_clocks_are_set_apart():
-    env = common.make_env({"task": "follow", "vehicles": 4, "max_episode_steps": 60}, 6, output="torch")
+    env = environments.make_env({"task": "follow", "vehicles": 4, "max_episode_steps": 60}, 6, output="torch")
     env.reset(seed=0)
-    common.desynchronise(env)
+    environments.desynchronise(env)
     before = env.state
     env.step(torch.zeros(6, 1))
     moved = (env.state.position - before.position)[:, 0]
@@ -182,21 +182,21 @@ def test_the_record_does_not_jump_when_clocks_are_set_apart():
 
 
 def test_restored_episodes_go_on_exactly(ring):
-    for keywords in environments({**ring, "effects": ["delay"]}):
-        env = common.make_env(keywords, 5, output="torch")
+    for keywords in both({**ring, "effects": ["delay"]}):
+        env = environments.make_env(keywords, 5, output="torch")
         env.reset(seed=3)
-        common.desynchronise(env)
+        environments.desynchronise(env)
         driven(env, 25)
-        saved, wanted = common.snapshot(env), driven(env, 70)
-        other = common.make_env(keywords, 5, output="torch")
-        observation = common.restore(other, saved)
-        assert torch.equal(observation, common.restore(env, saved))
+        saved, wanted = environments.snapshot(env), driven(env, 70)
+        other = environments.make_env(keywords, 5, output="torch")
+        observation = environments.restore(other, saved)
+        assert torch.equal(observation, environments.restore(env, saved))
         assert torch.equal(driven(other, 70), wanted)
 
 
 def test_cloning_learns_what_humans_do(ring):
     torch.manual_seed(0)
-    seen, actions = common.human_driving({**ring, "noise": 0.0}, 5, count=8, steps=200)
+    seen, actions = environments.human_driving({**ring, "noise": 0.0}, 5, count=8, steps=200)
     assert len(seen) == len(actions) <= 8 * 200 and float(actions.std()) > 0.0
     policy = Policy(3, (16, 16))
     policy.mean.copy_(seen.mean(0))

@@ -8,7 +8,8 @@ import torch
 from agents import common, evaluate
 from agents.classical import FollowerStopper, PISaturation, Seen, controllers, seen
 from agents.common import Policy
-from agents.evaluate import Driven, solved_at
+from agents.evaluate import solved_at
+from agents.rollout import Driven, ring_start, uniform_speed
 from idm_env import metrics
 
 RING = {"task": "ring"}
@@ -16,16 +17,16 @@ VEHICLE: dict[str, float] = {"dt": 0.1, "max_command": 1.0, "vehicle_length": 5.
 
 
 def test_uniform_speed_is_the_equilibrium_of_equal_drivers():
-    start = evaluate.ring_start(RING, (220.0, 260.0))
+    start = ring_start(RING, (220.0, 260.0))
     p = start.params["idm"]
     gap = start.world.state.gap.mean(-1)
-    assert torch.allclose(evaluate.uniform_speed(start), metrics.equilibrium_speed(gap, dict(p)), atol=1e-4)
+    assert torch.allclose(uniform_speed(start), metrics.equilibrium_speed(gap, dict(p)), atol=1e-4)
 
 
 def test_uniform_speed_of_unequal_drivers_fills_the_ring():
     time_gap = [1.0 + 0.02 * i for i in range(22)]
-    start = evaluate.ring_start({**RING, "parameters": {"idm": {"time_gap": time_gap}}}, (250.0,))
-    v = float(evaluate.uniform_speed(start))
+    start = ring_start({**RING, "parameters": {"idm": {"time_gap": time_gap}}}, (250.0,))
+    v = float(uniform_speed(start))
     gaps = [(2.0 + v * t) / (1.0 - (v / 30.0) ** 4) ** 0.5 for t in time_gap]
     assert sum(gaps) == pytest.approx(250.0 - 22 * 5.0, rel=1e-4)
 
@@ -39,8 +40,8 @@ def drives(start, speed, gap):
 
 
 def test_the_figures_of_the_ring_are_the_worst_of_all_lengths():
-    start = evaluate.ring_start(RING, (220.0, 260.0))
-    uniform = evaluate.uniform_speed(start)
+    start = ring_start(RING, (220.0, 260.0))
+    uniform = uniform_speed(start)
     calm = drives(start, uniform[None, :, None], 4.0)
     found = evaluate.judge_ring(start, calm)
     assert found["passed"] and found["speed_ratio"] == pytest.approx(1.0, rel=1e-4) and found["speed_std"] < 1e-5
@@ -83,7 +84,7 @@ def test_humans_make_waves_and_pi_with_saturation_dissolves_them():
 
 
 def test_observations_of_the_ring_are_unpacked():
-    start = evaluate.ring_start(RING, (240.0,))
+    start = ring_start(RING, (240.0,))
     view, state = seen(start.task.observe(start.world).flatten(1), 5.0), start.world.state
     assert torch.allclose(view.speed, state.speed[:, :1], atol=1e-4)
     assert torch.allclose(view.lead_speed, state.speed[:, -1:], atol=1e-4)
@@ -121,7 +122,7 @@ def test_pi_follows_the_mean_of_its_own_speed():
 
 
 def test_every_controller_is_made_and_commands_within_bounds():
-    start = evaluate.ring_start(RING, (220.0, 270.0))
+    start = ring_start(RING, (220.0, 270.0))
     observation = start.task.observe(start.world).flatten(1)
     made = controllers(RING, (220.0, 270.0))
     assert next(iter(made)) == "IDM for all" and made["IDM for all"]() is None

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from agents import common, imitation
+from agents import common, environments, imitation
 from idm_env.data import episodes, synthetic
 from idm_env.fitting.batch import Batch, windows
 
@@ -29,8 +29,8 @@ def arguments(data, tmp_path, **changes):
 
 
 def test_observations_are_those_of_task_follow():
-    task = common.task_of({"task": "follow", "max_command": 4.0})
-    env = common.make_env({"task": "follow"}, 3, output="torch")
+    task = environments.task_of({"task": "follow", "max_command": 4.0})
+    env = environments.make_env({"task": "follow"}, 3, output="torch")
     observation = env.reset(seed=0)[0]
     state = env.state
     ours = imitation.observe(state.speed[:, 1], state.speed[:, 0], state.gap[:, 1])
@@ -81,7 +81,7 @@ def test_the_table_and_resuming(data, tmp_path):
     policy, content = common.load(a.out / "last.pt", "follow", "imitation")
     assert content["training"]["update"] == 3
     # The saved policy drives in task follow.
-    env = common.make_env(content["environment"], 2, output="torch")
+    env = environments.make_env(content["environment"], 2, output="torch")
     assert env.action_space.contains(policy.predict(env.reset(seed=0)[0])[0])
     part = dataclasses.replace(a, out=tmp_path / "part")
     imitation.train(dataclasses.replace(part, cpu_seconds=1e-9))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents import apg, common, ppo, shac
+from agents import apg, common, environments, ppo, shac
 from agents.common import DivergedError, Policy
 from idm_env.tasks.ring import RingTask
 
@@ -103,7 +103,7 @@ def test_nan_stops_with_update_norm_and_the_last_good_checkpoint(name, quick, mo
 
 def test_nan_in_the_weights_of_a_baseline_stops_it(quick):
     arguments = ppo.Arguments(**quick, **AGENTS["ppo"][2])
-    env = common.make_env(arguments.environment, 4, output="numpy")
+    env = environments.make_env(arguments.environment, 4, output="numpy")
     policy = Policy(3, arguments.hidden)
     model = ppo.make_model(arguments, ppo.SB3VecEnv(env), policy)
     with torch.no_grad():
@@ -116,7 +116,9 @@ def test_nan_in_the_weights_of_a_baseline_stops_it(quick):
 def test_the_copied_actor_is_the_baselines(name, quick):
     arguments = ppo.Arguments(**quick, **AGENTS[name][2])
     policy, _ = common.begin(arguments, name, activation="tanh", squash="tanh" if name == "sac" else "clip")
-    model = ppo.make_model(arguments, ppo.SB3VecEnv(common.make_env(arguments.environment, 4, output="numpy")), policy)
+    model = ppo.make_model(
+        arguments, ppo.SB3VecEnv(environments.make_env(arguments.environment, 4, output="numpy")), policy
+    )
     model.learn(64)
     ppo.copy_actor(model, policy, 0, Path("kept"))
     seen = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32) * 0.1
@@ -155,7 +157,7 @@ def test_apg_follows_the_gradient_of_the_return(ring):
 
     def mean_reward(shift: torch.Tensor) -> torch.Tensor:
         shifted = {k: v + shift * along[k] for k, v in weights.items()}
-        env = common.make_env(ring, 3, output="torch")
+        env = environments.make_env(ring, 3, output="torch")
         observation, total = env.reset(seed=0)[0], torch.zeros((), dtype=torch.float64)
         for _ in range(25):
             observation, reward, *_ = env.step(torch.func.functional_call(policy, shifted, (observation,)))
@@ -204,7 +206,7 @@ class Ends(torch.nn.Module):
 def test_the_gain_values_last_scenes_and_cuts_gradients_at_resets(ring):
     """With zero rewards the gain is γ^k V'(last scene) of every episode in the window, truncated ones included."""
     ring |= {"max_episode_steps": 6, "warmup_pool": 0}
-    env = common.make_env(ring, 2, output="torch", autoreset_mode="Disabled")
+    env = environments.make_env(ring, 2, output="torch", autoreset_mode="Disabled")
     env.reset(seed=0)
     a = shac.Arguments(window=8, gamma=0.9, explore=0.0)
     pushes = []
@@ -228,7 +230,7 @@ def test_the_gain_values_last_scenes_and_cuts_gradients_at_resets(ring):
 
 
 def test_a_collision_is_worth_nothing(ring):
-    env = common.make_env(ring, 2, output="torch", autoreset_mode="Disabled")
+    env = environments.make_env(ring, 2, output="torch", autoreset_mode="Disabled")
     env.reset(seed=0)
     world = env.batch.world
     gap = world.state.gap.clone()

@@ -1,0 +1,177 @@
+"""The tables of ``benchmarks/agents.py``, from its files of results; Markdown on the standard output."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+Row = dict[str, Any]
+
+
+def results(out: Path, config: str) -> list[Row]:
+    """Return every result of a configuration, by trial and seed."""
+    found = [json.loads(path.read_text()) for path in (out / config).glob("trial*/seed*/result.json")]
+    return sorted(found, key=lambda r: (r["trial"], r["seed"]))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a Markdown table."""
+    print("\n| " + " | ".join(head) + " |\n|" + " --- |" * len(head))
+    for row in rows:
+        print("| " + " | ".join(row) + " |")
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Return median and range."""
+    if not values:
+        return "–"
+    middle, low, high = (format(x, form) for x in (statistics.median(values), min(values), max(values)))
+    return f"{middle} ({low}–{high})"
+
+
+def ring(r: Row) -> list[str]:
+    """Return speed ratio, deviation, time gap and collisions of one evaluation."""
+    return [f"{r['speed_ratio']:.3f}", f"{r['speed_std']:.2f}", f"{r['time_gap']:.2f}", str(r["collisions"])]
+
+
+def search_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print what the trials of each search came to."""
+    rows = []
+    for config in configs:
+        found = [r for r in results(out, config) if r["seed"] in seeds]
+        for trial in sorted({r["trial"] for r in found}):
+            part = [r for r in found if r["trial"] == trial]
+            ends = ["/".join(ring(r["last"])[:2]) for r in part if r["history"]]
+            options = ", ".join(f"{k} {v}" for k, v in part[0]["options"].items())
+            rows.append([config, str(trial), options, f"{solved(part)} of {len(part)}", ", ".join(ends)])
+    table(("agent", "trial", "what it changes", "solved", "last ratio/std of each seed"), rows)
+
+
+def solved(rows: Sequence[Row]) -> int:
+    """Return how many are solved."""
+    return sum(r["summary"]["solved"] for r in rows)
+
+
+def summary_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print one row per agent: how many seeds, how soon, how well at the end and on held-out traffic."""
+    rows = []
+    for config in configs:
+        part = [r for r in results(out, config) if r["seed"] in seeds]
+        if not part:
+            continue
+        done = [r["summary"] for r in part if r["summary"]["solved"]]
+        ended = [r for r in part if r["history"]]
+        rows.append([
+            config, str(part[0]["trial"]), f"{len(done)} of {len(part)}", str(sum(r["summary"]["ever"] for r in ended)),
+            spread([d["cpu_seconds"] for d in done], ".1f"), spread([d["steps"] / 1000 for d in done], ".0f"),
+            f"{min(r['last']['speed_ratio'] for r in ended):.3f}", f"{max(r['last']['speed_std'] for r in ended):.2f}",
+            f"{min(r['last']['time_gap'] for r in ended):.2f}", str(sum(r["last"]["collisions"] for r in ended)),
+        ])  # fmt: skip
+    table(
+        ("agent", "trial", "solved", "ever passed", "CPU s to solved", "1000 steps to solved", "worst last ratio",
+         "worst last std (m/s)", "smallest time gap (s)", "collisions"), rows,
+    )  # fmt: skip
+
+
+def ratio_line(out: Path, ours: str, theirs: str, seeds: Sequence[int]) -> None:
+    """Print how much more another agent needs, where both have solved seeds: medians, and the range over all pairs."""
+    one, other = ([r["summary"] for r in results(out, c) if r["seed"] in seeds] for c in (ours, theirs))
+    for key, name in (("cpu_seconds", "CPU seconds"), ("steps", "environment steps")):
+        a, b = ([s[key] for s in part if s["solved"]] for part in (one, other))
+        if a and b:
+            middle = statistics.median(b) / statistics.median(a)
+            print(f"\n{theirs} / {ours}, {name} to solved: {middle:.1f} ({min(b) / max(a):.1f}–{max(b) / min(a):.1f})")
+        else:
+            print(
+                f"\n{theirs} / {ours}, {name} to solved: no ratio, {len(b)} of {len(other)} and {len(a)} of {len(one)}"
+            )
+
+
+def seed_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print every seed: last and best checkpoint, and the last one on held-out lengths and drivers."""
+    rows = []
+    for config in configs:
+        for r in results(out, config):
+            if r["seed"] not in seeds or not r["history"]:
+                continue
+            s, unseen = r["summary"], r["held_out"]
+            when = [f"{s['cpu_seconds']:.1f}", f"{s['steps'] // 1000}"] if s["solved"] else ["–", "–"]
+            kinds = ("lengths", "drivers", "mixed")
+            far = [
+                "/".join(ring(unseen[k])[:2]) + (f" {unseen[k]['collisions']} coll." if unseen[k]["collisions"] else "")
+                for k in kinds
+            ]
+            rows.append([config, str(r["seed"]), *when, "/".join(ring(r["last"])), "/".join(ring(r["best"])), *far])
+    figures = "ratio/std/time gap/collisions"
+    table(
+        ("agent", "seed", "CPU s", "1000 steps", f"last: {figures}", f"best: {figures}", "lengths 200–300 m",
+         "drivers ±20 %, worst", "drivers mixed"), rows,
+    )  # fmt: skip
+
+
+def follow_table(out: Path, configs: Sequence[str], leader: Path | None) -> None:
+    """Print fuel and energy behind the made-up leader and, where there are, measured ones."""
+    from agents import apg
+    from agents.common import load, load_agent
+    from agents.evaluate import evaluate_follow
+
+    root = Path(__file__).resolve().parents[1]
+    plain = load_agent(root / "configs" / "follow-apg.yaml", apg.Arguments, "apg").environment
+    roads: dict[str, Row] = {"made-up": plain}
+    if leader is not None and leader.exists():
+        roads["I-80"] = {**plain, "leader": str(leader)}
+    rows = []
+    for name, environment in roads.items():
+        human = evaluate_follow(None, environment)
+        rows.append(
+            [name, "the leader itself", "", "", f"{human['leader_litres']:.2f}", "", f"{human['leader_energy']:.3f}"]
+        )
+        rows.append([name, "IDM", "", *follow(human)])
+        for config in configs:
+            for path in sorted((out / config).glob("trial*/seed*/training/last.pt")):
+                seed = path.parents[1].name.removeprefix("seed")
+                rows.append([name, config, seed, *follow(evaluate_follow(load(path)[0], environment))])
+    table(
+        ("leader", "vehicle", "seed", "reward per step", "L/100 km", "L/100 km with those behind", "energy (J/kg/m)",
+         "smallest time gap (s)", "collisions"), [r + [""] * (9 - len(r)) for r in rows],
+    )  # fmt: skip
+
+
+def follow(r: Row) -> list[str]:
+    """Return the figures of one policy in task follow."""
+    return [
+        f"{r['reward']:.3f}", f"{r['litres']:.2f}", f"{r['litres_behind']:.2f}", f"{r['energy']:.3f}",
+        f"{r['time_gap']:.2f}", str(r["collisions"]),
+    ]  # fmt: skip
+
+
+def classical_table() -> None:
+    """Print the classical controllers on the test and on unseen lengths."""
+    from agents import apg
+    from agents.classical import rows
+    from agents.common import load_agent
+
+    root = Path(__file__).resolve().parents[1]
+    environment = load_agent(root / "configs" / "ring-apg.yaml", apg.Arguments, "apg").environment
+    table(
+        ("controller", "test: ratio/std/time gap/collisions", "lengths 200–300 m"),
+        [[name, "/".join(ring(r["test"])), "/".join(ring(r["lengths"]))] for name, r in rows(environment).items()],
+    )
+
+
+def show(
+    out: Path, search: dict[str, list[Row]], search_seeds: Sequence[int], seeds: Sequence[int], data: Path
+) -> None:
+    """Print everything that there are results for."""
+    compared = [c for c, trials in search.items() if len(trials) > 1]
+    rings = [c for c in search if c.startswith("ring")]
+    search_table(out, compared, search_seeds)
+    summary_table(out, rings, seeds)
+    for other in compared[1:]:
+        ratio_line(out, compared[0], other, seeds)
+    seed_table(out, rings, seeds)
+    classical_table()
+    follow_table(out, [c for c in search if c.startswith("follow")], data)
