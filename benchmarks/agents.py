@@ -148,7 +148,8 @@ def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
     """
     from agents.evaluate import score
 
-    rows, ranks = [], []
+    rows: list[dict[str, Any]] = []
+    ranks: list[tuple[int, float]] = []
     if len(SEARCH[config]) == 1:
         return 0, []
     for trial, options in enumerate(SEARCH[config]):

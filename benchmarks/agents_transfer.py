@@ -80,10 +80,8 @@ def main() -> None:
     torch.set_num_threads(1)
     environments = models(options.out.resolve())
     truth = environments["the truth"]
-    print(
-        "trained on | seed | worst speed ratio | worst std (m/s) | smallest time gap (s) | collisions | in its own model"
-    )
-    print("--- | --- | --- | --- | --- | --- | ---")
+    head = "seed", "worst speed ratio", "worst std (m/s)", "smallest time gap (s)", "collisions", "own: ratio, std"
+    print("| trained on | " + " | ".join(head) + " |\n|" + " --- |" * (len(head) + 1))
     show("human drivers", "", evaluate_ring(None, truth), {})
     show("PI with saturation", "", evaluate_ring(PISaturation(0.1, 1.0, 5.0), truth), {})
     for name, environment in environments.items():
