@@ -10,16 +10,17 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
-import gymnasium
 import torch
 import tyro
+from torch import Tensor
 
 from agents.common import Policy, load
 from agents.environments import task_of
 from agents.rollout import LENGTHS, SEED, Act, Driven, Start, drive, follow_start, ring_start, uniform_speed
 from idm_env import metrics
+from idm_env.envs.gym import DiffIDMEnv
 
 STEPS = 3000
 JUDGED = 1000
@@ -164,7 +165,7 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, steps: int,
     """Write a video of one episode; every second step is a picture, at twice real time."""
     from gymnasium.utils.save_video import save_video
 
-    env = gymnasium.make("DiffIDM-v0", **{**environment, "warmup_pool": 0}, render_mode="rgb_array")
+    env = DiffIDMEnv(**{**environment, "warmup_pool": 0}, render_mode="rgb_array")
     observation, _ = env.reset(seed=seed)
     frames = []
     for step in range(steps):
@@ -176,6 +177,31 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, steps: int,
     save_video(frames, str(path.parent), name_prefix=path.stem, fps=10, episode_trigger=lambda _: True)
 
 
+def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: int, steps: int, seed: int = 0) -> None:
+    """Draw the space-time diagram of one episode: ``human`` steps of human driving, then ``steps`` with the policy."""
+    from idm_env.diagrams import space_time
+
+    chosen = {"length": 250.0} if environment.get("task", "ring") == "ring" else {}
+    env = DiffIDMEnv(**{**environment, **chosen, "warmup_pool": 0, "max_episode_steps": None})
+    observation, _ = env.reset(seed=seed)
+    states = []
+    for step in range(human + steps):
+        observation, *_ = env.step(None if step < human else policy.predict(observation)[0])
+        states.append(env.state)
+    motion = Motion(*(torch.cat([getattr(s, name) for s in states]) for name in Motion._fields))
+    ring = float((states[0].gap + states[0].length).sum()) if env.task.name == "ring" else None
+    dt = env.task.simulator.dt
+    title = f"human drivers; from {human * dt:.0f} s on the agent drives the blue vehicle"
+    space_time(motion, dt=dt, ring_length=ring, marked=env.task.agents, title=title).savefig(path)
+
+
+class Motion(NamedTuple):
+    """What a diagram takes, time first."""
+
+    position: Tensor
+    speed: Tensor
+
+
 @dataclass
 class Arguments:
     """Evaluate a saved policy.
@@ -183,13 +209,17 @@ class Arguments:
     Args:
         checkpoint: Such as runs/ring-apg/last.pt.
         video: Folder and first part of the name of a video, such as pictures/ring.
-        steps: Steps of the video.
-        seed: Of the video's episode.
+        picture: File of a space-time diagram, such as ring.png.
+        human: Steps of human driving before the policy, in the diagram.
+        steps: Steps with the policy, in video and diagram.
+        seed: Of the episode that is shown.
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
     video: Path | None = None
-    steps: int = 1200
+    picture: Path | None = None
+    human: int = 1500
+    steps: int = 1500
     seed: int = 0
 
 
@@ -202,6 +232,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(name, json.dumps(evaluate(act, environment)))
     if arguments.video is not None:
         film(arguments.video, environment, policy, arguments.steps, arguments.seed)
+    if arguments.picture is not None:
+        picture(arguments.picture, environment, policy, arguments.human, arguments.steps, arguments.seed)
 
 
 if __name__ == "__main__":

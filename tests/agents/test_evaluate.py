@@ -162,8 +162,9 @@ def test_a_saved_policy_is_evaluated_and_filmed(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(evaluate, "STEPS", 20)
     monkeypatch.setattr(evaluate, "JUDGED", 10)
     common.save(tmp_path / "a.pt", Policy(3, (4,)), "apg", {**RING, "warmup": 5}, {})
-    evaluate.main([str(tmp_path / "a.pt"), "--video", str(tmp_path / "film"), "--steps", "12"])
+    words = [str(tmp_path / "a.pt"), "--video", str(tmp_path / "film"), "--picture", str(tmp_path / "a.png")]
+    evaluate.main([*words, "--steps", "12", "--human", "5"])
     printed = capsys.readouterr().out
     assert "human {" in printed and "apg {" in printed
     film = next(tmp_path.glob("film*.mp4"))
-    assert film.stat().st_size > 1000
+    assert film.stat().st_size > 1000 and (tmp_path / "a.png").stat().st_size > 1000
