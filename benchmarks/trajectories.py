@@ -164,9 +164,7 @@ def reconstruction(data: Path) -> None:
                 dense = [_dense(m, clock_of(t, 0.1)) for m, t in zip(steps, scored, strict=True)]
                 show("  … parameters fixed" if fixed else "the paper's recipe", score(scored, dense, truth))
             for name in baselines.available():
-                best_of(
-                    name, tuned, scored, truth, given={"sigma": SPARSE_WHITE_M[0]} if name == "Kalman/RTS" else None
-                )
+                best_of(name, tuned, scored, truth, given={"sigma": SPARSE_WHITE_M} if name == "Kalman/RTS" else None)
 
 
 def _dense(motion: Motion, clock: np.ndarray) -> Motion:

@@ -7,7 +7,6 @@ them apart; data sparser than the correlation of the noise do not, and get white
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,8 +21,11 @@ DENSE_S = 0.25
 """Up to this sampling interval correlated noise can be told from white noise (s)."""
 TELLING_S = 3.0
 """Up to this sampling interval white noise can be told from driving (s)."""
-SPARSE_WHITE_M = (0.02, 0.7)
-"""White noise of sparse samples that a search starts from (m): of a survey's tracks, and of navigation satellites."""
+SPARSE_WHITE_M, NOISY_WHITE_M = 0.01, 0.7
+"""White noise assumed of sparse samples, and what a search for more starts from (m): that of satellite navigation."""
+DECISIVE = 0.1
+"""Sparse samples are taken as noisy where that makes each likelier by a factor of e to this: driving that is not normal
+looks a little like noise, too."""
 BOUNDS = {
     "white": (2e-3, 5.0),
     "sigma": (2e-3, 10.0),
@@ -64,46 +66,53 @@ def fit_noise(
 ) -> Noise:
     """Return the noise model under which the tracks (times, positions) are most likely.
 
-    Four numbers for dense data (white, correlated, its time, jerk), three for sparse (white, jerk, and the time in
-    which an acceleration fades), by simplex searches over their logarithms; above ``TELLING_S`` white noise is taken
-    as small. ValueError if no track has three samples.
+    Four numbers for dense data (white, correlated, its time, jerk), by a simplex search over their logarithms; jerk and
+    the time in which an acceleration fades for sparse data, and white noise where they are clearly noisy (``DECISIVE``;
+    above ``TELLING_S`` it cannot be told). ValueError if no track has three samples.
     """
     parts = [part for part in sample(tracks) if len(part[0]) >= 3]
     if not parts:
         raise ValueError("no track has three samples to fit the noise to. Give noise=Noise(…).")
     usual = interval([time for time, _ in parts])
-    dense, telling = usual <= DENSE_S, usual <= TELLING_S
-    if start is not None:
-        begins = [start]
-    elif dense:
-        begins = [Noise(0.1, 0.2, 0.3, 0.5)]
-    else:
-        begins = [Noise(white, 0.0, 0.3, 0.5, 5.0) for white in SPARSE_WHITE_M[: 1 + telling]]
-    names: tuple[str, ...] = ("white", "sigma", "time", "jerk") if dense else ("white", "jerk", "accel_time")
-    names = names if telling else names[1:]
+    dense = usual <= DENSE_S
     observed = [Observed.of(time, position, dt) for time, position in parts]
     inflated = [outlying(position) if dense else np.zeros(len(position)) for _, position in parts]
+    search = _Search(observed, inflated, evaluations)
+    if dense:
+        return search.best(start or Noise(0.1, 0.2, 0.3, 0.5), ("white", "sigma", "time", "jerk"))[0]
+    clean, cost = search.best(start or Noise(SPARSE_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("jerk", "accel_time"))
+    if usual > TELLING_S:
+        return clean
+    noisy, less = search.best(Noise(NOISY_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("white", "jerk", "accel_time"))
+    return noisy if less < cost - DECISIVE * sum(len(o.at) for o in observed) else clean
 
-    def noise(point: np.ndarray) -> Noise:
-        values = {
-            name: min(max(math.exp(x), BOUNDS[name][0]), BOUNDS[name][1]) for name, x in zip(names, point, strict=True)
-        }
-        return dataclasses.replace(begins[0], **values)
 
-    def cost(point: np.ndarray) -> float:
-        model = noise(point)
-        total = -sum(log_likelihood(o, model, extra) for o, extra in zip(observed, inflated, strict=True))
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Search:
+    """Maximum likelihood of some tracks, with extra variances of their samples."""
+
+    observed: Sequence[Observed]
+    inflated: Sequence[np.ndarray]
+    evaluations: int
+
+    def best(self, begin: Noise, names: tuple[str, ...]) -> tuple[Noise, float]:
+        """Return the likeliest noise that differs from ``begin`` in some of its numbers, and −log-likelihood."""
         low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
-        return total + float((np.maximum(low - point, 0) ** 2 + np.maximum(point - high, 0) ** 2).sum())
 
-    found = []
-    for begin in begins:
+        def noise(point: np.ndarray) -> Noise:
+            values = np.exp(np.clip(point, low, high)).tolist()
+            return dataclasses.replace(begin, **dict(zip(names, values, strict=True)))
+
+        def cost(point: np.ndarray) -> float:
+            model = noise(point)
+            pairs = zip(self.observed, self.inflated, strict=True)
+            outside = np.maximum(low - point, 0) ** 2 + np.maximum(point - high, 0) ** 2
+            return float(outside.sum()) - sum(log_likelihood(o, model, extra) for o, extra in pairs)
+
         first = np.log([getattr(begin, name) for name in names])
         simplex = np.vstack([first, first + 0.7 * np.eye(len(names))])
-        found.append(
-            minimize(
-                cost, first, method="Nelder-Mead",
-                options={"maxfev": evaluations, "xatol": 0.03, "fatol": 0.3, "initial_simplex": simplex},
-            )
+        found = minimize(
+            cost, first, method="Nelder-Mead",
+            options={"maxfev": self.evaluations, "xatol": 0.03, "fatol": 0.3, "initial_simplex": simplex},
         )  # fmt: skip
-    return noise(min(found, key=lambda result: float(result.fun)).x)
+        return noise(found.x), float(found.fun)
