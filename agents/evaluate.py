@@ -224,9 +224,12 @@ class Arguments:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Print the figures of a policy beside those of human drivers."""
+    """Print the figures of a policy beside those of human drivers; what is wrong is told in one line."""
     arguments = tyro.cli(Arguments, args=argv)
-    policy, content = load(arguments.checkpoint)
+    try:
+        policy, content = load(arguments.checkpoint)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
     environment = content["environment"]
     for name, act in (("human", None), (content["agent"], policy)):
         print(name, json.dumps(evaluate(act, environment)))

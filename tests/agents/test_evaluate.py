@@ -168,3 +168,8 @@ def test_a_saved_policy_is_evaluated_and_filmed(tmp_path, capsys, monkeypatch):
     assert "human {" in printed and "apg {" in printed
     film = next(tmp_path.glob("film*.mp4"))
     assert film.stat().st_size > 1000 and (tmp_path / "a.png").stat().st_size > 1000
+
+
+def test_a_wrong_file_is_told_in_one_line(tmp_path):
+    with pytest.raises(SystemExit, match=r"error: .*none\.pt is not a file"):
+        evaluate.main([str(tmp_path / "none.pt")])
