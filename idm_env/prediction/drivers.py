@@ -46,7 +46,7 @@ LONGEST_RED_S = 16.0
 """A red light ends at some time up to this from now (s)."""
 SPEED_SIGMA = 0.4
 """How far an observed speed may be from a driver's (m/s): tracking noise, and driving that IDM does not have."""
-INDEPENDENT = 3.0
+INDEPENDENT = 2.0
 """One second of correlated residuals is worth this many independent ones."""
 SURPRISES = 8
 DRAWS = {"limit": 48, "cruise": 24, "surprise": 4, "line": 32, "stays": 8}

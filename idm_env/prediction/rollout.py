@@ -16,6 +16,8 @@ from idm_env.simulator import Simulator
 from idm_env.types import Record
 
 DT = 0.1
+CUT_M = 3.0
+"""Drivers use about a metre of the lane's width, which adds this to the radius of a right-angled turn (m)."""
 AWAY_M = 1e5
 """Where an empty road has its leader (m of arc length)."""
 HALTED_MPS = 1.0
@@ -78,7 +80,7 @@ def nobody(steps: int) -> Ahead:
 
 def bend_speed(route: Route, lateral: np.ndarray, comfort: np.ndarray) -> np.ndarray:
     """Return the speed [N, M] from which every bend ahead can be taken: √(v_bend² + 2 b d), at every metre (m/s)."""
-    bend = np.sqrt(lateral[:, None] / np.maximum(np.abs(route.curvature), 1e-4))
+    bend = np.sqrt(lateral[:, None] * (1.0 / np.maximum(np.abs(route.curvature), 1e-4) + CUT_M))
     step = float(route.length[1] - route.length[0])
     speed = np.minimum(bend, 60.0)
     for k in range(speed.shape[1] - 2, -1, -1):
