@@ -27,11 +27,11 @@ from agents import apg, common  # noqa: E402
 from agents.classical import PISaturation  # noqa: E402
 from agents.evaluate import evaluate_ring  # noqa: E402
 
-EFFECT, STRENGTH, DATA_SEED = "delay", 0.8, 5
+EFFECT, STRENGTH, DATA_SEED = "delay", 0.5, 5
 NAMES = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 RING = {
     "task": "ring", "dt": 0.1, "integration": "ballistic", "noise": 0.2, "warmup": 750, "warmup_pool": 256,
-    "tailgating": 5.0, "tailgating_below": 1.0,
+    "tailgating": 5.0, "tailgating_below": 1.0, "max_command": 3.0,
 }  # fmt: skip
 
 
@@ -64,7 +64,7 @@ def models(out: Path) -> dict[str, Any]:
 
 def trained(environment: dict[str, Any], out: Path, seed: int) -> common.Policy:
     """Return a policy that was trained there, now if it is not there."""
-    chosen = apg.Arguments(environment=environment, out=out, seed=seed, updates=20, evaluate_every=1e9)
+    chosen = apg.Arguments(environment=environment, out=out, seed=seed, updates=16, evaluate_every=1e9)
     if not (out / "done").exists():
         apg.train(chosen)
         (out / "done").touch()
@@ -83,7 +83,7 @@ def main() -> None:
     head = "seed", "worst speed ratio", "worst std (m/s)", "smallest time gap (s)", "collisions", "own: ratio, std"
     print("| trained on | " + " | ".join(head) + " |\n|" + " --- |" * (len(head) + 1))
     show("human drivers", "", evaluate_ring(None, truth), {})
-    show("PI with saturation", "", evaluate_ring(PISaturation(0.1, 1.0, 5.0), truth), {})
+    show("PI with saturation", "", evaluate_ring(PISaturation(0.1, 3.0, 5.0), truth), {})
     for name, environment in environments.items():
         for seed in range(options.seeds):
             policy = trained(environment, options.out / name.replace(" ", "-") / f"seed{seed}", seed)
