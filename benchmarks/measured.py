@@ -108,7 +108,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             names.append(f"{f['name']}{number}")
         said = ", ".join(names) or r["verdict"]
         known = "".join(
-            f"; grade acts by {-9.81 * k['estimate']:.1f} ({-9.81 * k['high']:.1f} … {-9.81 * k['low']:.1f}) m/s² per unit"
+            f"; grade acts by {-9.81 * k['estimate']:.1f} ({-9.81 * k['high']:.1f} … {-9.81 * k['low']:.1f}) m/s²"
             for k in r["known"] if k["effect"] == "grade"
         )  # fmt: skip
         b, a = r["before"], r["after"] if r["found"] else {}

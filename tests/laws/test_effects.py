@@ -38,7 +38,7 @@ def test_the_catalogue_of_candidates_is_all_nullable() -> None:
 
 @nullable
 @pytest.mark.parametrize("road", [Lane(), Ring()], ids=["lane", "ring"])
-@pytest.mark.parametrize("integration", ["ballistic", "euler"])
+@pytest.mark.parametrize("integration", ["ballistic", "euler", "midpoint"])
 def test_null_is_absent(effect: Effect, road: Lane | Ring, integration: str) -> None:
     """At its null an effect leaves no trace, to the last bit."""
     with_it = around(effect, road, integration=integration)

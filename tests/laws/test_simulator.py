@@ -205,7 +205,7 @@ def test_a_command_drives_only_where_it_is_active_and_within_the_brakes() -> Non
     gap=st.floats(-20, 200),
     speed=st.floats(0, 60),
     lead_speed=st.floats(0, 60),
-    integration=st.sampled_from(["ballistic", "euler"]),
+    integration=st.sampled_from(["ballistic", "euler", "midpoint"]),
 )
 def test_bounds_and_signs_for_any_state(gap: float, speed: float, lead_speed: float, integration: str) -> None:
     """``−b_max ≤ a ≤ a_max``, no reverse, and a larger gap never means less acceleration, overlaps included."""

@@ -107,7 +107,7 @@ def clipped_idm(seconds: float, dt: float = 1e-3) -> float:
     return s
 
 
-@pytest.mark.parametrize("integration", ["ballistic", "euler"])
+@pytest.mark.parametrize("integration", ["ballistic", "euler", "midpoint"])
 def test_no_creep_behind_a_parked_leader(integration: str) -> None:
     """Within 5 cm of the exact clipped IDM after 600 s; the paper's floor creeps to 0.9 m."""
     exact = clipped_idm(200.0)
@@ -155,7 +155,7 @@ def test_linear_string_stability(speed: float, time_gap: float) -> None:
     assert measured.item() == pytest.approx(growth, abs=2e-4 + 0.02 * abs(growth))
 
 
-@pytest.mark.parametrize("integration", ["euler", "ballistic"])
+@pytest.mark.parametrize("integration", ["euler", "ballistic", "midpoint"])
 def test_both_integrators_converge_with_first_order(integration: str) -> None:
     """Against an adaptive eighth-order solution: the speed update is explicit in both, so first order in Δt."""
 
