@@ -157,7 +157,7 @@ def test_linear_string_stability(speed: float, time_gap: float) -> None:
 
 @pytest.mark.parametrize(("integration", "order"), [("euler", 1.0), ("ballistic", 1.0), ("midpoint", 2.0)])
 def test_integrators_converge_with_their_order(integration: str, order: float) -> None:
-    """Against an adaptive eighth-order solution; the speed update of the first two is explicit, so first order in Δt."""
+    """Against an adaptive eighth-order solution; the first two update speeds explicitly, so first order in Δt."""
 
     def right_hand_side(t: float, y: list[float]) -> list[float]:
         s, v = y
