@@ -112,23 +112,28 @@ def make_model(arguments: Arguments, env: VecEnv, policy: Policy) -> BaseAlgorit
     )  # fmt: skip
 
 
-def copy_actor(model: BaseAlgorithm, policy: Policy, update: int, kept: Path) -> None:
-    """Copy the actor of an SB3 model into a policy; DivergedError where a weight is not finite."""
+def layers(model: BaseAlgorithm, policy: Policy) -> list[tuple[nn.Linear, nn.Linear]]:
+    """Return the linear layers of a policy, each with that of the SB3 model's actor."""
     parts: list[nn.Module]
     if isinstance(model, SAC):
         parts = [*model.actor.latent_pi, model.actor.mu]
     else:
         actor: Any = model.policy
         parts = [*actor.mlp_extractor.policy_net, actor.action_net]
+    theirs = [p for p in parts if isinstance(p, nn.Linear)]
+    ours = [p for p in policy.body if isinstance(p, nn.Linear)]
+    return list(zip(ours, theirs, strict=True))
+
+
+def copy_actor(model: BaseAlgorithm, policy: Policy, update: int, kept: Path) -> None:
+    """Copy the actor of an SB3 model into a policy; DivergedError where a weight is not finite."""
     bad = [name for name, value in model.policy.named_parameters() if not bool(torch.isfinite(value).all())]
     if bad:
         raise DivergedError(
             f"update {update}: weights of {bad[0]} must be finite. The last good checkpoint is {kept}; resume from it "
             "with a lower learning_rate."
         )
-    theirs = [p for p in parts if isinstance(p, nn.Linear)]
-    ours = [p for p in policy.body if isinstance(p, nn.Linear)]
-    for mine, other in zip(ours, theirs, strict=True):
+    for mine, other in layers(model, policy):
         mine.load_state_dict(other.state_dict())
 
 
@@ -149,6 +154,9 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         model: BaseAlgorithm = (SAC if name == "sac" else PPO).load(file, env=env, device="cpu")
     else:
         model = make_model(arguments, env, policy)
+        if arguments.clone:
+            for mine, other in layers(model, policy):
+                other.load_state_dict(mine.state_dict())
     monitor = Monitor(name, arguments, began, saved)
 
     def keep() -> None:

@@ -125,6 +125,24 @@ def test_the_copied_actor_is_the_baselines(name, quick):
     assert np.allclose(policy.predict(seen)[0], model.predict(seen, deterministic=True)[0], atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_a_baseline_begins_as_the_clone(name, quick, monkeypatch):
+    """With a learning rate of nothing the last policy is the one that was cloned, not SB3's own first one."""
+    clones = []
+    plain = common.clone
+
+    def clone(policy, *rest):
+        result = plain(policy, *rest)
+        clones.append({k: v.clone() for k, v in policy.state_dict().items()})
+        return result
+
+    monkeypatch.setattr(common, "clone", clone)
+    small = {**AGENTS[name][2], "learning_rate": 1e-12, "clone": 20}
+    ppo.train(ppo.Arguments(**{**quick, "updates": 1}, **small))
+    last = weights(quick["out"] / "last.pt")
+    assert all(torch.allclose(last[k], clones[0][k], atol=1e-6) for k in last)
+
+
 def test_the_best_checkpoint_has_the_best_score(quick, monkeypatch):
     ratios = iter([0.5, 0.9, 0.7, 0.9])
 
