@@ -81,6 +81,9 @@ def fit(
     integration: Annotated[str, typer.Option(help="ballistic, or euler as in the paper.")] = "ballistic",
     starts: Annotated[int, typer.Option(help="Starts per group.", min=1)] = 4,
     substeps: Annotated[int | None, typer.Option(help="Simulated steps per sample; default: steps of 25 ms.")] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")
+    ] = None,
     seed: Seed = 0,
     ring_length: RingLength = None,
     place: Place = None,
@@ -102,7 +105,10 @@ def fit(
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out)
-    options = Options(by, share, objective, relative, loss, method, integration, starts, seed, substeps)  # type: ignore[arg-type]
+    options = Options(
+        by, share, objective, relative, loss, method, integration, starts, seed, substeps,  # type: ignore[arg-type]
+        None if model is None else str(model),
+    )  # fmt: skip
     with progress() as report:
         result = fit_file(source, options, out, resume=resume, on_progress=report)
     rows = [{"": "fitted", **result["fit"]}]

@@ -12,7 +12,7 @@ import torch
 from idm_env import report as page
 from idm_env.config import Model, Numbers, load_model, save_model
 from idm_env.data import LEADER_LOST_GAP_M, Episodes, Trajectories, episodes, load
-from idm_env.effects import Replay
+from idm_env.effects import Effect, Replay
 from idm_env.fitting import pictures
 from idm_env.fitting.batch import Batch, windows
 from idm_env.fitting.evaluate import Errors, errors, own_for
@@ -69,6 +69,26 @@ class Options:
     starts: int = 4
     seed: int = 0
     substeps: int | None = None
+    model: str | None = None
+
+    def simulator(self) -> tuple[Simulator, dict[str, float]]:
+        """Return what is calibrated and the parameters that stay: IDM, or a saved model whose effects are kept."""
+        if self.model is None:
+            return base_simulator(integration=self.integration), {}
+        saved = load_model(Path(self.model))
+        simulator = Simulator(Lane(), _behind_records(saved), dt=saved.dt, integration=saved.integration)
+        kept = {
+            f"{effect}.{name}": float(value)
+            for effect, parameters in saved.parameters.items() if effect != "idm"
+            for name, value in parameters.items()
+        }  # fmt: skip
+        return simulator, kept
+
+
+def _behind_records(model: Model) -> tuple[Effect, ...]:
+    """Return a model's effects with replayed leaders, without an agent's control."""
+    effects = tuple(e for e in model.effects if e.name != "control")
+    return effects if "replay" in {e.name for e in effects} else (*effects, Replay())
 
 
 def fit_file(
@@ -86,13 +106,13 @@ def fit_file(
     if options.held_out is not None:
         fitting, held = trajectories.split(options.held_out, seed=options.seed)
     chosen = source.episodes(fitting)
-    simulator = base_simulator(integration=options.integration)
+    simulator, kept = options.simulator()
 
     def run(by: str, checkpoint: str) -> Fit:
         return fit(
             chosen, by=by, simulator=simulator, objective=options.objective, relative=options.relative,
             loss=options.loss, method=options.method, starts=options.starts, seed=options.seed,
-            substeps=options.substeps, checkpoint=out / checkpoint, resume=resume, on_progress=on_progress,
+            substeps=options.substeps, fixed=kept, checkpoint=out / checkpoint, resume=resume, on_progress=on_progress,
         )  # fmt: skip
 
     found = run(options.by, "fit.resume.pt")
@@ -132,7 +152,7 @@ def _held_out(source: Source, options: Options, held: Trajectories, found: Fit, 
     fitted = found.problem
     problem = Problem(
         fitted.simulator, batch, fitted.own, (), group, names,
-        objective=fitted.objective, relative=fitted.relative, loss=fitted.loss,
+        objective=fitted.objective, relative=fitted.relative, loss=fitted.loss, fixed=fitted.fixed,
     )  # fmt: skip
     own, unseen = own_for(found, problem, pooled.own[0])
     error, _ = errors(problem, own, found.shared)
@@ -157,9 +177,13 @@ def model_of(found: Fit) -> Model:
 
     simulator = found.problem.simulator
     several = len(found.problem.groups) > 1
+    middle = numbers(values.median(0).values)
+    for name, value in found.problem.fixed.items():
+        effect, parameter = name.split(".")
+        middle.setdefault(effect, {})[parameter] = value
     return Model(
         effects=simulator.without("replay").effects if "replay" in simulator.by_name else simulator.effects,
-        parameters=numbers(values.median(0).values),
+        parameters=middle,
         dt=found.problem.batch.dt,
         integration=simulator.integration,
         drivers={g: numbers(values[i]) for i, g in enumerate(found.problem.groups)} if several else {},
@@ -245,9 +269,7 @@ def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0)
 def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, torch.Tensor, int]:
     """Return a problem with all parameters of a model, their values per episode, and how many drivers were matched."""
     batch = Batch.of(items)
-    effects = tuple(e for e in model.effects if e.name != "control")
-    if "replay" not in {e.name for e in effects}:
-        effects = (*effects, Replay())
+    effects = _behind_records(model)
     simulator = Simulator(Lane(), effects, dt=batch.step, integration=model.integration)
     names = tuple(f"{e.name}.{p.name}" for e in effects for p in e.parameters)
     rows, matched = [], 0

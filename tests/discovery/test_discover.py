@@ -106,3 +106,22 @@ def test_an_interrupted_search_goes_on(tmp_path: Path) -> None:
         discover(trajectories, effects=FEW, out=tmp_path, on_progress=stop)
     with pytest.raises(ValueError, match="other data or options"):
         discover(trajectories, effects=FEW[:3], out=tmp_path, resume=True)
+
+
+def test_the_corrected_model_is_fitted_to_other_drivers(drag: Discovery, tmp_path: Path) -> None:
+    from idm_env.fitting.job import Options, Source, fit_file
+
+    corrected = write_report(drag, tmp_path)["model.yaml"]
+    others = synthetic.generate(22, runs=2, followers=2, seconds=60.0, effect="leader_acceleration")[0]
+    others.table.write_parquet(tmp_path / "others.parquet")
+    source = Source(tmp_path / "others.parquet")
+    plain, better = (
+        fit_file(source, Options(starts=1, model=m), tmp_path / str(i)) for i, m in enumerate((None, str(corrected)))
+    )
+    assert better["fit"]["gap_rmse_m"] < 0.6 * plain["fit"]["gap_rmse_m"]
+    again = load_model(tmp_path / "1" / "model.yaml")
+    assert "leader_acceleration" in [e.name for e in again.effects]
+    assert (
+        again.parameters["leader_acceleration"]["gain"]
+        == load_model(corrected).parameters["leader_acceleration"]["gain"]
+    )
