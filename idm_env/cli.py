@@ -306,6 +306,7 @@ def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
 
 Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]
 FixedParameters = Annotated[bool, typer.Option("--fixed-parameters", help="Keep the driver parameters fixed.")]
+Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
 
 
 @app.command("filter")
@@ -314,6 +315,7 @@ def filter_(
     out: Out = Path("out/filter"),
     recipe: Recipe = "default",
     fixed_parameters: FixedParameters = False,
+    model: Corrected = None,
     layout: Layout = "auto",
     resume: Resume = False,
 ) -> None:
@@ -323,7 +325,7 @@ def filter_(
     with progress() as report:
         filter_file(
             data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            on_progress=lambda done, total: report("filter", done, total, ""),
+            model=model, on_progress=lambda done, total: report("filter", done, total, ""),
         )  # fmt: skip
     _done(out)
 
@@ -335,6 +337,7 @@ def reconstruct(
     dt: Annotated[float, typer.Option(help="Step of the dense trajectories (s).")] = 0.1,
     recipe: Recipe = "default",
     fixed_parameters: FixedParameters = False,
+    model: Corrected = None,
     layout: Layout = "auto",
     resume: Resume = False,
 ) -> None:
@@ -344,7 +347,7 @@ def reconstruct(
     with progress() as report:
         reconstruct_file(
             data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            on_progress=lambda done, total: report("reconstruct", done, total, ""),
+            model=model, on_progress=lambda done, total: report("reconstruct", done, total, ""),
         )  # fmt: skip
     _done(out)
 

@@ -38,7 +38,10 @@ PARAMETER_SCHEMA: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Settings:
-    """What determines a run: task, step (s; None takes the file's), recipe, ablation, baselines, vehicles per chunk."""
+    """What determines a run: task, step (s; None takes the file's), recipe, ablation, baselines, vehicles per chunk.
+
+    ``model`` is a model.yaml whose effects are behind the drivers' own parameters; None is IDM.
+    """
 
     task: Literal["filter", "reconstruct"]
     dt: float | None = None
@@ -46,6 +49,7 @@ class Settings:
     fixed_parameters: bool = False
     baselines: bool = True
     chunk: int = CHUNK
+    model: str | None = None
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ def done(
         assert plan.noise is not None
         filtered = recipe(tracks, plan.dt, plan.noise, plan.choices, recent) if tracks else []
         seconds = time.perf_counter() - begin
-        rows = [] if settings.fixed_parameters else parameter_rows(filtered, recent)
+        rows = [] if settings.fixed_parameters else parameter_rows(filtered, recent, settings.model)
         calibration = time.perf_counter() - begin - seconds
     tallies[OURS[settings.recipe]] = _tally([f.motion for f in filtered], tracks, seconds)
     for name in baselines.available() if settings.baselines else ():

@@ -11,6 +11,7 @@ from idm_env.data import Episode, Record
 from idm_env.data.records import FAR_M
 from idm_env.effects import IDM
 from idm_env.fitting.fit import Fit, fit
+from idm_env.fitting.job import Options
 from idm_env.trajectories.recipe import Filtered
 
 SHORTEST_S = 10.0
@@ -63,26 +64,34 @@ def _stretches(leader: np.ndarray, usable: np.ndarray) -> list[tuple[int, int]]:
 
 
 def fit_drivers(
-    filtered: Sequence[Filtered], before: Sequence[Filtered] = (), *, iterations: int = 15
+    filtered: Sequence[Filtered], before: Sequence[Filtered] = (), model: str | None = None, *, iterations: int = 15
 ) -> tuple[Fit | None, list[Episode]]:
-    """Calibrate IDM for every track that follows a leader for at least 10 s; None where nobody does."""
+    """Calibrate IDM for every track that follows a leader for at least 10 s; None where nobody does.
+
+    ``model`` is a model.yaml whose effects stay as they are.
+    """
     leaders: dict[tuple[str, str], list[Filtered]] = {}
     for f in (*filtered, *before):
         leaders.setdefault((f.track.run_id, f.track.vehicle_id), []).append(f)
     episodes = [e for e in (episode_of(f, leaders) for f in filtered) if e is not None]
     if not episodes:
         return None, []
-    found = fit(episodes, by="driver", loss="mse", starts=1, iterations=iterations)
+    simulator, kept = Options(model=model).simulator()
+    found = fit(
+        episodes, by="driver", simulator=simulator, fixed=kept, loss="mse", starts=1, iterations=iterations
+    )  # fmt: skip
     return found, episodes
 
 
-def parameter_rows(filtered: Sequence[Filtered], before: Sequence[Filtered] = ()) -> list[dict[str, Any]]:
+def parameter_rows(
+    filtered: Sequence[Filtered], before: Sequence[Filtered] = (), model: str | None = None
+) -> list[dict[str, Any]]:
     """Return one row per track: the five parameters, their standard errors, and whether the data tell them.
 
     ``source`` is ``leader`` for a calibration behind the real leader; ``none`` marks a track that follows nobody for
     10 s: its parameters are empty, since an imagined leader explains any motion at any parameters.
     """
-    found, _ = fit_drivers(filtered, before)
+    found, _ = fit_drivers(filtered, before, model)
     values: dict[str, dict[str, Any]] = {}
     if found is not None:
         for g, group in enumerate(found.problem.groups):

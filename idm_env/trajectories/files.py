@@ -45,6 +45,7 @@ def filter_file(
     recipe: Recipe = "default",
     fixed_parameters: bool = False,
     baselines: bool = True,
+    model: str | None = None,
     layout: str = "auto",
     chunk: int = CHUNK,
     resume: bool = False,
@@ -55,12 +56,13 @@ def filter_file(
     Writes ``trajectories.parquet`` (tidy: position, speed, acceleration, gap where there is a leader, imagined gap and
     standard deviations), ``parameters.parquet``, ``report.json`` and ``report.html``. ``recipe="paper"`` is the
     published one; ``fixed_parameters`` keeps its five parameters, and leaves out the calibration in the default one.
+    ``model`` is a model.yaml, such as explain writes, whose effects the calibration keeps.
     Tracks that cannot be used are left out and counted. ``resume`` goes on after the last finished chunk.
 
     Raises:
         DataError: If the file as a whole cannot be used, or ``resume`` finds a run with other data or settings.
     """
-    settings = Settings("filter", None, recipe, fixed_parameters, baselines, chunk)
+    settings = Settings("filter", None, recipe, fixed_parameters, baselines, chunk, model)
     return run(path, out, settings, layout=layout, resume=resume, on_progress=on_progress)
 
 
@@ -72,6 +74,7 @@ def reconstruct_file(
     recipe: Recipe = "default",
     fixed_parameters: bool = False,
     baselines: bool = True,
+    model: str | None = None,
     layout: str = "auto",
     chunk: int = CHUNK,
     resume: bool = False,
@@ -83,7 +86,7 @@ def reconstruct_file(
     """
     if not 0.01 <= dt <= 2.0:
         raise DataError(f"dt = {dt:g} s is outside [0.01, 2] s; 0.1 s suits vehicles.")
-    settings = Settings("reconstruct", dt, recipe, fixed_parameters, baselines, chunk)
+    settings = Settings("reconstruct", dt, recipe, fixed_parameters, baselines, chunk, model)
     return run(path, out, settings, layout=layout, resume=resume, on_progress=on_progress)
 
 
