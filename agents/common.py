@@ -177,7 +177,7 @@ class Policy(nn.Module):
 
 
 def save(path: Path, policy: Policy, agent: str, environment: Mapping[str, Any], training: Mapping[str, Any]) -> None:
-    """Write a checkpoint; a file of that name is replaced only by a whole one."""
+    """Write a checkpoint."""
     task = task_of(environment)
     content = {
         "schema": SCHEMA,
@@ -190,8 +190,13 @@ def save(path: Path, policy: Policy, agent: str, environment: Mapping[str, Any],
         "training": dict(training),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
+    write(path, lambda beside: torch.save(content, beside))
+
+
+def write(path: Path, writer: Callable[[Path], Any]) -> None:
+    """Let ``writer`` write a file; one of that name is replaced only by a whole one."""
     beside = path.with_suffix(".part")
-    torch.save(content, beside)
+    writer(beside)
     os.replace(beside, path)
 
 

@@ -2,8 +2,8 @@
 
 They see the same observations in the same fixed normalisation, get the same reward, are stopped by the same clock and
 judged by the same test as the agents that differentiate. After every chunk of learning the actor is copied into a
-``Policy``, so that all agents leave the same files; ``model.zip`` beside them is SB3's own, for ``resume`` (the replay
-buffer of SAC is not kept: it fills anew).
+``Policy``, so that all agents leave the same files; ``model.zip`` and SAC's ``replay.pkl`` beside them are SB3's own,
+for ``resume``.
 
 ``python -m agents.ppo --config configs/ring-ppo.yaml --seed 1``
 """
@@ -148,10 +148,12 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     vector.seed(environments.first_seed(arguments.seed, arguments.count))
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
-    file, moments = arguments.out / "model.zip", arguments.out / "returns.pkl"
+    file, moments, memory = (arguments.out / f for f in ("model.zip", "returns.pkl", "replay.pkl"))
     if saved:
         env = VecNormalize.load(str(moments), vector)
         model: BaseAlgorithm = (SAC if name == "sac" else PPO).load(file, env=env, device="cpu")
+        if isinstance(model, SAC):
+            model.load_replay_buffer(memory)
     else:
         model = make_model(arguments, env, policy)
         if arguments.clone:
@@ -160,8 +162,10 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     monitor = Monitor(name, arguments, began, saved)
 
     def keep() -> None:
-        model.save(file)
-        env.save(str(moments))
+        common.write(file, model.save)
+        common.write(moments, lambda path: env.save(str(path)))
+        if isinstance(model, SAC):
+            common.write(memory, model.save_replay_buffer)
 
     chunk = arguments.n_steps * arguments.count
     for update in range(saved.get("update", -1) + 1, arguments.updates):

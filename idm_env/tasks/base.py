@@ -27,6 +27,8 @@ from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params
 
 _NORMALS_AT_ONCE = 1 << 16
+_STANDSTILL = 1.0
+"""Gap that the failsafe leaves (m)."""
 _TAKE_INPUTS = {"control", "replay", "imagined", "lateral"}
 
 
@@ -50,6 +52,8 @@ class Task(abc.ABC):
         warmup: Steps before an episode begins, in which nobody is controlled.
         warmup_pool: If above 0, episodes begin in one of that many warmed-up worlds, which are made once.
         max_command: Acceleration that an action of 1 commands (m/s²).
+        failsafe: Deceleration (m/s²) of a failsafe: commands that leave a vehicle no room to stop at it behind a leader
+            who brakes as hard are cut, and may then brake beyond ``max_command``; 0 is none. See ``safe_command``.
 
     Raises:
         ValueError: In one line, with value, rule and cure.
@@ -66,6 +70,7 @@ class Task(abc.ABC):
     warmup: int = 0
     warmup_pool: int = 0
     max_command: float = 1.0
+    failsafe: float = 0.0
 
     name: ClassVar[str]
     road: ClassVar[Road]
@@ -86,6 +91,7 @@ class Task(abc.ABC):
         if self.warmup_pool and not self.warmup:
             raise ValueError(f"warmup_pool = {self.warmup_pool} has no use without warm-up. Give warmup=750 as well.")
         at_least("max_command", self.max_command, 1e-3, "m/s²")
+        at_least("failsafe", self.failsafe, 0.0, "m/s²")
         self.params(torch.float64, "cpu")
 
     # -- static facts --------------------------------------------------------------------------------------------
@@ -195,10 +201,26 @@ class Task(abc.ABC):
         """Return the commanded accelerations (m/s²) of actions, which are clipped to [−1, 1] (no gradient beyond)."""
         return action.clamp(-1.0, 1.0) * self.max_command
 
+    def safe_command(self, world: World) -> Tensor:
+        """Return the highest acceleration (m/s²) that the failsafe allows each agent, shape ``(…, agents)``.
+
+        The safe speed of Krauß 1998 (Microscopic modeling of traffic flow), which SUMO keeps, for one step Δt: the
+        largest v' with ``(v + v')/2 Δt + v'²/(2b) ≤ s − 1 m + v_lead²/(2b)``, b being ``failsafe``. Where it holds
+        at first and no leader brakes harder than b, it can be kept with b for ever, and no two vehicles touch.
+        """
+        state, decel, dt = world.state, self.failsafe, self.simulator.dt
+        there = self.road.leader_present(state.present, state.speed)
+        leader = self.road.leader(state.gap, state.speed, state.accel, there)
+        speed, ahead = self.pick(state.speed), self.pick(leader.speed)
+        room = 2.0 * decel * (self.pick(leader.gap) - _STANDSTILL) + ahead * ahead - decel * dt * speed
+        # Below the clamp the vehicle must stop at once, whatever the root.
+        safe = torch.sqrt((room + (0.5 * decel * dt) ** 2).clamp_min(1e-6)) - 0.5 * decel * dt
+        return (safe - speed) / dt
+
     def inputs(
         self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
     ) -> Inputs:
-        """Return the inputs of one step: the command (m/s², None for nobody), and the normals of the noise.
+        """Return the inputs of one step: the command (m/s², None for nobody) as far as safe, and the noise's normals.
 
         ``live`` (bool, ``(…, agents)``) says which agents still command; the others' vehicles go back to their drivers.
         """
@@ -207,6 +229,8 @@ class Task(abc.ABC):
             idle = self.constant("idle", [False] * self.vehicles, speed.device, torch.bool)
             inputs: dict[str, Any] = {"control": Command(speed.new_zeros(()), idle)}
         else:
+            if self.failsafe:
+                command = torch.minimum(command, self.safe_command(world))
             active = self.constant("active", self._is_agent, speed.device, torch.bool)
             if len(self.agents) > 1:
                 slot = self.constant("slots", self._agent_slots, speed.device, torch.int64)

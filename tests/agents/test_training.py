@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.save_util import load_from_pkl
 
 from agents import apg, common, environments, ppo, shac
 from agents.common import DivergedError, Policy
@@ -61,6 +62,19 @@ def test_apg_resumes_exactly(quick, tmp_path):
     apg.train(dataclasses.replace(whole, cpu_seconds=1e-9))
     apg.train(dataclasses.replace(whole, resume=True))
     assert same(weights(tmp_path / "whole" / "last.pt"), weights(whole.out / "last.pt"))
+
+
+def test_sac_resumes_with_its_memory(quick):
+    module, kind, small = AGENTS["sac"]
+    whole = kind(**quick, **small)
+    first = module.train(dataclasses.replace(whole, cpu_seconds=1e-9))
+    buffer = load_from_pkl(whole.out / "replay.pkl")
+    module.train(dataclasses.replace(whole, resume=True))
+    after = load_from_pkl(whole.out / "replay.pkl")
+    assert buffer.size() == first[0]["steps"] // small["count"]
+    assert after.size() == 4 * buffer.size()
+    np.testing.assert_array_equal(after.observations[: buffer.size()], buffer.observations[: buffer.size()])
+    assert not list(whole.out.glob("*.part"))
 
 
 def test_nothing_to_resume_is_told(quick):
