@@ -18,7 +18,7 @@ from torch import Tensor
 
 from agents.common import Policy, load
 from agents.environments import task_of
-from agents.rollout import LENGTHS, SEED, Act, Driven, Start, drive, follow_start, ring_start, uniform_speed
+from agents.rollout import LENGTHS, SEED, WARMUP, Act, Driven, Start, drive, follow_start, ring_start, uniform_speed
 from idm_env import metrics
 from idm_env.envs.gym import DiffIDMEnv
 
@@ -51,10 +51,10 @@ def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
 
 
 def evaluate_ring(
-    act: Act | None, environment: Mapping[str, Any], lengths: Sequence[float] = LENGTHS
+    act: Act | None, environment: Mapping[str, Any], lengths: Sequence[float] = LENGTHS, warmup: int = WARMUP
 ) -> dict[str, Any]:
-    """Return the figures of a policy on rings of these lengths."""
-    start = ring_start(environment, lengths)
+    """Return the figures of a policy on rings of these lengths, from a take-over after ``warmup`` steps on."""
+    start = ring_start(environment, lengths, warmup)
     return judge_ring(start, drive(start, act, STEPS))
 
 
@@ -68,6 +68,21 @@ def solved_at(history: Sequence[Mapping[str, Any]]) -> int | None:
     return first if len(history) - first >= IN_A_ROW else None
 
 
+def drivers_of(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the IDM parameters of the human drivers of a task."""
+    return {**task_of(environment).own_parameters["idm"], **environment.get("parameters", {}).get("idm", {})}
+
+
+def mixed(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an environment in which every driver's every parameter is drawn from ±20 %."""
+    generator, vehicles = torch.Generator().manual_seed(SEED), task_of(environment).vehicles
+    drawn = {
+        name: (value * (0.8 + 0.4 * torch.rand(vehicles, generator=generator))).tolist()
+        for name, value in drivers_of(environment).items()
+    }
+    return {**environment, "parameters": {"idm": drawn}}
+
+
 def held_out(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures on ring lengths and drivers that training has not seen, without any tuning.
 
@@ -76,18 +91,13 @@ def held_out(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
     from ±20 %. Ratios are to the uniform speed of those drivers.
     """
     result = {"lengths": evaluate_ring(act, environment, tuple(range(200, 301, 10)))}
-    idm = {**task_of(environment).own_parameters["idm"], **environment.get("parameters", {}).get("idm", {})}
-    generator = torch.Generator().manual_seed(SEED)
-    vehicles = task_of(environment).vehicles
-    mixed = {
-        name: (value * (0.8 + 0.4 * torch.rand(vehicles, generator=generator))).tolist() for name, value in idm.items()
-    }
+    idm = drivers_of(environment)
     cases = {
         f"{name} {sign}20 %": {name: idm[name] * factor} for name in idm for sign, factor in (("−", 0.8), ("+", 1.2))
     }
-    for name, change in {**cases, "mixed": mixed}.items():
-        changed = {**environment, "parameters": {"idm": {**idm, **change}}}
-        result[name] = evaluate_ring(act, changed)
+    for name, change in cases.items():
+        result[name] = evaluate_ring(act, {**environment, "parameters": {"idm": {**idm, **change}}})
+    result["mixed"] = evaluate_ring(act, mixed(environment))
     result["drivers"] = worst([result[name] for name in cases])
     return result
 

@@ -69,9 +69,9 @@ def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> D
 
 
 @lru_cache(maxsize=64)
-def _ring_start(environment: str, lengths: tuple[float, ...]) -> Start:
+def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int) -> Start:
     """Return one ring of every length after its warm-up; the keywords of the environment come as JSON."""
-    chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": WARMUP}
+    chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": warmup}
     tasks = [task_of({**chosen, "length": length}) for length in lengths]
     task = tasks[0]
     params = task.params(torch.float32, "cpu")
@@ -93,9 +93,9 @@ def _ring_start(environment: str, lengths: tuple[float, ...]) -> Start:
     )
 
 
-def ring_start(environment: Mapping[str, Any], lengths: Sequence[float] = LENGTHS) -> Start:
+def ring_start(environment: Mapping[str, Any], lengths: Sequence[float] = LENGTHS, warmup: int = WARMUP) -> Start:
     """Return one ring of every length after its warm-up."""
-    return _ring_start(json.dumps(dict(environment), sort_keys=True), tuple(lengths))
+    return _ring_start(json.dumps(dict(environment), sort_keys=True), tuple(lengths), warmup)
 
 
 def uniform_speed(start: Start) -> Tensor:

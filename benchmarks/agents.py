@@ -2,6 +2,7 @@
 
     python benchmarks/agents.py run [--only ring-ppo] [--out runs/benchmark]
     python benchmarks/agents.py table [--out runs/benchmark]
+    python benchmarks/agents.py takeover [--out runs/benchmark]
 
 Every training is one process with one thread and one file of results; what is done is skipped, what another process
 works on is left to it, so the command may be interrupted, repeated, and started several times. CPU seconds are those of
@@ -29,7 +30,7 @@ sys.path.insert(0, str(ROOT))
 BUDGET = {"ring-shac": 90.0}
 """CPU seconds of a training, 45 where nothing else is said; the three that are compared have the same."""
 EVERY = 3.0
-SEARCH_SEEDS, SEEDS, FEW = (100, 101), tuple(range(10)), tuple(range(3))
+SEARCH_SEEDS, SEEDS, FEW = (100, 101), tuple(range(10)), tuple(range(5))
 
 Options = dict[str, Any]
 SEARCH: dict[str, list[Options]] = {
@@ -175,11 +176,11 @@ def run(configs: list[str], out: Path, seeds: int) -> None:
 
 
 def main() -> None:
-    """Run or show."""
+    """Run, or show."""
     import argparse
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["run", "table"])
+    parser.add_argument("what", choices=["run", "table", "takeover"])
     parser.add_argument("--only", nargs="*", default=list(SEARCH))
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train no more seeds than that")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
@@ -189,6 +190,10 @@ def main() -> None:
         from benchmarks.agents_tables import show
 
         show(options.out, SEARCH, SEARCH_SEEDS, SEEDS, default_data())
+    elif options.what == "takeover":
+        from benchmarks.agents_tables import takeover_table
+
+        takeover_table(options.out, [c for c in SEARCH if c.startswith("ring")], SEEDS[: options.seeds])
     else:
         run(options.only, options.out.resolve(), options.seeds)
 

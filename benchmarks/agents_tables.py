@@ -112,6 +112,47 @@ def seed_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
     )  # fmt: skip
 
 
+def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print where the last checkpoints touch somebody, taking over in other traffic, without and with a failsafe.
+
+    A case is: rings with a collision of all rings, and the medians over seeds of worst speed ratio and deviation.
+    """
+    from agents.classical import PISaturation
+    from agents.common import load
+    from agents.evaluate import evaluate_ring, mixed
+
+    rows = []
+    # A controller with memory drives one batch once, so it is made anew for every case.
+    policies: dict[str, list[Any]] = {"PI with saturation": [lambda: PISaturation(0.1, 1.0, 5.0)]}
+    for config in configs:
+        paths = [(out / config).glob(f"trial*/seed{seed}/training/last.pt") for seed in seeds]
+        policies[config] = [lambda path=path: load(path)[0] for found in paths for path in found]
+    for name, makers in policies.items():
+        for failsafe in (0.0, 3.0):
+            own = {**ring_environment(), "failsafe": failsafe}
+            cases = {"test": (own, 750), "mixed": (mixed(own), 750), "175 s": (own, 1750), "300 s": (own, 3000)}
+            figures = []
+            for case, warmup in cases.values():
+                found = [evaluate_ring(make(), case, warmup=warmup) for make in makers]
+                touched, rings = sum(r["collisions"] for r in found), sum(len(r["ratios"]) for r in found)
+                ratio, std = (statistics.median(r[k] for r in found) for k in ("speed_ratio", "speed_std"))
+                figures.append(f"{touched} of {rings} / {ratio:.3f} / {std:.2f}")
+            rows.append([name, str(len(makers)), "3 m/s²" if failsafe else "none", *figures])
+    table(
+        ("agent", "seeds", "failsafe", "after 75 s (the test)", "after 75 s, drivers mixed", "after 175 s",
+         "after 300 s"), rows,
+    )  # fmt: skip
+
+
+def ring_environment() -> Row:
+    """Return the environment in which all agents are trained on the ring."""
+    from agents import apg
+    from agents.common import load_agent
+
+    root = Path(__file__).resolve().parents[1]
+    return load_agent(root / "configs" / "ring-apg.yaml", apg.Arguments, "apg").environment
+
+
 def follow_table(out: Path, configs: Sequence[str], leader: Path | None) -> None:
     """Print fuel and energy behind the made-up leader and, where there are, measured ones."""
     from agents import apg
@@ -150,15 +191,12 @@ def follow(r: Row) -> list[str]:
 
 def classical_table() -> None:
     """Print the classical controllers on the test and on unseen lengths."""
-    from agents import apg
     from agents.classical import rows
-    from agents.common import load_agent
 
-    root = Path(__file__).resolve().parents[1]
-    environment = load_agent(root / "configs" / "ring-apg.yaml", apg.Arguments, "apg").environment
+    found = rows(ring_environment()).items()
     table(
         ("controller", "test: ratio/std/time gap/collisions", "lengths 200–300 m"),
-        [[name, "/".join(ring(r["test"])), "/".join(ring(r["lengths"]))] for name, r in rows(environment).items()],
+        [[name, "/".join(ring(r["test"])), "/".join(ring(r["lengths"]))] for name, r in found],
     )
 
 

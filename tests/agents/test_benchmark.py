@@ -70,3 +70,24 @@ def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
         assert (ROOT / "configs" / f"{config}.yaml").exists()
         for options in trials:
             assert set(options) <= set(kinds[config.split("-")[1]].__dataclass_fields__)
+
+
+def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, monkeypatch, capsys):
+    from agents import evaluate
+    from agents.common import Policy, save
+    from benchmarks.agents_tables import ring_environment, takeover_table
+
+    judged = []
+
+    def judge(act, environment, warmup=750):
+        drawn = isinstance(environment["parameters"]["idm"]["time_gap"], list)
+        judged.append((type(act).__name__, environment["failsafe"], drawn, warmup))
+        return {**LAST, "collisions": int(not environment["failsafe"]), "ratios": [1.0] * 6}
+
+    monkeypatch.setattr(evaluate, "evaluate_ring", judge)
+    save(tmp_path / "ring-apg/trial2/seed1/training/last.pt", Policy(3), "apg", ring_environment(), {})
+    takeover_table(tmp_path, ["ring-apg"], (0, 1))
+    cases = [(False, 750), (True, 750), (False, 1750), (False, 3000)]
+    wanted = [(kind, b, *case) for kind in ("PISaturation", "Policy") for b in (0.0, 3.0) for case in cases]
+    assert judged == wanted
+    assert "| ring-apg | 1 | none | 1 of 6 / 1.000 / 0.10 |" in capsys.readouterr().out

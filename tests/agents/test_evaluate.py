@@ -157,6 +157,25 @@ def test_held_out_covers_lengths_and_drivers(monkeypatch):
     assert found["drivers"]["time_gap"] == min(found[name]["time_gap"] for name in cases)
 
 
+def test_a_later_take_over_finds_a_deeper_wave_and_a_failsafe_survives_it():
+    early, late = (ring_start(RING, (230.0, 260.0), warmup).world.state.speed.std() for warmup in (750, 3000))
+    assert late > 1.5 * early
+
+    def reckless(observation):
+        return torch.ones(len(observation), 1)
+
+    touched = evaluate.evaluate_ring(reckless, RING, (230.0, 260.0), warmup=3000)
+    guarded = evaluate.evaluate_ring(reckless, {**RING, "failsafe": 3.0}, (230.0, 260.0), warmup=3000)
+    assert touched["collisions"] == 2 and guarded["collisions"] == 0
+
+
+def test_mixed_drivers_are_within_a_fifth_of_the_given_ones():
+    drawn = evaluate.mixed({**RING, "parameters": {"idm": {"time_gap": 1.5}}})["parameters"]["idm"]
+    time_gap = torch.tensor(drawn["time_gap"]) / 1.5
+    assert set(drawn) == {"max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed"}
+    assert len(time_gap) == 22 and 0.8 <= float(time_gap.min()) < 0.9 and 1.1 < float(time_gap.max()) <= 1.2
+
+
 def test_a_saved_policy_is_evaluated_and_filmed(tmp_path, capsys, monkeypatch):
     pytest.importorskip("moviepy")
     monkeypatch.setattr(evaluate, "STEPS", 20)
