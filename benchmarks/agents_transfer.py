@@ -1,11 +1,11 @@
 """Does closing the loop pay in control? Policies trained on a plain and on a corrected model, judged in the truth.
 
-    python benchmarks/agents_transfer.py [--out runs/transfer] [--seeds 3]
+    python benchmarks/agents_transfer.py [--out runs/transfer] [--seeds 10]
 
 Platoons are generated whose drivers react with a hidden delay. From the same data come plain IDM, calibrated, and the
 model of ``discover``, which has the effect that it found; both are saved as ``model.yaml``. One APG policy per model
 and seed is trained on a ring of that model, and a third kind on the truth itself. All are judged on rings of the
-generated drivers, whose parameters and delay are known. What is done is kept and skipped.
+generated drivers, whose parameters and delay are known, also with a failsafe. What is done is kept and skipped.
 """
 
 from __future__ import annotations
@@ -22,12 +22,19 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch  # noqa: E402 (threads are set before torch starts)
+from scipy.stats import mannwhitneyu  # noqa: E402
 
 from agents import apg, common  # noqa: E402
 from agents.classical import PISaturation  # noqa: E402
 from agents.evaluate import evaluate_ring  # noqa: E402
 
+Row = dict[str, Any]
 EFFECT, STRENGTH, DATA_SEED = "delay", 0.5, 5
+FAILSAFE = 3.0
+HEAD = (
+    "trained on", "seed", "worst speed ratio", "worst std (m/s)", "smallest time gap (s)", "collisions",
+    "with a failsafe: ratio, std, collisions", "in its own model: ratio, std, collisions",
+)  # fmt: skip
 NAMES = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 RING = {
     "task": "ring", "dt": 0.1, "integration": "ballistic", "noise": 0.2, "warmup": 750, "warmup_pool": 256,
@@ -75,27 +82,34 @@ def main() -> None:
     """Train what is missing, judge all in the truth, print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/transfer"))
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=10)
     options = parser.parse_args()
     torch.set_num_threads(1)
     environments = models(options.out.resolve())
     truth = environments["the truth"]
-    head = "seed", "worst speed ratio", "worst std (m/s)", "smallest time gap (s)", "collisions", "own: ratio, std"
-    print("| trained on | " + " | ".join(head) + " |\n|" + " --- |" * (len(head) + 1))
-    show("human drivers", "", evaluate_ring(None, truth), {})
-    show("PI with saturation", "", evaluate_ring(PISaturation(0.1, 3.0, 5.0), truth), {})
+    guarded = {**truth, "failsafe": FAILSAFE}
+    print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD))
+    show("human drivers", "", evaluate_ring(None, truth), None, None)
+    by_hand = (evaluate_ring(PISaturation(0.1, 3.0, 5.0), where) for where in (truth, guarded))
+    show("PI with saturation", "", *by_hand, None)
+    touched: dict[str, list[int]] = {}
     for name, environment in environments.items():
         for seed in range(options.seeds):
             policy = trained(environment, options.out / name.replace(" ", "-") / f"seed{seed}", seed)
-            show(name, str(seed), evaluate_ring(policy, truth), evaluate_ring(policy, environment))
+            judged = [evaluate_ring(policy, where) for where in (truth, guarded, environment)]
+            show(name, str(seed), *judged)
+            touched.setdefault(name, []).append(judged[0]["collisions"])
+    for name, counts in touched.items():
+        p = mannwhitneyu(touched["plain IDM"], counts).pvalue
+        print(f"{name}: {sum(counts)} rings with a collision, of {len(counts)} seeds; Mann-Whitney p {p:.4f}")
     print(json.dumps({"effect": EFFECT, "strength": STRENGTH, "data_seed": DATA_SEED}))
 
 
-def show(name: str, seed: str, r: dict[str, Any], own: dict[str, Any]) -> None:
-    """Print one row."""
-    there = f"{own['speed_ratio']:.3f}, {own['speed_std']:.2f}" if own else "–"
+def show(name: str, seed: str, r: Row, guarded: Row | None, own: Row | None) -> None:
+    """Print one row: in the truth, there with a failsafe, and in the model of the training."""
     figures = f"{r['speed_ratio']:.3f} | {r['speed_std']:.2f} | {r['time_gap']:.2f} | {r['collisions']}"
-    print(f"| {name} | {seed} | {figures} | {there} |", flush=True)
+    others = [f"{x['speed_ratio']:.3f}, {x['speed_std']:.2f}, {x['collisions']}" if x else "–" for x in (guarded, own)]
+    print(f"| {name} | {seed} | {figures} | {others[0]} | {others[1]} |", flush=True)
 
 
 if __name__ == "__main__":
