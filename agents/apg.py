@@ -29,12 +29,15 @@ class Arguments(common.Arguments):
     Args:
         count: Environments that run together; their episodes begin at different times.
         window: Steps through which gradients go.
+        explore: Standard deviation of what is added to the actions of each environment throughout a window, falling
+            with the learning rate. Without it a vehicle that stands never feels what driving on is worth.
     """
 
     out: Path = Path("runs/apg")
     learning_rate: float = 1e-3
     count: int = 64
     window: int = 600
+    explore: float = 0.02
 
 
 def train(arguments: Arguments) -> list[dict[str, Any]]:
@@ -56,8 +59,11 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         optimiser.param_groups[0]["lr"] = rate
         env.detach()
         observation, total = observation.detach(), torch.zeros(())
+        # Seeded by the update, so that a resumed training repeats it.
+        torch.manual_seed(environments.first_seed(arguments.seed, update))
+        push = arguments.explore * rate / arguments.learning_rate * torch.randn(arguments.count, 1)
         for _ in range(arguments.window):
-            observation, reward, *_ = env.step(policy(observation))
+            observation, reward, *_ = env.step(policy(observation) + push)
             total = total + reward.mean()
         loss = -total / arguments.window
         norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)

@@ -23,7 +23,7 @@ from agents import apg
 from agents.common import load_agent
 from agents.environments import task_of
 from agents.evaluate import evaluate_ring
-from agents.rollout import LENGTHS, Act, ring_start, uniform_speed
+from agents.rollout import FRESH, LENGTHS, UNSEEN, Act, ring_start, uniform_speed
 
 
 class Seen(NamedTuple):
@@ -112,15 +112,23 @@ class PISaturation(Controller):
         return self._command
 
 
-def controllers(environment: Mapping[str, Any], lengths: Sequence[float]) -> dict[str, Callable[[], Act | None]]:
-    """Return what makes each controller for rings of these lengths, by the name of its row."""
+def no_command(observation: Tensor) -> Tensor:
+    """Return actions of zero: the vehicle keeps its speed, whatever happens, unless a failsafe brakes."""
+    return observation.new_zeros(len(observation), 1)
+
+
+def controllers(
+    environment: Mapping[str, Any], lengths: Sequence[float], draws: Sequence[int]
+) -> dict[str, Callable[[], Act | None]]:
+    """Return what makes each controller for rings of these lengths and draws, by the name of its row."""
     task = task_of(environment)
     vehicle = {"dt": task.simulator.dt, "max_command": task.max_command, "vehicle_length": task.vehicle_length}
-    uniform = uniform_speed(ring_start(environment, lengths)).unsqueeze(-1)
+    uniform = uniform_speed(ring_start(environment, lengths, draws=draws)).unsqueeze(-1)
     middle = float(uniform.median())
     return {
         "IDM for all": lambda: None,
-        f"FollowerStopper, U = {middle:.2f} m/s": lambda: FollowerStopper(**vehicle, desired=middle),
+        "no command": lambda: no_command,
+        "FollowerStopper, one speed for all rings": lambda: FollowerStopper(**vehicle, desired=middle),
         "FollowerStopper, told each ring's uniform speed": lambda: FollowerStopper(**vehicle, desired=uniform),
         "PI with saturation": lambda: PISaturation(**vehicle),
     }
@@ -138,13 +146,12 @@ class Arguments:
 
 
 def rows(environment: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the figures of every controller, on the test and on unseen lengths."""
-    unseen = tuple(range(200, 301, 10))
-    known, other = controllers(environment, LENGTHS), controllers(environment, unseen)
-    return {
-        name: {"test": evaluate_ring(make(), environment), "lengths": evaluate_ring(make_other(), environment, unseen)}
-        for (name, make), make_other in zip(known.items(), other.values(), strict=True)
-    }
+    """Return the figures of every controller, on the test's fresh draws and on unseen lengths."""
+    result: dict[str, dict[str, Any]] = {}
+    for kind, lengths, draws in (("test", LENGTHS, FRESH), ("lengths", UNSEEN, (1,))):
+        for name, make in controllers(environment, lengths, draws).items():
+            result.setdefault(name, {})[kind] = evaluate_ring(make(), environment, lengths, draws=draws)
+    return result
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -27,7 +27,7 @@ def make_env(environment: Mapping[str, Any], count: int, **keywords: Any) -> Dif
 
 
 def first_seed(seed: int, count: int) -> int:
-    """Return the seed of the first of ``count`` environments; different seeds of a training share none."""
+    """Return the seed of the first of ``count`` environments (the starts of a warm-up pool are the same for all)."""
     return 10_000 * (seed + 1) + count
 
 

@@ -1,7 +1,7 @@
 """How good a policy is: the same deterministic test for every agent, and pictures of it.
 
-``python -m agents.evaluate runs/ring-apg/last.pt [--video ring.mp4]``. On the ring: six lengths 220–270 m, 75 s of
-human driving, then 300 s with the policy; judged are the last 100 s.
+``python -m agents.evaluate runs/ring-apg/last.pt [--video ring]``. On the ring: six lengths 220–270 m, 300 s of
+human driving, in which a wave grows, then 300 s with the policy; judged are the last 100 s.
 """
 
 from __future__ import annotations
@@ -18,7 +18,19 @@ from torch import Tensor
 
 from agents.common import Policy, load
 from agents.environments import task_of
-from agents.rollout import LENGTHS, SEED, WARMUP, Act, Driven, Start, drive, follow_start, ring_start, uniform_speed
+from agents.rollout import (
+    LENGTHS,
+    SEED,
+    UNSEEN,
+    WARMUP,
+    Act,
+    Driven,
+    Start,
+    drive,
+    follow_start,
+    ring_start,
+    uniform_speed,
+)
 from idm_env import metrics
 from idm_env.envs.gym import DiffIDMEnv
 
@@ -32,14 +44,17 @@ def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
 
     ``speed_ratio``: mean speed of all vehicles in the last 100 s over the uniform speed; ``speed_std``: standard
     deviation over vehicles and time there (m/s); ``time_gap``: smallest of the controlled vehicles in the whole 300 s
-    (s); ``collisions``: rings in which any two vehicles have touched.
+    (s); ``collisions``: rings in which any two vehicles have touched; ``cut``: share of the judged steps in which
+    controlled vehicles accelerate less than commanded, as a failsafe makes them.
     """
     last = driven.speed[-JUDGED:]
     ratio = last.mean((0, 2)) / uniform_speed(start)
     std = last.std((0, 2), correction=0)
     gap = metrics.time_gap(start.task.pick(driven.gap), start.task.pick(driven.speed)).amin((0, 2))
     crashed = driven.gap.amin((0, 2)) <= 0.0
+    asked = start.task.command(driven.action[-JUDGED:])
     return {
+        "cut": float((start.task.pick(driven.accel[-JUDGED:]) < asked - 1e-3).float().mean()),
         "speed_ratio": float(ratio.min()),
         "speed_std": float(std.max()),
         "time_gap": float(gap.min()),
@@ -51,10 +66,14 @@ def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
 
 
 def evaluate_ring(
-    act: Act | None, environment: Mapping[str, Any], lengths: Sequence[float] = LENGTHS, warmup: int = WARMUP
+    act: Act | None,
+    environment: Mapping[str, Any],
+    lengths: Sequence[float] = LENGTHS,
+    warmup: int = WARMUP,
+    draws: Sequence[int] = (0,),
 ) -> dict[str, Any]:
     """Return the figures of a policy on rings of these lengths, from a take-over after ``warmup`` steps on."""
-    start = ring_start(environment, lengths, warmup)
+    start = ring_start(environment, lengths, warmup, draws)
     return judge_ring(start, drive(start, act, STEPS))
 
 
@@ -84,20 +103,20 @@ def mixed(environment: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def held_out(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures on ring lengths and drivers that training has not seen, without any tuning.
+    """Return the figures on ring lengths and drivers that training has not seen, on a fresh draw, without any tuning.
 
     ``lengths``: 200–300 m in steps of 10. ``drivers``: the six lengths of the test with one IDM parameter of all human
     drivers 20 % lower or higher, ten cases; the worst of each figure. ``mixed``: every driver's every parameter drawn
     from ±20 %. Ratios are to the uniform speed of those drivers.
     """
-    result = {"lengths": evaluate_ring(act, environment, tuple(range(200, 301, 10)))}
     idm = drivers_of(environment)
     cases = {
         f"{name} {sign}20 %": {name: idm[name] * factor} for name in idm for sign, factor in (("−", 0.8), ("+", 1.2))
     }
+    result = {"lengths": evaluate_ring(act, environment, UNSEEN, draws=(1,))}
     for name, change in cases.items():
-        result[name] = evaluate_ring(act, {**environment, "parameters": {"idm": {**idm, **change}}})
-    result["mixed"] = evaluate_ring(act, mixed(environment))
+        result[name] = evaluate_ring(act, {**environment, "parameters": {"idm": {**idm, **change}}}, draws=(1,))
+    result["mixed"] = evaluate_ring(act, mixed(environment), draws=(1,))
     result["drivers"] = worst([result[name] for name in cases])
     return result
 

@@ -14,9 +14,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import gymnasium
+import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -29,6 +30,7 @@ from agents import common, environments
 from agents.common import ACTIVATIONS, DivergedError, Policy
 from agents.monitor import Monitor
 from idm_env.envs.sb3 import SB3VecEnv
+from idm_env.envs.vector import DiffIDMVectorEnv
 
 
 @dataclass
@@ -85,6 +87,15 @@ class Normalised(BaseFeaturesExtractor):
     def forward(self, observation: Tensor) -> Tensor:
         """Return ``(o − m) / s``."""
         return (observation - self.mean) / self.scale
+
+
+class Desynchronised(SB3VecEnv):
+    """The adapter, with the clocks of the first episodes set apart as for the agents that differentiate."""
+
+    def reset(self) -> np.ndarray:
+        """Begin episodes at different clocks."""
+        super().reset()
+        return np.asarray(environments.desynchronise(cast(DiffIDMVectorEnv, self.vector_env)))
 
 
 def make_model(arguments: Arguments, env: VecEnv, policy: Policy) -> BaseAlgorithm:
@@ -144,8 +155,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     name = arguments.algorithm
     squash = "tanh" if name == "sac" else "clip"
     policy, saved = common.begin(arguments, name, activation=arguments.activation, squash=squash)
-    vector = SB3VecEnv(environments.make_env(arguments.environment, arguments.count, output="numpy"))
-    vector.seed(environments.first_seed(arguments.seed, arguments.count))
+    vector = Desynchronised(environments.make_env(arguments.environment, arguments.count, output="numpy"))
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
     file, moments, memory = (arguments.out / f for f in ("model.zip", "returns.pkl", "replay.pkl"))
@@ -159,6 +169,9 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         if arguments.clone:
             for mine, other in layers(model, policy):
                 other.load_state_dict(mine.state_dict())
+    # Making or loading a model seeds its environments; these are the ones of all agents, new ones after a resume.
+    done = saved.get("update", -1) + 1
+    vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
     monitor = Monitor(name, arguments, began, saved)
 
     def keep() -> None:
@@ -168,7 +181,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             common.write(memory, model.save_replay_buffer)
 
     chunk = arguments.n_steps * arguments.count
-    for update in range(saved.get("update", -1) + 1, arguments.updates):
+    for update in range(done, arguments.updates):
         rate = common.fall(arguments.learning_rate, update, arguments.updates)
         model.lr_schedule = FloatSchedule(rate)
         model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]

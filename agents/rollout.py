@@ -16,11 +16,16 @@ from idm_env.tasks import Draw, Task, World
 from idm_env.types import Params
 
 LENGTHS = (220.0, 230.0, 240.0, 250.0, 260.0, 270.0)
-WARMUP = 750
+UNSEEN = tuple(float(x) for x in range(200, 301, 10))
+WARMUP = 3000
+"""Steps of human driving before the take-over: the wave has grown by then. A vehicle that keeps its speed, with no
+command at all, dissolves the young wave that is there after 750 steps."""
 BLOCK = 250
 """Steps for which the drivers' noise is drawn at once."""
-SEED = 900_000
-"""Of evaluations; training uses other seeds."""
+SEED = 1 << 40
+"""Of evaluations; training uses smaller seeds."""
+FRESH = range(1, 6)
+"""Draws of noise and starts on which agents are reported; draw 0 is the one that chooses checkpoints and trials."""
 
 Act = Callable[[Tensor], Tensor]
 """Observations ``(n, agents · features)`` to actions ``(n, agents)``."""
@@ -69,33 +74,35 @@ def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> D
 
 
 @lru_cache(maxsize=64)
-def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int) -> Start:
-    """Return one ring of every length after its warm-up; the keywords of the environment come as JSON."""
+def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws: tuple[int, ...]) -> Start:
+    """Return one ring of every draw and length after its warm-up; the environment's keywords come as JSON."""
     chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": warmup}
-    tasks = [task_of({**chosen, "length": length}) for length in lengths]
-    task = tasks[0]
+    task = task_of(chosen)
     params = task.params(torch.float32, "cpu")
     advance = advance_of(task.simulator, "numpy", torch.device("cpu"), torch.float32)
-    draws = [Draw.of(torch.tensor([SEED + i]), torch.tensor([0])) for i in range(len(tasks))]
-    states = [
-        one.reset(draw, params, getattr(advance, "run", None)).state for one, draw in zip(tasks, draws, strict=True)
-    ]
+    keys, states = [], []
+    for i, length in enumerate(lengths):
+        draw = Draw.of(torch.tensor([SEED + 1000 * k + i for k in draws]), torch.zeros(len(draws), dtype=torch.int64))
+        one = task_of({**chosen, "length": length})
+        states.append(one.reset(draw, params, getattr(advance, "run", None)).state)
+        keys.append(draw.key)
     memory = {name: torch.cat([s.memory[name] for s in states]) for name in states[0].memory}
     columns = {
         k: torch.cat([getattr(s, k) for s in states]) for k in ("position", "speed", "accel", "gap", "length", "step")
     }
     world = World(states[0]._replace(**columns, memory=memory), {})
-    return Start(
-        task_of({**chosen, "length": [min(lengths), max(lengths)]}),
-        world,
-        Draw(torch.cat([d.key for d in draws])),
-        params,
-    )
+    whole = task_of({**chosen, "length": [min(lengths), max(lengths)]})
+    return Start(whole, world, Draw(torch.cat(keys)), params)
 
 
-def ring_start(environment: Mapping[str, Any], lengths: Sequence[float] = LENGTHS, warmup: int = WARMUP) -> Start:
-    """Return one ring of every length after its warm-up."""
-    return _ring_start(json.dumps(dict(environment), sort_keys=True), tuple(lengths), warmup)
+def ring_start(
+    environment: Mapping[str, Any],
+    lengths: Sequence[float] = LENGTHS,
+    warmup: int = WARMUP,
+    draws: Sequence[int] = (0,),
+) -> Start:
+    """Return one ring of every length and draw after its warm-up, the draws of a length together."""
+    return _ring_start(json.dumps(dict(environment), sort_keys=True), tuple(lengths), warmup, tuple(draws))
 
 
 def uniform_speed(start: Start) -> Tensor:

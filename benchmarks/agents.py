@@ -35,11 +35,11 @@ SEARCH_SEEDS, SEEDS, FEW = (100, 101), tuple(range(10)), tuple(range(5))
 Options = dict[str, Any]
 SEARCH: dict[str, list[Options]] = {
     "ring-apg": [
-        {"learning_rate": 1e-3},
         {"learning_rate": 3e-3},
-        {"learning_rate": 5e-4},
-        {"learning_rate": 1e-3, "window": 300, "updates": 72},
-        {"learning_rate": 1e-3, "count": 32, "updates": 44},
+        {"learning_rate": 1e-3},
+        {"learning_rate": 5e-3},
+        {"learning_rate": 3e-3, "window": 300, "updates": 60},
+        {"learning_rate": 3e-3, "count": 32, "updates": 44},
     ],
     "ring-ppo": [
         {"learning_rate": 1e-3, "log_std_init": -2.5},
@@ -51,9 +51,9 @@ SEARCH: dict[str, list[Options]] = {
     "ring-sac": [
         {"learning_rate": 1e-3},
         {"learning_rate": 1e-3, "gamma": 0.99},
-        {"learning_rate": 3e-4, "gamma": 0.999, "batch_size": 1024},
-        {"learning_rate": 1e-3, "count": 16, "n_steps": 400, "learning_starts": 1600},
-        {"learning_rate": 1e-3, "ent_coef": "0.002", "gradient_steps": 2},
+        {"learning_rate": 3e-4, "gamma": 0.999, "batch_size": 1024, "updates": 55},
+        {"learning_rate": 1e-3, "count": 16, "n_steps": 400, "learning_starts": 1600, "updates": 24},
+        {"learning_rate": 1e-3, "ent_coef": "0.002", "gradient_steps": 2, "updates": 48},
     ],
     "ring-shac": [{}],
     "follow-apg": [{}],
@@ -116,14 +116,17 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
 def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool) -> dict[str, Any]:
     """Return what a training came to: evaluations, last and best checkpoint, the last one on held-out traffic too."""
     from agents.common import load
-    from agents.evaluate import held_out, solved_at
+    from agents.evaluate import evaluate_ring, held_out, solved_at
+    from agents.rollout import FRESH
 
-    if not (training / "last.pt").exists():
-        return {"error": done.stderr[-2000:], "history": [], "summary": {"solved": False, "error": True}}
+    if not (training / "last.pt").exists() or not (training / "best.pt").exists():
+        summary = {"solved": False, "ever": False, "error": True}
+        return {"error": done.stderr[-2000:], "history": [], "summary": summary}
     policy, content = load(training / "last.pt")
-    _, at_best = load(training / "best.pt")
-    history = content["training"]["history"]
-    first = solved_at(history)
+    best, at_best = load(training / "best.pt")
+    environment, history = content["environment"], content["training"]["history"]
+    # What ended before its time has solved nothing.
+    first = solved_at(history) if done.returncode == 0 else None
     summary = {
         "solved": first is not None,
         "cpu_seconds": None if first is None else history[first]["cpu_seconds"],
@@ -131,15 +134,18 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
         "ever": any(row["passed"] for row in history),
         "error": done.returncode != 0,
     }
-    unseen = unseen and content["task"] == "ring"
-    return {
+    result = {
         "error": done.stderr[-2000:] if done.returncode else "",
         "summary": summary,
         "history": history,
         "last": history[-1],
         "best": at_best["training"]["history"][-1],
-        "held_out": held_out(policy, content["environment"]) if unseen else {},
     }
+    if unseen and content["task"] == "ring":
+        result["fresh_last"] = evaluate_ring(policy, environment, draws=FRESH)
+        result["fresh_best"] = evaluate_ring(best, environment, draws=FRESH)
+        result["held_out"] = held_out(policy, environment)
+    return result
 
 
 def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:

@@ -54,6 +54,7 @@ class Task(abc.ABC):
         max_command: Acceleration that an action of 1 commands (m/s²).
         failsafe: Deceleration (m/s²) of a failsafe: commands that leave a vehicle no room to stop at it behind a leader
             who brakes as hard are cut, and may then brake beyond ``max_command``; 0 is none. See ``safe_command``.
+        failsafe_time: Time (s) that the failsafe allows for before braking begins, as SUMO's tau.
 
     Raises:
         ValueError: In one line, with value, rule and cure.
@@ -71,6 +72,7 @@ class Task(abc.ABC):
     warmup_pool: int = 0
     max_command: float = 1.0
     failsafe: float = 0.0
+    failsafe_time: float = 1.0
 
     name: ClassVar[str]
     road: ClassVar[Road]
@@ -92,6 +94,7 @@ class Task(abc.ABC):
             raise ValueError(f"warmup_pool = {self.warmup_pool} has no use without warm-up. Give warmup=750 as well.")
         at_least("max_command", self.max_command, 1e-3, "m/s²")
         at_least("failsafe", self.failsafe, 0.0, "m/s²")
+        at_least("failsafe_time", self.failsafe_time, 0.0, "s")
         self.params(torch.float64, "cpu")
 
     # -- static facts --------------------------------------------------------------------------------------------
@@ -205,16 +208,21 @@ class Task(abc.ABC):
         """Return the highest acceleration (m/s²) that the failsafe allows each agent, shape ``(…, agents)``.
 
         The safe speed of Krauß 1998 (Microscopic modeling of traffic flow), which SUMO keeps, for one step Δt: the
-        largest v' with ``(v + v')/2 Δt + v'²/(2b) ≤ s − 1 m + v_lead²/(2b)``, b being ``failsafe``. Where it holds
-        at first and no leader brakes harder than b, it can be kept with b for ever, and no two vehicles touch.
+        largest v' with ``(v + v')/2 Δt + v' τ + v'²/(2b) ≤ s − 1 m + v_lead²/(2b)``, b and τ being ``failsafe`` and
+        ``failsafe_time``. Where it holds at first and no leader brakes harder than b, it can be kept with b for ever:
+        no two vehicles touch, and behind a leader of the same speed the time gap is at least τ.
         """
         state, decel, dt = world.state, self.failsafe, self.simulator.dt
-        there = self.road.leader_present(state.present, state.speed)
-        leader = self.road.leader(state.gap, state.speed, state.accel, there)
-        speed, ahead = self.pick(state.speed), self.pick(leader.speed)
-        room = 2.0 * decel * (self.pick(leader.gap) - _STANDSTILL) + ahead * ahead - decel * dt * speed
+        speed, ahead = self.pick(state.speed), self.pick(self.road.ahead(state.speed))
+        if state.present is not None:
+            there = self.road.leader_present(state.present, state.speed)
+            ahead = torch.where(self.pick(there) > 0, ahead, speed)
+        # Euler moves by the old speed; the speed after the step then costs its half step later.
+        way = speed * dt if self.simulator.integration == "euler" else 0.5 * speed * dt
+        half = decel * (self.failsafe_time + 0.5 * dt)
+        room = 2.0 * decel * (self.pick(state.gap) - _STANDSTILL - way) + ahead * ahead
         # Below the clamp the vehicle must stop at once, whatever the root.
-        safe = torch.sqrt((room + (0.5 * decel * dt) ** 2).clamp_min(1e-6)) - 0.5 * decel * dt
+        safe = torch.sqrt((room + half * half).clamp_min(1e-6)) - half
         return (safe - speed) / dt
 
     def inputs(

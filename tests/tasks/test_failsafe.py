@@ -36,18 +36,23 @@ TASKS = {
 }
 
 
+@pytest.mark.parametrize("integration", ["ballistic", "euler"])
+@pytest.mark.parametrize("failsafe_time", [0.0, 1.0])
 @pytest.mark.parametrize("name", TASKS)
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_nobody_touches_whatever_is_commanded(name, seed):
+def test_nobody_touches_whatever_is_commanded(name, failsafe_time, integration, seed):
     # Brakes reach 9 m/s², and so does the failsafe: no leader brakes harder than it assumes.
     chosen = {**TASKS[name], "controlled": list(TASKS[name]["controlled"]), "max_command": 9.0}
-    assert reckless(make_task(name, **chosen, failsafe=9.0), seed) > 0.0
+    chosen["integration"] = integration
+    assert reckless(make_task(name, **chosen, failsafe=9.0, failsafe_time=failsafe_time), seed) > 0.0
     assert reckless(make_task(name, **chosen), seed) < 0.0
 
 
 def test_a_vehicle_stops_a_metre_behind_one_that_stands_and_never_brakes_harder_than_planned():
-    task = make_task("ring", vehicles=2, length=200.0, noise=0.0, warmup=0, controlled=[0, 1], failsafe=3.0)
+    task = make_task(
+        "ring", vehicles=2, length=200.0, noise=0.0, warmup=0, controlled=[0, 1], failsafe=3.0, failsafe_time=0.0
+    )
     world, params = start(task, count=1)
     command = torch.tensor([[-1.0, 1.0]], dtype=torch.float64)
     hardest = 0.0
@@ -56,6 +61,14 @@ def test_a_vehicle_stops_a_metre_behind_one_that_stands_and_never_brakes_harder_
         hardest = min(hardest, float(world.state.accel.min()))
     assert float(world.state.gap[0, 1]) == pytest.approx(1.0, abs=1e-3)
     assert hardest == pytest.approx(-3.0, abs=1e-6)
+
+
+def test_behind_a_leader_of_the_same_speed_it_keeps_its_time():
+    task = make_task("platoon", vehicles=2, controlled=1, speed=10.0, disturbance=0.01, max_command=3.0, failsafe=3.0)
+    world, params = start(task, count=1)
+    for _ in range(600):
+        world = task.step(world, torch.ones(1, 1, dtype=torch.float64), None, params)
+    assert float(world.state.gap[0, 1]) == pytest.approx(1.0 + 10.0 * (1.0 + task.simulator.dt), rel=0.01)
 
 
 def test_where_there_is_room_a_command_is_left_as_it_is():
