@@ -49,7 +49,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
             raise ValueError("output = 'torch' has no meaning for PettingZoo. Use gym.make_vec for gradients.")
         self.settings = made
         self.task = made.task
-        self.max_cycles = max_cycles
+        self.max_cycles = made.limit
         self.render_mode = made.render_mode
         self.batch = Batch(made, 1)
         self.possible_agents = [f"vehicle_{i}" for i in self.task.agents]
@@ -76,7 +76,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise."""
         if seed is not None or self.batch.world is None:
             self.batch.seed([0], [seeding.np_random(seed)[1]])
-        self.batch.limit = min(x for x in (self.max_cycles, self.task.horizon) if x is not None)
+        self.batch.limit = min((x for x in (self.max_cycles, self.task.horizon) if x is not None), default=None)
         self.agents = list(self.possible_agents)
         seen = self.batch.reset()[0].cpu().numpy()
         if self.render_mode == "human":

@@ -62,7 +62,8 @@ def settings(
     """Return checked settings; ValueError in one line, with a suggestion, for a misspelled keyword or value.
 
     ``config`` is a YAML file that says ``configures: environment`` and gives any of these keywords; a keyword that is
-    given here as well wins. ``max_episode_steps`` of None or −1 leaves the limit to the task.
+    given here as well wins, but of two ``max_episode_steps`` the smaller one, as with ``gym.make``, which has one of
+    its own. ``max_episode_steps`` of None or −1 leaves the limit to the task.
     """
     own = {
         "task": task,
@@ -75,7 +76,10 @@ def settings(
     }
     if config is not None:
         read = load_environment(config)
-        own = {key: read.pop(key, None) if value is None else value for key, value in own.items()}
+        said = {key: read.pop(key, None) for key in own}
+        limits = [n for n in map(_limit, (max_episode_steps, said["max_episode_steps"])) if n is not None]
+        own = {key: said[key] if value is None else value for key, value in own.items()}
+        own["max_episode_steps"] = min(limits, default=None)
         choices = {**read, **choices}
     chosen = own["task"] or "ring"
     if isinstance(chosen, Task) and choices:

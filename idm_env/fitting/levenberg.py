@@ -94,12 +94,19 @@ def _free(value: Tensor, gradient: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def own_step(problem: Problem, now: Normal, own: Tensor, damping: Tensor) -> Tensor:
-    """Return trial values of the own parameters, inside their bounds."""
+    """Return trial values of the own parameters, inside their bounds: what a bound stops stays there, the rest adapts.
+
+    A step that is only clipped may lead uphill, because the parameters that move freely were meant for the whole step.
+    """
     count = len(problem.own)
     low, high = (bound[:count] for bound in problem.bounds)
-    gradient = now.gradient[..., :count]
+    gradient, hessian = now.gradient[..., :count], now.hessian[..., :count, :count]
     free = _free(own, gradient, low, high)
-    step = _solve(now.hessian[..., :count, :count], gradient, damping, free)
+    wanted = own + _solve(hessian, gradient, damping, free)
+    stopped = (wanted < low) | (wanted > high)
+    at_bound = torch.where(stopped, wanted.clamp(low, high) - own, 0.0)
+    left = gradient + (hessian @ at_bound[..., None])[..., 0]
+    step = torch.where(stopped, at_bound, _solve(hessian, left, damping, free & ~stopped))
     return torch.minimum(torch.maximum(own + step, low), high)
 
 
@@ -125,7 +132,8 @@ def refine(
         better = (then.cost < now.cost) & ~progress.done
         small = now.cost - then.cost <= tolerance * now.cost
         promised = -(now.gradient[..., : len(problem.own)] * (trial - progress.own)).sum(-1)
-        hopeless = ~better & (promised <= tolerance * now.cost)
+        # A clipped step that promises nothing says nothing either: more damping shortens it until it lies inside.
+        hopeless = ~better & (promised >= 0.0) & (promised <= tolerance * now.cost)
         damping = torch.where(better, progress.damping * 0.2, progress.damping * 5.0).clamp_min(1e-9)
         now = Normal(
             torch.where(better, then.cost, now.cost),

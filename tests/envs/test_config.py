@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -10,6 +11,8 @@ import yaml
 import idm_env  # noqa: F401
 from idm_env.config import Model, load_environment, load_model, save_model
 from idm_env.effects import IDM, Brakes, Curve, Delay
+from idm_env.envs.pettingzoo import parallel_env
+from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.tasks import make_task
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
@@ -103,8 +106,41 @@ def test_every_shipped_file_does_what_it_says(path):
         env.step(None)
 
 
+RING = next(path for path in CONFIGS if path.stem == "ring")
+FACES = {
+    "make": lambda **kw: gym.make("DiffIDM-v0", **kw),
+    "make_vec": lambda **kw: gym.make_vec("DiffIDM-v0", num_envs=2, **kw),
+    "vector": lambda **kw: DiffIDMVectorEnv(2, **kw),
+    "parallel": lambda **kw: parallel_env(**kw),
+}
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_every_face_takes_a_file_and_keywords_beside_it(face):
+    env = FACES[face](config=str(RING), task="ring", warmup=3, vehicles=5)
+    env.reset(seed=0)
+    assert env.unwrapped.task.vehicles == 5
+    env.close()
+
+
+@pytest.mark.parametrize(("said", "given", "steps"), [(4, None, 4), (4, 6, 4), (6, 4, 4)])
+@pytest.mark.parametrize("face", FACES)
+def test_the_smaller_limit_of_file_and_keyword_holds(face, said, given, steps, tmp_path):
+    path = write(tmp_path / "short.yaml", {"configures": "environment", "task": "platoon", "max_episode_steps": said})
+    name = "max_cycles" if face == "parallel" else "max_episode_steps"
+    env = FACES[face](config=path, **({} if given is None else {name: given}))
+    env.reset(seed=0)
+    if face == "parallel":
+        ends = [any(env.step({name: env.action_space(name).sample() for name in env.agents})[3].values())
+                for _ in range(steps)]  # fmt: skip
+    else:
+        ends = [bool(np.any(env.step(env.action_space.sample() * 0.0)[3])) for _ in range(steps)]
+    assert ends == [False] * (steps - 1) + [True]
+    env.close()
+
+
 def test_ring_yaml_is_the_default_ring():
-    path = next(path for path in CONFIGS if path.stem == "ring")
+    path = RING
     spelled, plain = (gym.make("DiffIDM-v0", warmup=20, **kw) for kw in ({"config": str(path)}, {}))
     assert (spelled.reset(seed=5)[0] == plain.reset(seed=5)[0]).all()
 
