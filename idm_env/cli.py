@@ -25,6 +25,24 @@ app = typer.Typer(
 )
 console = Console(stderr=True)
 
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        import idm_env
+
+        print(idm_env.__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    pass
+
+
 Data = Annotated[Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if missing.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
@@ -80,7 +98,9 @@ def fit(
     method: Annotated[str, typer.Option(help="lm (Levenberg-Marquardt) or adam (as in the paper).")] = "lm",
     integration: Annotated[str, typer.Option(help="ballistic, or euler as in the paper.")] = "ballistic",
     starts: Annotated[int, typer.Option(help="Starts per group.", min=1)] = 4,
-    substeps: Annotated[int | None, typer.Option(help="Simulated steps per sample; default: steps of 25 ms.")] = None,
+    substeps: Annotated[
+        int | None, typer.Option(help="Simulated steps per sample; default: steps of 25 ms.", min=1)
+    ] = None,
     model: Annotated[
         Path | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")
     ] = None,
@@ -157,7 +177,9 @@ def _explain(
     import json
 
     from idm_env.discovery import discover, write_report
+    from idm_env.report import output_folder
 
+    output_folder(out)
     with progress() as report:
         found = discover(
             trajectories,
@@ -189,17 +211,18 @@ def demo(
         Path | None, typer.Option(help="Your own file; default: generated data with a hidden effect.")
     ] = None,
     out: Out = Path("out/demo"),
-    seed: Seed = 7,
+    seed: Annotated[int, typer.Option(help="Seed of the generated data.")] = 7,
 ) -> None:
     """Show the main job: a platoon whose generator has an effect that the fitted model is not told of.
 
     The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
     """
     from idm_env.data import load, synthetic
+    from idm_env.report import output_folder
 
     path = data
+    output_folder(out)
     if path is None:
-        out.mkdir(parents=True, exist_ok=True)
         path = out / "platoon.csv"
         made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
         columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
@@ -259,7 +282,7 @@ def plot(
     ),
     where: Where = None,
     seconds: Annotated[
-        float, typer.Option(help="Length of a rollout, all vehicles left to their drivers (s).")
+        float, typer.Option(help="Length of a rollout, all vehicles left to their drivers (s).", min=0.1)
     ] = 300.0,
     seed: Seed = 0,
 ) -> None:
@@ -283,16 +306,19 @@ def plot(
 def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
     import torch
 
+    from idm_env.config import load_environment
     from idm_env.diagrams import space_time
     from idm_env.envs.gym import DiffIDMEnv
     from idm_env.roads import Ring
     from idm_env.simulator import Trajectory
 
-    env: Any = DiffIDMEnv(config=str(config))
+    # The picture is as long as it was asked for, whatever the limit of an episode.
+    keywords = {key: value for key, value in load_environment(config).items() if key != "max_episode_steps"}
+    env: Any = DiffIDMEnv(**keywords)
     env.reset(seed=seed)
     dt = env.task.simulator.dt
     kept = []
-    for _ in range(round(seconds / dt)):
+    for _ in range(max(1, round(seconds / dt))):
         _, _, terminated, truncated, _ = env.step(None)
         state = env.batch.world.state
         kept.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
@@ -413,5 +439,8 @@ def run() -> None:
 
 
 def _interrupted() -> None:
-    print("interrupted: what is done was kept. Run the same command with --resume to go on.", file=sys.stderr)
+    """End after Ctrl-C; only some commands are long enough to go on with."""
+    resumable = {"fit", "explain", "filter", "reconstruct", "predict"} & set(sys.argv[1:2])
+    advice = ": what is done was kept. Run the same command with --resume to go on." if resumable else "."
+    print(f"interrupted{advice}", file=sys.stderr)
     sys.exit(130)

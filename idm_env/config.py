@@ -6,7 +6,10 @@
     {configures: model, schema: 1, dt: 0.1, integration: ballistic,
      effects: [idm, brakes, {effect: delay, max_delay: 2.0}],
      parameters: {idm: {max_accel: 1.2, time_gap: 1.4}, delay: {delay: 0.6}},
-     drivers: {run1/7/0: {idm: {time_gap: 1.1}}}}
+     by: driver, drivers: {run1/7: {idm: {time_gap: 1.1}}}, substeps: 4}
+
+``by`` says what the keys of ``drivers`` are, as in ``fit``: ``driver`` (run/vehicle), ``run_id``, ``vehicle_id`` or a
+column. ``substeps`` is there where a fit chose another number of simulated steps per sample than the default.
 
 Unknown keys are errors with a suggestion, in one line.
 """
@@ -36,7 +39,7 @@ SCHEMA = 1
 Numbers = dict[str, dict[str, float]]
 """Effect name → parameter name → number."""
 
-_MODEL_KEYS = ("configures", "schema", "dt", "integration", "effects", "parameters", "drivers")
+_MODEL_KEYS = ("configures", "schema", "dt", "integration", "effects", "parameters", "by", "drivers", "substeps")
 
 
 @dataclass(frozen=True)
@@ -52,12 +55,16 @@ class Model:
     dt: float = 0.1
     integration: Integration = "ballistic"
     drivers: dict[str, Numbers] = field(default_factory=dict)
+    by: str = "driver"
+    substeps: int | None = None
 
     def __post_init__(self) -> None:
         if self.integration not in INTEGRATORS:
             raise ValueError(f"integration = '{self.integration}' is unknown.{nearest(self.integration, INTEGRATORS)}")
         if not self.dt > 0.0:
             raise ValueError(f"dt = {self.dt} s must be positive.")
+        if self.substeps is not None and (not isinstance(self.substeps, int) or self.substeps < 1):
+            raise ValueError(f"substeps = {self.substeps!r} must be a whole number of at least 1.")
         parameters.check(self.effects, self.params(dtype=torch.float64))
         for key in self.drivers:
             try:
@@ -110,6 +117,8 @@ def _model(content: dict[str, Any]) -> Model:
             str(key): numbers(_mapping(f"drivers.{key}", value))
             for key, value in _mapping("drivers", content.get("drivers") or {}).items()
         },
+        by=str(content.get("by", "driver")),
+        substeps=content.get("substeps"),
     )
 
 
@@ -123,7 +132,10 @@ def save_model(path: str | Path, model: Model) -> None:
         "effects": [describe(effect) for effect in model.effects],
         "parameters": {e: {n: float(x) for n, x in values.items()} for e, values in model.parameters.items()},
     }
+    if model.substeps is not None:
+        content["substeps"] = model.substeps
     if model.drivers:
+        content["by"] = model.by
         content["drivers"] = {
             key: {e: {n: float(x) for n, x in values.items()} for e, values in layer.items()}
             for key, layer in model.drivers.items()

@@ -51,6 +51,8 @@ def episodes(
         left_out.append(Repair("too short", len(too_short), text))
     if not spans:
         reasons = " ".join(repair.text for repair in left_out)
+        if too_short:
+            reasons += " Where samples are missing, idm-env reconstruct fills the holes."
         raise DataError(f"{trajectories.source}: no driver follows a leader for {min_seconds:g} s. {reasons}")
     source = records.Source.of(trajectories, table, around)
     numbers, texts = columns.extra(table)

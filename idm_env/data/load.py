@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -124,9 +125,16 @@ def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.Dat
     if layout == "ngsim" or (layout == "auto" and ngsim.matches(table.columns)):
         return ngsim.read(table, source)
     if layout == "auto" and not tidy.matches(table.columns):
+        plain = {re.sub(r"\W+", "_", name.lower()).strip("_"): name for name in table.columns}
+        near = [
+            f"'{plain[name]}' to {name}"
+            for name in ("vehicle_id", "time_s", "position_m")
+            if plain.get(name, name) != name
+        ]
+        cure = f" Rename {' and '.join(near)}." if near else ""
         raise DataError(
             f"{source}: no known layout has the columns {listed(table.columns, 8)}; a tidy table, separated by commas, "
-            "needs vehicle_id, time_s and position_m."
+            f"needs vehicle_id, time_s and position_m.{cure}"
         )
     return tidy.read(table)
 
@@ -142,6 +150,10 @@ def _checked(path: Path) -> str:
         raise DataError(f"{path.name} has an unknown extension; use one of {', '.join(EXTENSIONS)}.")
     if path.stat().st_size == 0:
         raise DataError(f"{path.name} is empty (0 bytes); it needs a header and rows.")
+    head = _first_lines(path, 1)[0] if extension != ".parquet" else ""
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        if head.count(mark) > head.count(","):
+            raise DataError(f"{path.name} is separated by {name}; separate it by commas, with points in the decimals.")
     return extension
 
 

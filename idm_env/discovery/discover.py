@@ -254,4 +254,5 @@ def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) ->
         dt=prepared.dt,
         integration="midpoint",
         drivers=drivers if by != "all" else {},
+        by=by,
     )

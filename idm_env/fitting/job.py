@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 
 from idm_env import report as page
 from idm_env.config import Model, Numbers, load_model, save_model
-from idm_env.data import LEADER_LOST_GAP_M, Episodes, Trajectories, episodes, load
+from idm_env.data import LEADER_LOST_GAP_M, DataError, Episodes, Trajectories, episodes, load
 from idm_env.effects import Effect, Replay
 from idm_env.fitting import pictures
 from idm_env.fitting.batch import Batch, windows
@@ -136,7 +137,7 @@ def fit_file(
         pooled = found if options.by == "all" else run("all", "pooled.resume.pt")
         result["held_out"] = _held_out(source, options, held, found, pooled)
     pl.DataFrame(result["parameters"]).write_parquet(out / "parameters.parquet")
-    save_model(out / "model.yaml", model_of(found))
+    save_model(out / "model.yaml", dataclasses.replace(model_of(found, options.by), substeps=options.substeps))
     page.write_json(out / "report.json", result)
     page.write_page(
         out / "report.html", f"IDM fitted to {source.path.name}", _fit_page(result, found, error, simulated)
@@ -164,8 +165,8 @@ def _held_out(source: Source, options: Options, held: Trajectories, found: Fit, 
     }
 
 
-def model_of(found: Fit) -> Model:
-    """Return a fit as a model: the median of the groups as its parameters, every group as a driver of its own."""
+def model_of(found: Fit, by: str = "driver") -> Model:
+    """Return a fit ``by`` groups as a model: their median as its parameters, every group as a driver of its own."""
     values = found.values()
 
     def numbers(row: torch.Tensor) -> Numbers:
@@ -187,6 +188,7 @@ def model_of(found: Fit) -> Model:
         dt=found.problem.batch.dt,
         integration=simulator.integration,
         drivers={g: numbers(values[i]) for i, g in enumerate(found.problem.groups)} if several else {},
+        by=by,
     )
 
 
@@ -231,8 +233,8 @@ def _fit_page(result: dict[str, Any], found: Fit, error: Errors, simulated: Simu
 def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0) -> dict[str, Any]:
     """Roll a saved model behind the measured leaders; write simulated.parquet, report.json and report.html.
 
-    A driver takes the parameters of ``drivers`` whose key is its run/vehicle, its run, its vehicle or one of its labels
-    (such as vehicle_name), otherwise the model's own. Noise is drawn with ``seed``.
+    A driver takes the parameters of ``drivers`` whose key is his, by the model's ``by``, otherwise the model's own.
+    Noise is drawn with ``seed``.
     """
     page.output_folder(out)
     model = load_model(model_path)
@@ -268,17 +270,19 @@ def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0)
 
 def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, torch.Tensor, int]:
     """Return a problem with all parameters of a model, their values per episode, and how many drivers were matched."""
-    batch = Batch.of(items)
+    batch = Batch.of(items, substeps=model.substeps)
     effects = _behind_records(model)
     simulator = Simulator(Lane(), effects, dt=batch.step, integration=model.integration)
     names = tuple(f"{e.name}.{p.name}" for e in effects for p in e.parameters)
-    rows, matched = [], 0
-    for episode in batch.episodes:
-        keys = (f"{episode.run_id}/{episode.vehicle_id}", episode.run_id, episode.vehicle_id, *episode.labels.values())
-        own = next((key for key in keys if key in model.drivers), None)
-        matched += own is not None
-        params = model.params(own, dtype=torch.float64)
-        rows.append(torch.stack([params[n.split(".")[0]][n.split(".")[1]] for n in names]))
+    try:
+        groups, labels = group_of(batch.episodes, model.by)
+        keys = [labels[i] for i in groups.tolist()]
+    except DataError:  # these data lack the column by which the drivers were told apart
+        keys = [""] * len(batch)
+    owns = [key if key in model.drivers else None for key in keys]
+    every = [model.params(own, dtype=torch.float64) for own in owns]
+    rows = [torch.stack([p[n.split(".")[0]][n.split(".")[1]] for n in names]) for p in every]
+    matched = sum(own is not None for own in owns)
     group = torch.arange(len(batch))
     problem = Problem(simulator, batch, names, (), group, tuple(str(i) for i in range(len(batch))), seed=seed)
     return problem, torch.stack(rows), matched

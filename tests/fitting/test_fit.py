@@ -16,6 +16,7 @@ from idm_env.effects import IDM, Brakes, Replay, make
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import fit
+from idm_env.fitting.levenberg import normal
 from idm_env.fitting.problem import IDM_NAMES, Problem, group_of
 from idm_env.fitting.uncertainty import effective_samples
 from idm_env.roads import Lane
@@ -62,6 +63,25 @@ def test_a_shared_effect_is_found_with_every_driver_of_its_own() -> None:
     after, _ = errors(found.problem, found.own, found.shared)
     assert after.gap_rmse.mean() < 0.5 * before.gap_rmse.mean()
     assert bool(found.converged.all())
+
+
+def test_what_has_converged_cannot_be_improved_by_starting_there_again() -> None:
+    """From anywhere within the bounds, where steps are clipped all the time."""
+    trajectories, _ = synthetic.generate(3, runs=3, followers=3, seconds=40.0, effect="delay", strength=0.5, noise=0.1)
+    items = episodes(trajectories, max_gap=None, smooth=True)
+    problem = fit(items, starts=1, substeps=1, iterations=1).problem
+    low, high = problem.bounds
+    none = torch.empty(0, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    arrived = 0
+    for _ in range(8):
+        share = torch.rand(len(problem.groups), len(low), generator=generator, dtype=torch.float64)
+        found = fit(items, start=(low + (high - low) * share, none), substeps=1)
+        again = fit(items, start=(found.own, none), substeps=1)
+        cost, least = (normal(problem, x.own[None], none[None]).cost[0] for x in (found, again))
+        assert bool((cost[found.converged] <= 1.01 * least[found.converged]).all())
+        arrived += int(found.converged.sum())
+    assert arrived > 0.6 * 8 * len(problem.groups)
 
 
 def test_bounds_hold_exactly_and_are_reported(platoon: tuple[Episodes, Truth]) -> None:

@@ -64,6 +64,23 @@ def test_pooled_and_grouped_fits(file: Path, tmp_path: Path) -> None:
     assert by_vehicle["fit"]["gap_rmse_m"] <= pooled["fit"]["gap_rmse_m"] * 1.001
 
 
+def test_drivers_are_told_apart_as_they_were_fitted(file: Path, tmp_path: Path) -> None:
+    """Runs are runs: a vehicle that happens to be called like a run gets nothing of it."""
+    fit_file(Source(file), Options(by="run_id", starts=1, substeps=1), tmp_path / "fit")
+    model = tmp_path / "fit" / "model.yaml"
+    assert load_model(model).by == "run_id" and load_model(model).substeps == 1
+    same = simulate_file(Source(file), model, tmp_path / "same")
+    assert same["drivers_with_own_parameters"] == same["data"]["episodes"]
+    runs = load_model(model).drivers
+    table = pl.read_csv(file, schema_overrides={"run_id": pl.String, "vehicle_id": pl.String, "leader_id": pl.String})
+    one = table.filter(pl.col("run_id") == table["run_id"][0])
+    names = dict(zip(one["vehicle_id"].unique().sort(), runs, strict=False))
+    other = one.with_columns(pl.lit("elsewhere").alias("run_id"), pl.col("vehicle_id", "leader_id").replace(names))
+    other.write_csv(tmp_path / "other.csv")
+    result = simulate_file(Source(tmp_path / "other.csv"), model, tmp_path / "sim")
+    assert result["drivers_with_own_parameters"] == 0
+
+
 def test_a_model_with_an_effect_and_with_noise_is_simulated(file: Path, tmp_path: Path) -> None:
     """Any effect of the catalogue; noise is drawn by the seed."""
     model = tmp_path / "model.yaml"
