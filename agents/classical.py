@@ -20,7 +20,7 @@ import tyro
 from torch import Tensor
 
 from agents import apg
-from agents.common import load_agent
+from agents.common import load_agent, one_line
 from agents.environments import task_of
 from agents.evaluate import evaluate_ring
 from agents.rollout import FRESH, LENGTHS, UNSEEN, Act, ring_start, uniform_speed
@@ -157,7 +157,8 @@ def rows(environment: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per controller."""
     torch.set_num_threads(1)
-    environment = load_agent(tyro.cli(Arguments, args=argv).config, apg.Arguments, "apg").environment
+    with one_line():
+        environment = load_agent(tyro.cli(Arguments, args=argv).config, apg.Arguments, "apg").environment
     print("controller | worst speed ratio | worst std (m/s) | smallest time gap (s) | collisions")
     for name, figures in rows(environment).items():
         r = figures["test"]

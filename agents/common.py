@@ -7,7 +7,9 @@ import dataclasses
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -26,6 +28,14 @@ from idm_env.parameters import nearest
 SCHEMA = 1
 """Version of the layout of checkpoints."""
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
+
+MAY_BE_ZERO = {"seed", "clone", "critic_first", "learning_starts"}
+LOGS = ("csv", "tensorboard", "stdout", "json")
+MAY_CHANGE = {
+    "out", "resume", "seed", "updates", "cpu_seconds", "evaluate_every", "log", "clone", "learning_rate", "window",
+    "data",
+}  # fmt: skip
+"""Arguments that a resumed training may give anew; the others are part of what it is."""
 
 # -- arguments -------------------------------------------------------------------------------------------------------
 
@@ -63,6 +73,19 @@ class Arguments:
     clip: float = 1.0
     clone: int = 0
 
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            low = 0 if f.name in MAY_BE_ZERO else 1
+            whole = value if isinstance(value, tuple) else (value,)
+            if any(isinstance(x, int) and not isinstance(x, bool) and x < low for x in whole):
+                raise ValueError(f"{f.name} = {value} must be at least {low}.")
+        if self.environment.get("dtype", "float32") != "float32":
+            raise ValueError(f"dtype = '{self.environment['dtype']}': agents learn in float32. Leave dtype out.")
+        unknown = [name for name in self.log.split(",") if name not in LOGS]
+        if unknown:
+            raise ValueError(f"log = '{unknown[0]}' is unknown.{nearest(unknown[0], LOGS)}")
+
 
 A = TypeVar("A", bound=Arguments)
 R = TypeVar("R")
@@ -81,10 +104,20 @@ def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
 def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Sequence[str] | None = None) -> R:
     """Train as the command line says, on one thread; what is wrong is told in one line."""
     torch.set_num_threads(1)
-    try:
+    with one_line():
         return train(parse(kind, agent, argv))
-    except (ValueError, DivergedError) as error:
-        raise SystemExit(f"error: {error}") from None
+
+
+@contextmanager
+def one_line() -> Iterator[None]:
+    """End with one line and exit code 1 for what is wrong, with 130 for Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("interrupted: the last checkpoint was kept. Add --resume to go on.", file=sys.stderr)
+        raise SystemExit(130) from None
+    except (ValueError, OSError, DivergedError) as error:
+        raise SystemExit(f"error: {' '.join(str(error).split())}") from None
 
 
 def load_agent(path: str | Path, kind: type[A], agent: str) -> A:
@@ -109,7 +142,10 @@ def load_agent(path: str | Path, kind: type[A], agent: str) -> A:
         values[key] = _as(f"{path}: {key}", value, getattr(default, key))
     if "config" in values.get("environment", {}):
         own = dict(values["environment"])
-        values["environment"] = {**load_environment(file.parent / own.pop("config")), **own}
+        beside = own.pop("config")
+        if not isinstance(beside, str):
+            raise ValueError(f"{path}: environment.config = {beside!r} must be the name of a file.")
+        values["environment"] = {**load_environment(file.parent / beside), **own}
     return kind(**values)
 
 
@@ -120,9 +156,20 @@ def _as(name: str, value: Any, like: Any) -> Any:
             raise ValueError(f"{name} = {value!r} must be {'true or false' if isinstance(like, bool) else 'no bool'}.")
         return value
     if isinstance(like, (int, float)):
-        return type(like)(number(name, value))
+        found = number(name, value)
+        if isinstance(like, int) and found != int(found):
+            raise ValueError(f"{name} = {value!r} must be a whole number.")
+        return type(like)(found)
     if isinstance(like, dict) and not isinstance(value, dict):
         raise ValueError(f"{name} = {value!r} must be a mapping, such as {{task: ring}}.")
+    if isinstance(like, tuple):
+        if not isinstance(value, list):
+            raise ValueError(f"{name} = {value!r} must be a list, such as {list(like)}.")
+        return tuple(_as(f"{name}[{i}]", x, like[0]) for i, x in enumerate(value))
+    if isinstance(like, str) and not isinstance(value, (str, int, float)):
+        raise ValueError(f"{name} = {value!r} must be a text.")
+    if isinstance(like, Path) and not isinstance(value, str):
+        raise ValueError(f"{name} = {value!r} must be a path.")
     return value if isinstance(like, dict) else type(like)(value)
 
 
@@ -239,6 +286,13 @@ def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[s
     task = task_of(arguments.environment)
     if arguments.resume:
         policy, content = load(arguments.out / "last.pt", task.name, agent)
+        before, now = content["training"].get("arguments", {}), choices(arguments)
+        for name in before:
+            if name not in MAY_CHANGE and before[name] != now.get(name):
+                raise ValueError(
+                    f"{name} = {now.get(name)} cannot be resumed: {arguments.out} was begun with {before[name]}. "
+                    "Give that, or another --out."
+                )
         return policy, content["training"]
     policy = Policy(len(task.bounds.names), arguments.hidden, **made)
     observations, actions = human_driving(arguments.environment, first_seed(arguments.seed, 0))
@@ -247,6 +301,11 @@ def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[s
     if arguments.clone:
         clone(policy, observations, actions, arguments.clone)
     return policy, {}
+
+
+def choices(arguments: Arguments) -> dict[str, Any]:
+    """Return the arguments as plain values, as a checkpoint keeps them."""
+    return {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(arguments).items()}
 
 
 def clone(policy: Policy, observations: Tensor, actions: Tensor, steps: int) -> float:
@@ -289,10 +348,15 @@ def descend(
     if not (math.isfinite(float(loss.detach())) and math.isfinite(norm)):
         raise DivergedError(
             f"update {update}: loss {float(loss.detach()):g} and gradient norm {norm:g} must be finite. "
-            f"The last good checkpoint is {kept}; resume from it with a lower learning_rate or a shorter window."
+            f"{last_good(kept, update)} with a lower learning_rate or a shorter window."
         )
     optimiser.step()
     return norm
+
+
+def last_good(kept: Path, update: int) -> str:
+    """Return which checkpoint is left after a failure, as the beginning of an advice."""
+    return f"The last good checkpoint is {kept}; resume from it" if update > 0 else "None was kept yet; begin again"
 
 
 def fall(learning_rate: float, update: int, updates: int, last: float = 0.1) -> float:

@@ -16,7 +16,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from agents.common import Policy, load
+from agents.common import Policy, load, one_line
 from agents.environments import task_of
 from agents.rollout import (
     LENGTHS,
@@ -255,17 +255,20 @@ class Arguments:
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the figures of a policy beside those of human drivers; what is wrong is told in one line."""
     arguments = tyro.cli(Arguments, args=argv)
-    try:
+    with one_line():
+        if min(arguments.steps, arguments.human + 1) < 1:
+            raise ValueError(f"steps = {arguments.steps} must be at least 1, human = {arguments.human} at least 0.")
         policy, content = load(arguments.checkpoint)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
-    environment = content["environment"]
-    for name, act in (("human", None), (content["agent"], policy)):
-        print(name, json.dumps(evaluate(act, environment)))
-    if arguments.video is not None:
-        film(arguments.video, environment, policy, arguments.steps, arguments.seed)
-    if arguments.picture is not None:
-        picture(arguments.picture, environment, policy, arguments.human, arguments.steps, arguments.seed)
+        environment = content["environment"]
+        for name, act in (("human", None), (content["agent"], policy)):
+            print(name, json.dumps(evaluate(act, environment)))
+        for path in (arguments.video, arguments.picture):
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+        if arguments.video is not None:
+            film(arguments.video, environment, policy, arguments.steps, arguments.seed)
+        if arguments.picture is not None:
+            picture(arguments.picture, environment, policy, arguments.human, arguments.steps, arguments.seed)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from typing import Annotated, Any
 
 import torch
 import tyro
+from stable_baselines3.common.logger import configure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -49,7 +50,7 @@ def default_data() -> Path:
 
 @dataclass
 class Arguments(common.Arguments):
-    """Arguments of imitation.
+    """Arguments of imitation; ``evaluate_every`` and ``clone`` have no meaning here.
 
     Args:
         data: Trajectory file of leader-follower pairs.
@@ -176,6 +177,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
         optimiser.load_state_dict(saved["optimiser"])
         first, before = saved["update"] + 1, saved["cpu_seconds"]
     batch = Batch.of(windows(training, a.window), dtype=torch.float32, substeps=1)
+    logger = configure(str(a.out / "log" / (f"from{first}" if first else "")), a.log.split(","))
     began, spent = time.process_time() - before, before
     bar = tqdm(range(first, a.updates), desc="imitation", disable=None)
     for update in bar:
@@ -185,9 +187,13 @@ def train(a: Arguments) -> list[dict[str, Any]]:
         spent = time.process_time() - began
         kept = {"update": update, "cpu_seconds": spent, "optimiser": optimiser.state_dict()}
         common.save(last, policy, "imitation", a.environment, kept)
+        for name, value in (("rmse", float(loss.detach())), ("norm", norm), ("cpu_seconds", spent)):
+            logger.record(name, value)
+        logger.dump(update)
         bar.set_postfix(rmse=f"{float(loss.detach()):.3f}", norm=f"{norm:.2g}", refresh=False)
         if 0.0 < a.cpu_seconds <= spent:
             break
+    logger.close()
     rows.append({"model": "cloning through the simulator", **judge(policy, test, top), "cpu_seconds": spent})
     return rows
 

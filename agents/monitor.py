@@ -27,16 +27,18 @@ class Monitor:
         self.agent, self.arguments = agent, arguments
         self.last, self.best = arguments.out / "last.pt", arguments.out / "best.pt"
         arguments.out.mkdir(parents=True, exist_ok=True)
+        saved = saved or {}
+        done = int(saved.get("update", -1)) + 1
+        # A resumed training logs beside what was logged before, which the formats would overwrite.
+        folder = arguments.out / "log" / (f"from{done}" if done else "")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            self.logger = configure(str(arguments.out / "log"), arguments.log.split(","))
-        saved = saved or {}
+            self.logger = configure(str(folder), arguments.log.split(","))
         self.history: list[dict[str, Any]] = list(saved.get("history", []))
         self.steps = int(saved.get("steps", 0))
         self.before = float(saved.get("cpu_seconds", 0.0))
         self._begin = began
         self._aside = 0.0
-        done = int(saved.get("update", -1)) + 1
         self._bar = tqdm(total=arguments.updates, initial=done, desc=agent, disable=None, dynamic_ncols=True)
 
     @property
@@ -67,6 +69,7 @@ class Monitor:
             row |= evaluate(policy, self.arguments.environment)
             self.history.append(row)
         kept = {**training, "update": update, "steps": self.steps, "cpu_seconds": spent, "history": self.history}
+        kept["arguments"] = common.choices(self.arguments)
         if keep is not None:
             keep()
         common.save(self.last, policy, self.agent, self.arguments.environment, kept)
@@ -78,6 +81,10 @@ class Monitor:
                 self.logger.record(key, float(value))
         self.logger.dump(self.steps)
         self._bar.update()
+        if row:
+            shown = {k: v for k, v in row.items() if isinstance(v, (int, float)) and k not in ("update", "steps")}
+            figures_of = ", ".join(f"{k} {float(v):.3g}" for k, v in shown.items())
+            self._bar.write(f"{self.last}, update {update}: {figures_of}")
         self._bar.set_postfix({k: f"{v:.3g}" for k, v in figures.items()}, refresh=False)
         self._aside += time.process_time() - begin
         if over:

@@ -31,6 +31,7 @@ from agents.common import ACTIVATIONS, DivergedError, Policy
 from agents.monitor import Monitor
 from idm_env.envs.sb3 import SB3VecEnv
 from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.parameters import nearest
 
 
 @dataclass
@@ -71,6 +72,13 @@ class Arguments(common.Arguments):
     use_sde: bool = False
     gradient_steps: int = 1
     learning_starts: int = 6400
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, known in (("algorithm", ("ppo", "sac")), ("activation", tuple(ACTIVATIONS))):
+            if getattr(self, name) not in known:
+                value = getattr(self, name)
+                raise ValueError(f"{name} = '{value}' is unknown.{nearest(value, known)}")
 
 
 class Normalised(BaseFeaturesExtractor):
@@ -136,14 +144,19 @@ def layers(model: BaseAlgorithm, policy: Policy) -> list[tuple[nn.Linear, nn.Lin
     return list(zip(ours, theirs, strict=True))
 
 
-def copy_actor(model: BaseAlgorithm, policy: Policy, update: int, kept: Path) -> None:
-    """Copy the actor of an SB3 model into a policy; DivergedError where a weight is not finite."""
+def check(model: BaseAlgorithm, update: int, kept: Path) -> None:
+    """Raise DivergedError where a weight is not finite."""
     bad = [name for name, value in model.policy.named_parameters() if not bool(torch.isfinite(value).all())]
     if bad:
         raise DivergedError(
-            f"update {update}: weights of {bad[0]} must be finite. The last good checkpoint is {kept}; resume from it "
-            "with a lower learning_rate."
+            f"update {update}: weights of {bad[0]} must be finite. {common.last_good(kept, update)} with a lower "
+            "learning_rate."
         )
+
+
+def copy_actor(model: BaseAlgorithm, policy: Policy, update: int, kept: Path) -> None:
+    """Copy the actor of an SB3 model into a policy; DivergedError where a weight is not finite."""
+    check(model, update, kept)
     for mine, other in layers(model, policy):
         mine.load_state_dict(other.state_dict())
 
@@ -170,7 +183,10 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             for mine, other in layers(model, policy):
                 other.load_state_dict(mine.state_dict())
     # Making or loading a model seeds its environments; these are the ones of all agents, new ones after a resume.
-    done = saved.get("update", -1) + 1
+    chunk = arguments.n_steps * arguments.count
+    done = model.num_timesteps // chunk
+    if saved:  # an interruption between two files leaves the model one chunk ahead
+        saved |= {"update": done - 1, "steps": done * chunk}
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
     monitor = Monitor(name, arguments, began, saved)
 
@@ -180,11 +196,14 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         if isinstance(model, SAC):
             common.write(memory, model.save_replay_buffer)
 
-    chunk = arguments.n_steps * arguments.count
     for update in range(done, arguments.updates):
         rate = common.fall(arguments.learning_rate, update, arguments.updates)
         model.lr_schedule = FloatSchedule(rate)
-        model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
+        try:
+            model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
+        except ValueError:  # SB3 meets weights that are not finite when it draws the next action
+            check(model, update, monitor.last)
+            raise
         copy_actor(model, policy, update, monitor.last)
         figures = {k: float(v) for k, v in model.logger.name_to_value.items() if "loss" in k or "std" in k}
         if not monitor.after(update, chunk, policy, {}, {**figures, "learning_rate": rate}, keep):

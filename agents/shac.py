@@ -157,17 +157,16 @@ def returns(window: Window, gamma: float, lam: float) -> Tensor:
     return result
 
 
-def learn_values(critic: nn.Module, optimiser: torch.optim.Optimizer, window: Window, a: Arguments) -> float:
-    """Fit the critic to a window's returns; return the last mean squared error."""
+def learn_values(
+    critic: nn.Module, optimiser: torch.optim.Optimizer, window: Window, a: Arguments, update: int, kept: Path
+) -> float:
+    """Fit the critic to a window's returns; return the last mean squared error. DivergedError as ``descend``."""
     scenes, wanted = window.scenes.flatten(0, 1), returns(window, a.gamma, a.lam).flatten()
     error = torch.zeros(())
     for _ in range(a.critic_epochs):
         for part in torch.randperm(len(wanted)).chunk(4):
             error = (critic(scenes[part]) - wanted[part]).square().mean()
-            optimiser.zero_grad()
-            error.backward()
-            nn.utils.clip_grad_norm_(critic.parameters(), a.clip)
-            optimiser.step()
+            common.descend(error, critic.parameters(), optimiser, a.clip, update, kept)
     return float(error.detach())
 
 
@@ -204,7 +203,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
         norm = 0.0
         if update >= a.critic_first:
             norm = common.descend(loss, policy.parameters(), actor_steps, a.clip, update, monitor.last)
-        error = learn_values(critic, critic_steps, window, a)
+        error = learn_values(critic, critic_steps, window, a, update, monitor.last)
         with torch.no_grad():
             for mine, theirs in zip(target.parameters(), critic.parameters(), strict=True):
                 mine.lerp_(theirs, 1.0 - a.follow)

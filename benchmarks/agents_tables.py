@@ -134,7 +134,7 @@ def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> N
         paths = [(out / config).glob(f"trial*/seed{seed}/training/last.pt") for seed in seeds]
         policies[config] = [lambda path=path: load(path)[0] for found in paths for path in found]
     for name, makers in policies.items():
-        for failsafe in (0.0, 2.0):
+        for failsafe in (0.0, 3.0):
             own = {**ring_environment(), "failsafe": failsafe}
             figures = []
             for case, warmup in ((own, 750), (own, 1750), (own, 3000), (mixed(own), 3000)):

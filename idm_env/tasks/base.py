@@ -53,7 +53,8 @@ class Task(abc.ABC):
         warmup_pool: If above 0, episodes begin in one of that many warmed-up worlds, which are made once.
         max_command: Acceleration that an action of 1 commands (m/s²).
         failsafe: Deceleration (m/s²) of a failsafe: commands that leave a vehicle no room to stop at it behind a leader
-            who brakes as hard are cut, and may then brake beyond ``max_command``; 0 is none. See ``safe_command``.
+            who brakes as hard are cut, and may then brake beyond ``max_command``; 0 is none. Rewards are for the
+            command as it was given. See ``safe_command``.
         failsafe_time: Time (s) that the failsafe allows for before braking begins, as SUMO's tau.
 
     Raises:

@@ -79,15 +79,16 @@ def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, 
 
     judged = []
 
-    def judge(act, environment, warmup=750):
+    def judge(act, environment, warmup, draws):
         drawn = isinstance(environment["parameters"]["idm"]["time_gap"], list)
-        judged.append((type(act).__name__, environment["failsafe"], drawn, warmup))
+        name = getattr(act, "__name__", type(act).__name__)
+        judged.append((name, environment["failsafe"], drawn, warmup))
         return {**LAST, "collisions": int(not environment["failsafe"]), "ratios": [1.0] * 6}
 
     monkeypatch.setattr(evaluate, "evaluate_ring", judge)
     save(tmp_path / "ring-apg/trial2/seed1/training/last.pt", Policy(3), "apg", ring_environment(), {})
     takeover_table(tmp_path, ["ring-apg"], (0, 1))
-    cases = [(False, 750), (True, 750), (False, 1750), (False, 3000)]
-    wanted = [(kind, b, *case) for kind in ("PISaturation", "Policy") for b in (0.0, 3.0) for case in cases]
-    assert judged == wanted
+    cases = [(False, 750), (False, 1750), (False, 3000), (True, 3000)]
+    names = ("no_command", "PISaturation", "Policy")
+    assert judged == [(name, b, *case) for name in names for b in (0.0, 3.0) for case in cases]
     assert "| ring-apg | 1 | none | 1 of 6 / 1.000 / 0.10 |" in capsys.readouterr().out

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents import apg, common, environments, imitation, ppo, shac
+from agents import apg, classical, common, environments, evaluate, imitation, ppo, shac
 from agents.common import DivergedError, Policy
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -43,6 +43,17 @@ def write(path: Path, text: str) -> Path:
         ("seed: true", "seed = True must be no bool"),
         ("environment: ring", "environment = 'ring' must be a mapping"),
         ("environment: {config: nowhere.yaml}", "nowhere.yaml is not a file"),
+        ("environment: {config: 5}", "environment.config = 5"),
+        ("hidden: 5", "hidden = 5 must be a list, such as [32, 32]"),
+        ("hidden: '32'", "hidden = '32' must be a list"),
+        ("hidden: [8, x]", "hidden[1] = 'x' must be a number"),
+        ("out: 5", "out = 5 must be a path"),
+        ("updates: 1.7", "updates = 1.7 must be a whole number"),
+        ("count: 0", "count = 0 must be at least 1"),
+        ("window: -5", "window = -5 must be at least 1"),
+        ("hidden: [8, -3]", "hidden = (8, -3) must be at least 1"),
+        ("log: cvs", "log = 'cvs' is unknown. Did you mean 'csv'?"),
+        ("environment: {task: ring, dtype: float64}", "dtype = 'float64': agents learn in float32"),
     ],
 )
 def test_a_bad_configuration_is_told_in_one_line(tmp_path, text, words):
@@ -202,3 +213,31 @@ def test_cloning_learns_what_humans_do(ring):
     policy.mean.copy_(seen.mean(0))
     policy.scale.copy_(seen.std(0))
     assert common.clone(policy, seen, actions, 300) < 0.1 * float(actions.var())
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "words"),
+    [
+        (ppo, ["--config", "CONFIG", "--algorithm", "ppo"], "this is not a file for ppo"),
+        (apg, ["--out", "FILE", "--updates", "1"], "File exists"),
+        (classical, ["--config", "nowhere.yaml"], "nowhere.yaml is not a file"),
+        (evaluate, ["nowhere.pt"], "nowhere.pt is not a file"),
+        (evaluate, ["nowhere.pt", "--steps", "0"], "steps = 0 must be at least 1"),
+    ],
+)
+def test_the_command_line_tells_in_one_line(module, arguments, words, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    given = {"CONFIG": str(CONFIGS / "ring-apg.yaml"), "FILE": str(file)}
+    with pytest.raises(SystemExit) as told:
+        module.main([given.get(word, word) for word in arguments])
+    assert words in str(told.value) and "\n" not in str(told.value)
+
+
+def test_an_interruption_says_how_to_go_on(capsys):
+    def train(arguments):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as told:
+        common.command_line(train, apg.Arguments, "apg", [])
+    assert told.value.code == 130 and "--resume" in capsys.readouterr().err

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from agents import common, evaluate
-from agents.classical import FollowerStopper, PISaturation, Seen, controllers, seen
+from agents.classical import FollowerStopper, PISaturation, Seen, controllers, no_command, seen
 from agents.common import Policy
 from agents.evaluate import solved_at
 from agents.rollout import Driven, ring_start, uniform_speed
@@ -75,12 +75,12 @@ def test_a_better_evaluation_has_a_higher_score():
     assert evaluate.score({"reward": 0.3, "speed_ratio": 9.0}) == 0.3
 
 
-def test_humans_make_waves_and_pi_with_saturation_dissolves_them():
-    human = evaluate.evaluate_ring(None, RING, (230.0,))
-    calm = evaluate.evaluate_ring(PISaturation(**VEHICLE), RING, (230.0,))
+def test_humans_make_waves_and_pi_with_saturation_dissolves_young_ones():
+    human = evaluate.evaluate_ring(None, RING, (230.0,), warmup=750)
+    calm = evaluate.evaluate_ring(PISaturation(**VEHICLE), RING, (230.0,), warmup=750)
     assert not human["passed"] and human["speed_ratio"] < 0.8 and human["speed_std"] > 2.0
     assert calm["passed"] and calm["time_gap"] > 0.8
-    assert calm == evaluate.evaluate_ring(PISaturation(**VEHICLE), RING, (230.0,))  # repeatable
+    assert calm == evaluate.evaluate_ring(PISaturation(**VEHICLE), RING, (230.0,), warmup=750)  # repeatable
 
 
 def test_observations_of_the_ring_are_unpacked():
@@ -124,7 +124,7 @@ def test_pi_follows_the_mean_of_its_own_speed():
 def test_every_controller_is_made_and_commands_within_bounds():
     start = ring_start(RING, (220.0, 270.0))
     observation = start.task.observe(start.world).flatten(1)
-    made = controllers(RING, (220.0, 270.0))
+    made = controllers(RING, (220.0, 270.0), (0,))
     assert next(iter(made)) == "IDM for all" and made["IDM for all"]() is None
     for name, make in made.items():
         if name != "IDM for all":
@@ -167,6 +167,23 @@ def test_a_later_take_over_finds_a_deeper_wave_and_a_failsafe_survives_it():
     touched = evaluate.evaluate_ring(reckless, RING, (230.0, 260.0), warmup=3000)
     guarded = evaluate.evaluate_ring(reckless, {**RING, "failsafe": 3.0}, (230.0, 260.0), warmup=3000)
     assert touched["collisions"] == 2 and guarded["collisions"] == 0
+
+
+def test_doing_nothing_passes_in_a_young_wave_only():
+    """Why agents are judged in a grown one."""
+    guarded = {**RING, "failsafe": 3.0}
+    young, grown = (evaluate.evaluate_ring(no_command, guarded, warmup=warmup) for warmup in (750, 3000))
+    assert young["passed"] and not grown["passed"] and grown["speed_ratio"] < 0.1
+
+
+def test_draws_differ_and_lengths_stay_together():
+    start = ring_start(RING, (220.0, 260.0), 100, draws=(0, 1, 2))
+    around = (start.world.state.gap + start.world.state.length).sum(-1)
+    assert torch.allclose(around, torch.tensor([220.0] * 3 + [260.0] * 3))
+    speed = start.world.state.speed
+    assert not torch.equal(speed[0], speed[1]) and not torch.equal(speed[1], speed[2])
+    alone = ring_start(RING, (220.0, 260.0), 100, draws=(1,)).world.state.speed
+    assert torch.allclose(alone, speed[[1, 4]])
 
 
 def test_mixed_drivers_are_within_a_fifth_of_the_given_ones():

@@ -53,7 +53,8 @@ def test_a_resumed_training_goes_on_where_it_was(name, quick):
     assert [row["update"] for row in history] == [0, 1, 2, 3]
     assert [row["steps"] for row in history] == [first[0]["steps"] * k for k in (1, 2, 3, 4)]
     assert history[1]["cpu_seconds"] > history[0]["cpu_seconds"] == first[0]["cpu_seconds"]
-    assert (whole.out / "log" / "progress.csv").exists()
+    rows = [(whole.out / "log" / part / "progress.csv").read_text().splitlines() for part in ("", "from1")]
+    assert [len(part) - 1 for part in rows] == [1, 3]  # what was logged before stays
 
 
 def test_apg_resumes_exactly(quick, tmp_path):
@@ -75,6 +76,31 @@ def test_sac_resumes_with_its_memory(quick):
     assert after.size() == 4 * buffer.size()
     np.testing.assert_array_equal(after.observations[: buffer.size()], buffer.observations[: buffer.size()])
     assert not list(whole.out.glob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [("apg", {"hidden": (4, 4)}), ("ppo", {"gamma": 0.5}), ("ppo", {"environment": {"task": "ring", "vehicles": 9}})],
+)
+def test_a_training_is_not_resumed_as_another(name, change, quick):
+    module, kind, small = AGENTS[name]
+    begun = kind(**{**quick, "updates": 1}, **small)
+    module.train(begun)
+    with pytest.raises(ValueError, match=rf"{next(iter(change))} = .* cannot be resumed: .* was begun with"):
+        module.train(dataclasses.replace(begun, **change, resume=True))
+    module.train(dataclasses.replace(begun, updates=2, learning_rate=1e-4, resume=True))
+
+
+def test_a_model_one_chunk_ahead_of_its_checkpoint_is_resumed(quick):
+    module, kind, small = AGENTS["ppo"]
+    whole = kind(**quick, **small)
+    module.train(dataclasses.replace(whole, updates=1))
+    before = (whole.out / "last.pt").read_bytes()
+    module.train(dataclasses.replace(whole, updates=2, resume=True))
+    (whole.out / "last.pt").write_bytes(before)  # as if killed between the two files
+    history = module.train(dataclasses.replace(whole, updates=3, resume=True))
+    assert [row["update"] for row in history] == [0, 2]
+    assert history[-1]["steps"] == 3 * small["n_steps"] * small["count"]
 
 
 def test_nothing_to_resume_is_told(quick):
@@ -100,6 +126,29 @@ def break_rewards(monkeypatch, after: int) -> None:
         return result * torch.nan if calls[0] > after else result
 
     monkeypatch.setattr(RingTask, "reward", reward)
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_nan_before_the_first_checkpoint_is_told_as_such(name, quick, monkeypatch):
+    module, kind, small = AGENTS[name]
+    monkeypatch.setattr(RingTask, "reward", lambda self, before, command, after: self.pick(after.state.gap) * torch.nan)
+    with pytest.raises(
+        DivergedError, match=r"update [01]: .* must be finite\. (None was kept yet|The last good)"
+    ) as told:
+        module.train(kind(**quick, **small))
+    assert "\n" not in str(told.value)
+    if (quick["out"] / "last.pt").exists():
+        policy, _ = common.load(quick["out"] / "last.pt")
+        assert all(bool(torch.isfinite(p).all()) for p in policy.parameters())
+
+
+def test_a_critic_that_diverges_before_the_actor_learns_is_not_kept(quick, monkeypatch):
+    module, kind, small = AGENTS["shac"]
+    break_rewards(monkeypatch, after=2 * 1500 + 25)
+    with pytest.raises(DivergedError, match="update 1"):
+        module.train(kind(**quick, **{**small, "critic_first": 3}))
+    kept = common.load(quick["out"] / "last.pt")[1]["training"]
+    assert kept["update"] == 0 and all(bool(torch.isfinite(x).all()) for x in kept["critic"].values())
 
 
 @pytest.mark.parametrize("name", ["apg", "shac"])
