@@ -25,8 +25,9 @@ import torch  # noqa: E402 (threads are set before torch starts)
 from scipy.stats import mannwhitneyu  # noqa: E402
 
 from agents import apg, common  # noqa: E402
-from agents.classical import PISaturation  # noqa: E402
+from agents.classical import PISaturation, no_command  # noqa: E402
 from agents.evaluate import evaluate_ring  # noqa: E402
+from agents.rollout import Act  # noqa: E402
 
 Row = dict[str, Any]
 EFFECT, STRENGTH, DATA_SEED = "delay", 0.5, 5
@@ -71,11 +72,16 @@ def models(out: Path) -> dict[str, Any]:
 
 def trained(environment: dict[str, Any], out: Path, seed: int) -> common.Policy:
     """Return a policy that was trained there, now if it is not there."""
-    chosen = apg.Arguments(environment=environment, out=out, seed=seed, updates=16, evaluate_every=1e9)
+    chosen = apg.Arguments(environment=environment, out=out, seed=seed, updates=16, evaluate_every=1e9, explore=0.0)
     if not (out / "done").exists():
         apg.train(chosen)
         (out / "done").touch()
     return common.load(out / "last.pt", "ring", "apg")[0]
+
+
+def judge(act: Act | None, environment: dict[str, Any]) -> Row:
+    """Return the figures on the six lengths, from a take-over after the warm-up of the training on."""
+    return evaluate_ring(act, environment, warmup=RING["warmup"])
 
 
 def main() -> None:
@@ -89,14 +95,15 @@ def main() -> None:
     truth = environments["the truth"]
     guarded = {**truth, "failsafe": FAILSAFE}
     print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD))
-    show("human drivers", "", evaluate_ring(None, truth), None, None)
-    by_hand = (evaluate_ring(PISaturation(0.1, 3.0, 5.0), where) for where in (truth, guarded))
+    show("human drivers", "", judge(None, truth), None, None)
+    show("no command", "", judge(no_command, truth), judge(no_command, guarded), None)
+    by_hand = (judge(PISaturation(0.1, 3.0, 5.0), where) for where in (truth, guarded))
     show("PI with saturation", "", *by_hand, None)
     touched: dict[str, list[int]] = {}
     for name, environment in environments.items():
         for seed in range(options.seeds):
             policy = trained(environment, options.out / name.replace(" ", "-") / f"seed{seed}", seed)
-            judged = [evaluate_ring(policy, where) for where in (truth, guarded, environment)]
+            judged = [judge(policy, where) for where in (truth, guarded, environment)]
             show(name, str(seed), *judged)
             touched.setdefault(name, []).append(judged[0]["collisions"])
     for name, counts in touched.items():

@@ -124,7 +124,7 @@ def fit(
     source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
-        share = _number("--held-out", held_out)
+        share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
     options = Options(
         by, share, objective, relative, loss, method, integration, starts, seed, substeps,  # type: ignore[arg-type]
         None if model is None else str(model),
@@ -297,7 +297,9 @@ def plot(
         trajectories = load(source)
         if where is not None:
             trajectories = trajectories.where(where)
-        figure = space_time(trajectories, title=source.name)
+        runs = len(trajectories.runs())
+        overlaid = f", {runs} runs on one axis (choose one with --where)" if runs > 1 else ""
+        figure = space_time(trajectories, title=f"{source.name}{overlaid}")
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out)
     console.print(f"Picture: [bold]{out.resolve()}[/bold]", soft_wrap=True)
@@ -404,15 +406,15 @@ def bench(
     """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine."""
     from idm_env.bench import run as measure
 
-    numbers = [int(_number("--sizes", size)) for size in sizes.split(",")]
+    numbers = [int(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
     measure(out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, verbose=verbose)
 
 
-def _number(option: str, text: str) -> float:
+def _number(option: str, text: str, wrong: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f'{option} = {text!r} is neither "column=value" nor a share such as 0.25.') from None
+        raise ValueError(f"{option} = {text!r} is {wrong}.") from None
 
 
 def _done(out: Path) -> None:

@@ -20,7 +20,7 @@ COLUMNS = (
     ("position_error_rate_percent", "position error rate (%)", 3),
     ("accel_mean_mps2", "mean |a| (m/s²)", 2),
     ("accel_std_mps2", "std |a| (m/s²)", 2),
-    ("implausible_percent", "implausible, |a| > 10 m/s² (%)", 1),
+    ("implausible_percent", "tracks with |a| > 10 m/s² anywhere (%)", 1),
     ("milliseconds_per_trajectory", "time per trajectory (ms)", 2),
 )
 MOST_LISTED = 100

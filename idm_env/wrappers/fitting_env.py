@@ -17,9 +17,9 @@ class FittingEnv(gymnasium.Env):
     """``gym.make("DiffIDM-Fit-v0", trajectories="pairs.parquet", task="ring", …)``: one step, one guess.
 
     Action: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean square
-    residual. Observation: the last guess, zeros at first. Episodes have one step. ``free``, ``by`` (one group only)
-    and ``objective`` are those of ``ParameterFitting``; all other keywords make the environment whose drivers are
-    fitted.
+    residual. Observation: the last guess, zeros at first. Episodes have one step. ``free`` and ``objective`` are those
+    of ``ParameterFitting``, with one set of parameters for all drivers; all other keywords make the environment whose
+    drivers are fitted.
 
     ``bounds`` narrows what [−1, 1] spans: ``{"idm.time_gap": [0.5, 3.0]}``.
     """
