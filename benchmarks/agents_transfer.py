@@ -27,7 +27,7 @@ from scipy.stats import mannwhitneyu  # noqa: E402
 from agents import apg, common  # noqa: E402
 from agents.classical import PISaturation, no_command  # noqa: E402
 from agents.evaluate import evaluate_ring  # noqa: E402
-from agents.rollout import Act  # noqa: E402
+from agents.rollout import FRESH, LENGTHS, Act  # noqa: E402
 
 Row = dict[str, Any]
 EFFECT, STRENGTH, DATA_SEED = "delay", 0.5, 5
@@ -80,8 +80,8 @@ def trained(environment: dict[str, Any], out: Path, seed: int) -> common.Policy:
 
 
 def judge(act: Act | None, environment: dict[str, Any]) -> Row:
-    """Return the figures on the six lengths, from a take-over after the warm-up of the training on."""
-    return evaluate_ring(act, environment, warmup=RING["warmup"])
+    """Return the figures on six lengths and five draws, from a take-over after the warm-up of the training on."""
+    return evaluate_ring(act, environment, warmup=RING["warmup"], draws=FRESH)
 
 
 def main() -> None:
@@ -108,7 +108,8 @@ def main() -> None:
             touched.setdefault(name, []).append(judged[0]["collisions"])
     for name, counts in touched.items():
         p = mannwhitneyu(touched["plain IDM"], counts).pvalue
-        print(f"{name}: {sum(counts)} rings with a collision, of {len(counts)} seeds; Mann-Whitney p {p:.4f}")
+        rings = len(counts) * len(FRESH) * len(LENGTHS)
+        print(f"{name}: {sum(counts)} of {rings} rings with a collision, {len(counts)} seeds; Mann-Whitney p {p:.4f}")
     print(json.dumps({"effect": EFFECT, "strength": STRENGTH, "data_seed": DATA_SEED}))
 
 
