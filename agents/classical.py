@@ -117,6 +117,11 @@ def no_command(observation: Tensor) -> Tensor:
     return observation.new_zeros(len(observation), 1)
 
 
+def constant(accel: float, max_command: float) -> Act:
+    """Return a controller that always commands this acceleration (m/s²): with a failsafe, that drives."""
+    return lambda observation: observation.new_full((len(observation), 1), accel / max_command)
+
+
 def controllers(
     environment: Mapping[str, Any], lengths: Sequence[float], draws: Sequence[int]
 ) -> dict[str, Callable[[], Act | None]]:
@@ -128,6 +133,8 @@ def controllers(
     return {
         "IDM for all": lambda: None,
         "no command": lambda: no_command,
+        "0.025 m/s² for ever": lambda: constant(0.025, task.max_command),
+        "0.05 m/s² for ever": lambda: constant(0.05, task.max_command),
         "FollowerStopper, one speed for all rings": lambda: FollowerStopper(**vehicle, desired=middle),
         "FollowerStopper, told each ring's uniform speed": lambda: FollowerStopper(**vehicle, desired=uniform),
         "PI with saturation": lambda: PISaturation(**vehicle),
