@@ -24,12 +24,12 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from stable_baselines3.common.logger import configure
 from torch import Tensor
 from tqdm import tqdm
 
 from agents import common
 from agents.common import Policy
+from agents.monitor import make_logger
 from idm_env.data import Episode, Trajectories, episodes, load
 from idm_env.effects import Control
 from idm_env.fitting.batch import Batch, windows
@@ -177,7 +177,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
         optimiser.load_state_dict(saved["optimiser"])
         first, before = saved["update"] + 1, saved["cpu_seconds"]
     batch = Batch.of(windows(training, a.window), dtype=torch.float32, substeps=1)
-    logger = configure(str(a.out / "log" / (f"from{first}" if first else "")), a.log.split(","))
+    logger = make_logger(a, first)
     began, spent = time.process_time() - before, before
     bar = tqdm(range(first, a.updates), desc="imitation", disable=None)
     for update in bar:

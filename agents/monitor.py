@@ -7,12 +7,20 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import Logger, configure
 from tqdm import tqdm
 
 from agents import common
 from agents.common import Arguments, Policy
 from agents.evaluate import evaluate, score
+
+
+def make_logger(arguments: Arguments, done: int) -> Logger:
+    """Return where figures go; a training resumed after ``done`` updates logs beside its beginning, not over it."""
+    folder = arguments.out / "log" / (f"from{done}" if done else "")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return configure(str(folder), arguments.log.split(","))
 
 
 class Monitor:
@@ -29,11 +37,7 @@ class Monitor:
         arguments.out.mkdir(parents=True, exist_ok=True)
         saved = saved or {}
         done = int(saved.get("update", -1)) + 1
-        # A resumed training logs beside what was logged before, which the formats would overwrite.
-        folder = arguments.out / "log" / (f"from{done}" if done else "")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            self.logger = configure(str(folder), arguments.log.split(","))
+        self.logger = make_logger(arguments, done)
         self.history: list[dict[str, Any]] = list(saved.get("history", []))
         self.steps = int(saved.get("steps", 0))
         self.before = float(saved.get("cpu_seconds", 0.0))
@@ -83,8 +87,7 @@ class Monitor:
         self._bar.update()
         if row:
             shown = {k: v for k, v in row.items() if isinstance(v, (int, float)) and k not in ("update", "steps")}
-            figures_of = ", ".join(f"{k} {float(v):.3g}" for k, v in shown.items())
-            self._bar.write(f"{self.last}, update {update}: {figures_of}")
+            self._bar.write(f"{self.last}, update {update}: " + ", ".join(f"{k} {v:.3g}" for k, v in shown.items()))
         self._bar.set_postfix({k: f"{v:.3g}" for k, v in figures.items()}, refresh=False)
         self._aside += time.process_time() - begin
         if over:

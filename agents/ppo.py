@@ -182,11 +182,11 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         if arguments.clone:
             for mine, other in layers(model, policy):
                 other.load_state_dict(mine.state_dict())
-    # Making or loading a model seeds its environments; these are the ones of all agents, new ones after a resume.
     chunk = arguments.n_steps * arguments.count
     done = model.num_timesteps // chunk
     if saved:  # an interruption between two files leaves the model one chunk ahead
         saved |= {"update": done - 1, "steps": done * chunk}
+    # Making or loading a model seeds its environments; these are the seeds of all agents, new ones after a resume.
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
     monitor = Monitor(name, arguments, began, saved)
 

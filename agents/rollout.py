@@ -77,7 +77,7 @@ def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> D
 def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws: tuple[int, ...]) -> Start:
     """Return one ring of every draw and length after its warm-up; the environment's keywords come as JSON."""
     chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": warmup}
-    task = task_of(chosen)
+    task = task_of({**chosen, "length": [min(lengths), max(lengths)]})
     params = task.params(torch.float32, "cpu")
     advance = advance_of(task.simulator, "numpy", torch.device("cpu"), torch.float32)
     keys, states = [], []
@@ -91,8 +91,7 @@ def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws
         k: torch.cat([getattr(s, k) for s in states]) for k in ("position", "speed", "accel", "gap", "length", "step")
     }
     world = World(states[0]._replace(**columns, memory=memory), {})
-    whole = task_of({**chosen, "length": [min(lengths), max(lengths)]})
-    return Start(whole, world, Draw(torch.cat(keys)), params)
+    return Start(task, world, Draw(torch.cat(keys)), params)
 
 
 def ring_start(

@@ -91,6 +91,8 @@ class Job:
 
 def perform(job: Job, out: Path) -> dict[str, Any] | None:
     """Return the results of a job, trained now if they are not there; None where another process works on it."""
+    from idm_env.report import write_text
+
     folder = out / job.name
     result = folder / "result.json"
     folder.mkdir(parents=True, exist_ok=True)
@@ -105,9 +107,7 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
             shutil.rmtree(training, ignore_errors=True)
             done = subprocess.run(job.command(training), cwd=ROOT, capture_output=True, text=True, check=False)
             row = {**dataclasses.asdict(job), **outcome(training, done, unseen=job.seed in SEEDS)}
-            beside = result.with_suffix(".part")
-            beside.write_text(json.dumps(row, indent=1))
-            os.replace(beside, result)
+            write_text(result, json.dumps(row, indent=1))
             print(f"{job.name}: {json.dumps(row['summary'])}", flush=True)
     content: dict[str, Any] = json.loads(result.read_text())
     return content

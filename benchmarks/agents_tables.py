@@ -120,25 +120,24 @@ def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> N
 
     A case is: rings with a collision of all rings, and the medians over seeds of worst speed ratio and deviation.
     """
-    from agents.classical import PISaturation, no_command
+    from agents.classical import controllers
     from agents.common import load
     from agents.evaluate import evaluate_ring, mixed
+    from agents.rollout import LENGTHS
 
-    rows = []
+    rows, environment, draws = [], environment_of("ring-apg"), (1,)
     # A controller with memory drives one batch once, so it is made anew for every case.
-    policies: dict[str, list[Any]] = {
-        "no command": [lambda: no_command],
-        "PI with saturation": [lambda: PISaturation(0.1, 1.0, 5.0)],
-    }
+    by_hand = controllers(environment, LENGTHS, draws)
+    policies: dict[str, list[Any]] = {name: [by_hand[name]] for name in ("no command", "PI with saturation")}
     for config in configs:
         paths = [(out / config).glob(f"trial*/seed{seed}/training/last.pt") for seed in seeds]
         policies[config] = [lambda path=path: load(path)[0] for found in paths for path in found]
     for name, makers in policies.items():
         for failsafe in (0.0, 3.0):
-            own = {**ring_environment(), "failsafe": failsafe}
+            own = {**environment, "failsafe": failsafe}
             figures = []
             for case, warmup in ((own, 750), (own, 1750), (own, 3000), (mixed(own), 3000)):
-                found = [evaluate_ring(make(), case, warmup=warmup, draws=(1,)) for make in makers]
+                found = [evaluate_ring(make(), case, warmup=warmup, draws=draws) for make in makers]
                 touched, rings = sum(r["collisions"] for r in found), sum(len(r["ratios"]) for r in found)
                 ratio, std = (statistics.median(r[k] for r in found) for k in ("speed_ratio", "speed_std"))
                 figures.append(f"{touched} of {rings} / {ratio:.3f} / {std:.2f}")
@@ -149,23 +148,21 @@ def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> N
     )  # fmt: skip
 
 
-def ring_environment() -> Row:
-    """Return the environment in which all agents are trained on the ring."""
+def environment_of(config: str) -> Row:
+    """Return the environment of one of APG's configurations; the other agents of a task have the same."""
     from agents import apg
     from agents.common import load_agent
 
     root = Path(__file__).resolve().parents[1]
-    return load_agent(root / "configs" / "ring-apg.yaml", apg.Arguments, "apg").environment
+    return load_agent(root / "configs" / f"{config}.yaml", apg.Arguments, "apg").environment
 
 
 def follow_table(out: Path, configs: Sequence[str], leader: Path | None) -> None:
     """Print fuel and energy behind the made-up leader and, where there are, measured ones."""
-    from agents import apg
-    from agents.common import load, load_agent
+    from agents.common import load
     from agents.evaluate import evaluate_follow
 
-    root = Path(__file__).resolve().parents[1]
-    plain = load_agent(root / "configs" / "follow-apg.yaml", apg.Arguments, "apg").environment
+    plain = environment_of("follow-apg")
     roads: dict[str, Row] = {"made-up": plain}
     if leader is not None and leader.exists():
         roads["I-80"] = {**plain, "leader": str(leader)}
@@ -198,7 +195,7 @@ def classical_table() -> None:
     """Print the classical controllers on the test and on unseen lengths."""
     from agents.classical import rows
 
-    found = rows(ring_environment()).items()
+    found = rows(environment_of("ring-apg")).items()
     table(
         ("controller", "test: ratio/std/time gap/collisions", "lengths 200–300 m"),
         [[name, "/".join(ring(r["test"])), "/".join(ring(r["lengths"]))] for name, r in found],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -54,6 +55,7 @@ MaxGap = Annotated[float, typer.Option(help="Gaps above this (m) mean a lost lea
 MinSeconds = Annotated[float, typer.Option(help="Shorter stretches behind one leader are left out (s).")]
 Where = Annotated[str | None, typer.Option(help='Only runs or drivers with "column=value".')]
 Window = Annotated[float | None, typer.Option(help="Cut longer stretches into windows of so many seconds.")]
+Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
 Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample, to this step (s).")]
 
 
@@ -101,9 +103,7 @@ def fit(
     substeps: Annotated[
         int | None, typer.Option(help="Simulated steps per sample; default: steps of 25 ms.", min=1)
     ] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")
-    ] = None,
+    model: Corrected = None,
     seed: Seed = 0,
     ring_length: RingLength = None,
     place: Place = None,
@@ -126,8 +126,7 @@ def fit(
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
     options = Options(
-        by, share, objective, relative, loss, method, integration, starts, seed, substeps,  # type: ignore[arg-type]
-        None if model is None else str(model),
+        by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
     )  # fmt: skip
     with progress() as report:
         result = fit_file(source, options, out, resume=resume, on_progress=report)
@@ -221,9 +220,8 @@ def demo(
     from idm_env.report import output_folder
 
     path = data
-    output_folder(out)
     if path is None:
-        path = out / "platoon.csv"
+        path = output_folder(out) / "platoon.csv"
         made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
         columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
         made.table.select(columns).write_csv(path)
@@ -334,7 +332,6 @@ def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
 
 Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]
 FixedParameters = Annotated[bool, typer.Option("--fixed-parameters", help="Keep the driver parameters fixed.")]
-Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
 
 
 @app.command("filter")
@@ -442,7 +439,9 @@ def run() -> None:
 
 def _interrupted() -> None:
     """End after Ctrl-C; only some commands are long enough to go on with."""
-    resumable = {"fit", "explain", "filter", "reconstruct", "predict"} & set(sys.argv[1:2])
+    commands = {c.name or c.callback.__name__: c.callback for c in app.registered_commands if c.callback}
+    command = commands.get(sys.argv[1]) if len(sys.argv) > 1 else None
+    resumable = command is not None and "resume" in inspect.signature(command).parameters
     advice = ": what is done was kept. Run the same command with --resume to go on." if resumable else "."
     print(f"interrupted{advice}", file=sys.stderr)
     sys.exit(130)

@@ -54,8 +54,7 @@ def read(path: str | Path, *, layout: str = "auto") -> tuple[pl.DataFrame, list[
     path = Path(path)
     if layout not in LAYOUTS:
         raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
-    extension = _checked(path)
-    lines = [] if extension == ".parquet" else _first_lines(path, openacc.SEARCHED_LINES)
+    extension, lines = _checked(path)
     above = openacc.header_line(lines)
     try:
         if layout == "openacc" or (layout == "auto" and above is not None):
@@ -75,8 +74,7 @@ def batches(path: str | Path, *, layout: str = "auto") -> Iterator[tuple[pl.Data
     path = Path(path)
     if layout not in LAYOUTS:
         raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
-    extension = _checked(path)
-    lines = [] if extension == ".parquet" else _first_lines(path, openacc.SEARCHED_LINES)
+    extension, lines = _checked(path)
     if layout == "openacc" or (layout == "auto" and openacc.header_line(lines) is not None):
         yield read(path, layout=layout)
         return
@@ -139,8 +137,8 @@ def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.Dat
     return tidy.read(table)
 
 
-def _checked(path: Path) -> str:
-    """Return the file's extension, or raise DataError for what is no readable file of a known kind."""
+def _checked(path: Path) -> tuple[str, list[str]]:
+    """Return the file's extension and first lines of text, or raise DataError for no readable file of a known kind."""
     if path.is_dir():
         raise DataError(f"{path} is a directory; name one file in it ({', '.join(EXTENSIONS)}).")
     if not path.exists():
@@ -150,11 +148,13 @@ def _checked(path: Path) -> str:
         raise DataError(f"{path.name} has an unknown extension; use one of {', '.join(EXTENSIONS)}.")
     if path.stat().st_size == 0:
         raise DataError(f"{path.name} is empty (0 bytes); it needs a header and rows.")
-    head = _first_lines(path, 1)[0] if extension != ".parquet" else ""
+    if extension == ".parquet":
+        return extension, []
+    lines = _first_lines(path, openacc.SEARCHED_LINES)
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
-        if head.count(mark) > head.count(","):
+        if lines[0].count(mark) > lines[0].count(","):
             raise DataError(f"{path.name} is separated by {name}; separate it by commas, with points in the decimals.")
-    return extension
+    return extension, lines
 
 
 def _first_lines(path: Path, count: int) -> list[str]:

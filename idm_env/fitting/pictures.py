@@ -48,16 +48,9 @@ def parameters(found: Fit) -> page.Block:
         else:
             # An interval ends where the parameter may not go.
             half = 1.96 * np.nan_to_num(spread[:, i], nan=np.inf)
-            below = np.minimum(half, values[:, i] - p.low)
-            above = np.minimum(half, p.high - values[:, i])
-            axis.errorbar(
-                np.arange(len(values)),
-                values[:, i],
-                (below.clip(0), above.clip(0)),
-                fmt="o",
-                color="#2e6f9e",
-                capsize=3,
-            )
+            room = np.stack((values[:, i] - p.low, p.high - values[:, i])).clip(0.0)
+            bars = np.minimum(half, room)
+            axis.errorbar(np.arange(len(values)), values[:, i], bars, fmt="o", color="#2e6f9e", capsize=3)
             axis.set_xticks(np.arange(len(values)), [g[:14] for g in found.problem.groups], rotation=90, fontsize=7)
         axis.set_title(f"{name.split('.')[1]} {p.symbol} ({p.unit})", fontsize=9)
         axis.grid(alpha=0.25)

@@ -24,7 +24,7 @@ from idm_env.tasks.behaviour import Behaviour, behaviour
 from idm_env.tasks.checks import agents_of, at_least, whole
 from idm_env.tasks.nouns import Advance, Bounds, Ended, Run, World
 from idm_env.tasks.random import Draw
-from idm_env.types import Command, Inputs, Params
+from idm_env.types import Command, Inputs, Params, State
 
 _NORMALS_AT_ONCE = 1 << 16
 _STANDSTILL = 1.0
@@ -205,6 +205,14 @@ class Task(abc.ABC):
         """Return the commanded accelerations (m/s²) of actions, which are clipped to [−1, 1] (no gradient beyond)."""
         return action.clamp(-1.0, 1.0) * self.max_command
 
+    def lead_speed(self, state: State) -> Tensor:
+        """Return the speed of each agent's leader (m/s), the agent's own where there is none, shape ``(…, agents)``."""
+        ahead = self.road.ahead(state.speed)
+        if state.present is not None:
+            there = self.road.leader_present(state.present, state.speed) > 0
+            ahead = torch.where(there, ahead, state.speed)
+        return self.pick(ahead)
+
     def safe_command(self, world: World) -> Tensor:
         """Return the highest acceleration (m/s²) that the failsafe allows each agent, shape ``(…, agents)``.
 
@@ -214,10 +222,7 @@ class Task(abc.ABC):
         no two vehicles touch, and behind a leader of the same speed the time gap is at least τ.
         """
         state, decel, dt = world.state, self.failsafe, self.simulator.dt
-        speed, ahead = self.pick(state.speed), self.pick(self.road.ahead(state.speed))
-        if state.present is not None:
-            there = self.road.leader_present(state.present, state.speed)
-            ahead = torch.where(self.pick(there) > 0, ahead, speed)
+        speed, ahead = self.pick(state.speed), self.lead_speed(state)
         # Euler moves by the old speed; the speed after the step then costs its half step later.
         way = speed * dt if self.simulator.integration == "euler" else 0.5 * speed * dt
         half = decel * (self.failsafe_time + 0.5 * dt)

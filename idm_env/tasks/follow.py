@@ -128,8 +128,8 @@ class FollowTask(Task):
     def observe(self, world: World) -> Tensor:
         """Return ``v/40, v_lead/40, gap/100`` of every agent."""
         state = world.state
-        lead_speed = self.pick(self.road.ahead(state.speed))
-        return self.clip([self.pick(state.speed), lead_speed, self.pick(state.gap)], (40.0, 40.0, 100.0))
+        seen = [self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)]
+        return self.clip(seen, (40.0, 40.0, 100.0))
 
     def reward(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``1 − fuel/10 − 0.002 u² − 2 p − 50 [crash]``."""

@@ -120,7 +120,7 @@ class PlatoonTask(Task):
     def observe(self, world: World) -> Tensor:
         """Return ``v/30, (v_lead − v)/10, gap/100, (v − v̄)/10`` of every agent."""
         state = world.state
-        speed, lead_speed = self.pick(state.speed), self.pick(self.road.ahead(state.speed))
+        speed, lead_speed = self.pick(state.speed), self.lead_speed(state)
         gap = self.pick(state.gap)
         return self.clip([speed, lead_speed - speed, gap, speed - self.speed], (30.0, 10.0, 100.0, 10.0))
 

@@ -204,9 +204,8 @@ class ReplayTask(Task):
     def observe(self, world: World) -> Tensor:
         """Return ``v/40, v_lead/40, gap/100`` of every agent."""
         state = world.state
-        there = self.road.leader_present(state.present, state.speed) > 0
-        lead_speed = torch.where(there, self.road.ahead(state.speed), state.speed)
-        return self.clip([self.pick(x) for x in (state.speed, lead_speed, state.gap)], (40.0, 40.0, 100.0))
+        seen = [self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)]
+        return self.clip(seen, (40.0, 40.0, 100.0))
 
     def reward(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return minus the distance to the record (10 m), or the terms of ``follow``."""

@@ -75,7 +75,7 @@ def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
 def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, monkeypatch, capsys):
     from agents import evaluate
     from agents.common import Policy, save
-    from benchmarks.agents_tables import ring_environment, takeover_table
+    from benchmarks.agents_tables import environment_of, takeover_table
 
     judged = []
 
@@ -86,7 +86,7 @@ def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, 
         return {**LAST, "collisions": int(not environment["failsafe"]), "ratios": [1.0] * 6}
 
     monkeypatch.setattr(evaluate, "evaluate_ring", judge)
-    save(tmp_path / "ring-apg/trial2/seed1/training/last.pt", Policy(3), "apg", ring_environment(), {})
+    save(tmp_path / "ring-apg/trial2/seed1/training/last.pt", Policy(3), "apg", environment_of("ring-apg"), {})
     takeover_table(tmp_path, ["ring-apg"], (0, 1))
     cases = [(False, 750), (False, 1750), (False, 3000), (True, 3000)]
     names = ("no_command", "PISaturation", "Policy")
