@@ -18,9 +18,10 @@ from torch.utils.checkpoint import checkpoint
 
 from idm_env import parameters
 from idm_env.effects.base import CarFollowing, Effect, Hook
+from idm_env.history import PAST, History
 from idm_env.kernels import dispatch
 from idm_env.roads.base import Road
-from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Scene, State
+from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
 
 Integration = Literal["ballistic", "euler", "midpoint"]
 
@@ -111,8 +112,14 @@ class Simulator:
             hook: tuple(e for e in self.effects if e.hook == hook)
             for hook in ("perceive", "adapt", "accelerate", "limit", "place")
         }
-        hooks["limit"] = tuple(sorted(hooks["limit"], key=lambda e: e.rank))
+        for hook in ("perceive", "limit"):
+            hooks[hook] = tuple(sorted(hooks[hook], key=lambda e: e.rank))
         return hooks
+
+    @cached_property
+    def looks_back(self) -> float:
+        """Seconds of the past that some effect may ask for."""
+        return max((e.looks_back for e in self.effects), default=0.0)
 
     @cached_property
     def _needs(self) -> frozenset[str]:
@@ -174,6 +181,8 @@ class Simulator:
             held = effect.initial_memory(scene, driver, dict(params[effect.name]))
             if held is not None:
                 memory[effect.name] = held
+        if self.looks_back:
+            memory[PAST] = History.beginning(scene, self.looks_back).buffer
         return start._replace(memory=memory)
 
     def _scene(self, state: State, inputs: Inputs) -> Scene:
@@ -194,8 +203,12 @@ class Simulator:
             euler=self.integration == "euler",
             inputs=inputs,
             memory=state.memory,
+            history=self._history(state),
         )
         return half_ahead(scene) if self.integration == "midpoint" else scene
+
+    def _history(self, state: State) -> Past | None:
+        return History(state.memory[PAST], self.dt) if PAST in state.memory else None
 
     def time(self, state: State) -> Tensor:
         """Return the time (s), shaped to broadcast against ``(..., vehicles)``."""
@@ -242,6 +255,8 @@ class Simulator:
             for e in self.effects
             if e.name in state.memory
         }
+        if scene.history is not None:
+            memory[PAST] = scene.history.pushed(scene)
         return state._replace(
             position=motion.position,
             speed=motion.speed,

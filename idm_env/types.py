@@ -15,7 +15,7 @@ Nobody there
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
@@ -75,6 +75,16 @@ class Neighbour(NamedTuple):
     present: Tensor
 
 
+class Past(Protocol):
+    """What a simulator keeps of the steps before where an effect looks back."""
+
+    def at(self, scene: Scene, seconds: Tensor) -> Scene:
+        """Return the scene of some seconds ago."""
+
+    def pushed(self, scene: Scene) -> Tensor:
+        """Return the buffer after this step."""
+
+
 class Scene(NamedTuple):
     """What one step looks like to every vehicle; effects read this and know no topology.
 
@@ -93,6 +103,16 @@ class Scene(NamedTuple):
     euler: bool
     inputs: Inputs
     memory: Memory
+    history: Past | None = None
+
+    def past(self, seconds: Tensor) -> Scene:
+        """Return the scene of some seconds ago, interpolated between steps; ``seconds`` broadcasts over vehicles.
+
+        ValueError for a scene without a past: the effect that asks must say how far it ``looks_back``.
+        """
+        if self.history is None:
+            raise ValueError("this scene has no past. Let the effect's `looks_back` return how many seconds it needs.")
+        return self.history.at(self, seconds)
 
     def input(self, name: str) -> Any:
         """Return the input of effect ``name``; ValueError tells which input is missing."""

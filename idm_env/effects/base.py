@@ -24,7 +24,7 @@ class Effect:
     ==============  =================================  ===========================  =======================
     hook            meaning                            composition                  example
     ==============  =================================  ===========================  =======================
-    ``perceive``    what the driver sees               chained, in simulator order  Delay, GapBias
+    ``perceive``    what the driver sees               chained by ``rank``          Delay, GapBias
     ``adapt``       how the driver's parameters change chained, in simulator order  Memory, SpeedZone
     ``accelerate``  what the driver wants, in m/s²     summed                       IDM, Grade, Noise
     ``limit``       what the vehicle can               chained by ``rank``          Control, Lag, Brakes
@@ -33,7 +33,7 @@ class Effect:
 
     Class attributes: ``kind`` is the name in ``effects.ALL`` and in YAML; ``needs`` names the optional neighbours
     of the scene that it reads; ``sees_truth`` marks effects of physics, which get the true scene instead of the
-    perceived one; ``rank`` orders limits, low first. Dataclass fields are the static choices.
+    perceived one; ``rank`` orders perceptions and limits, low first. Dataclass fields are the static choices.
     """
 
     kind: ClassVar[str] = ""
@@ -62,6 +62,11 @@ class Effect:
     def parameters(self) -> tuple[Parameter, ...]:
         """Parameters of this effect; overridden where static choices decide how many there are."""
         return self.declared
+
+    @property
+    def looks_back(self) -> float:
+        """Seconds of the past that this effect may ask the scene for (``scene.past``); 0 for none."""
+        return 0.0
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene as the driver sees it."""

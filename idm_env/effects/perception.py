@@ -2,79 +2,39 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import Tensor
 
 from idm_env.effects.base import Effect, P
 from idm_env.parameters import Parameter
-from idm_env.types import Driver, Imagined, Neighbour, Scene
-
-
-def _signals(scene: Scene) -> Tensor:
-    """Stack what a driver perceives: own speed, then gap, speed and acceleration of each neighbour in the scene."""
-    seen = [scene.speed]
-    for neighbour in (scene.leader, scene.second_leader, scene.behind):
-        if neighbour is not None:
-            seen += [neighbour.gap, neighbour.speed, neighbour.accel]
-    return torch.stack(torch.broadcast_tensors(*seen), dim=-1)
-
-
-def _with_signals(scene: Scene, signals: Tensor) -> Scene:
-    """Put stacked signals back into a scene; presence is never delayed, so an absent neighbour stays absent."""
-    channel = iter(signals.unbind(-1))
-
-    def renew(neighbour: Neighbour | None) -> Neighbour | None:
-        return neighbour and Neighbour(next(channel), next(channel), next(channel), neighbour.present)
-
-    speed = next(channel)
-    leader = renew(scene.leader)
-    assert leader is not None
-    return scene._replace(
-        speed=speed, leader=leader, second_leader=renew(scene.second_leader), behind=renew(scene.behind)
-    )
+from idm_env.types import Imagined, Neighbour, Scene
 
 
 @dataclass(frozen=True)
 class Delay(Effect):
     """Reaction delay: the driver reacts to the scene of τ seconds ago (Treiber, Kesting, Helbing 2006, Physica A 360).
 
-    Every input of the driver, his own speed included, is taken at t − τ, by linear interpolation between steps. The
-    interpolation starts from ``floor(τ/Δt)``, so its derivative at τ = 0 is minus the last change, not zero; it has
-    kinks at multiples of Δt. ``max_delay`` (s) sets the static length of the buffer.
+    Every input of the driver, his own speed included, is taken at t − τ, by linear interpolation between steps, before
+    anything else of perception acts. ``max_delay`` (s) is how far the past is kept.
     """
 
     kind: ClassVar[str] = "delay"
+    rank: ClassVar[int] = -10
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("delay", "τ", "s", 0.5, 0.0, 1.5, null=0.0, starts=(0.3, 0.8)),
     )
     max_delay: float = 1.5
 
-    def _slots(self, dt: float) -> int:
-        return math.ceil(self.max_delay / dt - 1e-9) + 1
-
-    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return a past that equals the present, shape ``(..., vehicles, slots, signals)``."""
-        signals = _signals(scene)
-        return signals.unsqueeze(-2).expand(*signals.shape[:-1], self._slots(scene.dt), signals.shape[-1])
+    @property
+    def looks_back(self) -> float:
+        """``max_delay`` (s)."""
+        return self.max_delay
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene of τ seconds ago."""
-        signals = _signals(scene)
-        past = torch.cat((signals.unsqueeze(-2), scene.memory[self.name]), dim=-2)
-        steps = (p["delay"] / scene.dt).expand(signals.shape[:-1])
-        whole = steps.detach().floor().clamp(0, past.shape[-2] - 2)
-        index = whole.long()[..., None, None].expand(*signals.shape[:-1], 1, signals.shape[-1])
-        newer = past.gather(-2, index).squeeze(-2)
-        older = past.gather(-2, index + 1).squeeze(-2)
-        return _with_signals(scene, newer + (steps - whole).unsqueeze(-1) * (older - newer))
-
-    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Push the true scene of this step."""
-        return torch.cat((_signals(scene).unsqueeze(-2), scene.memory[self.name][..., :-1, :]), dim=-2)
+        return scene.past(p["delay"])
 
 
 @dataclass(frozen=True)

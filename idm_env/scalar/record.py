@@ -1,0 +1,224 @@
+"""Records one step of a real simulator on scalars: what it senses, how it responds, and what becomes of the gaps.
+
+Nothing here knows an equation. The road is replaced by one that hands out the leader's numbers instead of tensors, the
+parameters by names; then ``Simulator.step`` itself runs, once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from idm_env import history
+from idm_env.roads.base import Road
+from idm_env.roads.ring import Ring
+from idm_env.scalar.graph import Graph, Node
+from idm_env.scalar.scalar import Scalar, Untraceable, static, value_of
+from idm_env.simulator import Simulator
+from idm_env.types import Motion, Scene, State
+
+
+@dataclass(frozen=True)
+class Form:
+    """What is given to a step beside its simulator, as far as it shapes the step: a key of what was recorded.
+
+    ``inputs`` are (effect, fields given, which of them are truth values); ``memories`` are effects that have a memory.
+    """
+
+    inputs: tuple[tuple[str, tuple[str, ...], tuple[bool, ...]], ...]
+    memories: tuple[str, ...]
+    present: bool
+
+    @classmethod
+    def of(cls, state: State, inputs: Mapping[str, Any]) -> Form:
+        """Return the form of a state and inputs."""
+        found = []
+        for effect, value in sorted(inputs.items()):
+            fields = {"": value} if isinstance(value, Tensor) else value._asdict()
+            given = {name: x for name, x in fields.items() if x is not None}
+            found.append((effect, tuple(given), tuple(x.dtype == torch.bool for x in given.values())))
+        memories = tuple(sorted(name for name in state.memory if name != history.PAST))
+        return cls(tuple(found), memories, state.present is not None)
+
+
+@dataclass
+class Recording:
+    """One step as graphs over slots.
+
+    ``sense`` are the signals that the past keeps (empty where nobody looks back), ``respond`` the motion and memories
+    after the step by name, ``close`` the gap, from everybody's displacement.
+    """
+
+    graph: Graph
+    sense: list[Node] = field(default_factory=list)
+    respond: dict[str, Node] = field(default_factory=dict)
+    close: dict[str, Node] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _SeenRoad(Road):
+    """A road on which ``ahead`` of an expression is the same expression of the leader."""
+
+    road: Road
+    graph: Graph
+
+    def ahead(self, x: Any) -> Any:
+        return Scalar(self.graph, self.graph.shifted(x.node, 1))
+
+    def back(self, x: Any) -> Any:
+        return Scalar(self.graph, self.graph.shifted(x.node, -1))
+
+    def led(self, x: Any) -> Any:
+        if isinstance(self.road, Ring):
+            return Scalar(self.graph, self.graph.constant(1.0))
+        return Scalar(self.graph, self.graph.input("led"))
+
+    def leads(self, x: Any) -> Any:
+        if isinstance(self.road, Ring):
+            return Scalar(self.graph, self.graph.constant(1.0))
+        return Scalar(self.graph, self.graph.input("leads"))
+
+    def gaps(self, position: Any, length: Any, circumference: Any = None) -> Any:
+        if isinstance(self.road, Ring):
+            raise Untraceable("vehicles that come and go on a ring")
+        return type(self.road).gaps(self, position, length)  # type: ignore[arg-type]
+
+
+class _Parameters(Mapping[str, Mapping[str, Any]]):
+    """Every parameter by name; a look at an effect's parameters also notes that this effect is at work."""
+
+    def __init__(self, simulator: Simulator, graph: Graph) -> None:
+        self._graph = graph
+        self._values = {
+            e.name: {p.name: static(graph, f"{e.name}.{p.name}") for p in e.parameters} for e in simulator.effects
+        }
+
+    def __getitem__(self, effect: str) -> Mapping[str, Any]:
+        self._graph.note = effect
+        return self._values[effect]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
+class _Past:
+    """The past as numbers that a loop looks up: how many steps ago, and which signal."""
+
+    def __init__(self, recording: Recording, seconds: float, dt: float) -> None:
+        self._recording = recording
+        self._slots, self._dt = history.slots(seconds, dt), dt
+
+    def at(self, scene: Scene, seconds: Any) -> Scene:
+        graph = self._recording.graph
+        steps = seconds / self._dt
+        whole = steps.detach().floor().clamp(0, self._slots - 1)
+        share = (steps - whole).node
+        newer, older = whole.node, graph.add(whole.node, graph.constant(1.0))
+        values = []
+        for i, _ in enumerate(history.signals(scene)):
+            a, b = graph.node("past", newer, label=i, level=2), graph.node("past", older, label=i, level=2)
+            values.append(Scalar(graph, graph.add(a, graph.mul(share, graph.sub(b, a)))))
+        return history.seeing(scene, values)  # type: ignore[arg-type]
+
+    def pushed(self, scene: Scene) -> Any:
+        self._recording.sense = [x.node for x in history.signals(scene)]  # type: ignore[attr-defined]
+        return scene.speed
+
+
+@dataclass(frozen=True)
+class _Recorder(Simulator):
+    recording: Recording | None = None
+
+    def _history(self, state: State) -> Any:
+        assert self.recording is not None
+        return _Past(self.recording, self.looks_back, self.dt) if self.looks_back else None
+
+    def _gaps(self, state: State, motion: Motion) -> Any:
+        # Gaps need the displacement of two vehicles: a graph of their own, from displacements that are known by then.
+        assert self.recording is not None
+        graph, now = self.recording.graph, self.recording.respond
+        graph.note = ""
+
+        def cut(name: str, x: Any) -> Any:
+            now[name] = value_of(graph, x)
+            return Scalar(graph, graph.input(name))
+
+        same = motion.present is state.present
+        after = Motion(
+            cut("displacement", motion.displacement),
+            Scalar(graph, graph.input("position after")),
+            motion.speed,
+            motion.accel,
+            motion.present if same else cut("present after", motion.present),
+        )
+        return super()._gaps(state, after)
+
+
+def record(simulator: Simulator, form: Form) -> Recording:
+    """Return one step of the simulator as graphs.
+
+    ``Untraceable`` names the effect and the function for which that cannot be done.
+    """
+    graph = Graph()
+    recording = Recording(graph)
+    simulator = _Recorder(
+        _SeenRoad(simulator.road, graph), simulator.effects, simulator.dt, simulator.integration, recording
+    )
+
+    def read(name: str) -> Any:
+        return Scalar(graph, graph.input(name))
+
+    state = State(
+        position=read("position"),
+        speed=read("speed"),
+        accel=read("accel"),
+        gap=read("gap"),
+        length=read("length"),
+        step=read("step"),
+        present=read("present") if form.present else None,
+        memory={name: read(f"memory of {name}") for name in form.memories},
+    )
+    try:
+        after = simulator.step(state, _inputs(simulator, form, graph), _Parameters(simulator, graph))  # type: ignore[arg-type]
+    except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
+        raise Untraceable(f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}") from error
+    for name in ("position", "speed", "accel"):
+        recording.respond[name] = value_of(graph, getattr(after, name))
+    for name in form.memories:
+        recording.respond[f"memory of {name}"] = value_of(graph, after.memory[name])
+    recording.close["gap"] = value_of(graph, after.gap)
+    return recording
+
+
+def _inputs(simulator: Simulator, form: Form, graph: Graph) -> dict[str, Any]:
+    made: dict[str, Any] = {}
+    for effect, fields, truths in form.inputs:
+        values: dict[str, Any] = {}
+        for name, truth in zip(fields, truths, strict=True):
+            node = graph.input(f"{effect} {name}".strip() + " now")
+            values[name] = Scalar(graph, graph.compare("gt", node, graph.constant(0.5)) if truth else node)
+        made[effect] = values[""] if "" in values else _Given(values)
+    return made
+
+
+class _Given:
+    """An input of several parts: whatever was not given is None, as in the tuples that effects know."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = dict(values)
+
+    def __getattr__(self, name: str) -> Any:
+        return self._values.get(name)
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._values.values())
+
+
+__all__ = ["Form", "Recording", "Untraceable", "record"]
