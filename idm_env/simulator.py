@@ -1,29 +1,19 @@
-"""One pure, differentiable step: the single source of the mathematics.
-
-``step`` is a function of tensors. Everything else here is that function composed: ``rollout`` repeats it, ``adding``
-and ``without`` change the tuple of effects that it sums.
-"""
+"""A simulator: one pure step (``step.py``), and that step repeated, by compiled kernels wherever these know it."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from idm_env import parameters
-from idm_env.effects.base import CarFollowing, Effect, Hook
-from idm_env.history import PAST, History
 from idm_env.kernels import dispatch
-from idm_env.roads.base import Road
-from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
-
-Integration = Literal["ballistic", "euler", "midpoint"]
+from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead
+from idm_env.types import Inputs, Params, State
 
 
 class Trajectory(NamedTuple):
@@ -40,242 +30,21 @@ def _kept(state: State) -> Trajectory:
 
 
 @dataclass(frozen=True)
-class Simulator:
+class Simulator(Stepping):
     """A road, a tuple of effects and a time step (s): the static half of a traffic model.
 
-    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps.
-
-    ``integration`` is ``"ballistic"`` (``x += v Δt + a Δt²/2``, and a car that would reverse stops inside the step) or
-    ``"euler"`` (the paper's: ``x += v Δt`` with the old speed). ``"midpoint"`` is ballistic with speeds and gaps of the
-    scene taken half a step ahead, by the accelerations of the step before: second order for one evaluation a step. The
-    other two act on the past half step, a hidden delay of Δt/2 that a search for missing effects would find.
-
-    ValueError: two effects of one name, or not exactly one car-following effect.
+    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps; ``Stepping``
+    says more. ``rollout`` repeats it.
     """
 
     kernels: ClassVar[bool] = True
     """Whether a kernel may stand in for repeated steps."""
-
-    road: Road
-    effects: tuple[Effect, ...]
-    dt: float = 0.1
-    integration: Integration = "ballistic"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "effects", tuple(self.effects))
-        names = [e.name for e in self.effects]
-        double = {n for n in names if names.count(n) > 1}
-        if double:
-            raise ValueError(f"effect '{double.pop()}' is given twice. Every effect of a simulator needs its own name.")
-        following = [e.name for e in self.effects if isinstance(e, CarFollowing)]
-        if len(following) != 1:
-            raise ValueError(
-                f"a simulator needs exactly one car-following effect, got {following or 'none'}. Add IDM() or drop one."
-            )
-        if self.integration not in INTEGRATORS:
-            hint = parameters.nearest(self.integration, INTEGRATORS)
-            raise ValueError(f"integration = '{self.integration}' is unknown.{hint}")
-        if not self.dt > 0:
-            raise ValueError(f"dt = {self.dt} s must be positive.")
 
     def compile(self, *, backend: str = "inductor", dynamic: bool | None = False) -> Simulator:
         """Return this simulator with a compiled step; where nothing can compile it, with one warning, as it is."""
         from idm_env.compiled import Compiled
 
         return Compiled(self.road, self.effects, self.dt, self.integration, backend, dynamic)
-
-    # -- composition ---------------------------------------------------------------------------------------------
-
-    def adding(self, *effects: Effect) -> Simulator:
-        """Return this simulator with more effects."""
-        return dataclasses.replace(self, effects=(*self.effects, *effects))
-
-    def without(self, *names: str) -> Simulator:
-        """Return this simulator without the named effects; ValueError if one is not there."""
-        for name in names:
-            if name not in self.by_name:
-                raise ValueError(f"effect '{name}' is not in this simulator.{parameters.nearest(name, self.by_name)}")
-        return dataclasses.replace(self, effects=tuple(e for e in self.effects if e.name not in names))
-
-    @cached_property
-    def by_name(self) -> dict[str, Effect]:
-        """Effects by name."""
-        return {e.name: e for e in self.effects}
-
-    @cached_property
-    def _following(self) -> CarFollowing:
-        return next(e for e in self.effects if isinstance(e, CarFollowing))
-
-    @cached_property
-    def _hooks(self) -> dict[Hook, tuple[Effect, ...]]:
-        hooks: dict[Hook, tuple[Effect, ...]] = {
-            hook: tuple(e for e in self.effects if e.hook == hook)
-            for hook in ("perceive", "adapt", "accelerate", "limit", "place")
-        }
-        for hook in ("perceive", "limit"):
-            hooks[hook] = tuple(sorted(hooks[hook], key=lambda e: e.rank))
-        return hooks
-
-    @cached_property
-    def looks_back(self) -> float:
-        """Seconds of the past that some effect may ask for."""
-        return max((e.looks_back for e in self.effects), default=0.0)
-
-    @cached_property
-    def _needs(self) -> frozenset[str]:
-        return frozenset().union(*(e.needs for e in self.effects))
-
-    def defaults(self, **kind: Any) -> dict[str, dict[str, Tensor]]:
-        """Return the default parameters; ``dtype`` and ``device`` as in ``torch.tensor``."""
-        return parameters.defaults(self.effects, **kind)
-
-    def check(self, params: Params, inputs: Inputs | None = None) -> None:
-        """Raise ValueError, in one line, for parameters or inputs that do not belong to this simulator."""
-        parameters.check(self.effects, params)
-        for name in inputs or {}:
-            if name not in self.by_name:
-                raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
-
-    # -- the function --------------------------------------------------------------------------------------------
-
-    def state(
-        self,
-        position: Tensor,
-        speed: Tensor,
-        params: Params,
-        *,
-        length: Tensor | float = 5.0,
-        accel: Tensor | None = None,
-        present: Tensor | None = None,
-        step: Tensor | int = 0,
-        circumference: Tensor | float | None = None,
-    ) -> State:
-        """Return the state at the start, with gaps built from positions (differentiably) and memories filled.
-
-        ``position`` and ``speed`` have shape ``(..., vehicles)``, front first; ``length`` (m) broadcasts; ``step`` sets
-        the clock; ``circumference`` (m) is a ring's, one per batch row. ValueError for shapes that do not fit.
-        """
-        if position.shape != speed.shape or position.dim() == 0:
-            raise ValueError(
-                f"position {tuple(position.shape)} and speed {tuple(speed.shape)} must have one shape (…, vehicles)."
-            )
-        length = torch.as_tensor(length, dtype=position.dtype, device=position.device).expand_as(position)
-        gap = self.road.gaps(position, length, circumference)
-        if present is not None:
-            present = present.to(position.dtype).expand_as(position)
-            gap = torch.where(self.road.leader_present(present, position) > 0, gap, FAR)
-        start = State(
-            position=position,
-            speed=speed,
-            accel=torch.zeros_like(speed) if accel is None else accel,
-            gap=gap,
-            length=length,
-            step=torch.as_tensor(step, device=position.device),
-            present=present,
-            memory={},
-        )
-        scene = self._scene(start, {})
-        driver = self._following.driver(dict(params[self._following.name]))
-        memory: dict[str, Tensor] = {}
-        for effect in self.effects:
-            held = effect.initial_memory(scene, driver, dict(params[effect.name]))
-            if held is not None:
-                memory[effect.name] = held
-        if self.looks_back:
-            memory[PAST] = History.beginning(scene, self.looks_back).buffer
-        return start._replace(memory=memory)
-
-    def _scene(self, state: State, inputs: Inputs) -> Scene:
-        road = self.road
-        there = road.leader_present(state.present, state.speed)
-        leader = road.leader(state.gap, state.speed, state.accel, there)
-        scene = Scene(
-            position=state.position,
-            speed=state.speed,
-            accel=state.accel,
-            leader=leader,
-            second_leader=(
-                road.second_leader(leader, state.length, state.speed) if "second_leader" in self._needs else None
-            ),
-            behind=road.behind(leader, state.speed, state.accel) if "behind" in self._needs else None,
-            time=self.time(state),
-            dt=self.dt,
-            euler=self.integration == "euler",
-            inputs=inputs,
-            memory=state.memory,
-            history=self._history(state),
-        )
-        return half_ahead(scene) if self.integration == "midpoint" else scene
-
-    def _history(self, state: State) -> Past | None:
-        return History(state.memory[PAST], self.dt) if PAST in state.memory else None
-
-    def time(self, state: State) -> Tensor:
-        """Return the time (s), shaped to broadcast against ``(..., vehicles)``."""
-        time = state.step * torch.as_tensor(self.dt, dtype=state.position.dtype, device=state.position.device)
-        return time if time.dim() == 0 else time.unsqueeze(-1)
-
-    def _respond(self, state: State, inputs: Inputs, params: Params) -> tuple[Tensor, Scene, Driver]:
-        scene = self._scene(state, inputs)
-        seen = scene
-        for effect in self._hooks["perceive"]:
-            seen = effect.perceive(seen, params[effect.name])  # type: ignore[arg-type]
-        driver = self._following.driver(params[self._following.name])  # type: ignore[arg-type]
-        for effect in self._hooks["adapt"]:
-            view = scene if effect.sees_truth else seen
-            driver = effect.adapt(driver, view, params[effect.name])  # type: ignore[arg-type]
-        accel: Tensor | None = None
-        for effect in self._hooks["accelerate"]:
-            view = scene if effect.sees_truth else seen
-            part = effect.accelerate(view, driver, params[effect.name])  # type: ignore[arg-type]
-            accel = part if accel is None else accel + part
-        assert accel is not None  # the car-following effect accelerates
-        for effect in self._hooks["limit"]:
-            view = scene if effect.sees_truth else seen
-            accel = effect.limit(accel, view, driver, params[effect.name])  # type: ignore[arg-type]
-        return accel, scene, driver
-
-    def acceleration(self, state: State, inputs: Inputs, params: Params) -> Tensor:
-        """Return the acceleration of every vehicle in this state (m/s²), before any record is replayed."""
-        return self._respond(state, inputs, params)[0]
-
-    def step(self, state: State, inputs: Inputs, params: Params) -> State:
-        """Return the state Δt later. Pure: the same arguments give the same result, with or without a graph.
-
-        ``inputs`` maps effect names to what they take at this step; ``params`` maps effect and parameter names to
-        tensors that broadcast against ``(..., vehicles)``.
-        """
-        accel, scene, driver = self._respond(state, inputs, params)
-        displacement, speed, accel = INTEGRATORS[self.integration](state.speed, accel, self.dt)
-        motion = Motion(displacement, state.position + displacement, speed, accel, state.present)
-        for effect in self._hooks["place"]:
-            motion = effect.place(motion, scene, params[effect.name])  # type: ignore[arg-type]
-        memory = {
-            e.name: e.remember(scene, driver, params[e.name])  # type: ignore[arg-type]
-            for e in self.effects
-            if e.name in state.memory
-        }
-        if scene.history is not None:
-            memory[PAST] = scene.history.pushed(scene)
-        return state._replace(
-            position=motion.position,
-            speed=motion.speed,
-            accel=motion.accel,
-            gap=self._gaps(state, motion),
-            step=state.step + 1,
-            present=motion.present,
-            memory=memory,
-        )
-
-    def _gaps(self, state: State, motion: Motion) -> Tensor:
-        gap = self.road.advance(state.gap, motion.displacement)
-        if motion.present is None:
-            return gap
-        now = self.road.leader_present(motion.present, motion.position) > 0
-        if motion.present is not state.present:
-            before = self.road.leader_present(state.present, state.position) > 0
-            gap = torch.where(now & ~before, self.road.gaps(motion.position, state.length), gap)
-        return torch.where(now, gap, FAR)
 
     def _covered(self, inputs: Inputs, steps: int) -> None:
         for name, value in inputs.items():
@@ -314,13 +83,12 @@ class Simulator:
         tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps
         instead of ``steps``, for about one more forward pass. ValueError for inputs that are too short or of no effect.
         """
-        if steps > 0 and keep in (_kept, None) and dispatch.refusal(self, state, inputs, params) is None:
-            from idm_env.kernels import lanes
-
+        if steps > 0 and keep in (_kept, None):
             self._covered(inputs, steps)
-            block = min(checkpoint_every or lanes.BLOCK, 4 * lanes.BLOCK)
-            last, fast = lanes.rollout(self, state, inputs, params, steps, block=block, keep=keep is not None)
-            return last, None if fast is None else Trajectory(*fast)
+            fast = dispatch.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)
+            if fast is not None:
+                last, kept_of_all = fast
+                return last, None if kept_of_all is None else Trajectory(*kept_of_all)
         slices = self.slices(inputs, steps)
 
         def run(state: State, begin: int, end: int) -> tuple[State, list[tuple[Tensor, ...]]]:
@@ -361,49 +129,4 @@ def _unbind(value: Any) -> list[Any]:
     return [type(value)(*row) for row in zip(*columns, strict=True)]
 
 
-def ballistic(speed: Tensor, accel: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return displacement (m), new speed and realised acceleration: ``x += v Δt + a Δt²/2``, with an exact stop.
-
-    A car whose speed would become negative stops inside the step, after ``v²/(2|a|)``.
-    """
-    after = speed + accel * dt
-    stops = after < 0
-    braking = torch.where(stops, -accel, 1.0)
-    displacement = torch.where(stops, 0.5 * speed * speed / braking, 0.5 * dt * (speed + after))
-    return displacement, after.clamp_min(0.0), torch.where(stops, -speed / dt, accel)
-
-
-def euler(speed: Tensor, accel: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return displacement (m), new speed and acceleration of the paper's explicit Euler: ``x += v Δt``, old v."""
-    return speed * dt, (speed + accel * dt).clamp_min(0.0), accel
-
-
-def half_ahead(scene: Scene) -> Scene:
-    """Return speeds and gaps half a step later, at the accelerations of the step before; positions stay."""
-    half = 0.5 * scene.dt
-
-    def later(speed: Tensor, accel: Tensor) -> Tensor:
-        return torch.relu(speed + half * accel)
-
-    def moved(other: Neighbour | None, sign: float) -> Neighbour | None:
-        if other is None:
-            return None
-        opening = (other.speed - scene.speed) + 0.5 * half * (other.accel - scene.accel)
-        gap = other.gap + sign * half * opening * other.present
-        return other._replace(gap=gap, speed=later(other.speed, other.accel))
-
-    leader = moved(scene.leader, 1.0)
-    assert leader is not None
-    return scene._replace(
-        speed=later(scene.speed, scene.accel),
-        leader=leader,
-        second_leader=moved(scene.second_leader, 1.0),
-        behind=moved(scene.behind, -1.0),
-    )
-
-
-INTEGRATORS: Mapping[Integration, Callable[[Tensor, Tensor, float], tuple[Tensor, Tensor, Tensor]]] = {
-    "ballistic": ballistic,
-    "euler": euler,
-    "midpoint": ballistic,
-}
+__all__ = ["INTEGRATORS", "Integration", "Simulator", "Trajectory", "ballistic", "euler", "half_ahead"]

@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Control, Noise, Replay
+from idm_env.history import PAST
 from idm_env.kernels import available
 from idm_env.roads import Lane, Ring
-from idm_env.types import Inputs, Params, Record, State
+from idm_env.scalar.record import Form
+from idm_env.types import Inputs, Params, State
 
 if TYPE_CHECKING:
+    from idm_env.kernels.printed import TileKernel
     from idm_env.simulator import Simulator
+    from idm_env.step import Stepping
 
 _off: ContextVar[str | None] = ContextVar("idm_env_kernels_off", default=None)
 
@@ -36,35 +39,20 @@ def off(reason: str = "switched off by kernels.off()") -> Iterator[None]:
         _off.reset(token)
 
 
-def unfit(simulator: Simulator) -> str | None:
-    """Return why this simulator has no kernel, or None if it has one."""
-    if not simulator.kernels:
-        return "the step is compiled by torch"
-    if type(simulator.road) not in (Lane, Ring):
-        return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
-    if simulator.integration not in ("ballistic", "euler"):
-        return f"integration is '{simulator.integration}'; kernels know ballistic and euler"
-    kinds = {type(e) for e in simulator.effects}
-    others = sorted(e.name for e in simulator.effects if type(e) not in (IDM, Brakes, Control, Replay, Noise))
-    if others:
-        return f"effect '{others[0]}' has no kernel"
-    if not {IDM, Brakes} <= kinds:
-        return "kernels need IDM and Brakes"
-    for effect in simulator.effects:
-        if isinstance(effect, IDM) and (effect.exponent != 4.0 or effect.sharpness is not None):
-            return "IDM has a free exponent or the published smooth form; the kernel has δ = 4 and exact bounds"
-        if isinstance(effect, Brakes) and effect.sharpness is not None:
-            return "Brakes have the published smooth form; the kernel has the exact floor"
-        if isinstance(effect, Noise) and effect.correlated:
-            return "the noise is correlated; the kernel's is white"
-    return None
-
-
-def refusal(simulator: Simulator, state: State, inputs: Inputs, params: Params) -> str | None:
-    """Return why this call takes the torch path, or None if a kernel takes it."""
-    why = _off.get() or unfit(simulator)
+def found(simulator: Stepping, state: State, inputs: Inputs, params: Params) -> TileKernel | str:
+    """Return the kernel for this call, or why it takes the torch path."""
+    why = _off.get() or surroundings() or _unfit_tensors(state, inputs, params)
     if why is not None:
         return why
+    if type(simulator.road) not in (Lane, Ring):
+        return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
+    from idm_env.kernels.printed import tile_kernel
+
+    return tile_kernel(simulator, Form.of(state, inputs))
+
+
+def surroundings() -> str | None:
+    """Return why no kernel can run here at all, or None."""
     if os.environ.get("IDM_ENV_KERNELS", "1") == "0":
         return "IDM_ENV_KERNELS=0"
     if not available():
@@ -73,10 +61,30 @@ def refusal(simulator: Simulator, state: State, inputs: Inputs, params: Params) 
         return "a torch.func transform or forward-mode differentiation is active"
     if torch.compiler.is_compiling():
         return "torch is compiling"
-    record = inputs.get("replay")
-    if isinstance(record, Record) and record.present is not None:
-        return "the record says who is present, step by step"
-    return _unfit_tensors(state, inputs, params)
+    return None
+
+
+def rollout(
+    simulator: Simulator, state: State, inputs: Inputs, params: Params, steps: int, every: int, keep: bool
+) -> tuple[State, tuple[Tensor, ...] | None] | None:
+    """Return what ``Simulator.rollout`` returns, by a kernel; None where there is none for this call."""
+    if not simulator.kernels:
+        return None
+    kernel = found(simulator, state, inputs, params)
+    if isinstance(kernel, str):
+        return None
+    from idm_env.kernels import lanes
+
+    block = min(every or lanes.BLOCK, 4 * lanes.BLOCK)
+    return lanes.rollout(kernel, simulator, state, inputs, params, steps, block=block, keep=keep)
+
+
+def refusal(simulator: Simulator, state: State, inputs: Inputs, params: Params) -> str | None:
+    """Return why this call takes the torch path, or None if a kernel takes it."""
+    if not simulator.kernels:
+        return "the step is compiled by torch"
+    kernel = found(simulator, state, inputs, params)
+    return kernel if isinstance(kernel, str) else None
 
 
 def _unfit_tensors(state: State, inputs: Inputs, params: Params) -> str | None:
@@ -86,7 +94,11 @@ def _unfit_tensors(state: State, inputs: Inputs, params: Params) -> str | None:
     if state.speed.numel() == 0:
         return "there are no vehicles"
     shape = state.speed.shape
-    tensors = [state.position, state.speed, state.gap, *_tensors(inputs)]
+    memories = [x for name, x in state.memory.items() if name != PAST]
+    for x in memories:
+        if not _within(x.shape, shape):
+            return f"a memory has shape {tuple(x.shape)}; kernels know one number per vehicle"
+    tensors = [state.position, state.speed, state.gap, *state.memory.values(), *_tensors(inputs)]
     for effect, values in params.items():
         for name, value in values.items():
             if not isinstance(value, Tensor):

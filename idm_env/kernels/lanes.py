@@ -1,41 +1,43 @@
-"""Rollouts of lanes and rings by compiled kernels, differentiable by an analytic vector-Jacobian product.
+"""Rollouts of lanes and rings by compiled kernels, differentiable by a vector-Jacobian product.
 
-The tape is the state at every ``block`` steps (gap, speed, position: 12 / block bytes per vehicle-step in float32); a
-tile recomputes what lies between while it is in cache. Blocks are cut alike with and without a graph, so values are
-too.
+The tape is the part of the state that the adjoint reads, at every ``block`` steps; a tile recomputes what lies between
+while it is in cache. Blocks are cut alike with and without a graph, so values are too.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.kernels import lane_adjoint, lane_loops, tiles
+from idm_env.history import PAST
 from idm_env.kernels import threads as pool
-from idm_env.kernels.dispatch import off
-from idm_env.kernels.equations import Array, constants
+from idm_env.kernels import tiles
 from idm_env.kernels.operands import Strides, dense, operand, reduced, table
+from idm_env.kernels.printed import TileKernel, constants
+from idm_env.kernels.tiles import Array
 from idm_env.kernels.workspace import take
-from idm_env.roads import Ring
+from idm_env.scalar.record import slot_name
 from idm_env.types import Inputs, Params, State
 
 if TYPE_CHECKING:
-    from idm_env.simulator import Simulator
+    from idm_env.step import Stepping
 
 BLOCK = 16
 """Steps that a tile runs before it leaves the cache, and between two states of the tape."""
 
-PARAMETERS = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 
-
-class _Plan(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Plan:
     """Everything about a rollout that is not differentiated."""
 
-    simulator: Simulator
+    kernel: TileKernel
+    simulator: Stepping
     state: State
     inputs: Inputs
     params: Params
@@ -43,176 +45,243 @@ class _Plan(NamedTuple):
     block: int
     keep: bool
     tape: bool
-    has: int
     operands: tuple[Array, ...]
     flags: tuple[Array, ...]
     strides: Array
-    constants: Array
     threads: int | None
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, ...]:
         return tuple(self.state.speed.shape)
 
-    @property
+    @cached_property
     def rows(self) -> int:
         return math.prod(self.shape[:-1])
+
+    @cached_property
+    def count(self) -> int:
+        return math.prod(self.shape)
+
+    @cached_property
+    def kind(self) -> np.dtype[Any]:
+        return np.dtype(np.float32 if self.state.speed.dtype == torch.float32 else np.float64)
+
+    @cached_property
+    def nothing(self) -> Array:
+        """An array that stands for one that is not wanted."""
+        return np.zeros(1, self.kind)
+
+    @cached_property
+    def slots(self) -> int:
+        """Steps that the past holds."""
+        return self.state.memory[PAST].shape[-2] if self.kernel.signals else 0
 
     def blocks(self) -> list[tuple[int, int]]:
         """First step and number of steps of every block."""
         return [(t, min(self.block, self.steps - t)) for t in range(0, self.steps, self.block)]
 
-    def run(self, loop: Any, steps: int, *arguments: Any) -> None:
+    def run(self, loop: Any, first: int, steps: int, *arguments: Any) -> None:
         """Call a compiled loop over all tiles, on one thread or several."""
         size = self.shape[-1]
         wide = tiles.width(size, steps)
-        count = tiles.tiles(self.rows, size, steps, wide)
-        threads = pool.count(self.rows * size * steps, self.threads)
+        around = tiles.halo(steps, self.kernel.program.reach)
+        given = (
+            *arguments, self.operands, self.flags, self.strides, constants(self.kernel.constants, self.kind.type),
+            first, steps, self.rows, size, wide, around,
+        )  # fmt: skip
         pool.split(
-            lambda begin, end: loop(*arguments, steps, self.rows, size, wide, self.has, self.constants, begin, end),
-            count, 1, threads,
+            lambda begin, end: loop(*given, begin, end),
+            tiles.tiles(self.rows, size, wide, around), 1, pool.count(self.rows * size * steps, self.threads),
         )  # fmt: skip
 
+    def past(self, filled: bool = False) -> Array:
+        """Return an array for the past: (slots · signals, vehicles)."""
+        shape = (self.slots * self.kernel.signals, self.count)
+        if not shape[0]:
+            return np.zeros((1, 1), self.kind)
+        return np.zeros(shape, self.kind) if filled else take(shape, self.kind)
 
-def _sources(simulator: Simulator, inputs: Inputs, params: Params) -> list[Tensor | None]:
-    """Return the tensors that a rollout is differentiated by, beside the state: six parameters, σ, five inputs."""
-    idm, brakes = params["idm"], params["brakes"]
-    tensors: list[Tensor | None] = [idm[name] for name in PARAMETERS]
-    tensors.append(brakes["max_decel"])
-    noisy = "noise" in simulator.by_name
-    tensors.append(params["noise"]["sigma"] if noisy else None)
-    tensors.append(inputs["noise"] if noisy else None)
-    tensors.append(inputs["control"].accel if "control" in simulator.by_name else None)
-    replay = inputs.get("replay") if "replay" in simulator.by_name else None
-    tensors += [None] * 3 if replay is None else [replay.position, replay.speed, replay.accel]
-    return tensors
+
+def _static(simulator: Stepping, state: State, params: Params, name: str) -> Tensor:
+    """Return what a static slot stands for, as a tensor."""
+    if name == "led":
+        return simulator.road.led(state.speed)
+    if name == "leads":
+        return simulator.road.leads(state.speed)
+    if name in ("length", "present"):
+        value = getattr(state, name)
+        assert value is not None
+        return value
+    effect, parameter = name.split(".", 1)
+    return params[effect][parameter]
+
+
+def _part(inputs: Inputs, name: str) -> Tensor:
+    """Return the input, or the part of one, that a slot stands for."""
+    for effect, value in inputs.items():
+        for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
+            if slot_name(effect, part) == name:
+                return x
+    raise KeyError(name)
+
+
+def _starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
+    """Return the tensors of the states, in the order of the program."""
+    found = []
+    for name in names:
+        if name.startswith("memory of "):
+            found.append(plan_state.memory[name.removeprefix("memory of ")])
+        elif name == "step":
+            step = plan_state.step.to(plan_state.speed.dtype)
+            found.append(step if step.dim() == 0 else step.unsqueeze(-1))
+        else:
+            found.append(getattr(plan_state, name))
+    return found
+
+
+def _past_rows(past: Tensor, shape: tuple[int, ...]) -> Array:
+    """Return the past as (slots · signals, vehicles): newest slot first."""
+    full = past.detach().expand(*shape, *past.shape[-2:])
+    return full.movedim((-2, -1), (0, 1)).reshape(full.shape[-2] * full.shape[-1], -1).contiguous().numpy()
+
+
+def _past_tensor(rows: Array, slots: int, shape: tuple[int, ...]) -> Tensor:
+    """Return rows of the past as ``(..., vehicles, slots, signals)``."""
+    return torch.from_numpy(rows).view(slots, -1, *shape).movedim((0, 1), (-2, -1)).contiguous()
 
 
 def _plan(
-    simulator: Simulator, state: State, inputs: Inputs, params: Params, steps: int, block: int, keep: bool,
-    threads: int | None,
-) -> tuple[_Plan, list[Tensor | None]]:  # fmt: skip
+    kernel: TileKernel, simulator: Stepping, state: State, inputs: Inputs, params: Params, steps: int, block: int,
+    keep: bool, threads: int | None,
+) -> tuple[_Plan, list[Tensor]]:  # fmt: skip
     *batch, size = state.speed.shape
-    sources = _sources(simulator, inputs, params)
-    kind = np.dtype(np.float32 if state.speed.dtype == torch.float32 else np.float64)
-    nothing: tuple[Array, Strides] = (np.zeros(1, kind), (0, 0, 0))
-    made = [operand(simulator.road.leader_present(state.present, state.speed), batch, size)]
-    for i, tensor in enumerate(sources):
-        timed = steps if i >= 7 else None
-        made.append(nothing if tensor is None else operand(tensor, batch, size, timed))
-    control, record = inputs.get("control"), inputs.get("replay")
-    flags = [
-        (np.zeros(1, np.uint8), (0, 0, 0)) if x is None else operand(x.active.bool(), batch, size, steps)
-        for x in (control, record)
-    ]
-    names = simulator.by_name
-    has = sum(
-        bit
-        for bit, there in (
-            (lane_loops.EULER, simulator.integration == "euler"),
-            (lane_loops.RING, isinstance(simulator.road, Ring)),
-            (lane_loops.NOISE, "noise" in names),
-            (lane_loops.CONTROL, "control" in names),
-            (lane_loops.REPLAY, "replay" in names),
-            (lane_loops.COMES_AND_GOES, state.present is not None),
-        )
-        if there
-    )
-    width: float = names["brakes"].width  # type: ignore[attr-defined]
-    differentiated = [state.gap, state.speed, state.position, *(x for x in sources if x is not None)]
-    tape = torch.is_grad_enabled() and any(x.requires_grad for x in differentiated)
+    program = kernel.program
+    given = [_static(simulator, state, params, n) for n in (*program.statics, *program.parameters)]
+    numbers = [_part(inputs, n) for n in kernel.numbers]
+    kind = state.speed.dtype
+    made = [operand(x.to(kind), batch, size) for x in given]
+    made += [operand(x, batch, size, steps) for x in numbers]
+    flags = [operand(_part(inputs, n), batch, size, steps) for n in kernel.flags]
+    nothing: tuple[Array, Strides] = (np.zeros(1, np.float32 if kind == torch.float32 else np.float64), (0, 0, 0))
     strides = table([*(s for _, s in made), *(s for _, s in flags), (0, size, 1)])
+    differentiated = _differentiated(program.moving, state, given[len(program.statics) :], numbers, kernel.signals)
+    tape = torch.is_grad_enabled() and any(x.requires_grad for x in differentiated)
     plan = _Plan(
-        simulator, state, inputs, params, steps, min(block, steps), keep, tape, has, tuple(a for a, _ in made),
-        tuple(a for a, _ in flags), strides, constants(simulator.dt, width, kind), threads,
+        kernel, simulator, state, inputs, params, steps, min(block, steps), keep, tape,
+        tuple(a for a, _ in made) or (nothing[0],), tuple(a for a, _ in flags) or (np.zeros(1, np.uint8),), strides,
+        threads,
     )  # fmt: skip
-    return plan, sources
+    return plan, differentiated
 
 
-def _forward(plan: _Plan, start: tuple[Array, ...]) -> tuple[list[Array], Array, list[tuple[Array, ...]]]:
-    """Return the last state (gap, speed, position, accel), what is kept of every step, and the states of the tape."""
-    count, kind = start[0].size, start[0].dtype
-    ends = [take((count,), kind) for _ in range(4)]
-    kept = take((4, plan.steps if plan.keep else 0, count), kind)
-    slots: list[tuple[Array, ...]] = []
+def _differentiated(
+    moving: tuple[str, ...], state: State, parameters: list[Tensor], numbers: list[Tensor], signals: int
+) -> list[Tensor]:
+    """Return what a rollout is differentiated by: states, the past, parameters, inputs."""
+    return [*_starts(state, moving), *([state.memory[PAST]] if signals else []), *parameters, *numbers]
+
+
+def _forward(plan: _Plan, start: list[Array], past: Array) -> tuple[list[Array], Array, Array, list[Any]]:
+    """Return the last states, the last past, what is kept of every step, and the tape: states at every block."""
+    program = plan.kernel.program
+    kept = take((4, plan.steps if plan.keep else 0, plan.count), plan.kind)
     blocks = plan.blocks()
+    tape: list[Any] = []
+    loops = plan.kernel.loops
+    now, before = start, past
+    spare: list[list[Array]] = []
     for number, (first, steps) in enumerate(blocks):
-        if number == len(blocks) - 1:
-            to = tuple(ends[:3])
-        elif plan.tape or number < 2:
-            to = tuple(take((count,), kind) for _ in range(3))
+        last = number == len(blocks) - 1
+        if plan.tape:
+            tape.append(([x if i in loops.AGAIN else plan.nothing for i, x in enumerate(now)], before))
+        if len(spare) > 1 and not plan.tape and not last:
+            ends = spare[number % 2]
         else:
-            to = slots[number - 2]
-        source = slots[number - 1] if number else start
-        plan.run(lane_loops.forward, steps, *source, *to, ends[3], kept, plan.operands, plan.flags, plan.strides, first)
-        slots.append(to)
-    return ends, kept, slots[:-1] if plan.tape else []
+            wanted = range(len(program.states)) if last else loops.READ
+            ends = [take((plan.count,), plan.kind) if i in wanted else plan.nothing for i in range(len(program.states))]
+            spare.append(ends)
+        after = plan.past()
+        plan.run(loops.forward, first, steps, tuple(now), tuple(ends), before, after, plan.slots, kept)
+        now, before = ends, after
+    return now, before, kept, tape
 
 
 class _Rollout(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, plan: _Plan, gap: Tensor, speed: Tensor, position: Tensor, *sources: Tensor | None
-    ) -> tuple[Tensor, ...]:
-        start = tuple(dense(x, plan.shape) for x in (gap, speed, position))
-        ends, kept, slots = _forward(plan, start)
-        ctx.plan, ctx.slots, ctx.start = plan, slots, start
-        ctx.save_for_backward(gap, speed, position, *sources)
+    def forward(ctx: Any, plan: _Plan, *sources: Tensor) -> tuple[Tensor, ...]:
+        program = plan.kernel.program
+        start = [dense(x.to(plan.state.speed.dtype), plan.shape) for x in _starts(plan.state, program.states)]
+        past = _past_rows(plan.state.memory[PAST], plan.shape) if plan.slots else plan.past()
+        ends, after, kept, tape = _forward(plan, start, past)
+        ctx.plan, ctx.tape = plan, tape
+        ctx.save_for_backward(*sources)
         ctx.set_materialize_grads(False)
         out = [torch.from_numpy(x).view(plan.shape) for x in ends]
+        if plan.slots:
+            out.append(_past_tensor(after, plan.slots, plan.shape))
         if plan.keep:
             out += [torch.from_numpy(x).view(plan.steps, *plan.shape) for x in kept]
+        fixed = [x for x, n in zip(out, program.states, strict=False) if n not in program.moving]
+        ctx.mark_non_differentiable(*fixed)
         return tuple(out)
 
     @staticmethod
     def backward(ctx: Any, *seeds: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        plan: _Plan = ctx.plan
         saved = ctx.saved_tensors
         if torch.is_grad_enabled():
-            return (None, *_differentiable(ctx.plan, saved, seeds))
-        return (None, *_backward(ctx.plan, ctx.start, ctx.slots, saved, seeds, ctx.needs_input_grad[1:]))
+            return (None, *_differentiable(plan, saved, seeds))
+        return (None, *_backward(plan, ctx.tape, saved, seeds, ctx.needs_input_grad[1:]))
 
 
 def _backward(
-    plan: _Plan,
-    start: tuple[Array, ...],
-    slots: list[tuple[Array, ...]],
-    saved: tuple[Tensor | None, ...],
-    seeds: tuple[Tensor | None, ...],
-    needed: tuple[bool, ...],
+    plan: _Plan, tape: list[Any], saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...], needed: tuple[bool, ...]
 ) -> list[Tensor | None]:
-    count, kind = start[0].size, start[0].dtype
-    nothing = np.zeros(1, kind)
-    on = [nothing if s is None else dense(s, plan.shape) for s in seeds[:4]]
-    every = [s for s in seeds[4:] if s is not None]
-    along = take((4, plan.steps if every else 0, count), kind)
-    for j, seed in enumerate(seeds[4:] if every else ()):
-        along[j] = 0 if seed is None else dense(seed, (plan.steps, *plan.shape)).reshape(plan.steps, count)
-    on_inputs = take((5, plan.steps if any(needed[10:]) else 0, count), kind)
-    on_parameters = take((7 if plan.has & lane_loops.NOISE else 6, count), kind)
+    kernel, loops = plan.kernel, plan.kernel.loops
+    program = kernel.program
+    states, moving = len(program.states), len(program.moving)
+    begin_of = moving + bool(plan.slots)
+    parameters = len(program.parameters)
+    on: list[Array] = [plan.nothing if s is None else dense(s, plan.shape) for s in seeds[:moving]]
+    on_past = plan.past(filled=True)
+    if plan.slots and seeds[states] is not None:
+        on_past = _past_rows(seeds[states], plan.shape)  # type: ignore[arg-type]
+    every = seeds[states + bool(plan.slots) :]
+    seeded = any(s is not None for s in every)
+    along = take((4, plan.steps if seeded else 0, plan.count), plan.kind)
+    for j, seed in enumerate(every if seeded else ()):
+        along[j] = 0 if seed is None else dense(seed, (plan.steps, *plan.shape)).reshape(plan.steps, plan.count)
+    wants_inputs = any(needed[begin_of + parameters :])
+    on_inputs = take((len(kernel.numbers), plan.steps if wants_inputs else 0, plan.count), plan.kind)
+    on_parameters = take((parameters, plan.count), plan.kind)
     blocks = plan.blocks()
     for number in range(len(blocks) - 1, -1, -1):
         first, steps = blocks[number]
-        source = slots[number - 1] if number else start
-        fresh = number == len(blocks) - 1
+        start, past = tape[number]
         # What nobody asks for is not written: half the time of a short rollout goes to memory.
-        begin = [take((count,), kind) if number or wanted else np.zeros(1, kind) for wanted in needed[:3]]
+        begin = [
+            take((plan.count,), plan.kind) if number or wanted else plan.nothing for wanted in needed[:moving]
+        ]  # fmt: skip
+        before = plan.past()
         plan.run(
-            lane_adjoint.backward, steps, *source, along, *on[:3], on[3], *begin,
-            on_parameters, fresh, on_inputs, plan.operands, plan.flags, plan.strides, first,
+            loops.backward, first, steps, tuple(start), past, plan.slots, along, tuple(on), tuple(begin),
+            on_past, before, on_parameters, number == len(blocks) - 1, on_inputs,
         )  # fmt: skip
-        on = [*begin, nothing]
-    full = [*on[:3], *on_parameters, *([None] if len(on_parameters) == 6 else [])]
-    command, normals, place, pace, pull = on_inputs
-    gradients: list[Tensor | None] = []
-    for i, gradient in enumerate([*full, normals, command, place, pace, pull]):
-        like = saved[i]
-        if like is None or gradient is None or not needed[i]:
-            gradients.append(None)
-        elif i < 10:
-            gradients.append(reduced(gradient, plan.shape, like))
-        else:
-            gradients.append(_timed(gradient, plan, like))
-    return gradients
+        on, on_past = begin, before
+    full = [*on, *([on_past] if plan.slots else []), *on_parameters, *on_inputs]
+    return [
+        _gradient(plan, i, gradient, like, begin_of, parameters) if wanted else None
+        for i, (gradient, like, wanted) in enumerate(zip(full, saved, needed, strict=True))
+    ]
+
+
+def _gradient(plan: _Plan, i: int, gradient: Array, like: Tensor, begin_of: int, parameters: int) -> Tensor:
+    """Return a gradient in the shape of the tensor that it belongs to."""
+    if plan.slots and i == begin_of - 1:
+        return _past_tensor(gradient, plan.slots, plan.shape).sum_to_size(like.shape)
+    if i < begin_of + parameters:
+        return reduced(gradient, plan.shape, like)
+    return _timed(gradient, plan, like)
 
 
 def _timed(gradient: Array, plan: _Plan, like: Tensor) -> Tensor:
@@ -225,41 +294,53 @@ def _timed(gradient: Array, plan: _Plan, like: Tensor) -> Tensor:
 
 
 def _differentiable(
-    plan: _Plan, saved: tuple[Tensor | None, ...], seeds: tuple[Tensor | None, ...]
+    plan: _Plan, saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...]
 ) -> list[Tensor | None]:
     """Return the gradients with a graph of their own, for second derivatives, from the torch path."""
-    gap, speed, position = saved[:3]
-    assert gap is not None and speed is not None and position is not None
-    state = plan.state._replace(gap=gap, speed=speed, position=position)
+    from idm_env.kernels.dispatch import off
+
+    program = plan.kernel.program
+    given = dict(zip(program.moving, saved, strict=False))
+    memory = dict(plan.state.memory)
+    memory.update({n.removeprefix("memory of "): x for n, x in given.items() if n in program.memories})
+    if plan.slots:
+        memory[PAST] = saved[len(program.moving)]
+    plain = {n: x for n, x in given.items() if n not in program.memories}
     with off("second derivatives"):
-        last, kept = plan.simulator.rollout(state, plan.inputs, plan.params, plan.steps)
-    outputs = (last.gap, last.speed, last.position, last.accel, *(kept if plan.keep else ()))
+        last, kept = plan.simulator.rollout(  # type: ignore[attr-defined]
+           
+            plan.state._replace(**plain, memory=memory), plan.inputs, plan.params, plan.steps
+        )
+    outputs = [*_starts(last, program.states), *([last.memory[PAST]] if plan.slots else []), *(kept if plan.keep else ())]
     pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if s is not None]
-    wanted = [x for x in saved if x is not None and x.requires_grad]
+    wanted = [x for x in saved if x.requires_grad]
     found = iter(
         torch.autograd.grad(
             [o for o, _ in pairs], wanted, [s for _, s in pairs], create_graph=True, allow_unused=True
         )
     )  # fmt: skip
-    return [next(found) if x is not None and x.requires_grad else None for x in saved]
+    return [next(found) if x.requires_grad else None for x in saved]
 
 
 def rollout(
-    simulator: Simulator,
-    state: State,
-    inputs: Inputs,
-    params: Params,
-    steps: int,
-    *,
-    block: int = BLOCK,
-    keep: bool = True,
-    threads: int | None = None,
-) -> tuple[State, tuple[Tensor, ...] | None]:
-    """Do what ``simulator.rollout`` does; ``dispatch.refusal`` must have nothing against it.
+    kernel: TileKernel, simulator: Stepping, state: State, inputs: Inputs, params: Params, steps: int, *,
+    block: int = BLOCK, keep: bool = True, threads: int | None = None,
+) -> tuple[State, tuple[Tensor, ...] | None]:  # fmt: skip
+    """Do what ``simulator.rollout`` does, by the kernel that ``dispatch`` found for it.
 
     Returns the last state and, where ``keep`` is set, position, speed, acceleration and gap of every step.
     """
-    plan, sources = _plan(simulator, state, inputs, params, steps, block, keep, threads)
-    gap, speed, position, accel, *kept = _Rollout.apply(plan, state.gap, state.speed, state.position, *sources)
-    last = state._replace(gap=gap, speed=speed, position=position, accel=accel, step=state.step + steps)
+    plan, sources = _plan(kernel, simulator, state, inputs, params, steps, block, keep, threads)
+    program = kernel.program
+    out = _Rollout.apply(plan, *sources)
+    made = dict(zip(program.states, out, strict=False))
+    memory = dict(state.memory)
+    memory.update({n.removeprefix("memory of "): made[n] for n in program.memories})
+    if plan.slots:
+        memory[PAST] = out[len(program.states)]
+    last = state._replace(
+        gap=made["gap"], speed=made["speed"], position=made["position"], accel=made["accel"], step=state.step + steps,
+        present=made.get("present", state.present), memory=memory,
+    )  # fmt: skip
+    kept = out[len(program.states) + bool(plan.slots) :]
     return last, tuple(kept) if keep else None

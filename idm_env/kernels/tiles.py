@@ -1,17 +1,32 @@
-"""Tiles of lanes and rings: which vehicles one holds, the rows of its workspace, and how they are filled.
+"""Tiles of lanes and rings: which vehicles one holds, and how the rows of its workspace are filled.
 
 Batch rows of ``size`` vehicles lie one behind the other in memory. Short rows share a tile, whole. A row longer than a
-tile is cut, and each piece carries a halo: over ``steps`` steps a vehicle feels nobody further ahead than ``steps``
-vehicles (and an adjoint nobody further behind), so a piece computes that many neighbours once more and needs no
+tile is cut, and each piece carries a halo: over some steps a vehicle feels nobody further ahead (and an adjoint nobody
+further behind) than a step reaches, times the steps, so a piece computes that many neighbours once more and needs no
 exchange while it stays in cache.
 
-A workspace ``w`` is one flat array; the names below are first indices of its rows.
+A workspace ``w`` is one flat array of rows that lie ``ROW`` apart. Loops run over rows at distances that the compiler
+knows, so it need not test dozens of arrays for overlap, which it refuses to do and then emits scalar code.
 """
 
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-from idm_env.kernels.equations import exact
+from typing import Any
+
+import numba
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+exact = numba.njit(cache=True, nogil=True, error_model="numpy")
+"""Compiler for whatever yields values: IEEE arithmetic as written, so values do not depend on the loop around them."""
+
+swift = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+"""Compiler for derivatives: may contract a product and a sum into one rounding. Nothing that assumes away NaN."""
+
+inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+"""As ``exact``, where the caller's constants must reach the loop."""
 
 TILE = 1024
 """Most vehicles per tile: some forty rows of 4 kB and the states of a time block stay in the second-level cache."""
@@ -22,46 +37,104 @@ NARROW = 256
 ROW = TILE + 16
 """Distance of two rows: not a power of two, or all rows would compete for the same cache sets."""
 
-GAP, SPEED, POSITION, ACCEL = (ROW * row for row in range(4))
-LED, LEAD_SPEED, MOVED, LEAD_MOVED, RAW = (ROW * row for row in range(4, 9))
-P_A, P_B, P_TIME, P_MIN, P_V0, P_MAX, P_SIGMA = (ROW * row for row in range(9, 16))
-NORMALS, COMMAND, ACTIVE, PLACE, PACE, PULL, PLACED = (ROW * row for row in range(16, 23))
-ON_GAP, ON_SPEED, ON_POSITION, ON_ACCEL, ON_MOVED, SENT, BEHIND = (ROW * row for row in range(23, 30))
-G_A, G_B, G_TIME, G_MIN, G_V0, G_MAX, G_SIGMA = (ROW * row for row in range(30, 37))
-G_COMMAND, G_NORMALS, G_PLACE, G_PACE, G_PULL = (ROW * row for row in range(37, 42))
-P_BRAKE, P_FREE = ROW * 42, ROW * 43
-ROWS = 44
-
 
 def width(size: int, steps: int) -> int:
     """Return how many vehicles a tile should hold."""
     return NARROW if steps <= 2 and (size <= NARROW or size > TILE) else TILE
 
 
-def tiles(rows: int, size: int, steps: int, wide: int) -> int:
-    """Return how many tiles hold ``rows`` batch rows of ``size`` vehicles over a block of ``steps`` steps."""
+def halo(steps: int, reach: int) -> int:
+    """Return how many neighbours on either side a piece of a long row computes once more."""
+    return reach * steps + 1 + (reach > 1)
+
+
+def tiles(rows: int, size: int, wide: int, around: int) -> int:
+    """Return how many tiles hold ``rows`` batch rows of ``size`` vehicles, with a halo of ``around`` where cut."""
     if size <= wide:
         return -(-rows // (wide // size))
-    return rows * -(-size // (wide - 2 * (steps + 1)))
+    return rows * -(-size // (wide - 2 * around))
 
 
 @exact
-def place(tile, rows, size, steps, wide, is_ring):
+def place(tile, rows, size, wide, around, is_ring):
     """Return first batch row, first vehicle (negative: round the ring), vehicles, and of these: skipped, own."""
     if size <= wide:
         several = wide // size
         row = tile * several
         n = min(several, rows - row) * size
         return row, 0, n, 0, n
-    halo = steps + 1
-    span = wide - 2 * halo
+    span = wide - 2 * around
     pieces = -(-size // span)
     row, begin = tile // pieces, tile % pieces * span
     own = min(span, size - begin)
-    head, tail = halo, halo
+    head, tail = around, around
     if not is_ring:
         head, tail = min(head, begin), min(tail, size - begin - own)
     return row, begin - head, head + own + tail, head, own
+
+
+# -- neighbours --------------------------------------------------------------------------------------------------
+
+
+@inlined
+def look_ahead(w, to, source, n, size, is_ring):
+    """Fill row ``to`` with each leader's value; whoever has no leader gets what he will not read."""
+    w[to] = w[source]
+    for j in range(1, padded(n)):
+        w[to + j] = w[source + j - 1]
+    if is_ring and n >= size:
+        for j in range(0, n, size):
+            w[to + j] = w[source + j + size - 1]
+
+
+@inlined
+def look_back(w, to, source, n, size, is_ring):
+    """Fill row ``to`` with each follower's value; whoever has no follower gets what he will not read."""
+    for j in range(padded(n)):
+        w[to + j] = w[source + j + 1]
+    w[to + n - 1] = w[source + n - 1]
+    if is_ring and n >= size:
+        for j in range(0, n, size):
+            w[to + j + size - 1] = w[source + j]
+
+
+@inlined
+def send_ahead(w, to, source, n, size, is_ring):
+    """Fill row ``to`` with what each follower sends to his leader, 0 for whoever has none: adjoint of looking ahead."""
+    for j in range(padded(n)):
+        w[to + j] = w[source + j + 1]
+    w[to + n - 1] = 0
+    if is_ring and n >= size:
+        for j in range(0, n, size):
+            w[to + j + size - 1] = w[source + j]
+
+
+@inlined
+def send_back(w, to, source, n, size, is_ring):
+    """Fill row ``to`` with what each leader sends to his follower, 0 for whoever has none: adjoint of looking back."""
+    w[to] = 0
+    for j in range(1, padded(n)):
+        w[to + j] = w[source + j - 1]
+    if is_ring and n >= size:
+        for j in range(0, n, size):
+            w[to + j] = w[source + j + size - 1]
+
+
+@inlined
+def gather(w, to, source, n):
+    """Add one row to another."""
+    for j in range(padded(n)):
+        w[to + j] += w[source + j]
+
+
+@inlined
+def replace(w, to, source, n):
+    """Copy one row to another."""
+    for j in range(padded(n)):
+        w[to + j] = w[source + j]
+
+
+# -- memory ------------------------------------------------------------------------------------------------------
 
 
 @exact

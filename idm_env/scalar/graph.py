@@ -9,13 +9,33 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 CONSTANT, STATIC, DYNAMIC = 0, 1, 2
 
 BOOLEAN = frozenset({"gt", "ge", "lt", "le", "eq", "ne", "and", "or", "not"})
 COSTLY = frozenset({"div", "sqrt", "exp", "expm1", "log", "pow", "tanh", "sigmoid", "sin", "cos"})
 """Operations worth taking out of the loop over time where they depend on parameters alone."""
+
+
+class TimeStep(float):
+    """The time step, and what Python makes of it: constants that are kept apart from others of the same value.
+
+    So a printed text does not depend on whether Δt happens to equal some constant of an effect.
+    """
+
+    @staticmethod
+    def _kept(name: str) -> Callable[..., Any]:
+        def method(self: float, *others: Any) -> Any:
+            if not all(isinstance(x, (int, float)) for x in others):
+                return NotImplemented
+            return TimeStep(getattr(float, name)(float(self), *map(float, others)))
+
+        return method
+
+    __add__, __radd__, __sub__, __rsub__ = map(_kept, ("__add__", "__radd__", "__sub__", "__rsub__"))
+    __mul__, __rmul__, __truediv__, __rtruediv__ = map(_kept, ("__mul__", "__rmul__", "__truediv__", "__rtruediv__"))
+    __neg__, __pow__ = map(_kept, ("__neg__", "__pow__"))
 
 
 class Slot(NamedTuple):
@@ -50,7 +70,7 @@ class Graph:
 
     def node(self, op: str, *args: Node, label: Slot | float | int | None = None, level: int | None = None) -> Node:
         """Return the node of this operation on these nodes."""
-        key = (op, *(id(a) for a in args), label)
+        key = (op, *(id(a) for a in args), label, type(label))
         found = self._known.get(key)
         if found is None:
             level = max((a.level for a in args), default=CONSTANT) if level is None else level
@@ -59,7 +79,7 @@ class Graph:
 
     def constant(self, value: float) -> Node:
         """Return a constant."""
-        return self.node("constant", label=float(value))
+        return self.node("constant", label=value if isinstance(value, float) else float(value))
 
     def input(self, name: str, shift: int = 0, level: int = DYNAMIC) -> Node:
         """Return what is read under a name."""

@@ -16,9 +16,9 @@ from torch import Tensor
 from idm_env import history
 from idm_env.roads.base import Road
 from idm_env.roads.ring import Ring
-from idm_env.scalar.graph import Graph, Node
+from idm_env.scalar.graph import Graph, Node, TimeStep
 from idm_env.scalar.scalar import Scalar, Untraceable, static, value_of
-from idm_env.simulator import Simulator
+from idm_env.step import Stepping
 from idm_env.types import Motion, Scene, State
 
 
@@ -43,6 +43,22 @@ class Form:
             found.append((effect, tuple(given), tuple(x.dtype == torch.bool for x in given.values())))
         memories = tuple(sorted(name for name in state.memory if name != history.PAST))
         return cls(tuple(found), memories, state.present is not None)
+
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Names of the inputs that are truth values."""
+        return tuple(
+            slot_name(effect, name)
+            for effect, names, truths in self.inputs
+            for name, truth in zip(names, truths, strict=True)
+            if truth
+        )
+
+
+def slot_name(effect: str, part: str) -> str:
+    """Return the name under which a step reads an input, or one part of it."""
+    return f"{effect} {part}".strip() + " now"
 
 
 @dataclass
@@ -91,7 +107,7 @@ class _SeenRoad(Road):
 class _Parameters(Mapping[str, Mapping[str, Any]]):
     """Every parameter by name; a look at an effect's parameters also notes that this effect is at work."""
 
-    def __init__(self, simulator: Simulator, graph: Graph) -> None:
+    def __init__(self, simulator: Stepping, graph: Graph) -> None:
         self._graph = graph
         self._values = {
             e.name: {p.name: static(graph, f"{e.name}.{p.name}") for p in e.parameters} for e in simulator.effects
@@ -133,7 +149,7 @@ class _Past:
 
 
 @dataclass(frozen=True)
-class _Recorder(Simulator):
+class _Recorder(Stepping):
     recording: Recording | None = None
 
     def _history(self, state: State) -> Any:
@@ -146,30 +162,25 @@ class _Recorder(Simulator):
         graph, now = self.recording.graph, self.recording.respond
         graph.note = ""
 
-        def cut(name: str, x: Any) -> Any:
-            now[name] = value_of(graph, x)
-            return Scalar(graph, graph.input(name))
-
-        same = motion.present is state.present
-        after = Motion(
-            cut("displacement", motion.displacement),
-            Scalar(graph, graph.input("position after")),
-            motion.speed,
-            motion.accel,
-            motion.present if same else cut("present after", motion.present),
+        now["displacement"] = value_of(graph, motion.displacement)
+        known = motion._replace(
+            displacement=Scalar(graph, graph.input("displacement")),
+            position=Scalar(graph, graph.input("position after")),
         )
-        return super()._gaps(state, after)
+        if motion.present is not state.present:
+            self.recording.close["present"] = value_of(graph, motion.present)
+        return super()._gaps(state, known)  # type: ignore[arg-type]
 
 
-def record(simulator: Simulator, form: Form) -> Recording:
+def record(simulator: Stepping, form: Form) -> Recording:
     """Return one step of the simulator as graphs.
 
     ``Untraceable`` names the effect and the function for which that cannot be done.
     """
     graph = Graph()
     recording = Recording(graph)
-    simulator = _Recorder(
-        _SeenRoad(simulator.road, graph), simulator.effects, simulator.dt, simulator.integration, recording
+    recorder = _Recorder(
+        _SeenRoad(simulator.road, graph), simulator.effects, TimeStep(simulator.dt), simulator.integration, recording
     )
 
     def read(name: str) -> Any:
@@ -186,7 +197,7 @@ def record(simulator: Simulator, form: Form) -> Recording:
         memory={name: read(f"memory of {name}") for name in form.memories},
     )
     try:
-        after = simulator.step(state, _inputs(simulator, form, graph), _Parameters(simulator, graph))  # type: ignore[arg-type]
+        after = recorder.step(state, _inputs(form, graph), _Parameters(recorder, graph))  # type: ignore[arg-type]
     except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
         raise Untraceable(f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}") from error
     for name in ("position", "speed", "accel"):
@@ -197,12 +208,12 @@ def record(simulator: Simulator, form: Form) -> Recording:
     return recording
 
 
-def _inputs(simulator: Simulator, form: Form, graph: Graph) -> dict[str, Any]:
+def _inputs(form: Form, graph: Graph) -> dict[str, Any]:
     made: dict[str, Any] = {}
     for effect, fields, truths in form.inputs:
         values: dict[str, Any] = {}
         for name, truth in zip(fields, truths, strict=True):
-            node = graph.input(f"{effect} {name}".strip() + " now")
+            node = graph.input(slot_name(effect, name))
             values[name] = Scalar(graph, graph.compare("gt", node, graph.constant(0.5)) if truth else node)
         made[effect] = values[""] if "" in values else _Given(values)
     return made
@@ -221,4 +232,4 @@ class _Given:
         return iter(self._values.values())
 
 
-__all__ = ["Form", "Recording", "Untraceable", "record"]
+__all__ = ["Form", "Recording", "Untraceable", "record", "slot_name"]

@@ -97,9 +97,7 @@ def _node(graph: Graph, value: Any) -> Any:
         if value.numel() != 1:
             raise _refused(graph, f"a tensor of shape {tuple(value.shape)} of its own")
         return graph.constant(float(value))
-    if isinstance(value, (bool, int, float)):
-        return graph.constant(float(value))
-    return value
+    return graph.constant(value) if isinstance(value, (bool, int, float)) else value
 
 
 # -- the table ---------------------------------------------------------------------------------------------------
@@ -108,7 +106,7 @@ Rule = Callable[..., Node]
 
 
 def _number(graph: Graph, value: Any) -> Node:
-    return value if isinstance(value, Node) else graph.constant(float(value))
+    return value if isinstance(value, Node) else graph.constant(value)
 
 
 def _one(op: str) -> Rule:

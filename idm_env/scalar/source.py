@@ -15,10 +15,17 @@ from typing import NamedTuple
 from idm_env.scalar.graph import Node, Slot, ordered
 
 
-class Write(NamedTuple):
-    """Where a result goes: the text of its place in the workspace, and whether it is added to what is there."""
+class Ago(NamedTuple):
+    """A place in the past: which signal, and how many steps ago."""
 
-    place: str
+    signal: int
+    steps: Node
+
+
+class Write(NamedTuple):
+    """Where a result goes: the text of its place (or a place in the past), and whether it is added to what is there."""
+
+    place: str | Ago
     node: Node
     adds: bool = False
 
@@ -32,7 +39,7 @@ class Constants:
     def index(self, value: float) -> int:
         """Return the place of a constant in ``k``."""
         for i, known in enumerate(self.values):
-            if known == value and str(known) == str(value):
+            if known == value and type(known) is type(value) and str(known) == str(value):
                 return i
         self.values.append(value)
         return len(self.values) - 1
@@ -67,6 +74,9 @@ _FORMS: dict[str, str] = {
 Read = Callable[[Slot], str]
 """How a slot is read inside the loop."""
 
+Past = Callable[[str, int, str], str]
+"""How the past is read: array, signal, and the name of how many steps ago."""
+
 
 class Body(NamedTuple):
     """Lines of one loop's body, the constants that it needs (name → index), and the places that it writes."""
@@ -75,7 +85,7 @@ class Body(NamedTuple):
     lines: list[str]
 
 
-def body(writes: Sequence[Write], read: Read, past: Callable[[int, str], str], constants: Constants) -> Body:
+def body(writes: Sequence[Write], read: Read, past: Past, constants: Constants) -> Body:
     """Return the body of a loop that computes the writes."""
     names: dict[Node, str] = {}
     used: dict[str, int] = {}
@@ -88,7 +98,8 @@ def body(writes: Sequence[Write], read: Read, past: Callable[[int, str], str], c
         used[f"k{at}"] = at
         return f"k{at}"
 
-    for node in ordered([write.node for write in writes]):
+    times = [write.place.steps for write in writes if isinstance(write.place, Ago)]
+    for node in ordered([*(write.node for write in writes), *times]):
         arguments = [names[a] for a in node.args]
         if node.op == "constant":
             assert isinstance(node.label, float)
@@ -106,19 +117,21 @@ def body(writes: Sequence[Write], read: Read, past: Callable[[int, str], str], c
             names[node] = f"t{len(names)}"
             if node.op == "past":
                 assert isinstance(node.label, int)
-                text = past(node.label, arguments[0])
+                text = past("h", node.label, arguments[0])
             else:
                 form = _FORMS[node.op]
                 fixed = {n: constant(v) for n, v in (("zero", 0.0), ("one", 1.0)) if f"{{{n}}}" in form}
                 text = form.format(*arguments, **fixed)
             lines.append(f"{names[node]} = {text}")
     for write in writes:
-        lines.append(f"{write.place} {'+=' if write.adds else '='} {names[write.node]}")
+        at = write.place
+        place = past("ah", at.signal, names[at.steps]) if isinstance(at, Ago) else at
+        lines.append(f"{place} {'+=' if write.adds else '='} {names[write.node]}")
     return Body(used, [*loads, *lines])
 
 
 def function(
-    name: str, arguments: str, doc: str, writes: Sequence[Write], read: Read, past: Callable[[int, str], str],
+    name: str, arguments: str, doc: str, writes: Sequence[Write], read: Read, past: Past,
     constants: Constants, compiler: str,
 ) -> str:  # fmt: skip
     """Return the text of one compiled function that loops over ``m`` vehicles."""

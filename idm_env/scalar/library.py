@@ -1,0 +1,71 @@
+"""Printed files and where they lie: named by the digest of their text, so that a text is compiled once and for all."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+
+BEGIN, END = "# <printed>", "# </printed>"
+"""Lines of a template between which the printed half goes."""
+
+
+@lru_cache(maxsize=1)
+def folder() -> Path:
+    """Return the folder of printed files: ``IDM_ENV_CACHE``, or the user's cache, or a temporary one."""
+    given = os.environ.get("IDM_ENV_CACHE")
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    for place in (Path(given) if given else None, home / "idm_env"):
+        if place is None:
+            continue
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=place):
+                return place
+        except OSError:
+            continue
+    return Path(tempfile.mkdtemp(prefix="idm_env_"))
+
+
+def filled(template: Path, printed: str) -> str:
+    """Return a template with its marked part replaced."""
+    text = template.read_text(encoding="utf-8")
+    begin, end = text.index(BEGIN), text.index(END) + len(END)
+    return text[:begin] + printed + text[end:]
+
+
+def load(name: str, text: str, relies_on: Sequence[Path] = ()) -> ModuleType:
+    """Write a text to the folder, unless it is there, and import it.
+
+    ``relies_on`` are files whose compiled functions it calls: numba notices a change of the file that holds a function,
+    not of one that it calls, so their text counts too.
+    """
+    digest = hashlib.sha256(text.encode())
+    for path in relies_on:
+        digest.update(path.read_bytes())
+    module_name = f"idm_env_{name}_{digest.hexdigest()[:16]}"
+    if module_name in sys.modules:
+        return sys.modules[module_name]
+    path = folder() / f"{module_name}.py"
+    if not path.exists():
+        # Beside and then renamed: another process never sees half a file.
+        handle, fresh = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        os.replace(fresh, path)
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[module_name]
+        raise
+    return module

@@ -1,0 +1,181 @@
+"""One recorded step as phases over rows, forwards and backwards: what every compiled loop is printed from.
+
+Phases of a step are ``sense`` (signals into the past), ``respond`` (motion and memories) and ``close`` (gaps, from
+everybody's displacement). Before a phase its loop copies neighbours' numbers beside one's own; after a phase of the
+adjoint it sends what fell on a neighbour's number to that neighbour. ``hoist`` computes, once for many steps, what
+depends on parameters alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from idm_env.scalar.derive import adjoint
+from idm_env.scalar.graph import STATIC, Node, Slot, hoisted, inputs_of
+from idm_env.scalar.record import Recording
+
+STATICS = ("led", "leads", "length", "present")
+"""What holds for a whole rollout and is no parameter; ``present`` only where no record changes it."""
+
+PHASES = ("sense", "respond", "close")
+
+
+@dataclass(frozen=True)
+class Backward:
+    """The adjoint of one phase: what is assigned, what is added, and what goes to neighbours, by slot."""
+
+    assigned: dict[Slot, Node]
+    added: dict[Slot, Node]
+    sent: dict[Slot, Node]
+    past: list[tuple[int, Node, Node]]
+
+    @property
+    def nodes(self) -> list[Node]:
+        """Return every node that is computed."""
+        return [*self.assigned.values(), *self.added.values(), *self.sent.values(), *(g for _, _, g in self.past)]
+
+
+class Program:
+    """The phases of one recorded step, with the names of all that they carry, read and change."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.graph = graph = recording.graph
+        respond, close = dict(recording.respond), dict(recording.close)
+        everything = [*recording.sense, *respond.values(), *close.values()]
+        if Slot("step") in inputs_of(everything):
+            respond["step"] = graph.add(graph.input("step"), graph.constant(1.0))
+        names = [f"{phase} {name}" for phase, made in (("respond", respond), ("close", close)) for name in made]
+        nodes = [*recording.sense, *respond.values(), *close.values()]
+        cut, self.hoist = hoisted(graph, nodes)
+        self.sense = cut[: len(recording.sense)]
+        rest = dict(zip(names, cut[len(self.sense) :], strict=True))
+        self.respond = {name: rest[f"respond {name}"] for name in respond}
+        self.close = {name: rest[f"close {name}"] for name in close}
+
+    # -- what there is -------------------------------------------------------------------------------------------
+
+    @cached_property
+    def memories(self) -> tuple[str, ...]:
+        """Memories of effects, as states."""
+        return tuple(name for name in self.respond if name.startswith("memory of "))
+
+    @cached_property
+    def states(self) -> tuple[str, ...]:
+        """What a step carries over, beside the past."""
+        more = [name for name in ("present", "step") if name in self.respond or name in self.close]
+        return ("gap", "speed", "position", "accel", *self.memories, *more)
+
+    @cached_property
+    def moving(self) -> tuple[str, ...]:
+        """States that have derivatives."""
+        return tuple(name for name in self.states if name not in ("present", "step"))
+
+    @cached_property
+    def slots(self) -> list[Slot]:
+        """Everything that some phase reads."""
+        return inputs_of([*self.hoist, *self.sense, *self.respond.values(), *self.close.values()])
+
+    @cached_property
+    def statics(self) -> tuple[str, ...]:
+        """What holds for the whole rollout and is no parameter."""
+        return tuple(n for n in STATICS if n not in self.states and any(slot.name == n for slot in self.slots))
+
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """Full names of the parameters that are read."""
+        return tuple(dict.fromkeys(s.name for s in self.slots if "." in s.name))
+
+    @cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """What is given anew at every step."""
+        return tuple(dict.fromkeys(s.name for s in self.slots if s.name.endswith(" now")))
+
+    @property
+    def constants_of_time(self) -> tuple[str, ...]:
+        """Names of the hoisted rows."""
+        return tuple(f"hoisted{i}" for i in range(len(self.hoist)))
+
+    def outputs(self, phase: str) -> list[Node]:
+        """Return what a phase computes."""
+        return {"sense": self.sense, "respond": [*self.respond.values()], "close": [*self.close.values()]}[phase]
+
+    def neighbours(self, nodes: Sequence[Node]) -> list[Slot]:
+        """Return the slots of other vehicles that some nodes read, nearest first."""
+        return sorted((s for s in inputs_of(nodes) if s.shift), key=lambda s: (abs(s.shift), s))
+
+    @cached_property
+    def reach(self) -> int:
+        """How many vehicles away a step looks."""
+        return max((abs(s.shift) for s in self.slots), default=1)
+
+    # -- backwards -----------------------------------------------------------------------------------------------
+
+    def seed(self, phase: str, name: str) -> Node:
+        """Return the adjoint of a phase's result as an input."""
+        return self.graph.input(f"on {name}") if phase != "sense" else self.graph.input(f"on signal {name}")
+
+    def backward(self, phase: str) -> Backward:
+        """Return the adjoint of one phase."""
+        if phase == "sense":
+            made = {str(i): node for i, node in enumerate(self.sense)}
+        else:
+            made = {n: x for n, x in (self.respond if phase == "respond" else self.close).items() if self._flows(n)}
+        found = adjoint(self.graph, list(made.values()), [self.seed(phase, name) for name in made])
+        assigned: dict[Slot, Node] = {
+            Slot(name): self.graph.constant(0.0) for name in made if name in self.moving and phase != "sense"
+        }
+        added: dict[Slot, Node] = {}
+        sent: dict[Slot, Node] = {}
+        past: list[tuple[int, Node, Node]] = []
+        for node, g in found.items():
+            if node.op == "past":
+                assert isinstance(node.label, int)
+                past.append((node.label, node.args[0], g))
+                continue
+            slot = node.label
+            assert isinstance(slot, Slot)
+            if not self._flows(slot.name):
+                continue
+            if slot.shift:
+                sent[slot] = g
+            elif slot in assigned or slot.name.endswith(" now") or slot.name == "displacement":
+                assigned[slot] = g
+            else:
+                added[slot] = g
+        return Backward(assigned, added, sent, past)
+
+    def hoist_backward(self) -> dict[Slot, Node]:
+        """Return what falls on the parameters from the hoisted rows."""
+        seeds = [self.graph.input(f"on {name}", level=STATIC) for name in self.constants_of_time]
+        found = adjoint(self.graph, self.hoist, seeds)
+        return {node.label: g for node, g in found.items() if isinstance(node.label, Slot)}
+
+    def _flows(self, name: str) -> bool:
+        """Whether derivatives are carried to what has this name."""
+        return name not in ("present", "step", *STATICS)
+
+    @cached_property
+    def needed_backward(self) -> tuple[str, ...]:
+        """States that the adjoint reads."""
+        nodes = [node for phase in PHASES for node in self.backward(phase).nodes]
+        past = [at for phase in PHASES for _, at, _ in self.backward(phase).past]
+        read = {slot.name for slot in inputs_of([*nodes, *past])}
+        return tuple(name for name in self.states if name in read)
+
+    @cached_property
+    def needed_again(self) -> tuple[str, ...]:
+        """States that must be known to compute those of ``needed_backward``, and the past, once more."""
+        made = {**self.respond, **self.close}
+        wanted = set(self.needed_backward) | {s.name for s in inputs_of(self.sense)} & set(self.states)
+        while True:
+            read = {s.name for name in wanted for s in inputs_of([made[name]])}
+            if "displacement" in read:
+                read |= {s.name for s in inputs_of([made["displacement"]])}
+            if "position after" in read:
+                read |= {"position"}
+            more = wanted | (read & set(self.states))
+            if more == wanted:
+                return tuple(name for name in self.states if name in wanted)
+            wanted = more
