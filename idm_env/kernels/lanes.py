@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from idm_env.history import PAST
+from idm_env.kernels import lane_adjoint, lane_loops, tiles
 from idm_env.kernels import threads as pool
-from idm_env.kernels import tiles
 from idm_env.kernels.operands import Strides, dense, operand, reduced, table
-from idm_env.kernels.printed import TileKernel, constants
+from idm_env.kernels.printed import TileKernel
 from idm_env.kernels.tiles import Array
 from idm_env.kernels.workspace import take
 from idm_env.scalar.record import slot_name
@@ -86,12 +86,28 @@ class _Plan:
         wide = tiles.width(size, steps)
         around = tiles.halo(steps, self.kernel.program.reach)
         given = (
-            *arguments, self.operands, self.flags, self.strides, constants(self.kernel.constants, self.kind.type),
+            *arguments, self.operands, self.flags, self.strides, self.kernel.constants[self.kind.name],
             first, steps, self.rows, size, wide, around,
         )  # fmt: skip
         pool.split(
             lambda begin, end: loop(*given, begin, end),
             tiles.tiles(self.rows, size, wide, around), 1, pool.count(self.rows * size * steps, self.threads),
+        )  # fmt: skip
+
+    def forward(self, first: int, steps: int, *arguments: Any) -> None:
+        """Run a block of steps."""
+        kernel = self.kernel
+        self.run(
+            lane_loops.forward, first, steps, *arguments, kernel.measures, kernel.forward(self.kind.name),
+            kernel.looks, kernel.read,
+        )  # fmt: skip
+
+    def backward(self, first: int, steps: int, *arguments: Any) -> None:
+        """Carry adjoints over a block of steps."""
+        kernel = self.kernel
+        self.run(
+            lane_adjoint.backward, first, steps, *arguments, kernel.measures, kernel.forward(self.kind.name),
+            kernel.looks, kernel.backward(self.kind.name), kernel.sends, kernel.taped, kernel.again,
         )  # fmt: skip
 
     def past(self, filled: bool = False) -> Array:
@@ -187,21 +203,21 @@ def _forward(plan: _Plan, start: list[Array], past: Array) -> tuple[list[Array],
     kept = take((4, plan.steps if plan.keep else 0, plan.count), plan.kind)
     blocks = plan.blocks()
     tape: list[Any] = []
-    loops = plan.kernel.loops
+    again, read = set(plan.kernel.again), set(plan.kernel.read)
     now, before = start, past
     spare: list[list[Array]] = []
     for number, (first, steps) in enumerate(blocks):
         last = number == len(blocks) - 1
         if plan.tape:
-            tape.append(([x if i in loops.AGAIN else plan.nothing for i, x in enumerate(now)], before))
+            tape.append(([x if i in again else plan.nothing for i, x in enumerate(now)], before))
         if len(spare) > 1 and not plan.tape and not last:
             ends = spare[number % 2]
         else:
-            wanted = range(len(program.states)) if last else loops.READ
+            wanted = range(len(program.states)) if last else read
             ends = [take((plan.count,), plan.kind) if i in wanted else plan.nothing for i in range(len(program.states))]
             spare.append(ends)
         after = plan.past()
-        plan.run(loops.forward, first, steps, tuple(now), tuple(ends), before, after, plan.slots, kept)
+        plan.forward(first, steps, tuple(now), tuple(ends), before, after, plan.slots, kept)
         now, before = ends, after
     return now, before, kept, tape
 
@@ -237,7 +253,7 @@ class _Rollout(torch.autograd.Function):
 def _backward(
     plan: _Plan, tape: list[Any], saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...], needed: tuple[bool, ...]
 ) -> list[Tensor | None]:
-    kernel, loops = plan.kernel, plan.kernel.loops
+    kernel = plan.kernel
     program = kernel.program
     states, moving = len(program.states), len(program.moving)
     begin_of = moving + bool(plan.slots)
@@ -263,8 +279,8 @@ def _backward(
             take((plan.count,), plan.kind) if number or wanted else plan.nothing for wanted in needed[:moving]
         ]  # fmt: skip
         before = plan.past()
-        plan.run(
-            loops.backward, first, steps, tuple(start), past, plan.slots, along, tuple(on), tuple(begin),
+        plan.backward(
+            first, steps, tuple(start), past, plan.slots, along, tuple(on), tuple(begin),
             on_past, before, on_parameters, number == len(blocks) - 1, on_inputs,
         )  # fmt: skip
         on, on_past = begin, before

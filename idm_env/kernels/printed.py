@@ -1,4 +1,4 @@
-"""Kernels of recorded simulators: what ``scalar`` prints, joined with a template of loops, compiled and kept.
+"""Kernels of recorded simulators: phases that ``scalar`` prints, compiled, and where the loops find everything.
 
 Everything here is looked up by what shapes a step: road, effects with their static choices, integration, and which
 inputs, memories and presence there are.
@@ -7,33 +7,130 @@ inputs, memories and presence there are.
 from __future__ import annotations
 
 import warnings
-from functools import lru_cache
-from pathlib import Path
-from types import ModuleType
-from typing import NamedTuple
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from idm_env.effects.base import Effect
+from idm_env.kernels.tiles import ROW, Array
 from idm_env.roads import Ring, Road
 from idm_env.scalar import library
-from idm_env.scalar.program import Program
+from idm_env.scalar.program import PHASES, Program
 from idm_env.scalar.record import Form, Untraceable, record
 from idm_env.scalar.tiles import TileText
 from idm_env.step import Integration, Stepping
 
-HERE = Path(__file__).parent
+HEADER = '''"""{title}
+
+Printed by idm_env from one recorded step; see idm_env/scalar. Delete at will: it is printed again when needed.
+"""
+
+import numpy as np
+from numba import carray, cfunc, types
+
+ROW = {row}
+SIZE = (1 << 40,)
+REAL = types.CPointer(types.{kind})
+SIGNATURE = types.void(REAL, REAL, REAL, types.int64, REAL, types.int64)
+exact = cfunc(SIGNATURE, cache=True, error_model="numpy")
+swift = cfunc(SIGNATURE, cache=True, error_model="numpy", fastmath={{"contract"}})
+
+'''
+
+MEASURES = (
+    "rows", "ring", "states", "moving", "statics", "parameters", "hoists", "numbers", "flags", "signals", "state_rows",
+    "on_rows", "static_rows", "gradient_rows", "input_rows", "on_input_rows", "scratch", "seeded", "on_gap", "on_speed",
+    "on_position", "on_accel", "gap", "speed", "position", "accel",
+)  # fmt: skip
+"""What loops are told, in this order: counts, then rows as first indices in the workspace."""
 
 
-class TileKernel(NamedTuple):
-    """Compiled loops of lanes or rings, the program that they were printed from, and the constants that they take."""
+class TileKernel:
+    """The phases of one simulator on lanes or rings, compiled when first asked for, and the plan of their workspace.
 
-    program: Program
-    loops: ModuleType
-    constants: tuple[float, ...]
-    numbers: tuple[str, ...]
-    flags: tuple[str, ...]
-    signals: int
+    ``measures`` are the numbers of ``MEASURES``; ``read``, ``taped`` and ``again`` are states (see ``TileText`` and
+    ``Program``); ``looks`` and ``sends`` are the copies between neighbours, phase after phase.
+    """
+
+    def __init__(self, program: Program, text: TileText, title: str) -> None:
+        self.program = program
+        self.numbers, self.flags, self.signals = text.numbers, text.flags, text.signals
+        self._title = title
+        self._forward = text.text(backward=False)
+        self._text = text
+        self.measures = _measures(text)
+        self.read = np.array(text.indices(text.read), np.int64)
+        self.looks = _flat(text.looks(), ("static", *PHASES))
+
+    @cached_property
+    def _backward(self) -> tuple[str, tuple[str, ...]]:
+        return self._text.text(backward=True)
+
+    @cached_property
+    def constants(self) -> dict[str, Array]:
+        """Constants by precision, rounded as torch rounds a Python number that meets a tensor."""
+        assert self._backward
+        values = [float(x) for x in self._text.constants.values]
+        return {kind: np.array(values, kind) for kind in ("float32", "float64")}
+
+    @cached_property
+    def taped(self) -> Array:
+        """States that the adjoint reads."""
+        return np.array(self._text.indices(self.program.needed_backward), np.int64)
+
+    @cached_property
+    def again(self) -> Array:
+        """States from which those can be computed once more."""
+        return np.array(self._text.indices(self.program.needed_again), np.int64)
+
+    @cached_property
+    def sends(self) -> Array:
+        """Adjoints to send to neighbours: (phase, shift, row sent, row of the adjoint it adds to)."""
+        return _flat(self._text.sends(), PHASES)
+
+    def forward(self, kind: str) -> Array:
+        """Return the addresses of hoist, sense, respond and close in a precision, 0 for what there is not."""
+        return self._addresses(kind, self._forward, ("hoist", *PHASES))
+
+    def backward(self, kind: str) -> Array:
+        """Return the addresses of their adjoints."""
+        return self._addresses(kind, self._backward, ("hoist_back", *(f"{phase}_back" for phase in PHASES)))
+
+    def _addresses(self, kind: str, printed: tuple[str, tuple[str, ...]], names: tuple[str, ...]) -> Array:
+        return _compiled(self._title, kind, printed, names)
+
+
+@lru_cache(maxsize=512)
+def _compiled(title: str, kind: str, printed: tuple[str, tuple[str, ...]], names: tuple[str, ...]) -> Array:
+    text, there = printed
+    module = library.load("phases", HEADER.format(title=title, row=ROW, kind=kind) + text)
+    return np.array([getattr(module, n).address if n in there else 0 for n in names], np.int64)
+
+
+def _measures(text: TileText) -> Array:
+    p = text.program
+    counts = {
+        "rows": text.rows, "ring": text.ring, "states": len(p.states), "moving": len(p.moving),
+        "statics": len(p.statics), "parameters": len(p.parameters), "hoists": len(p.hoist),
+        "numbers": len(text.numbers), "flags": len(text.flags), "signals": text.signals,
+    }  # fmt: skip
+    found = []
+    for name in MEASURES:
+        if name in counts:
+            found.append(int(counts[name]))
+        elif name.endswith("_rows"):
+            found.append(text.group(name.removesuffix("_rows").upper()) * ROW)
+        else:
+            found.append(text.at(name.upper()) * ROW)
+    return np.array(found, np.int64)
+
+
+def _flat(moves: dict[str, list[tuple[int, int, int]]], order: tuple[str, ...]) -> Array:
+    """Return moves as rows (place of the phase in the order, direction, index, index)."""
+    found = [
+        (order.index(phase), step, to * ROW, source * ROW) for phase in order for step, to, source in moves[phase]
+    ]  # fmt: skip
+    return np.array(found, np.int64).reshape(-1, 4)
 
 
 def tile_kernel(simulator: Stepping, form: Form) -> TileKernel | str:
@@ -54,16 +151,8 @@ def _tile_kernel(
         warnings.warn(f"no compiled kernel, the torch path runs instead: {why}.", stacklevel=2)
         return str(why)
     program = Program(recording)
-    text = TileText(program, ring=isinstance(road, Ring), flags=form.flags)
-    module = library.load(
-        "tiles",
-        library.filled(HERE / "lane_loops.py", text.text()),
-        (HERE / "tiles.py", HERE / "prefetch.py"),
-    )
-    return TileKernel(program, module, tuple(map(float, text.constants.values)), text.numbers, text.flags, text.signals)
+    title = f"One step of {', '.join(e.name for e in effects)} on a {type(road).__name__.lower()}, {integration}."
+    return TileKernel(program, TileText(program, ring=isinstance(road, Ring), flags=form.flags), title)
 
 
-@lru_cache(maxsize=512)
-def constants(values: tuple[float, ...], kind: type) -> np.ndarray:
-    """Return constants in the precision of the state, rounded as torch rounds a Python number that meets a tensor."""
-    return np.array(values, dtype=kind)
+__all__ = ["MEASURES", "TileKernel", "tile_kernel"]

@@ -5,8 +5,8 @@ tile is cut, and each piece carries a halo: over some steps a vehicle feels nobo
 further behind) than a step reaches, times the steps, so a piece computes that many neighbours once more and needs no
 exchange while it stays in cache.
 
-A workspace ``w`` is one flat array of rows that lie ``ROW`` apart. Loops run over rows at distances that the compiler
-knows, so it need not test dozens of arrays for overlap, which it refuses to do and then emits scalar code.
+A workspace ``w`` is one flat array of rows that lie ``ROW`` apart. Printed phases run over rows at distances that the
+compiler knows, so it need not test dozens of arrays for overlap, which it refuses to do and then emits scalar code.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -21,12 +21,6 @@ Array = NDArray[Any]
 
 exact = numba.njit(cache=True, nogil=True, error_model="numpy")
 """Compiler for whatever yields values: IEEE arithmetic as written, so values do not depend on the loop around them."""
-
-swift = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-"""Compiler for derivatives: may contract a product and a sum into one rounding. Nothing that assumes away NaN."""
-
-inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-"""As ``exact``, where the caller's constants must reach the loop."""
 
 TILE = 1024
 """Most vehicles per tile: some forty rows of 4 kB and the states of a time block stay in the second-level cache."""
@@ -76,62 +70,52 @@ def place(tile, rows, size, wide, around, is_ring):
 # -- neighbours --------------------------------------------------------------------------------------------------
 
 
-@inlined
+@exact
 def look_ahead(w, to, source, n, size, is_ring):
     """Fill row ``to`` with each leader's value; whoever has no leader gets what he will not read."""
     w[to] = w[source]
-    for j in range(1, padded(n)):
-        w[to + j] = w[source + j - 1]
+    _copy(w[to + 1 :], w[source:], padded(n) - 1)
     if is_ring and n >= size:
         for j in range(0, n, size):
             w[to + j] = w[source + j + size - 1]
 
 
-@inlined
+@exact
 def look_back(w, to, source, n, size, is_ring):
     """Fill row ``to`` with each follower's value; whoever has no follower gets what he will not read."""
-    for j in range(padded(n)):
-        w[to + j] = w[source + j + 1]
+    _copy(w[to:], w[source + 1 :], padded(n))
     w[to + n - 1] = w[source + n - 1]
     if is_ring and n >= size:
         for j in range(0, n, size):
             w[to + j + size - 1] = w[source + j]
 
 
-@inlined
+@exact
 def send_ahead(w, to, source, n, size, is_ring):
     """Fill row ``to`` with what each follower sends to his leader, 0 for whoever has none: adjoint of looking ahead."""
-    for j in range(padded(n)):
-        w[to + j] = w[source + j + 1]
+    _copy(w[to:], w[source + 1 :], padded(n))
     w[to + n - 1] = 0
     if is_ring and n >= size:
         for j in range(0, n, size):
             w[to + j + size - 1] = w[source + j]
 
 
-@inlined
+@exact
 def send_back(w, to, source, n, size, is_ring):
     """Fill row ``to`` with what each leader sends to his follower, 0 for whoever has none: adjoint of looking back."""
     w[to] = 0
-    for j in range(1, padded(n)):
-        w[to + j] = w[source + j - 1]
+    _copy(w[to + 1 :], w[source:], padded(n) - 1)
     if is_ring and n >= size:
         for j in range(0, n, size):
             w[to + j] = w[source + j + size - 1]
 
 
-@inlined
+@exact
 def gather(w, to, source, n):
     """Add one row to another."""
+    left, right = w[to:], w[source:]
     for j in range(padded(n)):
-        w[to + j] += w[source + j]
-
-
-@inlined
-def replace(w, to, source, n):
-    """Copy one row to another."""
-    for j in range(padded(n)):
-        w[to + j] = w[source + j]
+        left[j] += right[j]
 
 
 # -- memory ------------------------------------------------------------------------------------------------------

@@ -130,15 +130,10 @@ def body(writes: Sequence[Write], read: Read, past: Past, constants: Constants) 
     return Body(used, [*loads, *lines])
 
 
-def function(
-    name: str, arguments: str, doc: str, writes: Sequence[Write], read: Read, past: Past,
-    constants: Constants, compiler: str,
-) -> str:  # fmt: skip
-    """Return the text of one compiled function that loops over ``m`` vehicles."""
-    text = [f"@{compiler}", f"def {name}({arguments}):", f'    """{doc}"""']
-    if not writes:
-        return "\n".join([*text, "    return", ""])
-    made = body(writes, read, past, constants)
+def function(name: str, doc: str, made: Body, compiler: str) -> str:
+    """Return the text of one phase: a compiled function that loops over ``m`` vehicles."""
+    text = [f"@{compiler}", f"def {name}(w_, h_, ah_, m, k_, now):", f'    """{doc}"""']
+    text += [f"    {array} = carray({array}_, SIZE)" for array in ("w", "h", "ah", "k")]
     text += [f"    {n} = k[{i}]" for n, i in made.constants.items()]
     text += ["    for j in range(m):", *(f"        {line}" for line in made.lines)]
     return "\n".join([*text, ""])

@@ -1,14 +1,16 @@
 """A program printed for tiles of lanes and rings: rows of a workspace, and phases that run over them.
 
-The loops are ``kernels/lane_loops.py``, which contain no equation: this prints what they import, and both together are
-one file (``library``).
+The loops are ``kernels/lane_loops.py``, which contain no equation: they call what is printed here, and are told where
+in the workspace everything is.
 """
 
 from __future__ import annotations
 
+from functools import cached_property
+
 from idm_env.scalar.graph import Node, Slot, inputs_of
 from idm_env.scalar.program import PHASES, Program
-from idm_env.scalar.source import Ago, Constants, Write, assignments, function, row
+from idm_env.scalar.source import Ago, Constants, Write, assignments, body, function, row
 
 
 class TileText:
@@ -18,7 +20,7 @@ class TileText:
         self.program = program
         self.constants = Constants()
         self._rows: list[str] = []
-        self._ring = ring
+        self.ring = ring
         p = program
         self._back = {phase: p.backward(phase) for phase in PHASES}
         self.signals = len(p.sense)
@@ -53,76 +55,113 @@ class TileText:
             Slot(s.name, sign * k) for s in slots for sign in [1 if s.shift > 0 else -1] for k in range(1, abs(s.shift) + 1)
         }
 
-    # -- text ----------------------------------------------------------------------------------------------------
+    # -- where things are ----------------------------------------------------------------------------------------
 
-    def text(self) -> str:
-        """Return rows, counts and functions; ``constants.values`` are complete afterwards."""
-        p = self.program
-        counts = [
-            ("ROWS", len(self._rows)),
-            ("RING", self._ring),
-            ("STATES", len(p.states)),
-            ("MOVING", len(p.moving)),
-            ("STATICS", len(p.statics)),
-            ("PARAMETERS", len(p.parameters)),
-            ("HOISTS", len(p.hoist)),
-            ("NUMBERS", len(self.numbers)),
-            ("FLAGS", len(self.flags)),
-            ("SIGNALS", self.signals),
-            ("READ", self._indices(self._states_read())),
-            ("TAPED", self._indices(p.needed_backward)),
-            ("AGAIN", self._indices(p.needed_again)),
-        ]
-        rows = [(name, f"{i} * ROW") for i, name in enumerate(self._rows)]
-        groups = [(f"{group}_ROWS", f"{begin} * ROW") for group, (begin, _) in self._groups.items()]
-        parts = [assignments(counts), assignments(rows), assignments(groups), *self._functions()]
-        return "\n\n".join(parts)
+    def at(self, name: str) -> int:
+        """Return the number of a row."""
+        return self._rows.index(name)
 
-    def _states_read(self) -> tuple[str, ...]:
-        """States whose value before a step matters, to what a rollout returns."""
-        nodes = [n for phase in PHASES for n in self.program.outputs(phase)]
-        read = {s.name for s in inputs_of(nodes)} | ({"position"} if "position" in self.program.states else set())
-        return tuple(n for n in self.program.states if n in read)
+    @property
+    def rows(self) -> int:
+        """Number of rows of a workspace."""
+        return len(self._rows)
 
-    def _indices(self, names: tuple[str, ...]) -> tuple[int, ...]:
+    def group(self, name: str) -> int:
+        """Return the first row of a group."""
+        return self._groups[name][0]
+
+    def indices(self, names: tuple[str, ...]) -> tuple[int, ...]:
+        """Return the places of states."""
         return tuple(self.program.states.index(n) for n in names)
 
-    def _functions(self) -> list[str]:
-        p = self.program
-        hoist = [Write(f"w[{row(Slot(n))} + j]", x) for n, x in zip(p.constants_of_time, p.hoist, strict=True)]
-        back = [Write(f"w[ON_{row(slot)} + j]", x, adds=True) for slot, x in p.hoist_backward().items()]
-        made = [
-            self._function("hoist", "Compute what depends on parameters alone.", hoist, "exact"),
-            self._function("hoist_back", "Carry adjoints of the hoisted rows to the parameters.", back, "swift"),
-            self._look("look_static", "Fill what holds for a whole rollout.", self._static_neighbours()),
-        ]
-        known = set(self._static_neighbours())
+    @cached_property
+    def read(self) -> tuple[str, ...]:
+        """States whose value before a step matters to what a rollout returns."""
+        nodes = [n for phase in PHASES for n in self.program.outputs(phase)]
+        read = {s.name for s in inputs_of(nodes)} | {"position"}
+        return tuple(n for n in self.program.states if n in read)
+
+    def looks(self) -> dict[str, list[tuple[int, int, int]]]:
+        """Return, by phase, the copies to make before it: (1 from the leader, −1 from behind; row to fill; source)."""
+        fixed = [s for s in self._neighbours if s.name in self.program.statics]
+        made = {"static": self._looks(fixed)}
+        known = set(fixed)
         for phase in PHASES:
             near = [s for s in self._chain_of(phase) if s not in known]
             if phase != "close":
                 known |= set(near)
-            made.append(self._look(f"look_{phase}", "Copy neighbours' numbers beside one's own.", near))
-            made.append(self._forward(phase))
-            made.append(self._backward(phase))
-            made.append(self._send(phase))
+            made[phase] = self._looks(near)
         return made
+
+    def _looks(self, slots: list[Slot]) -> list[tuple[int, int, int]]:
+        found = []
+        for s in slots:
+            step = 1 if s.shift > 0 else -1
+            found.append((step, self.at(self._row(s)), self.at(self._row(Slot(s.name, s.shift - step)))))
+        return found
+
+    def sends(self) -> dict[str, list[tuple[int, int, int]]]:
+        """Return, by phase, the adjoints to send after it: (shift, row that is sent, row of the adjoint it adds to)."""
+        return {
+            phase: [
+                (s.shift, self.at(f"SENT_{row(s)}"), self.at(f"ON_{self._row(Slot(s.name))}"))
+                for s in self._back[phase].sent
+            ]
+            for phase in PHASES
+        }
 
     def _chain_of(self, phase: str) -> list[Slot]:
         slots = self._chain(set(self.program.neighbours(self._read(phase))))
         return [s for s in self._neighbours if s in slots]
 
-    def _static_neighbours(self) -> list[Slot]:
-        fixed = {*self.program.statics}
-        return [s for s in self._neighbours if s.name in fixed]
+    # -- text ----------------------------------------------------------------------------------------------------
 
-    def _look(self, name: str, doc: str, slots: list[Slot]) -> str:
-        lines = [f"@exact\ndef {name}(w, n, size):", f'    """{doc}"""']
-        for s in slots:
-            step = 1 if s.shift > 0 else -1
-            source = Slot(s.name, s.shift - step)
-            verb = "look_ahead" if step > 0 else "look_back"
-            lines.append(f"    {verb}(w, {self._row(s)}, {self._row(source)}, n, size, RING)")
-        return "\n".join([*lines, *([] if slots else ["    return"]), ""])
+    def text(self, *, backward: bool) -> tuple[str, tuple[str, ...]]:
+        """Return rows and phases as text, and the names of the phases that there are.
+
+        ``constants.values`` are complete once both texts were made; those of the forward text come first.
+        """
+        made = self._back_phases() if backward else self._phases()
+        made = {name: phase for name, phase in made.items() if phase[1]}
+        rows = assignments((name, f"{i} * ROW") for i, name in enumerate(self._rows))
+        compiler = "swift" if backward else "exact"
+        functions = [
+            function(name, doc, body(writes, self._read_slot, self._past, self.constants), compiler)
+            for name, (doc, writes) in made.items()
+        ]
+        size = assignments([("SIGNALS", self.signals)])
+        return "\n\n".join([size, rows, *functions]), tuple(made)
+
+    def _phases(self) -> dict[str, tuple[str, list[Write]]]:
+        p = self.program
+        place = "h[(now * SIGNALS + {}) * ROW + j]"
+        return {
+            "hoist": (
+                "What depends on parameters alone.",
+                [Write(f"w[{row(Slot(n))} + j]", x) for n, x in zip(p.constants_of_time, p.hoist, strict=True)],
+            ),
+            "sense": ("What the past keeps.", [Write(place.format(i), x) for i, x in enumerate(p.sense)]),
+            "respond": (
+                "Motion and memories after the step.",
+                [Write(f"w[{self._row(Slot(n))} + j]", x) for n, x in p.respond.items()],
+            ),
+            "close": (
+                "Gaps after the step.",
+                [Write(f"w[{self._row(Slot(n))} + j]", x) for n, x in p.close.items()],
+            ),
+        }
+
+    def _back_phases(self) -> dict[str, tuple[str, list[Write]]]:
+        hoist = [Write(f"w[ON_{row(s)} + j]", x, adds=True) for s, x in self.program.hoist_backward().items()]
+        made = {"hoist_back": ("Adjoint of what depends on parameters alone.", hoist)}
+        for phase in PHASES:
+            back = self._back[phase]
+            writes = [Write(f"w[ON_{self._row(s)} + j]", x) for s, x in back.assigned.items()]
+            writes += [Write(f"w[ON_{self._row(s)} + j]", x, adds=True) for s, x in back.added.items()]
+            writes += [Write(f"w[SENT_{row(s)} + j]", x) for s, x in back.sent.items()]
+            writes += [Write(Ago(signal, at), g, adds=True) for signal, at, g in back.past]
+            made[f"{phase}_back"] = (f"Adjoint of {phase}.", writes)
+        return made
 
     def _row(self, slot: Slot) -> str:
         # By the time that gaps are closed, positions are those after the step.
@@ -137,34 +176,3 @@ class TileText:
 
     def _past(self, array: str, signal: int, ago: str) -> str:
         return f"{array}[((now - int({ago})) * SIGNALS + {signal}) * ROW + j]"
-
-    def _function(self, name: str, doc: str, writes: list[Write], compiler: str, arguments: str = "w, m, k") -> str:
-        return function(name, arguments, doc, writes, self._read_slot, self._past, self.constants, compiler)
-
-    def _forward(self, phase: str) -> str:
-        p = self.program
-        if phase == "sense":
-            writes = [Write(f"h[(now * SIGNALS + {i}) * ROW + j]", x) for i, x in enumerate(p.sense)]
-        else:
-            named = p.respond if phase == "respond" else p.close
-            writes = [Write(f"w[{self._row(Slot(n))} + j]", x) for n, x in named.items()]
-        return self._function(phase, f"Forward: {phase}.", writes, "exact", "w, h, m, k, now")
-
-    def _backward(self, phase: str) -> str:
-        back = self._back[phase]
-        writes = [Write(f"w[ON_{self._row(s)} + j]", x) for s, x in back.assigned.items()]
-        writes += [Write(f"w[ON_{self._row(s)} + j]", x, adds=True) for s, x in back.added.items()]
-        writes += [Write(f"w[SENT_{row(s)} + j]", x) for s, x in back.sent.items()]
-        writes += [Write(Ago(signal, at), g, adds=True) for signal, at, g in back.past]
-        return self._function(f"{phase}_back", f"Adjoint: {phase}.", writes, "swift", "w, h, ah, m, k, now")
-
-    def _send(self, phase: str) -> str:
-        lines = [f"@exact\ndef {phase}_send(w, n, size):", '    """Send what fell on neighbours\' numbers to them."""']
-        for s in self._back[phase].sent:
-            verb = "send_ahead" if s.shift > 0 else "send_back"
-            for _ in range(abs(s.shift) - 1):
-                lines.append(f"    {verb}(w, SCRATCH, SENT_{row(s)}, n, size, RING)")
-                lines.append(f"    replace(w, SENT_{row(s)}, SCRATCH, n)")
-            lines.append(f"    {verb}(w, SCRATCH, SENT_{row(s)}, n, size, RING)")
-            lines.append(f"    gather(w, ON_{self._row(Slot(s.name))}, SCRATCH, n)")
-        return "\n".join([*lines, *([] if self._back[phase].sent else ["    return"]), ""])
