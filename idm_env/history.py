@@ -51,10 +51,10 @@ class History(NamedTuple):
 
     @classmethod
     def beginning(cls, scene: Scene, seconds: float) -> History:
-        """Return a past that equals the present."""
-        now = torch.stack(torch.broadcast_tensors(*signals(scene)), dim=-1)
-        length = slots(seconds, scene.dt)
-        return cls(now.unsqueeze(-2).expand(*now.shape[:-1], length, now.shape[-1]), scene.dt)
+        """Return a past that equals the present; in memory vehicles are innermost, as compiled loops want them."""
+        now = torch.stack(torch.broadcast_tensors(*signals(scene)))
+        past = now.expand(slots(seconds, scene.dt), *now.shape)
+        return cls(past.movedim((0, 1), (-2, -1)), scene.dt)
 
     def with_present(self, scene: Scene) -> Tensor:
         """Return the buffer with the present in front, one step longer."""

@@ -11,16 +11,13 @@ from idm_env.simulator import Simulator
 from idm_env.tasks import Advance
 
 
-def advance_of(simulator: Simulator, output: str, device: torch.device, dtype: torch.dtype) -> Advance:
-    """Return the fastest function that does what ``simulator.step`` does here.
+def stepper_of(simulator: Simulator, device: torch.device) -> Stepper | None:
+    """Return the kernel of this simulator, or None where there is none for it here.
 
-    With torch output it is always ``simulator.step``, so that values are bit-identical with and without a graph. With
-    numpy output on the CPU it is fused where a kernel knows the simulator and numba is installed; ``IDM_ENV_KERNELS=0``
-    in the environment prevents it.
+    ``IDM_ENV_KERNELS=0`` in the environment prevents it.
     """
-    if output == "numpy" and device.type == "cpu" and kernels.available() and os.environ.get("IDM_ENV_KERNELS") != "0":
-        from idm_env.envs.fused import FusedStep, fits
+    if device.type != "cpu" or dispatch.surroundings() is not None or not simulator.kernels:
+        return None
+    from idm_env.kernels.stepper import Stepper
 
-        if fits(simulator):
-            return FusedStep(simulator, dtype)
-    return simulator.step
+    return Stepper(simulator)

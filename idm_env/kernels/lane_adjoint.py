@@ -9,12 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from idm_env.kernels.lane_loops import (
-    AT_RESPOND, AT_SENSE, FLAGS, GRADIENT_ROWS, HOIST, HOISTS, IS_RING, MOVING, N_ROWS, NUMBERS, ON_ACCEL, ON_GAP,
-    ON_INPUT_ROWS, ON_POSITION, ON_ROWS, ON_SPEED, PARAMETERS, SCRATCH, SEEDED, SENSE, SIGNALS, STATE_ROWS, STATICS,
-    fetch_next, load_inputs, load_past, load_static, look, step, store_past,
+    FLAGS, GRADIENT_ROWS, HOIST, HOISTS, IS_RING, MOVING, N_ROWS, NUMBERS, ON_ACCEL, ON_GAP, ON_INPUT_ROWS, ON_POSITION,
+    ON_ROWS, ON_SIGNAL_ROWS, ON_SPEED, PARAMETERS, RESPOND, SCRATCH, SEEDED, SENSE, SIGNALS, STATE_ROWS, STATICS, CLOSE,
+    fetch_next, load_inputs, load_past, load_static, perceive, step, store_past,
 )  # fmt: skip
 from idm_env.kernels.phases import call
-from idm_env.kernels.tiles import ROW, add, clear, exact, gather, load, padded, place, send_ahead, send_back, store
+from idm_env.kernels.tiles import (
+    ROW, add, clear, exact, gather, load, padded, place, send_ahead, send_back, store, uniform,
+)  # fmt: skip
 
 
 @exact
@@ -36,21 +38,37 @@ def send(w, n, size, measures, sends, phase):
 
 
 @exact
-def step_back(w, h, ah, n, size, measures, back, looks, sends, k, now):
+def give_back(w, ah, n, signals, recalls, now):
+    """Add the adjoints of what drivers recalled to those of the past."""
+    for i in range(recalls.shape[0]):
+        ago, signal, on = recalls[i, 0], recalls[i, 1], recalls[i, 3]
+        if uniform(w, ago, n):
+            add(ah, ((now - int(w[ago])) * signals + signal) * ROW, w, on, n)
+        else:
+            for j in range(n):
+                ah[((now - int(w[ago + j])) * signals + signal) * ROW + j] += w[on + j]
+
+
+@exact
+def step_back(w, h, ah, n, size, measures, phases, back, looks, recalls, sends, k, now):
     """Carry the adjoint of a tile back by one step, in place; the states are those before that step."""
-    m = padded(n)
-    look(w, n, size, measures, looks, AT_SENSE)
-    look(w, n, size, measures, looks, AT_RESPOND)
-    for phase in (3, 2, 1):
-        if back[phase]:
-            call(back[phase], w, h, ah, m, k, now)  # type: ignore[call-arg]
-            send(w, n, size, measures, sends, phase - 1)
+    m, signals = padded(n), measures[SIGNALS]
+    perceive(w, h, n, size, measures, phases, looks, recalls, k, now)
+    for phase in (CLOSE, RESPOND):
+        call(back[phase], w, m, k)  # type: ignore[call-arg]
+        send(w, n, size, measures, sends, phase)
+    if phases[SENSE]:
+        give_back(w, ah, n, signals, recalls, now)
+        for i in range(signals):
+            store(w, measures[ON_SIGNAL_ROWS] + i * ROW, ah, (now * signals + i) * ROW, n)
+        call(back[SENSE], w, m, k)  # type: ignore[call-arg]
+        send(w, n, size, measures, sends, SENSE)
 
 
 @exact
 def recompute(
     w, h, tape, taped, operands, flags, strides, k, begin_step, steps, slots, row, first, n, size, measures, phases,
-    looks,
+    looks, recalls,
 ):  # fmt: skip
     """Run a block once more and put what the adjoint reads on the tape of the tile."""
     for t in range(steps):
@@ -60,7 +78,7 @@ def recompute(
         if t + 1 < steps or phases[SENSE]:
             if measures[NUMBERS] + measures[FLAGS]:
                 load_inputs(w, operands, flags, strides, begin_step + t, row, first, n, size, measures)
-            step(w, h, n, size, measures, phases, looks, k, slots + t)
+            step(w, h, n, size, measures, phases, looks, recalls, k, slots + t)
 
 
 @exact
@@ -84,7 +102,7 @@ def add_seeds(w, seeds, t, dense, row, first, n, size, measures):
 @exact
 def backward(
     start, past, slots, seeds, on_end, on_begin, on_past_end, on_past, on_parameters, fresh, on_inputs,
-    measures, phases, looks, back, sends, taped, again, operands, flags, strides, k,
+    measures, phases, looks, recalls, back, sends, taped, again, operands, flags, strides, k,
     begin_step, steps, rows, size, wide, around, begin, end,
 ):  # fmt: skip
     """Carry adjoints at the end of a block to its begin; store (``fresh``) or add what falls on the parameters.
@@ -117,7 +135,7 @@ def backward(
             load_past(ah, on_past_end, steps, slots, signals, dense, row, first, n, size)
         recompute(
             w, h, tape, taped, operands, flags, strides, k, begin_step, steps, slots, row, first, n, size, measures,
-            phases, looks,
+            phases, looks, recalls,
         )  # fmt: skip
         for i in range(measures[MOVING]):
             seed(w, measures[ON_ROWS] + i * ROW, on_end[i], dense, row, first, n, size)
@@ -130,12 +148,12 @@ def backward(
                 store(w, measures[STATE_ROWS] + taped[i] * ROW, tape, (t * len(taped) + i) * ROW, n)
             if has_inputs:
                 load_inputs(w, operands, flags, strides, now, row, first, n, size, measures)
-            step_back(w, h, ah, n, size, measures, back, looks, sends, k, slots + t)
+            step_back(w, h, ah, n, size, measures, phases, back, looks, recalls, sends, k, slots + t)
             if on_inputs.shape[1]:
                 for i in range(measures[NUMBERS]):
                     store(on_inputs[i, now], at, w, measures[ON_INPUT_ROWS] + i * ROW + skip, own)
         if back[HOIST]:
-            call(back[HOIST], w, h, ah, padded(n), k, 0)  # type: ignore[call-arg]
+            call(back[HOIST], w, padded(n), k)  # type: ignore[call-arg]
         for i in range(measures[MOVING]):
             if on_begin[i].size == count:
                 store(on_begin[i], at, w, measures[ON_ROWS] + i * ROW + skip, own)

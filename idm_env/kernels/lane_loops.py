@@ -22,20 +22,21 @@ from idm_env.kernels.tiles import (
     place,
     repeats,
     store,
+    uniform,
 )
 
 (
     N_ROWS, IS_RING, STATES, MOVING, STATICS, PARAMETERS, HOISTS, NUMBERS, FLAGS, SIGNALS, STATE_ROWS, ON_ROWS,
     STATIC_ROWS, GRADIENT_ROWS, INPUT_ROWS, ON_INPUT_ROWS, SCRATCH, SEEDED, ON_GAP, ON_SPEED, ON_POSITION, ON_ACCEL,
-    GAP, SPEED, POSITION, ACCEL,
-) = range(26)  # fmt: skip
+    GAP, SPEED, POSITION, ACCEL, SIGNAL_ROWS, ON_SIGNAL_ROWS,
+) = range(28)  # fmt: skip
 """Places in ``measures``."""
 
-HOIST, SENSE, RESPOND, CLOSE = range(4)
+HOIST, SENSE, RECALL, RESPOND, CLOSE = range(5)
 """Places of the phases' addresses."""
 
-BEFORE, AT_SENSE, AT_RESPOND, AT_CLOSE = range(4)
-"""First column of ``looks``: for the whole rollout, or before which phase."""
+BEFORE = 0
+"""First column of ``looks``: 0 for the whole rollout, or the phase before which they are needed."""
 
 
 @exact
@@ -45,7 +46,7 @@ def load_static(w, operands, strides, row, first, n, size, again, measures, phas
         if not (again and repeats(strides[i], n, size)):
             load(w, measures[STATIC_ROWS] + i * ROW, operands[i], 0, strides[i], row, first, n, size)
     if phases[HOIST]:
-        call(phases[HOIST], w, w, w, padded(n), k, 0)  # type: ignore[call-arg]
+        call(phases[HOIST], w, padded(n), k)  # type: ignore[call-arg]
     look(w, n, size, measures, looks, BEFORE)
 
 
@@ -73,25 +74,55 @@ def look(w, n, size, measures, looks, when):
 
 
 @exact
-def step(w, h, n, size, measures, phases, looks, k, now):
+def fetch(w, h, n, signals, recalls, now):
+    """Fill the rows of what drivers recall; ``now`` is the place of this step in the past."""
+    for i in range(recalls.shape[0]):
+        ago, signal, to = recalls[i, 0], recalls[i, 1], recalls[i, 2]
+        if uniform(w, ago, n):
+            store(w, to, h, ((now - int(w[ago])) * signals + signal) * ROW, n)
+        else:
+            for j in range(n):
+                w[to + j] = h[((now - int(w[ago + j])) * signals + signal) * ROW + j]
+
+
+@exact
+def remember(w, h, n, signals, signal_rows, now):
+    """Put the signals of this step into the past."""
+    for i in range(signals):
+        store(h, (now * signals + i) * ROW, w, signal_rows + i * ROW, n)
+
+
+@exact
+def perceive(w, h, n, size, measures, phases, looks, recalls, k, now):
+    """Do all of a step that comes before the response."""
+    m = padded(n)
+    look(w, n, size, measures, looks, SENSE)
+    look(w, n, size, measures, looks, RESPOND)
+    if phases[SENSE]:
+        call(phases[SENSE], w, m, k)  # type: ignore[call-arg]
+        remember(w, h, n, measures[SIGNALS], measures[SIGNAL_ROWS], now)
+        look(w, n, size, measures, looks, RECALL)
+        call(phases[RECALL], w, m, k)  # type: ignore[call-arg]
+        fetch(w, h, n, measures[SIGNALS], recalls, now)
+
+
+@exact
+def step(w, h, n, size, measures, phases, looks, recalls, k, now):
     """Advance a tile by one step, in place; ``now`` is the place of this step in the past."""
     m = padded(n)
-    look(w, n, size, measures, looks, AT_SENSE)
-    look(w, n, size, measures, looks, AT_RESPOND)
-    if phases[SENSE]:
-        call(phases[SENSE], w, h, h, m, k, now)  # type: ignore[call-arg]
-    call(phases[RESPOND], w, h, h, m, k, now)  # type: ignore[call-arg]
-    look(w, n, size, measures, looks, AT_CLOSE)
-    call(phases[CLOSE], w, h, h, m, k, now)  # type: ignore[call-arg]
+    perceive(w, h, n, size, measures, phases, looks, recalls, k, now)
+    call(phases[RESPOND], w, m, k)  # type: ignore[call-arg]
+    look(w, n, size, measures, looks, CLOSE)
+    call(phases[CLOSE], w, m, k)  # type: ignore[call-arg]
 
 
 @exact
 def load_past(h, past, begin, slots, signals, dense, row, first, n, size):
-    """Fill the past of a tile; slot 0 is the newest, at place ``begin + slots − 1``."""
+    """Fill the past of a tile; slot 0 is the newest, at place ``begin + slots − 1``. One slot may stand for all."""
     for s in range(slots):
         for i in range(signals):
             to = ((begin + slots - 1 - s) * signals + i) * ROW
-            load(h, to, past[s * signals + i], 0, dense, row, first, n, size)
+            load(h, to, past[(s * signals + i) % past.shape[0]], 0, dense, row, first, n, size)
 
 
 @exact
@@ -116,7 +147,7 @@ def fetch_next(arrays, operands, many, strides, placed, size):
 
 @exact
 def forward(
-    start, ends, past, past_end, slots, kept, measures, phases, looks, read, operands, flags, strides, k,
+    start, ends, past, past_end, slots, kept, measures, phases, looks, recalls, read, operands, flags, strides, k,
     begin_step, steps, rows, size, wide, around, begin, end,
 ):  # fmt: skip
     """Run tiles ``begin`` to ``end`` through a block of steps.
@@ -143,7 +174,7 @@ def forward(
         for t in range(begin_step, begin_step + steps):
             if has_inputs:
                 load_inputs(w, operands, flags, strides, t, row, first, n, size, measures)
-            step(w, h, n, size, measures, phases, looks, k, slots + t - begin_step)
+            step(w, h, n, size, measures, phases, looks, recalls, k, slots + t - begin_step)
             if kept.shape[1]:
                 store(kept[0, t], at, w, measures[POSITION] + skip, own)
                 store(kept[1, t], at, w, measures[SPEED] + skip, own)

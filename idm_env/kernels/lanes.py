@@ -7,6 +7,7 @@ while it is in cache. Blocks are cut alike with and without a graph, so values a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from idm_env.kernels.operands import Strides, dense, operand, reduced, table
 from idm_env.kernels.printed import TileKernel
 from idm_env.kernels.tiles import Array
 from idm_env.kernels.workspace import take
+from idm_env.scalar.program import Program
 from idm_env.scalar.record import slot_name
 from idm_env.types import Inputs, Params, State
 
@@ -83,7 +85,7 @@ class _Plan:
     def run(self, loop: Any, first: int, steps: int, *arguments: Any) -> None:
         """Call a compiled loop over all tiles, on one thread or several."""
         size = self.shape[-1]
-        wide = tiles.width(size, steps)
+        wide = tiles.NARROW if self.kernel.signals and size <= tiles.NARROW else tiles.width(size, steps)
         around = tiles.halo(steps, self.kernel.program.reach)
         given = (
             *arguments, self.operands, self.flags, self.strides, self.kernel.constants[self.kind.name],
@@ -99,7 +101,7 @@ class _Plan:
         kernel = self.kernel
         self.run(
             lane_loops.forward, first, steps, *arguments, kernel.measures, kernel.forward(self.kind.name),
-            kernel.looks, kernel.read,
+            kernel.looks, kernel.recalls, kernel.read,
         )  # fmt: skip
 
     def backward(self, first: int, steps: int, *arguments: Any) -> None:
@@ -107,7 +109,7 @@ class _Plan:
         kernel = self.kernel
         self.run(
             lane_adjoint.backward, first, steps, *arguments, kernel.measures, kernel.forward(self.kind.name),
-            kernel.looks, kernel.backward(self.kind.name), kernel.sends, kernel.taped, kernel.again,
+            kernel.looks, kernel.recalls, kernel.backward(self.kind.name), kernel.sends, kernel.taped, kernel.again,
         )  # fmt: skip
 
     def past(self, filled: bool = False) -> Array:
@@ -118,7 +120,7 @@ class _Plan:
         return np.zeros(shape, self.kind) if filled else take(shape, self.kind)
 
 
-def _static(simulator: Stepping, state: State, params: Params, name: str) -> Tensor:
+def static_of(simulator: Stepping, state: State, params: Params, name: str) -> Tensor:
     """Return what a static slot stands for, as a tensor."""
     if name == "led":
         return simulator.road.led(state.speed)
@@ -132,7 +134,7 @@ def _static(simulator: Stepping, state: State, params: Params, name: str) -> Ten
     return params[effect][parameter]
 
 
-def _part(inputs: Inputs, name: str) -> Tensor:
+def part_of(inputs: Inputs, name: str) -> Tensor:
     """Return the input, or the part of one, that a slot stands for."""
     for effect, value in inputs.items():
         for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
@@ -141,7 +143,7 @@ def _part(inputs: Inputs, name: str) -> Tensor:
     raise KeyError(name)
 
 
-def _starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
+def starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
     """Return the tensors of the states, in the order of the program."""
     found = []
     for name in names:
@@ -155,15 +157,17 @@ def _starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
     return found
 
 
-def _past_rows(past: Tensor, shape: tuple[int, ...]) -> Array:
-    """Return the past as (slots · signals, vehicles): newest slot first."""
-    full = past.detach().expand(*shape, *past.shape[-2:])
-    return full.movedim((-2, -1), (0, 1)).reshape(full.shape[-2] * full.shape[-1], -1).contiguous().numpy()
+def past_rows(past: Tensor, shape: tuple[int, ...]) -> Array:
+    """Return the past as (slots · signals, vehicles), newest slot first; as (signals, vehicles) if all slots are one."""
+    full = past.detach().expand(*shape, *past.shape[-2:]).movedim((-2, -1), (0, 1))
+    if full.stride(0) == 0:
+        full = full[:1]
+    return full.reshape(full.shape[0] * full.shape[1], -1).contiguous().numpy()
 
 
-def _past_tensor(rows: Array, slots: int, shape: tuple[int, ...]) -> Tensor:
+def past_tensor(rows: Array, slots: int, shape: tuple[int, ...]) -> Tensor:
     """Return rows of the past as ``(..., vehicles, slots, signals)``."""
-    return torch.from_numpy(rows).view(slots, -1, *shape).movedim((0, 1), (-2, -1)).contiguous()
+    return torch.from_numpy(rows).view(slots, -1, *shape).movedim((0, 1), (-2, -1))
 
 
 def _plan(
@@ -172,12 +176,12 @@ def _plan(
 ) -> tuple[_Plan, list[Tensor]]:  # fmt: skip
     *batch, size = state.speed.shape
     program = kernel.program
-    given = [_static(simulator, state, params, n) for n in (*program.statics, *program.parameters)]
-    numbers = [_part(inputs, n) for n in kernel.numbers]
+    given = [static_of(simulator, state, params, n) for n in (*program.statics, *program.parameters)]
+    numbers = [part_of(inputs, n) for n in kernel.numbers]
     kind = state.speed.dtype
     made = [operand(x.to(kind), batch, size) for x in given]
     made += [operand(x, batch, size, steps) for x in numbers]
-    flags = [operand(_part(inputs, n), batch, size, steps) for n in kernel.flags]
+    flags = [operand(part_of(inputs, n), batch, size, steps) for n in kernel.flags]
     nothing: tuple[Array, Strides] = (np.zeros(1, np.float32 if kind == torch.float32 else np.float64), (0, 0, 0))
     strides = table([*(s for _, s in made), *(s for _, s in flags), (0, size, 1)])
     differentiated = _differentiated(program.moving, state, given[len(program.statics) :], numbers, kernel.signals)
@@ -194,7 +198,7 @@ def _differentiated(
     moving: tuple[str, ...], state: State, parameters: list[Tensor], numbers: list[Tensor], signals: int
 ) -> list[Tensor]:
     """Return what a rollout is differentiated by: states, the past, parameters, inputs."""
-    return [*_starts(state, moving), *([state.memory[PAST]] if signals else []), *parameters, *numbers]
+    return [*starts(state, moving), *([state.memory[PAST]] if signals else []), *parameters, *numbers]
 
 
 def _forward(plan: _Plan, start: list[Array], past: Array) -> tuple[list[Array], Array, Array, list[Any]]:
@@ -226,15 +230,15 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, plan: _Plan, *sources: Tensor) -> tuple[Tensor, ...]:
         program = plan.kernel.program
-        start = [dense(x.to(plan.state.speed.dtype), plan.shape) for x in _starts(plan.state, program.states)]
-        past = _past_rows(plan.state.memory[PAST], plan.shape) if plan.slots else plan.past()
+        start = [dense(x.to(plan.state.speed.dtype), plan.shape) for x in starts(plan.state, program.states)]
+        past = past_rows(plan.state.memory[PAST], plan.shape) if plan.slots else plan.past()
         ends, after, kept, tape = _forward(plan, start, past)
         ctx.plan, ctx.tape = plan, tape
         ctx.save_for_backward(*sources)
         ctx.set_materialize_grads(False)
         out = [torch.from_numpy(x).view(plan.shape) for x in ends]
         if plan.slots:
-            out.append(_past_tensor(after, plan.slots, plan.shape))
+            out.append(past_tensor(after, plan.slots, plan.shape))
         if plan.keep:
             out += [torch.from_numpy(x).view(plan.steps, *plan.shape) for x in kept]
         fixed = [x for x, n in zip(out, program.states, strict=False) if n not in program.moving]
@@ -261,7 +265,7 @@ def _backward(
     on: list[Array] = [plan.nothing if s is None else dense(s, plan.shape) for s in seeds[:moving]]
     on_past = plan.past(filled=True)
     if plan.slots and seeds[states] is not None:
-        on_past = _past_rows(seeds[states], plan.shape)  # type: ignore[arg-type]
+        on_past = past_rows(seeds[states], plan.shape)  # type: ignore[arg-type]
     every = seeds[states + bool(plan.slots) :]
     seeded = any(s is not None for s in every)
     along = take((4, plan.steps if seeded else 0, plan.count), plan.kind)
@@ -294,7 +298,7 @@ def _backward(
 def _gradient(plan: _Plan, i: int, gradient: Array, like: Tensor, begin_of: int, parameters: int) -> Tensor:
     """Return a gradient in the shape of the tensor that it belongs to."""
     if plan.slots and i == begin_of - 1:
-        return _past_tensor(gradient, plan.slots, plan.shape).sum_to_size(like.shape)
+        return past_tensor(gradient, plan.slots, plan.shape).sum_to_size(like.shape)
     if i < begin_of + parameters:
         return reduced(gradient, plan.shape, like)
     return _timed(gradient, plan, like)
@@ -327,7 +331,7 @@ def _differentiable(
            
             plan.state._replace(**plain, memory=memory), plan.inputs, plan.params, plan.steps
         )
-    outputs = [*_starts(last, program.states), *([last.memory[PAST]] if plan.slots else []), *(kept if plan.keep else ())]
+    outputs = [*starts(last, program.states), *([last.memory[PAST]] if plan.slots else []), *(kept if plan.keep else ())]
     pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if s is not None]
     wanted = [x for x in saved if x.requires_grad]
     found = iter(
@@ -349,14 +353,18 @@ def rollout(
     plan, sources = _plan(kernel, simulator, state, inputs, params, steps, block, keep, threads)
     program = kernel.program
     out = _Rollout.apply(plan, *sources)
+    kept = out[len(program.states) + bool(plan.slots) :]
+    return state_after(program, state, out, steps), tuple(kept) if keep else None
+
+
+def state_after(program: Program, state: State, out: Sequence[Tensor], steps: int) -> State:
+    """Return the state after some steps from its parts, in the order of the program, with the past behind them."""
     made = dict(zip(program.states, out, strict=False))
     memory = dict(state.memory)
     memory.update({n.removeprefix("memory of "): made[n] for n in program.memories})
-    if plan.slots:
+    if PAST in memory and len(out) > len(program.states):
         memory[PAST] = out[len(program.states)]
-    last = state._replace(
+    return state._replace(
         gap=made["gap"], speed=made["speed"], position=made["position"], accel=made["accel"], step=state.step + steps,
         present=made.get("present", state.present), memory=memory,
     )  # fmt: skip
-    kept = out[len(program.states) + bool(plan.slots) :]
-    return last, tuple(kept) if keep else None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -17,8 +18,12 @@ from idm_env.roads import Ring, Road
 from idm_env.scalar import library
 from idm_env.scalar.program import PHASES, Program
 from idm_env.scalar.record import Form, Untraceable, record
+from idm_env.scalar.source import row
 from idm_env.scalar.tiles import TileText
 from idm_env.step import Integration, Stepping
+
+FUNCTIONS = Path(__file__).with_name("functions.py")
+"""What printed phases call."""
 
 HEADER = '''"""{title}
 
@@ -28,10 +33,12 @@ Printed by idm_env from one recorded step; see idm_env/scalar. Delete at will: i
 import numpy as np
 from numba import carray, cfunc, types
 
+from idm_env.kernels.functions import exp_{kind} as exp, sigmoid_{kind} as sigmoid
+
 ROW = {row}
 SIZE = (1 << 40,)
 REAL = types.CPointer(types.{kind})
-SIGNATURE = types.void(REAL, REAL, REAL, types.int64, REAL, types.int64)
+SIGNATURE = types.void(REAL, types.int64, REAL)
 exact = cfunc(SIGNATURE, cache=True, error_model="numpy")
 swift = cfunc(SIGNATURE, cache=True, error_model="numpy", fastmath={{"contract"}})
 
@@ -40,7 +47,7 @@ swift = cfunc(SIGNATURE, cache=True, error_model="numpy", fastmath={{"contract"}
 MEASURES = (
     "rows", "ring", "states", "moving", "statics", "parameters", "hoists", "numbers", "flags", "signals", "state_rows",
     "on_rows", "static_rows", "gradient_rows", "input_rows", "on_input_rows", "scratch", "seeded", "on_gap", "on_speed",
-    "on_position", "on_accel", "gap", "speed", "position", "accel",
+    "on_position", "on_accel", "gap", "speed", "position", "accel", "signal_rows", "on_signal_rows",
 )  # fmt: skip
 """What loops are told, in this order: counts, then rows as first indices in the workspace."""
 
@@ -49,7 +56,8 @@ class TileKernel:
     """The phases of one simulator on lanes or rings, compiled when first asked for, and the plan of their workspace.
 
     ``measures`` are the numbers of ``MEASURES``; ``read``, ``taped`` and ``again`` are states (see ``TileText`` and
-    ``Program``); ``looks`` and ``sends`` are the copies between neighbours, phase after phase.
+    ``Program``); ``looks`` and ``sends`` are the copies between neighbours, phase after phase;
+    ``recalls`` what is fetched from the past: (row of how long ago, signal, row to fill, row of its adjoint).
     """
 
     def __init__(self, program: Program, text: TileText, title: str) -> None:
@@ -61,6 +69,13 @@ class TileKernel:
         self.measures = _measures(text)
         self.read = np.array(text.indices(text.read), np.int64)
         self.looks = _flat(text.looks(), ("static", *PHASES))
+        self.recalls = np.array(
+            [
+                (text.at(f"AGO_{r.ago}") * ROW, r.signal, text.at(row(r.slot)) * ROW, text.at(f"ON_{row(r.slot)}") * ROW)
+                for r in program.recalls
+            ],
+            np.int64,
+        ).reshape(-1, 4)
 
     @cached_property
     def _backward(self) -> tuple[str, tuple[str, ...]]:
@@ -86,10 +101,10 @@ class TileKernel:
     @cached_property
     def sends(self) -> Array:
         """Adjoints to send to neighbours: (phase, shift, row sent, row of the adjoint it adds to)."""
-        return _flat(self._text.sends(), PHASES)
+        return _flat(self._text.sends(), ("hoist", *PHASES))
 
     def forward(self, kind: str) -> Array:
-        """Return the addresses of hoist, sense, respond and close in a precision, 0 for what there is not."""
+        """Return the addresses of hoist and the phases in a precision, 0 for what there is not."""
         return self._addresses(kind, self._forward, ("hoist", *PHASES))
 
     def backward(self, kind: str) -> Array:
@@ -103,7 +118,7 @@ class TileKernel:
 @lru_cache(maxsize=512)
 def _compiled(title: str, kind: str, printed: tuple[str, tuple[str, ...]], names: tuple[str, ...]) -> Array:
     text, there = printed
-    module = library.load("phases", HEADER.format(title=title, row=ROW, kind=kind) + text)
+    module = library.load("phases", HEADER.format(title=title, row=ROW, kind=kind) + text, (FUNCTIONS,))
     return np.array([getattr(module, n).address if n in there else 0 for n in names], np.int64)
 
 
@@ -128,8 +143,10 @@ def _measures(text: TileText) -> Array:
 def _flat(moves: dict[str, list[tuple[int, int, int]]], order: tuple[str, ...]) -> Array:
     """Return moves as rows (place of the phase in the order, direction, index, index)."""
     found = [
-        (order.index(phase), step, to * ROW, source * ROW) for phase in order for step, to, source in moves[phase]
-    ]  # fmt: skip
+        (order.index(phase), step, to * ROW, source * ROW)
+        for phase in order
+        for step, to, source in moves.get(phase, ())
+    ]
     return np.array(found, np.int64).reshape(-1, 4)
 
 

@@ -179,6 +179,16 @@ def repeats(stride, n, size):
 
 
 @exact
+def uniform(w, row, n):
+    """Whether all values of a workspace row are the same."""
+    values, others = w[row:], 0
+    first = values[0]
+    for j in range(n):
+        others += values[j] != first
+    return others == 0
+
+
+@exact
 def store(target, base, w, row, n):
     """Copy ``n`` values from index ``row`` of the workspace."""
     _copy(target[base:], w[row:], n)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from idm_env.scalar.graph import Graph, Node, Slot, ordered
+from idm_env.scalar.graph import Graph, Node, ordered
 
 Share = tuple[int, Node]
 """Which argument gets how much of a result's adjoint."""
@@ -93,10 +93,6 @@ RULES: dict[str, Callable[[Graph, Node, Node], list[Share]]] = {
 }  # fmt: skip
 """Operation → the adjoints of its arguments from that of its result."""
 
-LEAVES = frozenset({"input", "past"})
-"""What adjoints end in: numbers from outside the graph."""
-
-
 def adjoint(graph: Graph, outputs: Sequence[Node], seeds: Sequence[Node]) -> dict[Node, Node]:
     """Return the adjoint of every leaf that the outputs depend on: Σ seed · ∂output/∂leaf."""
     order = [node for node in ordered(outputs) if not node.boolean]
@@ -111,20 +107,20 @@ def adjoint(graph: Graph, outputs: Sequence[Node], seeds: Sequence[Node]) -> dic
         give(output, seed)
     for node in reversed(order):
         g = found.get(node)
-        if g is None or not node.args or node.op in LEAVES:
+        if g is None or not node.args or node.op == "input":
             continue
         graph.note = node.note
         for index, part in RULES[node.op](graph, node, g):
             if node.args[index] in moving:
                 give(node.args[index], part)
-    return {node: g for node, g in found.items() if node.op in LEAVES}
+    return {node: g for node, g in found.items() if node.op == "input"}
 
 
 def _moving(order: Sequence[Node]) -> set[Node]:
     """Return the nodes that depend on a leaf: constants and truth values need no adjoint."""
     moving: set[Node] = set()
     for node in order:
-        if node.op in LEAVES or any(a in moving for a in node.args):
+        if node.op == "input" or any(a in moving for a in node.args):
             moving.add(node)
     return moving
 
@@ -132,9 +128,3 @@ def _moving(order: Sequence[Node]) -> set[Node]:
 def jacobian(graph: Graph, outputs: Sequence[Node]) -> list[Mapping[Node, Node]]:
     """Return, for every output, its derivatives by the leaves that it depends on."""
     return [adjoint(graph, [output], [graph.constant(1.0)]) for output in outputs]
-
-
-def slot(node: Node) -> Slot:
-    """Return the slot of an input."""
-    assert isinstance(node.label, Slot)
-    return node.label

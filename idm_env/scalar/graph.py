@@ -7,7 +7,7 @@ nothing (``CONSTANT``), with parameters only (``STATIC``), or with every step (`
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -225,11 +225,17 @@ def hoisted(graph: Graph, outputs: Sequence[Node], name: str = "hoisted") -> tup
         if node.level == DYNAMIC:
             wanted += [a for a in node.args if a in costly and a not in wanted]
     wanted += [node for node in outputs if node in costly and node not in wanted]
-    done: dict[Node, Node] = {node: graph.input(f"{name}{i}", level=STATIC) for i, node in enumerate(wanted)}
-    for node in order:
+    places = {node: graph.input(f"{name}{i}", level=STATIC) for i, node in enumerate(wanted)}
+    return replaced(graph, outputs, places), wanted
+
+
+def replaced(graph: Graph, outputs: Sequence[Node], places: Mapping[Node, Node]) -> list[Node]:
+    """Return the outputs with some nodes replaced by others."""
+    done = dict(places)
+    for node in ordered(outputs):
         if node not in done:
             note, graph.note = graph.note, node.note
             changed = any(done[a] is not a for a in node.args)
             done[node] = graph.node(node.op, *(done[a] for a in node.args), label=node.label) if changed else node
             graph.note = note
-    return [done[node] for node in outputs], wanted
+    return [done[node] for node in outputs]

@@ -1,7 +1,8 @@
 """One recorded step as phases over rows, forwards and backwards: what every compiled loop is printed from.
 
-Phases of a step are ``sense`` (signals into the past), ``respond`` (motion and memories) and ``close`` (gaps, from
-everybody's displacement). Before a phase its loop copies neighbours' numbers beside one's own; after a phase of the
+Phases of a step are ``sense`` (signals, which the loop puts into the past), ``recall`` (how many steps ago somebody
+looks back to; the loop fetches those signals), ``respond`` (motion and memories) and ``close`` (gaps, from everybody's
+displacement). Before a phase its loop copies neighbours' numbers beside one's own; after a phase of the
 adjoint it sends what fell on a neighbour's number to that neighbour. ``hoist`` computes, once for many steps, what
 depends on parameters alone.
 """
@@ -11,15 +12,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 from idm_env.scalar.derive import adjoint
-from idm_env.scalar.graph import STATIC, Node, Slot, hoisted, inputs_of
+from idm_env.scalar.graph import STATIC, Graph, Node, Slot, hoisted, inputs_of, replaced, ordered
 from idm_env.scalar.record import Recording
 
 STATICS = ("led", "leads", "length", "present")
 """What holds for a whole rollout and is no parameter; ``present`` only where no record changes it."""
 
-PHASES = ("sense", "respond", "close")
+PHASES = ("sense", "recall", "respond", "close")
+
+
+class Recall(NamedTuple):
+    """A signal of the past: its slot, which of the ``ago`` it is looked up at, and the number of the signal."""
+
+    slot: Slot
+    ago: int
+    signal: int
 
 
 @dataclass(frozen=True)
@@ -29,12 +39,11 @@ class Backward:
     assigned: dict[Slot, Node]
     added: dict[Slot, Node]
     sent: dict[Slot, Node]
-    past: list[tuple[int, Node, Node]]
 
     @property
     def nodes(self) -> list[Node]:
         """Return every node that is computed."""
-        return [*self.assigned.values(), *self.added.values(), *self.sent.values(), *(g for _, _, g in self.past)]
+        return [*self.assigned.values(), *self.added.values(), *self.sent.values()]
 
 
 class Program:
@@ -48,9 +57,11 @@ class Program:
             respond["step"] = graph.add(graph.input("step"), graph.constant(1.0))
         names = [f"{phase} {name}" for phase, made in (("respond", respond), ("close", close)) for name in made]
         nodes = [*recording.sense, *respond.values(), *close.values()]
-        cut, self.hoist = hoisted(graph, nodes)
+        nodes, self.recalls, times = _recalled(graph, nodes)
+        cut, self.hoist = hoisted(graph, [*nodes, *times])
+        self.recall = cut[len(nodes) :]
         self.sense = cut[: len(recording.sense)]
-        rest = dict(zip(names, cut[len(self.sense) :], strict=True))
+        rest = dict(zip(names, cut[len(self.sense) :], strict=False))
         self.respond = {name: rest[f"respond {name}"] for name in respond}
         self.close = {name: rest[f"close {name}"] for name in close}
 
@@ -75,7 +86,7 @@ class Program:
     @cached_property
     def slots(self) -> list[Slot]:
         """Everything that some phase reads."""
-        return inputs_of([*self.hoist, *self.sense, *self.respond.values(), *self.close.values()])
+        return inputs_of([*self.hoist, *(node for phase in PHASES for node in self.outputs(phase))])
 
     @cached_property
     def statics(self) -> tuple[str, ...]:
@@ -99,7 +110,16 @@ class Program:
 
     def outputs(self, phase: str) -> list[Node]:
         """Return what a phase computes."""
-        return {"sense": self.sense, "respond": [*self.respond.values()], "close": [*self.close.values()]}[phase]
+        return list(self.named(phase).values())
+
+    def named(self, phase: str) -> dict[str, Node]:
+        """Return what a phase computes, by name."""
+        return {
+            "sense": {f"signal {i}": node for i, node in enumerate(self.sense)},
+            "recall": {f"ago {i}": node for i, node in enumerate(self.recall)},
+            "respond": self.respond,
+            "close": self.close,
+        }[phase]
 
     def neighbours(self, nodes: Sequence[Node]) -> list[Slot]:
         """Return the slots of other vehicles that some nodes read, nearest first."""
@@ -112,39 +132,28 @@ class Program:
 
     # -- backwards -----------------------------------------------------------------------------------------------
 
-    def seed(self, phase: str, name: str) -> Node:
-        """Return the adjoint of a phase's result as an input."""
-        return self.graph.input(f"on {name}") if phase != "sense" else self.graph.input(f"on signal {name}")
-
     def backward(self, phase: str) -> Backward:
-        """Return the adjoint of one phase."""
-        if phase == "sense":
-            made = {str(i): node for i, node in enumerate(self.sense)}
-        else:
-            made = {n: x for n, x in (self.respond if phase == "respond" else self.close).items() if self._flows(n)}
-        found = adjoint(self.graph, list(made.values()), [self.seed(phase, name) for name in made])
-        assigned: dict[Slot, Node] = {
-            Slot(name): self.graph.constant(0.0) for name in made if name in self.moving and phase != "sense"
-        }
+        """Return the adjoint of one phase; nothing flows through how long ago something was."""
+        if phase == "recall":
+            return Backward({}, {}, {})
+        made = {name: node for name, node in self.named(phase).items() if self._flows(name)}
+        seeds = [self.graph.input(f"on {name}") for name in made]
+        found = adjoint(self.graph, list(made.values()), seeds)
+        assigned: dict[Slot, Node] = {Slot(name): self.graph.constant(0.0) for name in made if name in self.moving}
         added: dict[Slot, Node] = {}
         sent: dict[Slot, Node] = {}
-        past: list[tuple[int, Node, Node]] = []
         for node, g in found.items():
-            if node.op == "past":
-                assert isinstance(node.label, int)
-                past.append((node.label, node.args[0], g))
-                continue
             slot = node.label
             assert isinstance(slot, Slot)
             if not self._flows(slot.name):
                 continue
             if slot.shift:
                 sent[slot] = g
-            elif slot in assigned or slot.name.endswith(" now") or slot.name == "displacement":
+            elif slot in assigned or slot.name.endswith(" now") or slot.name.split()[0] in ("displacement", "recalled"):
                 assigned[slot] = g
             else:
                 added[slot] = g
-        return Backward(assigned, added, sent, past)
+        return Backward(assigned, added, sent)
 
     def hoist_backward(self) -> dict[Slot, Node]:
         """Return what falls on the parameters from the hoisted rows."""
@@ -160,8 +169,7 @@ class Program:
     def needed_backward(self) -> tuple[str, ...]:
         """States that the adjoint reads."""
         nodes = [node for phase in PHASES for node in self.backward(phase).nodes]
-        past = [at for phase in PHASES for _, at, _ in self.backward(phase).past]
-        read = {slot.name for slot in inputs_of([*nodes, *past])}
+        read = {slot.name for slot in inputs_of([*nodes, *self.recall])}
         return tuple(name for name in self.states if name in read)
 
     @cached_property
@@ -179,3 +187,20 @@ class Program:
             if more == wanted:
                 return tuple(name for name in self.states if name in wanted)
             wanted = more
+
+
+def _recalled(graph: Graph, nodes: list[Node]) -> tuple[list[Node], list[Recall], list[Node]]:
+    """Put inputs in place of the signals of the past; return them with what is looked up, and how long ago each is."""
+    times: list[Node] = []
+    recalls: list[Recall] = []
+    places: dict[Node, Node] = {}
+    for node in ordered(nodes):
+        if node.op == "past":
+            assert isinstance(node.label, int)
+            if node.args[0] not in times:
+                times.append(node.args[0])
+            ago = times.index(node.args[0])
+            slot = Slot(f"recalled {node.label} of {ago}")
+            places[node] = graph.input(slot.name)
+            recalls.append(Recall(slot, ago, node.label))
+    return replaced(graph, nodes, places), recalls, times

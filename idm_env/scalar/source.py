@@ -15,17 +15,10 @@ from typing import NamedTuple
 from idm_env.scalar.graph import Node, Slot, ordered
 
 
-class Ago(NamedTuple):
-    """A place in the past: which signal, and how many steps ago."""
-
-    signal: int
-    steps: Node
-
-
 class Write(NamedTuple):
-    """Where a result goes: the text of its place (or a place in the past), and whether it is added to what is there."""
+    """Where a result goes: the text of its place, and whether it is added to what is there."""
 
-    place: str | Ago
+    place: str
     node: Node
     adds: bool = False
 
@@ -59,9 +52,9 @@ def row(slot: Slot) -> str:
 
 _FORMS: dict[str, str] = {
     "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "neg": "-{0}", "pow": "{0} ** {1}",
-    "abs": "abs({0})", "sqrt": "np.sqrt({0})", "exp": "np.exp({0})", "expm1": "np.expm1({0})", "log": "np.log({0})",
+    "abs": "abs({0})", "sqrt": "np.sqrt({0})", "exp": "exp({0})", "expm1": "np.expm1({0})", "log": "np.log({0})",
     "log1p": "np.log1p({0})", "tanh": "np.tanh({0})", "sin": "np.sin({0})", "cos": "np.cos({0})",
-    "floor": "np.floor({0})", "detach": "{0}", "sigmoid": "{one} / ({one} + np.exp(-{0}))",
+    "floor": "np.floor({0})", "detach": "{0}", "sigmoid": "sigmoid({0})",
     "relu": "{zero} if {0} < {zero} else {0}", "clamp_min": "{1} if {0} < {1} else {0}",
     "clamp_max": "{1} if {0} > {1} else {0}", "maximum": "{0} if {0} > {1} else {1}",
     "minimum": "{0} if {0} < {1} else {1}", "select": "{1} if {0} else {2}",
@@ -74,10 +67,6 @@ _FORMS: dict[str, str] = {
 Read = Callable[[Slot], str]
 """How a slot is read inside the loop."""
 
-Past = Callable[[str, int, str], str]
-"""How the past is read: array, signal, and the name of how many steps ago."""
-
-
 class Body(NamedTuple):
     """Lines of one loop's body, the constants that it needs (name → index), and the places that it writes."""
 
@@ -85,7 +74,7 @@ class Body(NamedTuple):
     lines: list[str]
 
 
-def body(writes: Sequence[Write], read: Read, past: Past, constants: Constants) -> Body:
+def body(writes: Sequence[Write], read: Read, constants: Constants) -> Body:
     """Return the body of a loop that computes the writes."""
     names: dict[Node, str] = {}
     used: dict[str, int] = {}
@@ -98,8 +87,7 @@ def body(writes: Sequence[Write], read: Read, past: Past, constants: Constants) 
         used[f"k{at}"] = at
         return f"k{at}"
 
-    times = [write.place.steps for write in writes if isinstance(write.place, Ago)]
-    for node in ordered([*(write.node for write in writes), *times]):
+    for node in ordered([write.node for write in writes]):
         arguments = [names[a] for a in node.args]
         if node.op == "constant":
             assert isinstance(node.label, float)
@@ -115,25 +103,19 @@ def body(writes: Sequence[Write], read: Read, past: Past, constants: Constants) 
                 note = node.note
                 lines.append(f"# {note or 'motion'}")
             names[node] = f"t{len(names)}"
-            if node.op == "past":
-                assert isinstance(node.label, int)
-                text = past("h", node.label, arguments[0])
-            else:
-                form = _FORMS[node.op]
-                fixed = {n: constant(v) for n, v in (("zero", 0.0), ("one", 1.0)) if f"{{{n}}}" in form}
-                text = form.format(*arguments, **fixed)
+            form = _FORMS[node.op]
+            fixed = {n: constant(v) for n, v in (("zero", 0.0), ("one", 1.0)) if f"{{{n}}}" in form}
+            text = form.format(*arguments, **fixed)
             lines.append(f"{names[node]} = {text}")
     for write in writes:
-        at = write.place
-        place = past("ah", at.signal, names[at.steps]) if isinstance(at, Ago) else at
-        lines.append(f"{place} {'+=' if write.adds else '='} {names[write.node]}")
+        lines.append(f"{write.place} {'+=' if write.adds else '='} {names[write.node]}")
     return Body(used, [*loads, *lines])
 
 
 def function(name: str, doc: str, made: Body, compiler: str) -> str:
     """Return the text of one phase: a compiled function that loops over ``m`` vehicles."""
-    text = [f"@{compiler}", f"def {name}(w_, h_, ah_, m, k_, now):", f'    """{doc}"""']
-    text += [f"    {array} = carray({array}_, SIZE)" for array in ("w", "h", "ah", "k")]
+    text = [f"@{compiler}", f"def {name}(w_, m, k_):", f'    """{doc}"""']
+    text += [f"    {array} = carray({array}_, SIZE)" for array in ("w", "k")]
     text += [f"    {n} = k[{i}]" for n, i in made.constants.items()]
     text += ["    for j in range(m):", *(f"        {line}" for line in made.lines)]
     return "\n".join([*text, ""])

@@ -10,7 +10,7 @@ from functools import cached_property
 
 from idm_env.scalar.graph import Node, Slot, inputs_of
 from idm_env.scalar.program import PHASES, Program
-from idm_env.scalar.source import Ago, Constants, Write, assignments, body, function, row
+from idm_env.scalar.source import Constants, Write, assignments, body, function, row
 
 
 class TileText:
@@ -36,6 +36,11 @@ class TileText:
         self._begin("ON_INPUT", [f"ON_{row(Slot(n))}" for n in self.numbers])
         neighbours = {s for phase in PHASES for s in p.neighbours(self._read(phase))}
         self._neighbours = sorted(self._chain(neighbours), key=lambda s: (abs(s.shift), s))
+        self._begin("SIGNAL", [row(Slot(f"signal {i}")) for i in range(self.signals)])
+        self._begin("ON_SIGNAL", [f"ON_{row(Slot(f'signal {i}'))}" for i in range(self.signals)])
+        self._begin("RECALLED", [row(r.slot) for r in p.recalls])
+        self._begin("ON_RECALLED", [f"ON_{row(r.slot)}" for r in p.recalls])
+        self._begin("AGO", [row(Slot(f"ago {i}")) for i in range(len(p.recall))])
         self._begin("OTHER", ["DISPLACEMENT", "ON_DISPLACEMENT", "SCRATCH", *(row(s) for s in self._neighbours)])
         self._rows += [f"SENT_{row(s)}" for phase in PHASES for s in self._back[phase].sent]
         self._rows = list(dict.fromkeys([*self._rows, "SEEDED"]))
@@ -46,7 +51,7 @@ class TileText:
 
     def _read(self, phase: str) -> list[Node]:
         back = self._back[phase]
-        return [*self.program.outputs(phase), *back.nodes, *(at for _, at, _ in back.past)]
+        return [*self.program.outputs(phase), *back.nodes]
 
     @staticmethod
     def _chain(slots: set[Slot]) -> set[Slot]:
@@ -126,29 +131,23 @@ class TileText:
         rows = assignments((name, f"{i} * ROW") for i, name in enumerate(self._rows))
         compiler = "swift" if backward else "exact"
         functions = [
-            function(name, doc, body(writes, self._read_slot, self._past, self.constants), compiler)
+            function(name, doc, body(writes, self._read_slot, self.constants), compiler)
             for name, (doc, writes) in made.items()
         ]
-        size = assignments([("SIGNALS", self.signals)])
-        return "\n\n".join([size, rows, *functions]), tuple(made)
+        return "\n\n".join([rows, *functions]), tuple(made)
 
     def _phases(self) -> dict[str, tuple[str, list[Write]]]:
         p = self.program
-        place = "h[(now * SIGNALS + {}) * ROW + j]"
+        hoist = dict(zip(p.constants_of_time, p.hoist, strict=True))
         return {
-            "hoist": (
-                "What depends on parameters alone.",
-                [Write(f"w[{row(Slot(n))} + j]", x) for n, x in zip(p.constants_of_time, p.hoist, strict=True)],
-            ),
-            "sense": ("What the past keeps.", [Write(place.format(i), x) for i, x in enumerate(p.sense)]),
-            "respond": (
-                "Motion and memories after the step.",
-                [Write(f"w[{self._row(Slot(n))} + j]", x) for n, x in p.respond.items()],
-            ),
-            "close": (
-                "Gaps after the step.",
-                [Write(f"w[{self._row(Slot(n))} + j]", x) for n, x in p.close.items()],
-            ),
+            name: (doc, [Write(f"w[{row(Slot(n))} + j]", node) for n, node in named.items()])
+            for name, doc, named in (
+                ("hoist", "What depends on parameters alone.", hoist),
+                ("sense", "Signals that the past keeps.", p.named("sense")),
+                ("recall", "How many steps ago somebody looks back to.", p.named("recall")),
+                ("respond", "Motion and memories after the step.", p.named("respond")),
+                ("close", "Gaps after the step.", p.named("close")),
+            )
         }
 
     def _back_phases(self) -> dict[str, tuple[str, list[Write]]]:
@@ -159,7 +158,6 @@ class TileText:
             writes = [Write(f"w[ON_{self._row(s)} + j]", x) for s, x in back.assigned.items()]
             writes += [Write(f"w[ON_{self._row(s)} + j]", x, adds=True) for s, x in back.added.items()]
             writes += [Write(f"w[SENT_{row(s)} + j]", x) for s, x in back.sent.items()]
-            writes += [Write(Ago(signal, at), g, adds=True) for signal, at, g in back.past]
             made[f"{phase}_back"] = (f"Adjoint of {phase}.", writes)
         return made
 
@@ -168,11 +166,6 @@ class TileText:
         return row(Slot("position") if slot == Slot("position after") else slot)
 
     def _read_slot(self, slot: Slot) -> str:
-        if slot.name.startswith("on signal "):
-            return f"ah[(now * SIGNALS + {slot.name.split()[-1]}) * ROW + j]"
         if slot.name.startswith("on "):
             return f"w[ON_{row(Slot(slot.name[3:]))} + j]"
         return f"w[{self._row(slot)} + j]"
-
-    def _past(self, array: str, signal: int, ago: str) -> str:
-        return f"{array}[((now - int({ago})) * SIGNALS + {signal}) * ROW + j]"
