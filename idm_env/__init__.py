@@ -7,6 +7,10 @@ Gymnasium ids ``DiffIDM-v0`` and ``DiffIDM-Fit-v0``.
 from __future__ import annotations
 
 import importlib
+import os
+import signal
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -52,6 +56,18 @@ if TYPE_CHECKING:
     from idm_env.types import Command, Record, State
 
 
+def _end_quietly() -> None:
+    """Let Ctrl-C end the command ``idm-env`` without a traceback while its imports run; ``cli.run`` takes over."""
+    command = any(Path(word).stem == "idm-env" for word in sys.argv[:1]) or sys.orig_argv[1:3] == ["-m", "idm_env"]
+    if command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+
+        def end(number: int, frame: object) -> None:
+            os.write(2, b"interrupted.\n")
+            os._exit(130)
+
+        signal.signal(signal.SIGINT, end)
+
+
 def _register() -> None:
     """Register the environment ids; entry points are text, so that nothing heavy is imported here."""
     from gymnasium.envs.registration import register, registry
@@ -74,6 +90,7 @@ def _register() -> None:
         )
 
 
+_end_quietly()
 _register()
 
 

@@ -4,6 +4,7 @@ and a candidate in discovery.
 
 from __future__ import annotations
 
+from idm_env.checks import nearest, shown
 from idm_env.effects.actions import Control, Replay
 from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
 from idm_env.effects.base import CarFollowing, Effect
@@ -14,7 +15,6 @@ from idm_env.effects.neighbours import BrakeLight, Follower, Lateral, LeaderAcce
 from idm_env.effects.noise import Noise
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.surroundings import Drag, Grade
-from idm_env.parameters import nearest
 
 ALL: dict[str, type[Effect]] = {
     effect.kind: effect
@@ -74,12 +74,12 @@ CANDIDATES: tuple[str, ...] = (
 def make(kind: str, **choices: object) -> Effect:
     """Build an effect from its name in ``ALL`` and its static choices; ValueError names the nearest known one."""
     if kind not in ALL:
-        raise ValueError(f"unknown effect '{kind}'.{nearest(kind, ALL)}")
+        raise ValueError(f"unknown effect {shown(kind)}.{nearest(str(kind), ALL)}")
     cls = ALL[kind]
     known = list(cls.__dataclass_fields__)
     for choice in choices:
         if choice not in known:
-            raise ValueError(f"effect '{kind}' has no choice '{choice}'.{nearest(choice, known)}")
+            raise ValueError(f"effect '{kind}' has no choice {shown(choice)}.{nearest(choice, known)}")
     return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in choices.items()})  # type: ignore[arg-type]
 
 
