@@ -56,16 +56,17 @@ if TYPE_CHECKING:
     from idm_env.types import Command, Record, State
 
 
+def _end(number: int, frame: object) -> None:
+    os.write(2, b"interrupted.\n")
+    os._exit(130)
+
+
 def _end_quietly() -> None:
-    """Let Ctrl-C end the command ``idm-env`` without a traceback while its imports run; ``cli.run`` takes over."""
-    command = any(Path(word).stem == "idm-env" for word in sys.argv[:1]) or sys.orig_argv[1:3] == ["-m", "idm_env"]
+    """Let Ctrl-C end the command ``idm-env`` in one line while imports run; ``cli`` takes over when work begins."""
+    name = sys.argv[0] if sys.argv else ""  # "-m" while python -m looks for its module
+    command = Path(name).stem == "idm-env" or (name == "-m" and "idm_env" in sys.orig_argv)
     if command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-
-        def end(number: int, frame: object) -> None:
-            os.write(2, b"interrupted.\n")
-            os._exit(130)
-
-        signal.signal(signal.SIGINT, end)
+        signal.signal(signal.SIGINT, _end)
 
 
 def _register() -> None:

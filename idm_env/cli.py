@@ -6,7 +6,6 @@ import inspect
 import math
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+import idm_env
 from idm_env import checks, keep
 
 app = typer.Typer(
@@ -37,8 +37,6 @@ PICTURES = (".png", ".svg", ".pdf")
 
 def _version(wanted: bool) -> None:
     if wanted:
-        import idm_env
-
         print(idm_env.__version__)
         raise typer.Exit
 
@@ -89,9 +87,25 @@ Step = Annotated[
 ]
 
 
+_stopped: list[int] = []
+"""Signals that have ended the work."""
+
+
+def _work_begins() -> None:
+    """Make Ctrl-C an exception, so that what is done is kept; while modules are imported it could crash them."""
+    if signal.getsignal(signal.SIGINT) is idm_env._end:
+        signal.signal(signal.SIGINT, _stop)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    _stopped.append(number)
+    raise KeyboardInterrupt
+
+
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int, float | str], None]]:
-    """Show a bar per phase on standard error."""
+    """Show a bar per phase on standard error; from here on Ctrl-C keeps what is done."""
+    _work_begins()
     columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TextColumn("{task.fields[value]}"), console=console, transient=False) as bars:
         tasks: dict[str, Any] = {}
@@ -459,24 +473,15 @@ def _done(out: Path) -> None:
 
 def run() -> None:
     """Run the command line: bad input ends with one line and exit code 1, Ctrl-C with 130."""
-    stopped: list[int] = []
-
-    def stop(number: int, frame: object) -> None:
-        stopped.append(number)
-        raise KeyboardInterrupt
-
-    mine = threading.current_thread() is threading.main_thread()
-    if mine and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None):
-        signal.signal(signal.SIGINT, stop)
     try:
         code = app(standalone_mode=False)  # an exit code where typer has dealt with the end itself
         if code == 130:
             _interrupted()
         sys.exit(code if isinstance(code, int) else 0)
     except Exception as error:
-        # Importing may turn an interruption into an error of another kind; typer makes EOFError an Abort.
+        # A library may turn an interruption into an error of another kind; typer makes EOFError an Abort.
         cause = error.__cause__ if isinstance(error, typer.Abort) else error
-        if stopped or not isinstance(cause, Exception):
+        if _stopped or not isinstance(cause, Exception):
             _interrupted()
         if isinstance(cause, (ValueError, ImportError, OSError, EOFError, MemoryError)) or keep.full(cause):
             _failed(cause)

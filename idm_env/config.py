@@ -156,7 +156,7 @@ def load_environment(path: str | Path) -> dict[str, Any]:
         raise ValueError(
             f"{path}: no environment is configured here. Write 'configures: environment' in its first line."
         )
-    return content
+    return {str(key): value for key, value in content.items()}
 
 
 def describe(effect: Effect) -> str | dict[str, Any]:

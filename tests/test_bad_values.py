@@ -334,25 +334,21 @@ def test_a_full_disk_is_one_line(data: Path, tmp_path: Path, command: str) -> No
     assert not list((tmp_path / "out").rglob("*idm-env-part*"))
 
 
-@pytest.mark.parametrize("seconds", [0.15, 0.4, 0.8, 1.4, 2.2])
+@pytest.mark.parametrize("seconds", [0.1, 0.4, 0.8, 1.4, 2.2])
 def test_ctrl_c_while_modules_are_imported_is_one_line(data: Path, tmp_path: Path, seconds: float) -> None:
-    running = subprocess.Popen(
-        [sys.executable, "-X", "importtime", "-m", "idm_env", "fit", str(data), "--out", str(tmp_path / "out")],
-        stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    given = ("-X", "importtime", "-m", "idm_env", "fit", data, "--out", tmp_path / "out")
+    running = subprocess.Popen([sys.executable, *map(str, given)], stderr=subprocess.PIPE, text=True)
     assert running.stderr is not None
-    seen = ""
-    while "pathlib" not in seen or "idm_env.keep" in seen:  # Python itself has begun; nothing of ours is done
-        seen = running.stderr.readline()
-        if " signal" in seen or " gymnasium" in seen:
+    for line in running.stderr:
+        if line.split()[-1] == "signal":  # the first thing that the package imports: nothing of ours has begun yet
             break
     time.sleep(seconds)
     os.kill(running.pid, signal.SIGINT)
     _, words = running.communicate(timeout=120)
-    rest = [line for line in words.splitlines() if not line.startswith("import time:")]
-    assert "Traceback" not in words and (running.returncode, rest and rest[-1].split(":")[0].rstrip(".")) == (
-        130, "interrupted",
-    ), words[-1500:]  # fmt: skip
+    said = [line for line in words.splitlines() if not line.startswith("import time:")]
+    assert "Traceback" not in words and said and said[-1].startswith("interrupted"), words[-1500:]
+    # Python ends by the signal itself where it met the interruption in code made from text; a shell says 130 to both.
+    assert running.returncode in (130, -signal.SIGINT)
 
 
 # -- checkpoints of agents -------------------------------------------------------------------------------------------

@@ -79,7 +79,7 @@ def settings(
         "max_episode_steps": max_episode_steps,
     }
     if config is not None:
-        read = {str(key): value for key, value in load_environment(config).items()}
+        read = load_environment(config)
         said = {key: read.pop(key, None) for key in own}
         limits = [n for n in map(_limit, (max_episode_steps, said["max_episode_steps"])) if n is not None]
         own = {key: said[key] if value is None else value for key, value in own.items()}
