@@ -31,6 +31,8 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
 MAY_BE_ZERO = {"seed", "clone", "critic_first", "learning_starts"}
 POSITIVE = {"learning_rate", "clip"}
+KEPT = ("last.pt", "best.pt", "model.zip", "returns.pkl", "replay.pkl")
+"""What trainings keep in ``out``, beside their logs."""
 LOGS = ("csv", "tensorboard", "stdout", "json")
 MAY_CHANGE = {
     "out", "resume", "seed", "updates", "cpu_seconds", "evaluate_every", "log", "clone", "learning_rate", "window",
@@ -103,7 +105,14 @@ def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
     known, rest = before.parse_known_args(argv)
     default = kind() if known.config is None else load_agent(known.config, kind, agent)
     text = f"{kind.__doc__}\n\n--config FILE reads a YAML file first, such as configs/ring-apg.yaml."
-    return tyro.cli(kind, default=default, args=rest, description=text)
+    found = tyro.cli(kind, default=default, args=rest, description=text)
+    for path in (found.out / name for name in KEPT):
+        keep.not_an_input(path, (known.config, getattr(found, "data", None)))
+        if path.suffix == ".pt" and path.exists() and not found.resume and _content(path) is None:
+            raise ValueError(
+                f"{path} is not a checkpoint of an agent, or is broken. Move or delete it, or give another --out."
+            )
+    return found
 
 
 def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Sequence[str] | None = None) -> R:
@@ -250,19 +259,18 @@ def load(path: str | Path, task: str | None = None, agent: str | None = None) ->
     """
     if not Path(path).is_file():
         raise ValueError(f"{path} is not a file. Give the path of a checkpoint, such as runs/ring-apg/last.pt.")
-    try:
-        content = torch.load(path, weights_only=True)
-    except Exception:
-        content = None
-    if not isinstance(content, dict) or "schema" not in content:
+    content = _content(Path(path))
+    if content is None:
         raise ValueError(
-            f"{path} is not a checkpoint of an agent, or is broken. Give a file that an agent has written, or train "
-            "anew, without --resume."
+            f"{path} is not a checkpoint of an agent, or is broken. Give a file that an agent has written, or delete "
+            "it and train anew, without --resume."
         )
     if content["schema"] != SCHEMA:
         raise ValueError(f"{path} has layout {content['schema']}; this version reads layout {SCHEMA}. Train it anew.")
     if not _whole(content):
-        raise ValueError(f"{path} is broken (parts of a checkpoint are missing). Train anew, without --resume.")
+        raise ValueError(
+            f"{path} is broken (parts of a checkpoint are missing). Delete it and train anew, without --resume."
+        )
     for name, wanted in (("task", task), ("agent", agent)):
         if wanted is not None and content[name] != wanted:
             raise ValueError(
@@ -279,6 +287,15 @@ def load(path: str | Path, task: str | None = None, agent: str | None = None) ->
     return policy, content
 
 
+def _content(path: Path) -> dict[str, Any] | None:
+    """Return what a checkpoint holds, or None for a file that is none."""
+    try:
+        content = torch.load(path, weights_only=True)
+    except Exception:
+        return None
+    return content if isinstance(content, dict) and "schema" in content else None
+
+
 def _whole(content: Any) -> bool:
     """Tell whether a checkpoint has all that ``save`` writes, each of its kind."""
     kinds = {
@@ -292,7 +309,7 @@ def _whole(content: Any) -> bool:
         policy.load_state_dict(content["policy"]["state"])
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError):
         return False
-    return len(content["features"]) == policy.made["features"]
+    return True
 
 
 def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[str, Any]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import polars as pl
@@ -17,6 +19,8 @@ from idm_env.discovery import write
 from idm_env.fitting import job
 from idm_env.fitting.job import Options, Source, fit_file, simulate_file
 from idm_env.parts import Parts
+from idm_env.prediction.files import predict_files
+from idm_env.trajectories import files
 
 NAMES = ("report.json", "table.parquet")
 
@@ -224,3 +228,87 @@ def test_what_determines_a_run_is_in_its_fingerprint(tmp_path: Path) -> None:
     assert keep.fingerprint(file, torch.ones(2), "x") != first and keep.fingerprint(file, torch.zeros(2), "y") != first
     file.write_text("b")
     assert keep.fingerprint(file, torch.zeros(2), "x") != first
+
+
+# -- commands --------------------------------------------------------------------------------------------------------
+
+
+def refused(*arguments: object) -> str:
+    """Return the one line with which a command refuses what it was given."""
+    done = subprocess.run([sys.executable, "-m", "idm_env", *map(str, arguments)], capture_output=True, text=True)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert done.returncode == 1 and len(lines) == 1 and "Traceback" not in done.stderr, done.stderr
+    return lines[0]
+
+
+def test_filter_keeps_a_user_s_parts_and_refuses_its_own_output_as_input(data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("numba", reason="numba is not installed")
+    out = tmp_path / "out"
+    (out / "parts").mkdir(parents=True)
+    (out / "parts" / "thesis.txt").write_text("years of work")
+    files.filter_file(data, out, baselines=False)
+    assert (out / "parts" / "thesis.txt").read_text() == "years of work" and not (out / keep.UNFINISHED).exists()
+    before = content(out)
+    with pytest.raises(ValueError, match=r"trajectories\.parquet is an input, and"):
+        files.filter_file(out / "trajectories.parquet", out, baselines=False)
+    with pytest.raises(ValueError, match=r"report\.json is an input, and"):
+        predict_files([out / "report.json"], out)
+    assert content(out) == before
+    (out / keep.UNFINISHED).mkdir()
+    shutil.copy(data, out / keep.UNFINISHED / "mine.csv")
+    with pytest.raises(ValueError, match=r"mine\.csv belongs to an interrupted run"):
+        files.filter_file(out / keep.UNFINISHED / "mine.csv", out)
+
+
+def test_predict_that_refuses_deletes_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "parts").mkdir(parents=True)
+    (out / "parts" / "thesis.txt").write_text("years of work")
+    (out / "predictions.parquet").write_text("mine")
+    (tmp_path / "broken.json").write_text("{")
+    before = content(tmp_path)
+    with pytest.raises(ValueError, match="was not written by idm-env"):
+        predict_files([tmp_path / "broken.json"], out)
+    (out / "predictions.parquet").rename(out / "mine.parquet")
+    with pytest.raises(ValueError, match="no scenario can be used"):
+        predict_files([tmp_path / "broken.json"], out)
+    (out / "mine.parquet").rename(out / "predictions.parquet")
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize(("command", "name"), [("demo", "platoon.csv"), ("bench", "performance.json")])
+def test_commands_without_input_keep_what_is_not_theirs(tmp_path: Path, command: str, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    more = ("--sizes", 100) if command == "bench" else ()
+    assert f"{name} was not written by idm-env" in refused(command, "--out", tmp_path, *more)
+    assert content(tmp_path) == {name: b"mine"}
+
+
+def test_a_broken_checkpoint_is_one_line_and_without_resume_a_fit_starts_afresh(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def stop(phase: str, done: int, total: int, value: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_file(Source(data), Options(by="all", starts=1, substeps=1), out, on_progress=stop)
+    folder = out / keep.UNFINISHED / "fit"
+    (kept,) = folder.glob("*.kept")
+    options = ("--by", "all", "--starts", 1, "--substeps", 1, "--out", out)
+    for broken in (b"", b"garbage", kept.read_bytes()[:-5]):
+        kept.write_bytes(broken)
+        line = refused("fit", data, *options, "--resume")
+        assert f"{kept.name} is broken" in line and "Leave out --resume to start afresh" in line
+    (folder / keep.MARK).write_text("")
+    assert "Delete" in refused("fit", data, *options, "--resume")
+    keep._sign(folder, fingerprint="")
+    fit_file(Source(data), Options(by="all", starts=1, substeps=1), out)
+    assert not (out / keep.UNFINISHED).exists()
+
+
+def test_explain_and_fit_refuse_inputs_among_their_outputs(data: Path, tmp_path: Path) -> None:
+    link = tmp_path / "report.json"
+    link.symlink_to(data)
+    for command in ("explain", "fit"):
+        assert "is an input" in refused(command, data, "--out", tmp_path)
+    assert link.is_symlink() and sorted(p.name for p in tmp_path.iterdir()) == ["data.csv", "report.json"]
