@@ -151,7 +151,6 @@ def test_unknown_reset_options_are_refused() -> None:
     for env, known in (
         (gym.make("DiffIDM-v0").unwrapped, "state"),
         (gym.make_vec("DiffIDM-v0", num_envs=2), "reset_mask"),
-        (parallel_env(), "none"),
     ):
         with pytest.raises(ValueError, match=rf"unknown reset option 'reset_maks'\..*{known}"):
             env.reset(options={"reset_maks": 1})

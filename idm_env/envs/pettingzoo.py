@@ -19,7 +19,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from idm_env.checks import shown
 from idm_env.envs.batch import Batch
-from idm_env.envs.settings import RENDER_MODES, reset_options, settings
+from idm_env.envs.settings import RENDER_MODES, settings
 from idm_env.envs.spaces import action_box, numpy_dtype, observation_box
 
 CYCLES = 3000
@@ -74,8 +74,10 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise."""
-        reset_options(options, ())
+        """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise.
+
+        There are no options; PettingZoo's own tests give some, so they are left aside without a word.
+        """
         if seed is not None or self.batch.world is None:
             self.batch.seed([0], [seeding.np_random(seed)[1]])
         self.batch.limit = min((x for x in (self.max_cycles, self.task.horizon) if x is not None), default=None)

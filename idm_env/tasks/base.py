@@ -17,12 +17,11 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.checks import at_least, whole
 from idm_env.effects import Control, Effect, Noise
 from idm_env.roads import Road
 from idm_env.simulator import Simulator
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import agents_of
+from idm_env.tasks.checks import agents_of, at_least, whole
 from idm_env.tasks.nouns import Advance, Bounds, Ended, Run, World
 from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params, State

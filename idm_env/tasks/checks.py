@@ -7,6 +7,8 @@ from typing import Any
 
 from idm_env.checks import at_least, shown, whole
 
+__all__ = ["agents_of", "at_least", "span", "whole"]
+
 
 def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
     """Return a range from one number or from ``[lowest, highest]``."""

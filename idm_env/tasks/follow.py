@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.checks import whole
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Bounds, Ended, Task, World
+from idm_env.tasks.checks import whole
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import Leaders, equilibrium_gap, head, made_up_leader, queue, recorded_leaders, starts
 from idm_env.types import Inputs, Params

@@ -11,11 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.checks import at_least, whole
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Bounds, Task, World
-from idm_env.tasks.checks import span
+from idm_env.tasks.checks import at_least, span, whole
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import equilibrium_gap, head, queue
 from idm_env.types import Inputs, Params

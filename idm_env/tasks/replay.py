@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.checks import nearest, whole
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
+from idm_env.parameters import nearest
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Bounds, Ended, Task, World
+from idm_env.tasks.checks import whole
 from idm_env.tasks.follow import headway_penalty
 from idm_env.tasks.random import Draw
 from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene

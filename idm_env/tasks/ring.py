@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.checks import at_least, nearest
 from idm_env.effects import IDM, Brakes, Effect
+from idm_env.parameters import nearest
 from idm_env.roads import Ring, Road
 from idm_env.tasks.base import Bounds, Task, World
-from idm_env.tasks.checks import span
+from idm_env.tasks.checks import at_least, span
 from idm_env.tasks.random import Draw
 from idm_env.types import Params
 
