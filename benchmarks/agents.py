@@ -91,7 +91,7 @@ class Job:
 
 def perform(job: Job, out: Path) -> dict[str, Any] | None:
     """Return the results of a job, trained now if they are not there; None where another process works on it."""
-    from idm_env.report import write_text
+    from idm_env.keep import write_text
 
     folder = out / job.name
     result = folder / "result.json"

@@ -7,6 +7,10 @@ Gymnasium ids ``DiffIDM-v0`` and ``DiffIDM-Fit-v0``.
 from __future__ import annotations
 
 import importlib
+import os
+import signal
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -52,6 +56,19 @@ if TYPE_CHECKING:
     from idm_env.types import Command, Record, State
 
 
+def _end(number: int, frame: object) -> None:
+    os.write(2, b"interrupted.\n")
+    os._exit(130)
+
+
+def _end_quietly() -> None:
+    """Let Ctrl-C end the command ``idm-env`` in one line while imports run; ``cli`` takes over when work begins."""
+    name = sys.argv[0] if sys.argv else ""  # "-m" while python -m looks for its module
+    command = Path(name).stem == "idm-env" or (name == "-m" and "idm_env" in sys.orig_argv)
+    if command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end)
+
+
 def _register() -> None:
     """Register the environment ids; entry points are text, so that nothing heavy is imported here."""
     from gymnasium.envs.registration import register, registry
@@ -74,6 +91,7 @@ def _register() -> None:
         )
 
 
+_end_quietly()
 _register()
 
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import inspect
+import math
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+import idm_env
+from idm_env import checks, keep
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -25,12 +30,13 @@ app = typer.Typer(
     "speed_mps, length_m and run_id are used where present. Ctrl-C keeps what is done: add `--resume` to go on.",
 )
 console = Console(stderr=True)
+EXPLAINED = ("report.json", "report.html", "model.yaml")
+"""What ``explain`` writes."""
+PICTURES = (".png", ".svg", ".pdf")
 
 
 def _version(wanted: bool) -> None:
     if wanted:
-        import idm_env
-
         print(idm_env.__version__)
         raise typer.Exit
 
@@ -44,24 +50,62 @@ def _options(
     pass
 
 
+def _ranged(*names: str, help: str, low: float, high: float, unit: str = "") -> Any:
+    """Return an option whose number must lie in ``[low, high]``: all flags' numbers are checked here."""
+
+    def check(param: typer.CallbackParam, value: float | None) -> float | None:
+        if value is not None:
+            checks.within(param.opts[0], value, low, high, unit)
+        return value
+
+    return typer.Option(*names, help=help, callback=check)
+
+
 Data = Annotated[Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if missing.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
-RingLength = Annotated[float | None, typer.Option(help="Circumference (m), if the traffic runs on a ring.")]
+Seed = Annotated[int, _ranged(help="Seed of everything random.", low=0, high=1e9)]
+RingLength = Annotated[
+    float | None, _ranged(help="Circumference (m), if the traffic runs on a ring.", low=1.0, high=1e6, unit="m")
+]
 Place = Annotated[str | None, typer.Option(help="Column that names places, such as track_s_m on a lap.")]
 Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim or openacc.")]
-MaxGap = Annotated[float, typer.Option(help="Gaps above this (m) mean a lost leader and are left out.")]
-MinSeconds = Annotated[float, typer.Option(help="Shorter stretches behind one leader are left out (s).")]
+MaxGap = Annotated[
+    float,
+    _ranged(help="Gaps above this (m) mean a lost leader and are left out.", low=0.1, high=math.inf, unit="m"),
+]
+MinSeconds = Annotated[
+    float, _ranged(help="Shorter stretches behind one leader are left out (s).", low=0.0, high=1e6, unit="s")
+]
 Where = Annotated[str | None, typer.Option(help='Only runs or drivers with "column=value".')]
-Window = Annotated[float | None, typer.Option(help="Cut longer stretches into windows of so many seconds.")]
+Window = Annotated[
+    float | None, _ranged(help="Cut longer stretches into windows of so many seconds.", low=1.0, high=1e6, unit="s")
+]
 Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
-Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample, to this step (s).")]
+Step = Annotated[
+    float | None, _ranged("--dt", help="Use every n-th sample, to this step (s).", low=0.001, high=100.0, unit="s")
+]
+
+
+_stopped: list[int] = []
+"""Signals that have ended the work."""
+
+
+def _work_begins() -> None:
+    """Make Ctrl-C an exception, so that what is done is kept; while modules are imported it could crash them."""
+    if signal.getsignal(signal.SIGINT) is idm_env._end:
+        signal.signal(signal.SIGINT, _stop)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    _stopped.append(number)
+    raise KeyboardInterrupt
 
 
 @contextmanager
 def progress() -> Iterator[Callable[[str, int, int, float | str], None]]:
-    """Show a bar per phase on standard error."""
+    """Show a bar per phase on standard error; from here on Ctrl-C keeps what is done."""
+    _work_begins()
     columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TextColumn("{task.fields[value]}"), console=console, transient=False) as bars:
         tasks: dict[str, Any] = {}
@@ -99,9 +143,9 @@ def fit(
     loss: Annotated[str, typer.Option(help="rmse (mean over episodes) or mse (all samples alike).")] = "rmse",
     method: Annotated[str, typer.Option(help="lm (Levenberg-Marquardt) or adam (as in the paper).")] = "lm",
     integration: Annotated[str, typer.Option(help="ballistic, or euler as in the paper.")] = "ballistic",
-    starts: Annotated[int, typer.Option(help="Starts per group.", min=1)] = 4,
+    starts: Annotated[int, _ranged(help="Starts per group.", low=1, high=1000)] = 4,
     substeps: Annotated[
-        int | None, typer.Option(help="Simulated steps per sample; default: steps of 25 ms.", min=1)
+        int | None, _ranged(help="Simulated steps per sample; default: steps of 25 ms.", low=1, high=1000)
     ] = None,
     model: Corrected = None,
     seed: Seed = 0,
@@ -125,6 +169,7 @@ def fit(
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
+        checks.within("--held-out", share, 0.001, 0.999)
     options = Options(
         by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
     )  # fmt: skip
@@ -158,10 +203,12 @@ def explain(
     """
     from idm_env.data import load
 
-    trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
-    if where is not None:
-        trajectories = trajectories.where(where)
-    _explain(trajectories, out, by, _names(effects), _names(known) or (), seed, resume)
+    names, given = _names("--effects", effects), _names("--known", known) or ()
+    with keep.results(out, EXPLAINED, [data]):
+        trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
+        if where is not None:
+            trajectories = trajectories.where(where)
+        _explain(trajectories, out, by, names, given, seed, resume)
 
 
 def _explain(
@@ -176,9 +223,7 @@ def _explain(
     import json
 
     from idm_env.discovery import discover, write_report
-    from idm_env.report import output_folder
 
-    output_folder(out)
     with progress() as report:
         found = discover(
             trajectories,
@@ -200,8 +245,11 @@ def _explain(
     _done(out)
 
 
-def _names(text: str | None) -> tuple[str, ...] | None:
-    return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+def _names(option: str, text: str | None) -> tuple[str, ...] | None:
+    found = None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+    if found == ():
+        raise ValueError(f"{option} = {checks.shown(text)} names nothing. Give names by comma, or leave {option} out.")
+    return found
 
 
 @app.command()
@@ -210,23 +258,23 @@ def demo(
         Path | None, typer.Option(help="Your own file; default: generated data with a hidden effect.")
     ] = None,
     out: Out = Path("out/demo"),
-    seed: Annotated[int, typer.Option(help="Seed of the generated data.")] = 7,
+    seed: Annotated[int, _ranged(help="Seed of the generated data.", low=0, high=1e9)] = 7,
 ) -> None:
     """Show the main job: a platoon whose generator has an effect that the fitted model is not told of.
 
     The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
     """
     from idm_env.data import load, synthetic
-    from idm_env.report import output_folder
 
-    path = data
-    if path is None:
-        path = output_folder(out) / "platoon.csv"
-        made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
-        columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
-        made.table.select(columns).write_csv(path)
-        console.print(f"Ten runs of a leader and three followers: {path}")
-    _explain(load(path), out)
+    with keep.results(out, (*EXPLAINED, *(("platoon.csv",) if data is None else ())), [data]) as folder:
+        path = data
+        if path is None:
+            path = folder / "platoon.csv"
+            made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
+            columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
+            keep.write(path, made.table.select(columns).write_csv)
+            console.print(f"Ten runs of a leader and three followers: {path}")
+        _explain(load(path), out)
 
 
 @app.command()
@@ -280,13 +328,18 @@ def plot(
     ),
     where: Where = None,
     seconds: Annotated[
-        float, typer.Option(help="Length of a rollout, all vehicles left to their drivers (s).", min=0.1)
+        float,
+        _ranged(help="Length of a rollout, all vehicles left to their drivers (s).", low=0.1, high=1e5, unit="s"),
     ] = 300.0,
     seed: Seed = 0,
 ) -> None:
     """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout."""
     from idm_env.diagrams import space_time
 
+    if out.is_dir() or out.suffix.lower() not in PICTURES:
+        told = "is a folder" if out.is_dir() else "names no kind of picture"
+        raise ValueError(f"--out = {out} {told}. Give a file that ends in {', '.join(PICTURES)}.")
+    keep.not_an_input(out, [source])
     if source.suffix in (".yaml", ".yml"):
         figure = _rollout_figure(source, seconds, seed)
     else:
@@ -299,7 +352,7 @@ def plot(
         overlaid = f", {runs} runs on one axis (choose one with --where)" if runs > 1 else ""
         figure = space_time(trajectories, title=f"{source.name}{overlaid}")
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out)
+    keep.write(out, figure.savefig)
     console.print(f"Picture: [bold]{out.resolve()}[/bold]", soft_wrap=True)
 
 
@@ -359,7 +412,7 @@ def filter_(
 def reconstruct(
     data: Data,
     out: Out = Path("out/reconstruct"),
-    dt: Annotated[float, typer.Option(help="Step of the dense trajectories (s).")] = 0.1,
+    dt: Annotated[float, _ranged(help="Step of the dense trajectories (s).", low=0.01, high=2.0, unit="s")] = 0.1,
     recipe: Recipe = "default",
     fixed_parameters: FixedParameters = False,
     model: Corrected = None,
@@ -395,7 +448,7 @@ def predict(
 def bench(
     out: Out = Path("out/bench"),
     sizes: Annotated[str, typer.Option(help="Numbers of vehicles, by comma.")] = "2000,20000,200000,2000000",
-    rounds: Annotated[int, typer.Option(help="Interleaved rounds; minimum and median are reported.", min=1)] = 5,
+    rounds: Annotated[int, _ranged(help="Interleaved rounds; minimum and median are reported.", low=1, high=1000)] = 5,
     compiled: Annotated[bool, typer.Option(help="Include the step compiled by inductor.")] = True,
     peers: Annotated[bool, typer.Option(help="Include SUMO and HighwayEnv.")] = True,
     verbose: Annotated[bool, typer.Option("--verbose", help="Say which path ran, and why.")] = False,
@@ -403,15 +456,15 @@ def bench(
     """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine."""
     from idm_env.bench import run as measure
 
-    numbers = [int(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
+    numbers = [round(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
     measure(out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, verbose=verbose)
 
 
 def _number(option: str, text: str, wrong: str) -> float:
     try:
-        return float(text)
+        return checks.finite(option, float(text))
     except ValueError:
-        raise ValueError(f"{option} = {text!r} is {wrong}.") from None
+        raise ValueError(f"{option} = {checks.shown(text)} is {wrong}.") from None
 
 
 def _done(out: Path) -> None:
@@ -425,19 +478,29 @@ def run() -> None:
         if code == 130:
             _interrupted()
         sys.exit(code if isinstance(code, int) else 0)
-    except (KeyboardInterrupt, typer.Abort):
-        _interrupted()
-    except (ValueError, ImportError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(1)
     except Exception as error:
+        # A library may turn an interruption into an error of another kind; typer makes EOFError an Abort.
+        cause = error.__cause__ if isinstance(error, typer.Abort) else error
+        if _stopped or not isinstance(cause, Exception):
+            _interrupted()
+        if isinstance(cause, (ValueError, ImportError, OSError, EOFError, MemoryError)) or keep.full(cause):
+            _failed(cause)
         if not hasattr(error, "show"):
             raise
         error.show()  # a usage error: typer's own message, with the usage line
         sys.exit(getattr(error, "exit_code", 2))
+    except KeyboardInterrupt:
+        _interrupted()
 
 
-def _interrupted() -> None:
+def _failed(error: Exception) -> NoReturn:
+    """End with one line that says what is wrong, never longer than a terminal can take."""
+    text = " ".join((keep.full(error) or str(error) or type(error).__name__).split())
+    print(f"error: {text if len(text) <= 1000 else text[:1000] + ' …'}", file=sys.stderr)
+    sys.exit(1)
+
+
+def _interrupted() -> NoReturn:
     """End after Ctrl-C; only some commands are long enough to go on with."""
     commands = {c.name or c.callback.__name__: c.callback for c in app.registered_commands if c.callback}
     command = commands.get(sys.argv[1]) if len(sys.argv) > 1 else None

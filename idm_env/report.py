@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import platform
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,6 +12,8 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from idm_env.keep import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -158,32 +159,18 @@ def write_page(path: Path, title: str, blocks: Iterable[Block]) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON; NaN and infinities, which JSON does not have, become null."""
-    write_text(path, json.dumps(_finite(content), indent=1, ensure_ascii=False) + "\n")
+    write_text(path, json.dumps(plain(content), indent=1, ensure_ascii=False) + "\n")
 
 
-def _finite(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: NaN and infinities are null."""
     if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, float) and not abs(value) < float("inf"):
         return None
     return value
-
-
-def write_text(path: Path, content: str) -> None:
-    """Write a file in one piece: whoever is killed in between leaves the old one."""
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(content, encoding="utf-8")
-    os.replace(beside, path)
-
-
-def output_folder(out: Path) -> Path:
-    """Return ``out`` as a folder that exists; ValueError if a file is in the way."""
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file. Give --out a folder.")
-    out.mkdir(parents=True, exist_ok=True)
-    return out
 
 
 def versions() -> dict[str, str]:

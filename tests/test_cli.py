@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from idm_env import keep
 from idm_env.data import synthetic
 
 
@@ -128,13 +129,14 @@ def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
             [sys.executable, "-m", "idm_env", "fit", str(path), *options, str(out)], stderr=subprocess.PIPE, text=True
         )
         deadline = time.monotonic() + 120
-        while not (out / "fit.resume.pt").exists() and running.poll() is None and time.monotonic() < deadline:
+        kept = out / keep.UNFINISHED / "fit" / "adam.kept"
+        while not kept.exists() and running.poll() is None and time.monotonic() < deadline:
             time.sleep(0.01)
         os.kill(running.pid, number)
         _, words = running.communicate(timeout=60)
         if number == signal.SIGINT:
             assert running.returncode == 130 and "--resume" in words
-        assert (out / "fit.resume.pt").exists()
+        assert kept.exists()
         assert call("fit", path, *options, out, "--resume").returncode == 0
         whole, resumed = (pl.read_parquet(folder / "parameters.parquet") for folder in (tmp_path / "whole", out))
         assert whole.equals(resumed)

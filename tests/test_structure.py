@@ -14,17 +14,20 @@ PACKAGE = ROOT / "idm_env"
 
 ALLOWED = {
     "types": set(),
-    "parameters": {"types"},
-    "effects": {"types", "parameters"},
+    "checks": set(),
+    "keep": set(),
+    "parameters": {"types", "checks"},
+    "effects": {"types", "parameters", "checks"},
     "roads": {"types"},
     "kernels": {"types", "parameters", "effects", "roads", "simulator"},
-    "simulator": {"types", "parameters", "effects", "roads", "kernels", "compiled"},
+    "simulator": {"types", "parameters", "checks", "effects", "roads", "kernels", "compiled"},
     "compiled": {"types", "parameters", "simulator"},
-    "report": set(),
-    "config": {"types", "parameters", "effects", "roads", "simulator"},
+    "report": {"keep"},
+    "config": {"types", "parameters", "checks", "effects", "roads", "simulator", "keep"},
     "data": set(),
     "fitting": {
         "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "report", "metrics",
+        "checks", "keep",
     },
 }  # fmt: skip
 """What a part may import of the package; parts that are not named may import anything but what FORBIDDEN says."""

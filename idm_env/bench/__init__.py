@@ -14,11 +14,12 @@ from typing import Any
 
 import torch
 
-from idm_env import kernels
+from idm_env import keep, kernels
 from idm_env.bench import fits, memory, peers, traffic
 from idm_env.bench.measure import Case, machine, measure
 from idm_env.kernels import dispatch
 
+OUTPUT = ("performance.json", "performance.png")
 SIZES = (2_000, 20_000, 200_000, 2_000_000)
 BYTES = 4 * (3 + 6 + 4)
 """What one step of one vehicle has to read (state, parameters) and write (state, acceleration) in float32."""
@@ -45,6 +46,9 @@ def run(
     for size in sizes:
         if size <= 0 or size % traffic.LANE:
             raise ValueError(f"size {size} is no multiple of {traffic.LANE}, the length of a lane. Take {SIZES}.")
+    if out is not None:
+        with keep.results(out, OUTPUT):  # what is in the way is told before anything is measured
+            pass
     threads = torch.get_num_threads()
     result: dict[str, Any] = {"machine": machine(), "physics": " ".join((traffic.__doc__ or "").split())}
     say(f"{result['machine']}")
@@ -69,10 +73,9 @@ def run(
     if out is not None:
         from idm_env.bench.picture import draw
 
-        folder = Path(out)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "performance.json").write_text(json.dumps(result, indent=1))
-        draw(result, folder / "performance.png")
+        with keep.results(out, OUTPUT) as folder:
+            keep.write_text(folder / "performance.json", json.dumps(result, indent=1))
+            keep.write(folder / "performance.png", lambda beside: draw(result, beside))
     return result
 
 

@@ -118,13 +118,15 @@ def read_json(path: str | Path) -> Scenario:
     try:
         with opener(path, "rt", encoding="utf-8") as file:
             content = json.load(file)
-    except (OSError, EOFError, ValueError) as error:
+    except (OSError, EOFError, ValueError, RecursionError) as error:
         raise DataError(f"{path.name} cannot be read ({str(error)[:120]}); is it complete JSON?") from None
     if not isinstance(content, dict) or not content.get("objects"):
         raise DataError(f"{path.name} has no 'objects'; it must be a scenario in the layout of Nocturne or GPUDrive.")
     try:
         return _scenario(content, path.name)
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        if isinstance(error, DataError):
+            raise
         text = f"{path.name} lacks what a scenario needs ({type(error).__name__}: {error}); is it in Nocturne's layout?"
         raise DataError(text) from None
 

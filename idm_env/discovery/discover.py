@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from idm_env import keep
+from idm_env.checks import nearest
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
-from idm_env.discovery import checkpoint, judge, places, records, search, summary
+from idm_env.discovery import judge, places, records, search, summary
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.decide import Round, decide
@@ -22,7 +24,6 @@ from idm_env.discovery.records import Records
 from idm_env.discovery.search import OnProgress, Search
 from idm_env.discovery.solve import NAMES, Solution, Task
 from idm_env.effects import CANDIDATES, IDM, Brakes
-from idm_env.parameters import nearest
 
 
 @dataclass(eq=False)
@@ -88,10 +89,9 @@ def discover(
     names = [n for n in names if n not in known]
     fit_runs, kept_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-    mark = checkpoint.fingerprint(prepared, names, tuple(known), seed, located, lockbox)
-    saved = checkpoint.Checkpoint(None if out is None else out / "discovery.npz", mark, resume)
+    options = (names, tuple(known), seed, located, lockbox)
+    mark = keep.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
+    saved = keep.Store(None if out is None else out / keep.UNFINISHED / "explain", mark, resume)
     task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
     searching = Search(task, names, located and effects is None, saved, progress)
     progress("calibration", "idm", 0, 1)
@@ -100,7 +100,7 @@ def discover(
     base = Model(tuple(_known_terms(prepared, known, trajectories)))
     null = searching.null(base, theta)
     null, steps, rounds = decide(searching, null, seed)
-    saved.done()
+    saved.remove()
     discovery = _finish(
         trajectories,
         prepared,

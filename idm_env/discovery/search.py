@@ -6,16 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 
 from idm_env.discovery import model as terms
 from idm_env.discovery import noise as noises
 from idm_env.discovery import places
-from idm_env.discovery.checkpoint import Checkpoint
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out
 from idm_env.discovery.solve import NAMES, Prior, Solution, Task, centred, finish, linearise, solve, with_noise
 from idm_env.effects import IDM
+from idm_env.keep import Store
 
 OnProgress = Callable[[str, str, int, int], None]
 """Called with the stage, the current candidate, candidates done and candidates in all."""
@@ -44,7 +45,7 @@ class Search:
     task: Task
     names: Sequence[str]
     located: bool
-    saved: Checkpoint
+    saved: Store
     on_progress: OnProgress
     base: Model = field(default_factory=Model)
 
@@ -115,16 +116,17 @@ class Search:
         model = solution.model.adding(term)
         kept = self.saved.get(key)
         if kept is not None:
-            theta, values = kept["theta"], kept["values"]
+            theta, values = kept["theta"].numpy(), kept["values"].numpy()
             task = centred(self.task, theta)
             linear = linearise(task, model, theta, values)
-            best = finish(task, model, theta, values, linear, float(kept["cost"]))
+            best = finish(task, model, theta, values, linear, kept["cost"])
         else:
             starts = starts or [np.append(solution.values, s) for s in term.starts]
             first = [solve(self.task, model, solution.theta, s, iterations=5) for s in starts]
             best = min(first, key=lambda s: s.cost)
             best = solve(self.task, model, best.theta, best.values, iterations=iterations)
-            self.saved.put(key, theta=best.theta, values=best.values, cost=np.array(best.cost))
+            arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
+            self.saved.put(key, {**arrays, "cost": float(best.cost)})
         gains = 0.5 * np.log(before / held_out(self.task, best))
         return Scored(term, best, gains)
 

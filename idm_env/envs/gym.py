@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from idm_env.envs.batch import Batch, Outcome
-from idm_env.envs.settings import RENDER_MODES, settings
+from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_box, action_tensor, observation_box
 from idm_env.types import Params, State
 
@@ -56,11 +56,12 @@ class DiffIDMEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for ``seed`` and ``options``."""
+        given = reset_options(options, ("state",))
         super().reset(seed=seed)
         if seed is not None or self.batch.world is None:
             # Without any seed the one that Gymnasium draws from the operating system is used.
             self.batch.seed([0], [self.np_random_seed if seed is None else seed])
-        observation = self.batch.reset(state=(options or {}).get("state"))
+        observation = self.batch.reset(state=given.get("state"))
         if self.render_mode == "human":
             self.render()
         return self._out(observation), {}

@@ -17,6 +17,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
+from idm_env.checks import shown
 from idm_env.envs.batch import Batch
 from idm_env.envs.settings import RENDER_MODES, settings
 from idm_env.envs.spaces import action_box, numpy_dtype, observation_box
@@ -73,7 +74,10 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise."""
+        """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise.
+
+        There are no options; PettingZoo's own tests give some, so they are left aside without a word.
+        """
         if seed is not None or self.batch.world is None:
             self.batch.seed([0], [seeding.np_random(seed)[1]])
         self.batch.limit = min((x for x in (self.max_cycles, self.task.horizon) if x is not None), default=None)
@@ -112,10 +116,10 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     def _action(self, agent: str, actions: dict[str, np.ndarray]) -> float:
         if agent not in actions:
             raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
-        action = np.asarray(actions[agent], dtype=float)
-        if action.shape != (1,) or not np.isfinite(action).all():
+        action = np.asarray(actions[agent])
+        if action.shape != (1,) or action.dtype.kind not in "fiu" or not np.isfinite(action).all():
             raise ValueError(
-                f"action of '{agent}' = {actions[agent]!r} must be one finite number, as an array of shape (1,)."
+                f"action of '{agent}' = {shown(actions[agent])} must be one finite number, as an array of shape (1,)."
             )
         return float(action[0])
 

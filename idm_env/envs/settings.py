@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 import torch
 from gymnasium.vector import AutoresetMode
 
+from idm_env.checks import nearest, one_of, shown
 from idm_env.config import load_environment
-from idm_env.parameters import nearest
 from idm_env.tasks import Task, make_task
 
 OUTPUTS = ("numpy", "torch")
@@ -26,6 +28,8 @@ KEYWORDS = (
     "max_episode_steps",
     "num_envs",
 )
+TENSORS, SPACES, ROW_BYTES = 25, 8, 400
+"""Memory of one environment: tensors per vehicle, arrays per observed feature, and bytes besides, as measured."""
 _MODES = {"NextStep": AutoresetMode.NEXT_STEP, "SameStep": AutoresetMode.SAME_STEP, "Disabled": AutoresetMode.DISABLED}
 
 
@@ -88,27 +92,21 @@ def settings(
         )
     return Settings(
         task=chosen if isinstance(chosen, Task) else make_task(cast(str, chosen), others=KEYWORDS, **choices),
-        output=cast(Any, _one_of("output", own["output"] or "numpy", OUTPUTS)),
+        output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),
         device=_device(own["device"] or "cpu"),
-        dtype=DTYPES[_one_of("dtype", own["dtype"] or "float32", DTYPES)],
+        dtype=DTYPES[one_of("dtype", own["dtype"] or "float32", DTYPES)],
         autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.NEXT_STEP),
-        render_mode=None if own["render_mode"] is None else _one_of("render_mode", own["render_mode"], RENDER_MODES),
+        render_mode=None if own["render_mode"] is None else one_of("render_mode", own["render_mode"], RENDER_MODES),
         limit=_limit(own["max_episode_steps"]),
     )
-
-
-def _one_of(name: str, value: Any, known: Any) -> str:
-    if value not in known:
-        raise ValueError(f"{name} = {value!r} is unknown.{nearest(str(value), known)}")
-    return str(value)
 
 
 def _mode(value: Any) -> AutoresetMode:
     if isinstance(value, AutoresetMode):
         return value
     spelled = {**_MODES, **{mode.value: mode for mode in AutoresetMode}, **{mode.name: mode for mode in AutoresetMode}}
-    if value not in spelled:
-        raise ValueError(f"autoreset_mode = {value!r} is unknown.{nearest(str(value), _MODES)}")
+    if not isinstance(value, str) or value not in spelled:
+        raise ValueError(f"autoreset_mode = {shown(value)} is unknown.{nearest(shown(value), _MODES)}")
     return spelled[value]
 
 
@@ -118,7 +116,7 @@ def _device(value: Any) -> torch.device:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, TypeError):
         known = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-        raise ValueError(f"device = {value!r} is unknown or not there. Available: {', '.join(known)}.") from None
+        raise ValueError(f"device = {shown(value)} is unknown or not there. Available: {', '.join(known)}.") from None
     return device
 
 
@@ -126,5 +124,35 @@ def _limit(value: Any) -> int | None:
     if value is None or value == -1:
         return None
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"max_episode_steps = {value!r} must be a whole number of at least 1, or -1 for no limit.")
+        raise ValueError(
+            f"max_episode_steps = {shown(value)} must be a whole number of at least 1, or -1 for no limit."
+        )
     return value
+
+
+def reset_options(options: Any, known: tuple[str, ...]) -> dict[str, Any]:
+    """Return the options of a reset; ValueError for one that does not exist."""
+    if options is None:
+        return {}
+    if not isinstance(options, dict):
+        raise ValueError(f"options = {shown(options)} must be a mapping, such as {{'state': state}}.")
+    for name in options:
+        if name not in known:
+            raise ValueError(f"unknown reset option {shown(name)}.{nearest(str(name), known)}")
+    return options
+
+
+def affordable(made: Settings, count: int) -> None:
+    """Raise ValueError where ``count`` environments would need more memory than the device has."""
+    task, size = made.task, made.dtype.itemsize
+    features = len(task.bounds.names) * len(task.agents)
+    needed = count * (size * (TENSORS * task.vehicles + SPACES * features) + ROW_BYTES)
+    if made.device.type == "cuda":
+        there = torch.cuda.get_device_properties(made.device).total_memory
+    else:
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else sys.maxsize
+    if needed > there:
+        raise ValueError(
+            f"num_envs = {count} would take about {needed / 1e9:,.0f} GB, and {made.device} has {there / 1e9:,.0f} GB. "
+            f"Take at most {int(count * there / needed / 2)}."
+        )

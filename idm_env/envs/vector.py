@@ -13,11 +13,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from idm_env.checks import shown, whole
 from idm_env.envs.batch import Batch
 from idm_env.envs.gym import single_ends
-from idm_env.envs.settings import RENDER_MODES, settings
+from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
 from idm_env.envs.spaces import action_box, action_tensor, observation_box
-from idm_env.tasks.checks import whole
 from idm_env.types import Params, State
 
 LIMIT = 3000
@@ -52,6 +52,7 @@ class DiffIDMVectorEnv(VectorEnv):
         self.settings = made
         self.task = made.task
         self.num_envs = whole("num_envs", num_envs, 1)
+        affordable(made, num_envs)
         self.render_mode = made.render_mode
         self.metadata = {
             **type(self).metadata,
@@ -79,9 +80,10 @@ class DiffIDMVectorEnv(VectorEnv):
         A number seeds environment i with ``seed + i``; a sequence gives every one its own. ``options["state"]`` is a
         ``State`` to start from, one row per environment that is reset.
         """
-        rows = self._masked((options or {}).get("reset_mask"))
+        given = reset_options(options, ("state", "reset_mask"))
+        rows = self._masked(given.get("reset_mask"))
         self._seed(seed, rows)
-        observation = self.batch.reset(rows, (options or {}).get("state"))
+        observation = self.batch.reset(rows, given.get("state"))
         self._ended[rows] = False
         if self.render_mode == "human":
             self.render()
@@ -93,7 +95,7 @@ class DiffIDMVectorEnv(VectorEnv):
         mask = mask.cpu().numpy() if isinstance(mask, Tensor) else mask
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ValueError(
-                f"options['reset_mask'] = {mask!r} must be a bool array of shape ({self.num_envs},) with at "
+                f"options['reset_mask'] = {shown(mask)} must be a bool array of shape ({self.num_envs},) with at "
                 f"least one True."
             )
         if self.batch.world is None and not mask.all():

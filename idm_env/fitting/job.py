@@ -10,6 +10,7 @@ from typing import Any
 import polars as pl
 import torch
 
+from idm_env import keep
 from idm_env import report as page
 from idm_env.config import Model, Numbers, load_model, save_model
 from idm_env.data import LEADER_LOST_GAP_M, DataError, Episodes, Trajectories, episodes, load
@@ -21,6 +22,10 @@ from idm_env.fitting.fit import Fit, Method, OnProgress, base_simulator, fit
 from idm_env.fitting.problem import Loss, Objective, Problem, Simulated, group_of
 from idm_env.roads import Lane
 from idm_env.simulator import Integration, Simulator
+
+FITTED = ("parameters.parquet", "model.yaml", "report.json", "report.html")
+SIMULATED = ("simulated.parquet", "report.json", "report.html")
+"""What ``fit_file`` and ``simulate_file`` write."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,13 @@ def fit_file(
     otherwise with those of a pooled fit of the fitting runs. DataError and ValueError for what cannot be read or
     fitted.
     """
-    page.output_folder(out)
+    with keep.results(out, FITTED, (source.path, options.model)):
+        return _fit_file(source, options, out, resume, on_progress)
+
+
+def _fit_file(
+    source: Source, options: Options, out: Path, resume: bool, on_progress: OnProgress | None
+) -> dict[str, Any]:
     trajectories = source.trajectories()
     fitting, held = trajectories, None
     if options.held_out is not None:
@@ -113,10 +124,11 @@ def fit_file(
         return fit(
             chosen, by=by, simulator=simulator, objective=options.objective, relative=options.relative,
             loss=options.loss, method=options.method, starts=options.starts, seed=options.seed,
-            substeps=options.substeps, fixed=kept, checkpoint=out / checkpoint, resume=resume, on_progress=on_progress,
+            substeps=options.substeps, fixed=kept, checkpoint=out / keep.UNFINISHED / checkpoint, resume=resume,
+            on_progress=on_progress,
         )  # fmt: skip
 
-    found = run(options.by, "fit.resume.pt")
+    found = run(options.by, "fit")
     error, simulated = errors(found.problem, found.own, found.shared)
     result: dict[str, Any] = {
         "schema": 1,
@@ -134,9 +146,9 @@ def fit_file(
         "versions": page.versions(),
     }
     if held is not None:
-        pooled = found if options.by == "all" else run("all", "pooled.resume.pt")
+        pooled = found if options.by == "all" else run("all", "pooled")
         result["held_out"] = _held_out(source, options, held, found, pooled)
-    pl.DataFrame(result["parameters"]).write_parquet(out / "parameters.parquet")
+    keep.write(out / "parameters.parquet", pl.DataFrame(result["parameters"]).write_parquet)
     save_model(out / "model.yaml", dataclasses.replace(model_of(found, options.by), substeps=options.substeps))
     page.write_json(out / "report.json", result)
     page.write_page(
@@ -236,7 +248,11 @@ def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0)
     A driver takes the parameters of ``drivers`` whose key is his, by the model's ``by``, otherwise the model's own.
     Noise is drawn with ``seed``.
     """
-    page.output_folder(out)
+    with keep.results(out, SIMULATED, (source.path, model_path)):
+        return _simulate_file(source, model_path, out, seed)
+
+
+def _simulate_file(source: Source, model_path: Path, out: Path, seed: int) -> dict[str, Any]:
     model = load_model(model_path)
     trajectories = source.trajectories()
     items = source.episodes(trajectories)
@@ -244,7 +260,7 @@ def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0)
     with torch.no_grad():
         error, simulated = errors(problem, values, torch.zeros(0, dtype=values.dtype))
     tables = [_simulated_table(problem, simulated, row) for row in range(len(items))]
-    pl.concat(tables).write_parquet(out / "simulated.parquet")
+    keep.write(out / "simulated.parquet", pl.concat(tables).write_parquet)
     result = {
         "schema": 1,
         "command": page.command_line(),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from idm_env import keep
 from idm_env import report as page
 from idm_env.data import DataError
 from idm_env.data.womd import Scenario, scenarios
@@ -24,6 +24,7 @@ from idm_env.prediction.scene import Scene
 OnProgress = Callable[[int, int], None]
 """Called with files done and files in all."""
 OURS = "drivers on routes"
+OUTPUT = ("predictions.parquet", "parameters.parquet", "report.json", "report.html")
 MOST_PICTURES = 24
 SCHEMA = {
     "scenario_id": pl.String, "agent_id": pl.Int64, "kind": pl.String, "source": pl.String, "future": pl.Int32,
@@ -57,9 +58,15 @@ def predict_files(
     Raises:
         DataError: If no file holds a scenario that can be used, or ``resume`` finds a run on other files or settings.
     """
-    out = page.output_folder(Path(out))
     files = [Path(path) for path in paths]
-    parts = Parts(out, _fingerprint(files, baselines), resume)
+    with keep.results(out, OUTPUT, files) as folder:
+        return _predict_files(files, folder, baselines, resume, on_progress)
+
+
+def _predict_files(
+    files: Sequence[Path], out: Path, baselines: bool, resume: bool, on_progress: OnProgress | None
+) -> dict[str, Any]:
+    parts = Parts(out / keep.UNFINISHED / "predict", _fingerprint(files, baselines), resume)
     for number, path in enumerate(files):
         if not parts.done(number):
             _file(parts, number, path, [name for name in available() if baselines or name == OURS])
@@ -82,7 +89,7 @@ def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
     stats = [
         (path.name, path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else path.name for path in files
     ]
-    return hashlib.sha256(repr((stats, baselines)).encode()).hexdigest()
+    return keep.fingerprint(stats, baselines)
 
 
 def _file(parts: Parts, number: int, path: Path, methods: Sequence[str]) -> None:
@@ -112,8 +119,8 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str]) -> None
             if len(pictures) < MOST_PICTURES:
                 block = page.picture(*scene_picture(scenario, ours))
                 pictures.append({"text": block.text, "image": block.image})
-    pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]).write_parquet(parts.path(number, "predictions"))
-    pl.DataFrame(rows, schema=PARAMETERS).write_parquet(parts.path(number, "parameters"))
+    parts.write(number, "predictions", pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]))
+    parts.write(number, "parameters", pl.DataFrame(rows, schema=PARAMETERS))
     parts.finish(
         number,
         {

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-from idm_env.parameters import nearest
+from idm_env.checks import nearest, shown
 from idm_env.tasks.base import Advance, Bounds, Ended, Task, World
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.platoon import PlatoonTask
@@ -22,12 +22,12 @@ def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any)
 
     ``others`` are keywords that the caller takes himself: they are suggested too.
     """
-    if task not in TASKS:
-        raise ValueError(f"unknown task {task!r}.{nearest(str(task), TASKS)}")
+    if not isinstance(task, str) or task not in TASKS:
+        raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), TASKS)}")
     known = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]
     for choice in choices:
         if choice not in known:
-            raise ValueError(f"task '{task}' has no keyword '{choice}'.{nearest(choice, [*known, *others])}")
+            raise ValueError(f"task '{task}' has no keyword {shown(choice)}.{nearest(str(choice), [*known, *others])}")
     return TASKS[task](**choices)
 
 

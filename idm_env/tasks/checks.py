@@ -1,44 +1,23 @@
-"""Checks of keyword arguments: one line that names the value, the rule and the cure."""
+"""Checks of tasks' keyword arguments: one line that names the value, the rule and the cure."""
 
 from __future__ import annotations
 
-import math
-import numbers
 from collections.abc import Sequence
 from typing import Any
 
+from idm_env.checks import at_least, shown, whole
 
-def whole(name: str, value: Any, low: int) -> int:
-    """Return a whole number of at least ``low``."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-        raise ValueError(f"{name} = {value!r} must be a whole number.")
-    if value < low:
-        raise ValueError(f"{name} = {value} must be at least {low}.")
-    return int(value)
-
-
-def finite(name: str, value: Any, unit: str = "") -> float:
-    """Return a finite number."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
-        raise ValueError(f"{name} = {value!r} must be a finite number{' of ' + unit if unit else ''}.")
-    return float(value)
-
-
-def at_least(name: str, value: Any, low: float, unit: str = "") -> float:
-    """Return a finite number of at least ``low``."""
-    if finite(name, value, unit) < low:
-        raise ValueError(f"{name} = {value:g}{' ' + unit if unit else ''} must be at least {low:g}.")
-    return float(value)
+__all__ = ["agents_of", "at_least", "span", "whole"]
 
 
 def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
     """Return a range from one number or from ``[lowest, highest]``."""
     ends = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value, value]
     if len(ends) != 2:
-        raise ValueError(f"{name} = {value!r} must be one number or [lowest, highest] ({unit}).")
+        raise ValueError(f"{name} = {shown(value)} must be one number or [lowest, highest] ({unit}).")
     first, last = (at_least(name, end, low, unit) for end in ends)
     if first > last:
-        raise ValueError(f"{name} = {value!r} must rise: write [{last:g}, {first:g}] ({unit}).")
+        raise ValueError(f"{name} = {shown(value)} must rise: write [{last:g}, {first:g}] ({unit}).")
     return first, last
 
 

@@ -89,8 +89,8 @@ def done(
         motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in tracks]
         tallies[name] = _tally(motions, tracks, time.perf_counter() - begin)
     total, new = overlaps(filtered, recent)
-    _table(filtered).write_parquet(parts.path(number, TRAJECTORIES))
-    pl.DataFrame(rows, schema=PARAMETER_SCHEMA).write_parquet(parts.path(number, PARAMETERS))
+    parts.write(number, TRAJECTORIES, _table(filtered))
+    parts.write(number, PARAMETERS, pl.DataFrame(rows, schema=PARAMETER_SCHEMA))
     parts.finish(
         number,
         {

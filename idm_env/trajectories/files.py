@@ -7,7 +7,6 @@ on disk (``parts.py``), and the parts are joined at the end without being read a
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -17,9 +16,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from idm_env import keep
 from idm_env.data import DataError
 from idm_env.parts import Parts
-from idm_env.report import output_folder, versions
+from idm_env.report import versions
 from idm_env.trajectories import chunks, paper
 from idm_env.trajectories.chunks import CHUNK, OURS, PARAMETERS, TRAJECTORIES, Plan, Recipe, Settings
 from idm_env.trajectories.noise import fit_noise, is_dense
@@ -32,6 +32,7 @@ from idm_env.trajectories.tracks import Pieces, Track
 
 OnProgress = Callable[[int, int], None]
 """Called with vehicles done and vehicles in all."""
+OUTPUT = ("trajectories.parquet", "parameters.parquet", "report.json", "report.html")
 SAMPLED = 64
 """Vehicles that noise and step are taken from."""
 SHOWN = 4
@@ -103,8 +104,15 @@ def run(
     if settings.recipe not in OURS:
         raise DataError(f"recipe = {settings.recipe!r} is unknown; use 'default' or 'paper'.")
     _compile()
-    out = output_folder(Path(out))
-    parts = Parts(out, _fingerprint(Path(path), settings, layout), resume)
+    with keep.results(out, OUTPUT, (path, settings.model)) as folder:
+        return _run(Path(path), folder, settings, layout, resume, on_progress)
+
+
+def _run(
+    path: Path, out: Path, settings: Settings, layout: str, resume: bool, on_progress: OnProgress | None
+) -> dict[str, Any]:  # fmt: skip
+    model = None if settings.model is None else Path(settings.model)
+    parts = Parts(out / keep.UNFINISHED / settings.task, keep.fingerprint(settings, layout, path, model), resume)
     try:
         spool = Spool(path, parts.folder / "spool", layout, settings.chunk)
         bridge = 2.0 if settings.task == "filter" else None
@@ -142,16 +150,6 @@ def _compile() -> None:
     track = Track("", "", 0, time_s, 10.0 * time_s, 4.5, nobody, np.full(len(time_s), -1))
     recipe([track], 0.1, fit_noise([(time_s, track.position_m)], 0.1, evaluations=2))
     paper.imitate(track, iterations=1)
-
-
-def _fingerprint(path: Path, settings: Settings, layout: str) -> str:
-    """Return a digest of the file's bytes, where there is a file, and of what is done to them."""
-    digest = hashlib.sha256(repr((settings, layout)).encode())
-    if path.is_file():
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
 
 
 def _plan(spool: Spool, settings: Settings, bridge: float | None) -> Plan:

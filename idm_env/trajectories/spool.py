@@ -13,6 +13,7 @@ from pathlib import Path
 
 import polars as pl
 
+from idm_env import keep
 from idm_env.data import DataError, Repair
 from idm_env.data.clean import check_columns, identifiers, natural, numbers
 from idm_env.data.load import batches
@@ -119,7 +120,7 @@ class Spool:
             kept = kept.select(pl.col(name) for name in KEPT if name in kept.columns)
             # derived leaders wait for _led: the vehicle ahead may be in another piece
             waits = "leader_id" not in kept.columns and "lane" in kept.columns
-            (kept if waits else with_leaders(kept)).write_parquet(files[-1])
+            keep.write(files[-1], (kept if waits else with_leaders(kept)).write_parquet)
             index = _indexed(index, kept)
         if index is None:
             raise DataError(
@@ -149,7 +150,7 @@ class Spool:
             frame, repairs = prepared(pl.read_parquet(files, missing_columns="insert"))
             self._counted.add(repairs)
             led.append(self.folder / f"led-{number:05d}.parquet")
-            with_leaders(frame).write_parquet(led[-1])
+            keep.write(led[-1], with_leaders(frame).write_parquet)
             _remove(files)
         return led
 
@@ -167,7 +168,7 @@ class Spool:
                 frame = frame.join(index.select(*KEY, "number"), on=KEY, how="left", maintain_order="left")
             frame = frame.with_columns(bucket.cast(pl.Int64).alias("bucket"))
             for (key,), part in frame.partition_by("bucket", as_dict=True, include_key=False).items():
-                part.write_parquet(self.folder / f"{name}-{key:03d}-{n:05d}.parquet")
+                keep.write(self.folder / f"{name}-{key:03d}-{n:05d}.parquet", part.write_parquet)
             path.unlink()
         return self.folder
 

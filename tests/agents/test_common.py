@@ -234,6 +234,22 @@ def test_the_command_line_tells_in_one_line(module, arguments, words, tmp_path):
     assert words in str(told.value) and "\n" not in str(told.value)
 
 
+def test_a_training_overwrites_neither_its_configuration_nor_what_no_agent_wrote(tmp_path):
+    config = tmp_path / "agent.yaml"
+    config.write_text("configures: agent\nagent: apg\n")
+    (tmp_path / "run").mkdir()
+    last = tmp_path / "run" / "last.pt"
+    last.symlink_to(config)
+    given = ["--config", str(config), "--out", str(tmp_path / "run")]
+    with pytest.raises(ValueError, match="is an input, and"):
+        common.parse(apg.Arguments, "apg", given)
+    last.unlink()
+    last.write_text("mine")
+    with pytest.raises(ValueError, match="is not a checkpoint of an agent, or is broken"):
+        common.parse(apg.Arguments, "apg", given)
+    assert last.read_text() == "mine" and config.read_text().startswith("configures")
+
+
 def test_an_interruption_says_how_to_go_on(capsys):
     def train(arguments):
         raise KeyboardInterrupt

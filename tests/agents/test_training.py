@@ -65,6 +65,19 @@ def test_apg_resumes_exactly(quick, tmp_path):
     assert same(weights(tmp_path / "whole" / "last.pt"), weights(whole.out / "last.pt"))
 
 
+@pytest.mark.parametrize("file", ["model.zip", "returns.pkl"])
+def test_a_broken_file_of_stable_baselines3_is_one_line(file, quick):
+    module, kind, small = AGENTS["ppo"]
+    begun = kind(**quick, **{**small, "cpu_seconds": 1e-9})
+    module.train(begun)
+    path = begun.out / file
+    for broken in (b"", b"garbage", path.read_bytes()[:-30]):
+        path.write_bytes(broken)
+        with pytest.raises(ValueError, match=rf"{file} is broken .*Leave out --resume") as told:
+            module.train(dataclasses.replace(begun, resume=True))
+        assert "\n" not in str(told.value)
+
+
 def test_sac_resumes_with_its_memory(quick):
     module, kind, small = AGENTS["sac"]
     whole = kind(**quick, **small)

@@ -12,6 +12,7 @@ import torch
 from idm_env.config import load_model
 from idm_env.data import Trajectories, synthetic
 from idm_env.discovery import Discovery, discover, write_report
+from idm_env.keep import UNFINISHED
 from idm_env.roads import Lane
 
 FEW = ("lag", "leader_acceleration", "drag", "grade", "speed_zone", "regime_shift")
@@ -96,10 +97,10 @@ def test_an_interrupted_search_goes_on(tmp_path: Path) -> None:
     trajectories = data("leader_acceleration", runs=6)
     with pytest.raises(KeyboardInterrupt):
         discover(trajectories, effects=FEW, out=tmp_path, on_progress=stop)
-    assert seen[-1] == "drag" and (tmp_path / "discovery.npz").exists()
+    assert seen[-1] == "drag" and (tmp_path / UNFINISHED).exists()
     resumed = discover(trajectories, effects=FEW, out=tmp_path, resume=True)
     fresh = discover(trajectories, effects=FEW)
-    assert not (tmp_path / "discovery.npz").exists()
+    assert not (tmp_path / UNFINISHED).exists()
     assert resumed.report["verdict"] == fresh.report["verdict"]
     assert resumed.values == pytest.approx(fresh.values, rel=1e-6)
     with pytest.raises(KeyboardInterrupt):

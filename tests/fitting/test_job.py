@@ -10,7 +10,7 @@ import pytest
 
 from idm_env.config import load_model
 from idm_env.data import synthetic
-from idm_env.fitting.job import Options, Source, fit_file, simulate_file
+from idm_env.fitting.job import FITTED, Options, Source, fit_file, simulate_file
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_fit_writes_parameters_model_and_reports(file: Path, tmp_path: Path) -> 
     before = file.read_bytes()
     result = fit_file(Source(file, smooth=True), Options(starts=2, held_out=0.25), tmp_path)
     assert file.read_bytes() == before
-    assert {p.name for p in tmp_path.iterdir()} == {"parameters.parquet", "model.yaml", "report.json", "report.html"}
+    assert {p.name for p in tmp_path.iterdir()} == {*FITTED, "run.json"}
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["fit"]["gap_rmse_m"] == pytest.approx(result["fit"]["gap_rmse_m"])
     assert report["fit"]["gap_rmse_m"] < 0.3

@@ -11,6 +11,7 @@ import pytest
 
 from idm_env.data import DataError
 from idm_env.data.womd import Control, Scenario, read_json, scenarios
+from idm_env.keep import UNFINISHED
 from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
 from idm_env.prediction.files import case_of, predict_files
 from idm_env.prediction.lanes import LaneGraph, Route
@@ -262,7 +263,7 @@ def test_files_report_and_bad_input(tmp_path: Path) -> None:
         on_progress=lambda done, total: seen.append(done),
     )
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        "predictions.parquet", "parameters.parquet", "report.json", "report.html",
+        "predictions.parquet", "parameters.parquet", "report.json", "report.html", "run.json",
     }  # fmt: skip
     assert report["scenarios"] == 3 and report["agents"] == 4 and seen == [1, 2, 3, 4]
     reasons = " ".join(item["reason"] for item in report["left_out"])
@@ -287,11 +288,11 @@ def test_an_interrupted_run_goes_on_after_the_last_file(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         predict_files(paths, tmp_path / "out", on_progress=stop)
-    assert (tmp_path / "out" / "parts" / "000001.json").exists()
-    with pytest.raises(DataError, match="other data or settings; leave out resume"):
+    assert (tmp_path / "out" / UNFINISHED / "predict" / "000001.kept").exists()
+    with pytest.raises(ValueError, match="other data or options"):
         predict_files(paths[:2], tmp_path / "out", resume=True)
     paths[0].write_text(paths[0].read_text())  # as new: another file by its time
-    with pytest.raises(DataError, match="other data or settings"):
+    with pytest.raises(ValueError, match="other data or options"):
         predict_files(paths, tmp_path / "out", resume=True)
     with pytest.raises(KeyboardInterrupt):
         predict_files(paths, tmp_path / "out", on_progress=stop)
@@ -299,7 +300,7 @@ def test_an_interrupted_run_goes_on_after_the_last_file(tmp_path: Path) -> None:
     report = predict_files(paths, tmp_path / "out", resume=True, on_progress=lambda done, total: seen.append(done))
     assert report["methods"] == whole["methods"] and seen == [1, 2, 3]
     tables = [pl.read_parquet(tmp_path / name / "predictions.parquet") for name in ("whole", "out")]
-    assert tables[0].equals(tables[1]) and not (tmp_path / "out" / "parts").exists()
+    assert tables[0].equals(tables[1]) and not (tmp_path / "out" / UNFINISHED).exists()
 
 
 def test_better_than_all_three_single_futures_on_measured_scenes(measured) -> None:  # type: ignore[no-untyped-def]

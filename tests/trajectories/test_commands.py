@@ -83,6 +83,6 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, arguments: tuple[str, ...], w
     (tmp_path / "broken.json").write_text("{")
     name, file, *more = arguments
     done = call(name, tmp_path / file, *more, "--out", tmp_path / "out")
-    assert done.returncode == 1 and not (tmp_path / "out" / "parts").exists()
+    assert done.returncode == 1 and not (tmp_path / "out" / "idm-env-unfinished").exists()
     (line,) = [line for line in done.stderr.strip().splitlines() if line.startswith("error:")]
     assert words in line

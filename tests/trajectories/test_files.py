@@ -10,11 +10,12 @@ import polars as pl
 import pytest
 
 from idm_env.data import DataError
+from idm_env.keep import UNFINISHED
 from idm_env.trajectories import files
 from tests.trajectories.test_recipe import correlated
 from tests.trajectories.tracks import swinging
 
-OUTPUT = {"trajectories.parquet", "parameters.parquet", "report.json", "report.html"}
+OUTPUT = {"trajectories.parquet", "parameters.parquet", "report.json", "report.html", "run.json"}
 
 
 def lane(path: Path, vehicles: int = 4, seconds: float = 25.0, every: int = 1) -> Path:
@@ -66,14 +67,14 @@ def test_chunks_and_resume_change_nothing(tmp_path: Path) -> None:
 
     with pytest.raises(StoppedError):
         files.filter_file(path, tmp_path / "out", baselines=False, chunk=2, on_progress=stop)
-    assert (tmp_path / "out" / "parts").exists()
+    assert (tmp_path / "out" / UNFINISHED).exists()
     files.filter_file(path, tmp_path / "out", baselines=False, chunk=2, resume=True)
     whole, out = (pl.read_parquet(tmp_path / name / "trajectories.parquet") for name in ("whole", "out"))
     for name in ("position_m", "speed_mps", "accel_mps2"):
         assert np.allclose(whole[name], out[name], atol=1e-9)
     gaps = [table["gap_m"].fill_null(-1.0).to_numpy() for table in (whole, out)]
     assert np.allclose(gaps[0], gaps[1], atol=1e-9)
-    assert not (tmp_path / "out" / "parts").exists()
+    assert not (tmp_path / "out" / UNFINISHED).exists()
 
 
 def test_resume_refuses_other_settings(tmp_path: Path) -> None:
@@ -84,7 +85,7 @@ def test_resume_refuses_other_settings(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         files.filter_file(path, tmp_path / "out", chunk=1, baselines=False, on_progress=stop)
-    with pytest.raises(DataError, match="other data or settings; leave out resume"):
+    with pytest.raises(ValueError, match="other data or options"):
         files.filter_file(path, tmp_path / "out", chunk=2, baselines=False, resume=True)
 
 
