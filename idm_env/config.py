@@ -28,9 +28,9 @@ from torch import Tensor
 
 from idm_env import effects as catalogue
 from idm_env import parameters
-from idm_env.effects import Effect
+from idm_env.effects import CarFollowing, Effect
 from idm_env.parameters import nearest
-from idm_env.roads import Road
+from idm_env.roads import Lane, Road
 from idm_env.simulator import INTEGRATORS, Integration, Simulator
 
 SCHEMA = 1
@@ -61,8 +61,8 @@ class Model:
     def __post_init__(self) -> None:
         if self.integration not in INTEGRATORS:
             raise ValueError(f"integration = '{self.integration}' is unknown.{nearest(self.integration, INTEGRATORS)}")
-        if not self.dt > 0.0:
-            raise ValueError(f"dt = {self.dt} s must be positive.")
+        if any(isinstance(effect, CarFollowing) for effect in self.effects):
+            Simulator(Lane(), self.effects, self.dt, self.integration)  # its rules on effects and dt
         if self.substeps is not None and (not isinstance(self.substeps, int) or self.substeps < 1):
             raise ValueError(f"substeps = {self.substeps!r} must be a whole number of at least 1.")
         parameters.check(self.effects, self.params(dtype=torch.float64))
