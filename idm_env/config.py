@@ -192,12 +192,16 @@ def nested(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     result: dict[str, dict[str, Any]] = {}
     for key, value in _mapping("parameters", values).items():
         if isinstance(value, Mapping):
-            result.setdefault(str(key), {}).update(value)
+            part, effect = dict(value), str(key)
         elif "." in str(key):
             effect, name = str(key).split(".", 1)
-            result.setdefault(effect, {})[name] = value
+            part = {name: value}
         else:
             raise ValueError(f"parameters.{key} = {value!r} must be a mapping, such as {{time_gap: 1.2}}.")
+        for name in part:
+            if name in result.get(effect, {}):
+                raise ValueError(f"parameter '{effect}.{name}' is given twice. Remove one of them.")
+        result.setdefault(effect, {}).update(part)
     return result
 
 
@@ -230,12 +234,27 @@ def _read(path: str | Path) -> dict[str, Any]:
     if not file.is_file():
         raise ValueError(f"{path} is not a file. Give the path of a YAML file.")
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        content = yaml.load(file.read_text(encoding="utf-8"), _strict(yaml))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict):
         raise ValueError(f"{path} must hold a mapping, one 'key: value' per line.")
     return content
+
+
+def _strict(yaml: Any) -> Any:
+    """Return PyYAML's safe loader, except that a key that is there twice is an error, not a silent choice."""
+
+    class Strict(yaml.SafeLoader):  # type: ignore[misc]
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.value != "<<"]
+            for key, _ in node.value:
+                if isinstance(key, yaml.ScalarNode) and keys.count(key.value) > 1:
+                    line = key.start_mark.line + 1
+                    raise yaml.YAMLError(f"key '{key.value}' in line {line} is there twice. Remove one of them.")
+            return super().construct_mapping(node, deep)
+
+    return Strict
 
 
 def _yaml() -> Any:

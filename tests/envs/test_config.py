@@ -67,6 +67,21 @@ def test_mistakes_in_a_model_are_one_line(tmp_path, change, words):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("effects: [idm, brakes]\ndt: 0.1\ndt: 0.2\n", "key 'dt' in line 2 is there twice"),
+        ("effects: [idm]\nparameters: {idm: {time_gap: 1.1, time_gap: 1.2}}\n", "key 'time_gap' in line 2 is there tw"),
+        ("effects: [idm]\nparameters: {idm: {time_gap: 1.1}, idm.time_gap: 1.2}\n", "'idm.time_gap' is given twice"),
+    ],
+)
+def test_nothing_is_given_twice(tmp_path, text, words):
+    (tmp_path / "model.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=words) as caught:
+        load_model(tmp_path / "model.yaml")
+    assert "model.yaml" in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_files_that_are_no_yaml(tmp_path):
     (tmp_path / "bad.yaml").write_text("a: [1,", encoding="utf-8")
     with pytest.raises(ValueError, match="not valid YAML") as caught:
