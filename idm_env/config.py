@@ -10,6 +10,8 @@
 
 ``by`` says what the keys of ``drivers`` are, as in ``fit``: ``driver`` (run/vehicle), ``run_id``, ``vehicle_id`` or a
 column. ``substeps`` is there where a fit chose another number of simulated steps per sample than the default.
+``fitted_on`` holds the name of the file and a digest of every track that the model was fitted on, so that ``simulate``
+can tell a fitted from a held-out figure.
 
 Unknown keys are errors with a suggestion, in one line.
 """
@@ -39,7 +41,18 @@ SCHEMA = 1
 Numbers = dict[str, dict[str, float]]
 """Effect name → parameter name → number."""
 
-_MODEL_KEYS = ("configures", "schema", "dt", "integration", "effects", "parameters", "by", "drivers", "substeps")
+_MODEL_KEYS = (
+    "configures",
+    "schema",
+    "dt",
+    "integration",
+    "effects",
+    "parameters",
+    "by",
+    "drivers",
+    "substeps",
+    "fitted_on",
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +70,7 @@ class Model:
     drivers: dict[str, Numbers] = field(default_factory=dict)
     by: str = "driver"
     substeps: int | None = None
+    fitted_on: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.integration not in INTEGRATORS:
@@ -119,7 +133,16 @@ def _model(content: dict[str, Any]) -> Model:
         },
         by=str(content.get("by", "driver")),
         substeps=content.get("substeps"),
+        fitted_on=_fitted_on(content.get("fitted_on") or {}),
     )
+
+
+def _fitted_on(value: Any) -> dict[str, Any]:
+    _known(_mapping("fitted_on", value), ("source", "tracks"), "key of fitted_on")
+    tracks = value.get("tracks", [])
+    if not isinstance(tracks, list):
+        raise ValueError("fitted_on.tracks must be a list of digests, as fit writes it. Remove fitted_on if in doubt.")
+    return {"source": str(value.get("source", "")), "tracks": [str(track) for track in tracks]} if value else {}
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -140,6 +163,8 @@ def save_model(path: str | Path, model: Model) -> None:
             key: {e: {n: float(x) for n, x in values.items()} for e, values in layer.items()}
             for key, layer in model.drivers.items()
         }
+    if model.fitted_on:
+        content["fitted_on"] = model.fitted_on
     text = _yaml().safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
     Path(path).write_text(text, encoding="utf-8")
 

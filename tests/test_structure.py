@@ -20,7 +20,8 @@ ALLOWED = {
     "kernels": {"types", "parameters", "effects", "roads", "simulator"},
     "simulator": {"types", "parameters", "effects", "roads", "kernels", "compiled"},
     "compiled": {"types", "parameters", "simulator"},
-    "report": set(),
+    "fonts": set(),
+    "report": {"fonts"},
     "config": {"types", "parameters", "effects", "roads", "simulator"},
     "data": set(),
     "fitting": {
