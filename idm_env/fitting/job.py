@@ -288,7 +288,7 @@ def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0)
         error, simulated = errors(problem, values, torch.zeros(0, dtype=values.dtype))
     tables = [_simulated_table(problem, simulated, row) for row in range(len(items))]
     pl.concat(tables).write_parquet(out / "simulated.parquet")
-    result = {
+    result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
         "model": str(model_path),

@@ -103,10 +103,8 @@ def from_frame(frame: pl.DataFrame, source: str = "table", repairs: list[Repair]
     if frame.height == 0:
         raise DataError(f"{source}: position_m is empty in every row; it must hold positions in metres.")
     frame, more = directions.one_way(frame)
-    done += [
-        *more,
-        *length_assumed(frame.group_by("run_id", "vehicle_id").agg(has_length(frame)).get_column("known").not_().sum()),
-    ]
+    known = frame.group_by("run_id", "vehicle_id").agg(has_length(frame))["known"]
+    done += [*more, *length_assumed(int((~known).sum()))]
     check_units(frame, source)
     unsorted = int(frame.select((pl.col("time_s").diff().over("run_id", "vehicle_id") < 0).sum()).item() or 0)
     if unsorted:
