@@ -298,6 +298,7 @@ def simulate(
     source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
     result = simulate_file(source, model, out, seed=seed)
     _show("Errors in free simulation", [result["error"]])
+    console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)
     _done(out)
 
 

@@ -10,6 +10,8 @@
 
 ``by`` says what the keys of ``drivers`` are, as in ``fit``: ``driver`` (run/vehicle), ``run_id``, ``vehicle_id`` or a
 column. ``substeps`` is there where a fit chose another number of simulated steps per sample than the default.
+``fitted_on`` holds the name of the file and a digest of every track that the model was fitted on, so that ``simulate``
+can tell a fitted from a held-out figure.
 
 Unknown keys are errors with a suggestion, in one line.
 """
@@ -29,9 +31,9 @@ from torch import Tensor
 from idm_env import effects as catalogue
 from idm_env import parameters
 from idm_env.checks import nearest, one_of, shown, whole
-from idm_env.effects import Effect
+from idm_env.effects import CarFollowing, Effect
 from idm_env.keep import write_text
-from idm_env.roads import Road
+from idm_env.roads import Lane, Road
 from idm_env.simulator import INTEGRATORS, Integration, Simulator
 
 SCHEMA = 1
@@ -43,7 +45,18 @@ MOST_BYTES, DEEPEST, LONGEST = 20_000_000, 20, 500
 Numbers = dict[str, dict[str, float]]
 """Effect name → parameter name → number."""
 
-_MODEL_KEYS = ("configures", "schema", "dt", "integration", "effects", "parameters", "by", "drivers", "substeps")
+_MODEL_KEYS = (
+    "configures",
+    "schema",
+    "dt",
+    "integration",
+    "effects",
+    "parameters",
+    "by",
+    "drivers",
+    "substeps",
+    "fitted_on",
+)
 
 
 @dataclass(frozen=True)
@@ -61,10 +74,13 @@ class Model:
     drivers: dict[str, Numbers] = field(default_factory=dict)
     by: str = "driver"
     substeps: int | None = None
+    fitted_on: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         one_of("integration", self.integration, INTEGRATORS)
-        if not self.dt > 0.0:
+        if any(isinstance(effect, CarFollowing) for effect in self.effects):
+            Simulator(Lane(), self.effects, self.dt, self.integration)  # its rules on effects and dt
+        elif not self.dt > 0.0:
             raise ValueError(f"dt = {self.dt} s must be positive.")
         if self.substeps is not None:
             whole("substeps", self.substeps, 1, 1000)
@@ -124,7 +140,16 @@ def _model(content: dict[str, Any]) -> Model:
         },
         by=_text("by", content.get("by", "driver")),
         substeps=content.get("substeps"),
+        fitted_on=_fitted_on(content.get("fitted_on") or {}),
     )
+
+
+def _fitted_on(value: Any) -> dict[str, Any]:
+    _known(_mapping("fitted_on", value), ("source", "tracks"), "key of fitted_on")
+    tracks = value.get("tracks", [])
+    if not isinstance(tracks, list):
+        raise ValueError("fitted_on.tracks must be a list of digests, as fit writes it. Remove fitted_on if in doubt.")
+    return {"source": str(value.get("source", "")), "tracks": [str(track) for track in tracks]} if value else {}
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -145,6 +170,8 @@ def save_model(path: str | Path, model: Model) -> None:
             key: {e: {n: float(x) for n, x in values.items()} for e, values in layer.items()}
             for key, layer in model.drivers.items()
         }
+    if model.fitted_on:
+        content["fitted_on"] = model.fitted_on
     text = _yaml().safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
     write_text(Path(path), text)
 
@@ -200,12 +227,16 @@ def nested(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     result: dict[str, dict[str, Any]] = {}
     for key, value in _mapping("parameters", values).items():
         if isinstance(value, Mapping):
-            result.setdefault(str(key), {}).update({str(name): x for name, x in value.items()})
+            part, effect = {str(name): x for name, x in value.items()}, str(key)
         elif "." in str(key):
             effect, name = str(key).split(".", 1)
-            result.setdefault(effect, {})[name] = value
+            part = {name: value}
         else:
             raise ValueError(f"parameters.{shown(key)} = {shown(value)} must be a mapping, such as {{time_gap: 1.2}}.")
+        for name in part:
+            if name in result.get(effect, {}):
+                raise ValueError(f"parameter {shown(f'{effect}.{name}')} is given twice. Remove one of them.")
+        result.setdefault(effect, {}).update(part)
     return result
 
 
@@ -262,16 +293,32 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def _harmless(yaml: Any, text: str, loader: Any) -> None:
-    """Raise ValueError for what a small file can grow by: aliases, deep nesting, very long numbers."""
-    depth = 0
+    """Raise ValueError for aliases, deep nesting and long numbers, by which a small file grows, and for equal keys."""
+    keys: list[set[str] | None] = []  # of every open collection; None for a list
+    waits: list[bool] = []  # whether the next node in it is a key
     for event in yaml.parse(text, loader):
+        line = f"line {event.start_mark.line + 1}"
         if isinstance(event, yaml.AliasEvent):
-            raise ValueError(f"line {event.start_mark.line + 1}: aliases (*) are not taken; write the value out.")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            raise ValueError(f"line {event.start_mark.line + 1}: nested deeper than {DEEPEST}.")
-        if isinstance(event, yaml.ScalarEvent) and event.style is None and len(event.value) > LONGEST:
-            raise ValueError(f"line {event.start_mark.line + 1}: a value of {len(event.value)} characters; quote it.")
+            raise ValueError(f"{line}: aliases (*) are not taken; write the value out.")
+        if isinstance(event, yaml.CollectionEndEvent):
+            keys.pop(), waits.pop()
+            continue
+        if not isinstance(event, yaml.NodeEvent):
+            continue
+        known = keys[-1] if keys and waits[-1] else None
+        if keys:
+            waits[-1] = not waits[-1]
+        if isinstance(event, yaml.CollectionStartEvent):
+            keys.append(set() if isinstance(event, yaml.MappingStartEvent) else None)
+            waits.append(True)
+            if len(keys) > DEEPEST:
+                raise ValueError(f"{line}: nested deeper than {DEEPEST}.")
+        elif event.style is None and len(event.value) > LONGEST:
+            raise ValueError(f"{line}: a value of {len(event.value)} characters; quote it.")
+        elif known is not None and event.value in known:
+            raise ValueError(f"{line}: key {shown(event.value)} is there twice. Remove one of them.")
+        elif known is not None:
+            known.add(event.value)
 
 
 def _yaml() -> Any:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from idm_env.fonts import legible
+
 COLOURS = np.array([(178, 24, 43), (239, 138, 98), (253, 219, 120), (120, 190, 110), (26, 120, 80)], float)
 """Red at standstill, over yellow, to green at full speed; RGB in 0–255."""
 
@@ -72,6 +74,7 @@ def space_time(
     axes.set(xlabel="time (s)", ylabel=place_label, title=title)
     if drawn is not None:
         figure.colorbar(drawn, ax=axes, label="speed (m/s)")
+    legible(figure)
     return figure
 
 

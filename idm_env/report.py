@@ -130,6 +130,10 @@ def picture(figure: Figure, caption: str) -> Block:
     """Return a matplotlib figure as a block; the picture travels inside the page. The figure is closed."""
     import matplotlib.pyplot as plt
 
+    from idm_env.fonts import legible
+
+    if numbers := legible(figure):
+        caption += " " + ", ".join(f"{number}: {word}" for number, word in numbers.items()) + "."
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
     plt.close(figure)

@@ -22,7 +22,8 @@ ALLOWED = {
     "kernels": {"types", "parameters", "effects", "roads", "simulator"},
     "simulator": {"types", "parameters", "checks", "effects", "roads", "kernels", "compiled"},
     "compiled": {"types", "parameters", "simulator"},
-    "report": {"keep"},
+    "fonts": set(),
+    "report": {"fonts", "keep"},
     "config": {"types", "parameters", "checks", "effects", "roads", "simulator", "keep"},
     "data": set(),
     "fitting": {

@@ -15,6 +15,7 @@ from idm_env import keep
 from idm_env.checks import nearest
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
+from idm_env.data.fingerprint import fitted_on
 from idm_env.discovery import judge, places, records, search, summary
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
@@ -225,8 +226,11 @@ def _finish(
         trajectories, prepared, fit_runs, kept_runs, searching.task, null, final, rounds, refused, before, after,
         partial, thetas, by, seed, names,
     )  # fmt: skip
+    # Drivers who adapt are calibrated on parts of the held-out runs too.
+    seen = [(e.run_id, e.vehicle_id) for e in (prepared if adapt else fit_records).episodes]
+    model = replace(corrected(prepared, final, thetas[1].theta, by), fitted_on=fitted_on(trajectories, seen))
     return Discovery(
-        report, corrected(prepared, final, thetas[1].theta, by), prepared, final.model, final.values, null, final,
+        report, model, prepared, final.model, final.values, null, final,
         searching.task, rounds, before, after, responses,
     )  # fmt: skip
 

@@ -143,7 +143,7 @@ EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed"
 
 _BOUNDS = {
     # Wider than plausible where the declaration is narrow, narrower where IDM would collide.
-    "delay.delay": (0.0, 1.2), "lag.lag": (0.0, 2.0), "power_limit.power": (2.0, 60.0),
+    "lag.lag": (0.0, 2.0), "power_limit.power": (2.0, 60.0),
 }  # fmt: skip
 STARTS: dict[str, tuple[tuple[float, ...], ...]] = {
     "delay": ((0.3,), (0.8,)), "lag": ((0.3,), (0.8,)), "second_leader": ((0.1,),), "leader_acceleration": ((0.1,),),

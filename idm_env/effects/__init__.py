@@ -13,7 +13,7 @@ from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGa
 from idm_env.effects.base import CarFollowing, Effect
 from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
-from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit
+from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
 from idm_env.effects.neighbours import BrakeLight, Follower, Lateral, LeaderAcceleration, SecondLeader
 from idm_env.effects.noise import Noise
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
@@ -24,6 +24,7 @@ ALL: dict[str, type[Effect]] = {
     for effect in (
         IDM,
         Brakes,
+        Traction,
         Control,
         Replay,
         Delay,
@@ -136,5 +137,7 @@ __all__ = [
     "SecondLeader",
     "SpeedDependentGap",
     "SpeedZone",
+    "Traction",
     "make",
+    "unspoken",
 ]

@@ -33,7 +33,10 @@ class Effect:
 
     Class attributes: ``kind`` is the name in ``effects.ALL`` and in YAML; ``needs`` names the optional neighbours
     of the scene that it reads; ``sees_truth`` marks effects of physics, which get the true scene instead of the
-    perceived one; ``rank`` orders perceptions and limits, low first. Dataclass fields are the static choices.
+    perceived one; ``rank`` orders perceptions and limits, low first; ``adds`` says whether the effect can lift an
+    acceleration above what the driver wants by himself, which is taken for granted of every effect that adapts,
+    accelerates or limits and does not deny it: a simulator with such an effect has tyres (``Traction``). Dataclass
+    fields are the static choices.
     """
 
     kind: ClassVar[str] = ""
@@ -42,6 +45,7 @@ class Effect:
     sees_truth: ClassVar[bool] = False
     remembers: ClassVar[bool] = False
     rank: ClassVar[int] = 0
+    adds: ClassVar[bool] = False
     hook: ClassVar[Hook]
 
     def __init_subclass__(cls) -> None:
@@ -51,6 +55,8 @@ class Effect:
                 f"effect {cls.__name__} overrides {mine or 'no hook'}; override exactly one of {', '.join(HOOKS)}."
             )
         cls.hook = mine[0]
+        # Not inherited: a subclass has another equation, and what its parent promised of his is not known of it.
+        cls.adds = vars(cls).get("adds", cls.hook in ("adapt", "accelerate", "limit"))
         cls.remembers = cls.remember is not Effect.remember
 
     @property

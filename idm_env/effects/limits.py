@@ -1,7 +1,8 @@
-"""What the vehicle can: asymmetry, action points, power, lag and brakes (hook ``limit``, chained by rank)."""
+"""What the vehicle can: asymmetry, action points, power, lag, brakes and tyres (hook ``limit``, chained by rank)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -35,6 +36,7 @@ class ActionPoint(Effect):
     """
 
     kind: ClassVar[str] = "action_point"
+    adds: ClassVar[bool] = False
     rank: ClassVar[int] = 30
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "Δa", "m/s²", 0.3, 0.0, 2.0, null=0.0, role="threshold", starts=(0.15, 0.4)),
@@ -50,6 +52,7 @@ class PowerLimit(Effect):
     """``a ≤ (P/m) / v`` with specific power P/m (W/kg); absent at its null, a power that no car has."""
 
     kind: ClassVar[str] = "power_limit"
+    adds: ClassVar[bool] = False
     rank: ClassVar[int] = 40
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
@@ -69,6 +72,7 @@ class Lag(Effect):
     """
 
     kind: ClassVar[str] = "lag"
+    adds: ClassVar[bool] = False
     rank: ClassVar[int] = 50
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
@@ -94,6 +98,7 @@ class Brakes(Effect):
     """
 
     kind: ClassVar[str] = "brakes"
+    adds: ClassVar[bool] = False
     rank: ClassVar[int] = 60
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (Parameter("max_decel", "b_max", "m/s²", 9.0, 1.0, 15.0, role="shape"),)
@@ -110,3 +115,32 @@ class Brakes(Effect):
         above = torch.relu(accel - floor)
         part = above.clamp_max(self.width)
         return floor + part * part * (2.0 * self.width - part) * (1.0 / self.width**2) + (above - part)
+
+
+@dataclass(frozen=True)
+class Traction(Effect):
+    """Tyres hold no more than ``a ≤ μ g``, whatever was added: the last word on every acceleration.
+
+    The default is a friction coefficient of about 1, dry asphalt (Rajamani 2012, Vehicle Dynamics and Control, ch. 13).
+    A simulator with an effect that can add to what the driver wants has this one without being told; it is named to
+    give another maximum, or its null to be rid of it. Below the maximum it changes no bit; above, its gradient is zero.
+    """
+
+    kind: ClassVar[str] = "traction"
+    rank: ClassVar[int] = 90
+    sees_truth: ClassVar[bool] = True
+    adds: ClassVar[bool] = False
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("max_accel", "μ g", "m/s²", 10.0, 1.0, 15.0, null=1e5, role="threshold"),
+    )
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the acceleration that the tyres allow."""
+        return accel.clamp_max(p["max_accel"])  # type: ignore[arg-type]
+
+
+def unspoken(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Return the physics that these effects need and do not name: tyres, where something adds accelerations."""
+    effects = tuple(effects)
+    named = any(isinstance(effect, Traction) for effect in effects)
+    return (Traction(),) if not named and any(effect.adds for effect in effects) else ()

@@ -41,12 +41,13 @@ class SecondLeader(Effect):
 class LeaderAcceleration(Effect):
     """Feed-forward of the leader's acceleration, ``+ c a_lead``, as in adaptive and cooperative cruise control.
 
-    It is measured or sent, not perceived: a driver's delay does not hold it up.
+    It is measured or sent, not perceived: a driver's delay does not hold it up. Down a platoon quick changes are
+    multiplied by c from vehicle to vehicle, so that beyond |c| = 1 they grow without end: it is not string stable.
     """
 
     kind: ClassVar[str] = "leader_acceleration"
     sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.4, -1.0, 1.5, null=0.0),)
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.4, -0.95, 0.95, null=0.0),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return c a_lead (m/s²)."""

@@ -17,15 +17,19 @@ class Delay(Effect):
     """Reaction delay: the driver reacts to the scene of τ seconds ago (Treiber, Kesting, Helbing 2006, Physica A 360).
 
     Every input of the driver, his own speed included, is taken at t − τ, by linear interpolation between steps, before
-    anything else of perception acts. ``max_delay`` (s) is how far the past is kept.
+    anything else of perception acts. ``max_delay`` (s) is how far the past is kept and the upper bound of τ: by default
+    what a platoon of default drivers (T = 1.5 s) can bear; at 1.1 s they collide without any reason ahead.
     """
 
     kind: ClassVar[str] = "delay"
     rank: ClassVar[int] = -10
-    declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("delay", "τ", "s", 0.5, 0.0, 1.5, null=0.0, starts=(0.3, 0.8)),
-    )
-    max_delay: float = 1.5
+    max_delay: float = 1.0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """τ, between 0 and ``max_delay``."""
+        longest = self.max_delay
+        return (Parameter("delay", "τ", "s", min(0.5, longest), 0.0, longest, null=0.0, starts=(0.3, 0.8)),)
 
     @property
     def looks_back(self) -> float:

@@ -14,6 +14,7 @@ from idm_env import keep
 from idm_env import report as page
 from idm_env.config import Model, Numbers, load_model, save_model
 from idm_env.data import LEADER_LOST_GAP_M, DataError, Episodes, Trajectories, episodes, load
+from idm_env.data.fingerprint import fingerprints, fitted_on
 from idm_env.effects import Effect, Replay
 from idm_env.fitting import pictures
 from idm_env.fitting.batch import Batch, windows
@@ -149,12 +150,18 @@ def _fit_file(
         pooled = found if options.by == "all" else run("all", "pooled")
         result["held_out"] = _held_out(source, options, held, found, pooled)
     keep.write(out / "parameters.parquet", pl.DataFrame(result["parameters"]).write_parquet)
-    save_model(out / "model.yaml", dataclasses.replace(model_of(found, options.by), substeps=options.substeps))
+    marked = fitted_on(trajectories, _drivers(chosen))
+    model = dataclasses.replace(model_of(found, options.by), substeps=options.substeps, fitted_on=marked)
+    save_model(out / "model.yaml", model)
     page.write_json(out / "report.json", result)
     page.write_page(
         out / "report.html", f"IDM fitted to {source.path.name}", _fit_page(result, found, error, simulated)
     )
     return result
+
+
+def _drivers(items: Episodes) -> list[tuple[str, str]]:
+    return [(episode.run_id, episode.vehicle_id) for episode in items]
 
 
 def _held_out(source: Source, options: Options, held: Trajectories, found: Fit, pooled: Fit) -> dict[str, Any]:
@@ -211,7 +218,6 @@ def _fit_page(result: dict[str, Any], found: Fit, error: Errors, simulated: Simu
         for row in result["parameters"]
         if row["at_bound"] or not row["identified"]
     ]
-    repairs = [*(r["text"] for r in result["data"]["repairs"]), *result["data"]["left_out"]]
     held = result["held_out"]
     lead = (
         f"{result['fit']['episodes']} episodes of {result['fit']['groups']} groups: mean gap RMSE "
@@ -237,9 +243,46 @@ def _fit_page(result: dict[str, Any], found: Fit, error: Errors, simulated: Simu
         *([page.note("The first 200 rows of parameters.parquet.")] if len(result["parameters"]) > 200 else []),
         page.heading(f"Doubtful parameters: {len(doubtful)} of {len(result['parameters'])}"),
         page.bullets(doubtful[:40] or ["none"]),
+        *_data_section(result),
+    ]
+
+
+def _data_section(result: dict[str, Any]) -> list[page.Block]:
+    """Return what the data are, and what was repaired or left out."""
+    data = result["data"]
+    size = (
+        f"{data['source']}: {data['rows']} rows, {data['vehicles']} vehicles in {data['runs']} runs, "
+        f"{data['followers']} followers, {data['episodes']} episodes."
+    )
+    repairs = [*(r["text"] for r in data["repairs"]), *data["left_out"]]
+    return [
         page.heading("Data"),
+        page.text(size),
         page.bullets(repairs or ["Nothing was repaired or left out."]),
     ]
+
+
+def _seen(model: Model, trajectories: Trajectories, items: Episodes, error: Errors) -> dict[str, Any]:
+    """Return how many episodes are of tracks that the model was fitted on, the error on the others, and it in words."""
+    tracks = fingerprints(trajectories, _drivers(items))
+    known = set(model.fitted_on.get("tracks", ()))
+    new = torch.tensor([tracks[driver] not in known for driver in _drivers(items)])
+    count, others = int((~new).sum()), float(error.gap_rmse[new].mean()) if new.any() else None
+    if not known:
+        words = "of which the model does not say whether it was fitted on them."
+    elif others is None:
+        words = "fitted on these data: not a held-out figure."
+    elif count:
+        words = (
+            f"in part fitted on these data ({count} of {len(items)} episodes): not a held-out figure. On the others it "
+            f"is {others:.2f} m."
+        )
+    else:
+        words = "on data that the model was not fitted on."
+    return {
+        "source": model.fitted_on.get("source"), "episodes_fitted_on": count if known else None,
+        "gap_rmse_of_others_m": others if known else None, "words": words,
+    }  # fmt: skip
 
 
 def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0) -> dict[str, Any]:
@@ -261,13 +304,14 @@ def _simulate_file(source: Source, model_path: Path, out: Path, seed: int) -> di
         error, simulated = errors(problem, values, torch.zeros(0, dtype=values.dtype))
     tables = [_simulated_table(problem, simulated, row) for row in range(len(items))]
     keep.write(out / "simulated.parquet", pl.concat(tables).write_parquet)
-    result = {
+    result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
         "model": str(model_path),
         "data": {**trajectories.summary(), "left_out": [str(r) for r in items.left_out], "episodes": len(items)},
         "drivers_with_own_parameters": matched,
         "error": error.summary(),
+        "fitted_on": _seen(model, trajectories, items, error),
         "seed": seed,
         "versions": page.versions(),
     }
@@ -275,10 +319,12 @@ def _simulate_file(source: Source, model_path: Path, out: Path, seed: int) -> di
     blocks = [
         page.lead(
             f"{len(items)} episodes simulated behind their measured leaders: mean gap RMSE "
-            f"{error.summary()['gap_rmse_m']:.2f} m. {matched} of them have driver parameters of their own."
+            f"{error.summary()['gap_rmse_m']:.2f} m, {result['fitted_on']['words']} {matched} of them have driver "
+            "parameters of their own."
         ),
         page.table([error.summary()]),
         pictures.examples(problem, error, simulated),
+        *_data_section(result),
     ]
     page.write_page(out / "report.html", f"{model_path.name} behind the leaders of {source.path.name}", blocks)
     return result

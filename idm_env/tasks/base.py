@@ -162,8 +162,10 @@ class Task(abc.ABC):
         return found
 
     def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
-        """Return the parameters as tensors (a number: scalar; a list: one per vehicle; a tensor: as it is)."""
-        return self._behaviour.params(self.vehicles, dtype, device)
+        """Return checked parameters as tensors (a number: scalar; a list: one per vehicle; a tensor: as it is)."""
+        values = self._behaviour.params(self.vehicles, dtype, device)
+        self.simulator.check(values)
+        return values
 
     def _is_agent(self) -> list[bool]:
         return [i in self.agents for i in range(self.vehicles)]

@@ -55,7 +55,9 @@ def test_a_model_comes_back_the_same(tmp_path):
         ({"schema": 9}, "reads schema 1"),
         ({"integration": "eulr"}, "Did you mean 'euler'"),
         ({"configures": "environment"}, "a model is wanted"),
-        ({"dt": 0}, "must be positive"),
+        ({"dt": 0}, "dt = 0 s is outside"),
+        ({"dt": 100}, "dt = 100 s is outside .0, 5. s: no step may be longer than a driver's time gap"),
+        ({"dt": 2}, "dt = 2 s is longer than the shortest time gap, idm.time_gap = 1.1 s"),
     ],
 )
 def test_mistakes_in_a_model_are_one_line(tmp_path, change, words):
@@ -63,6 +65,21 @@ def test_mistakes_in_a_model_are_one_line(tmp_path, change, words):
     with pytest.raises(ValueError, match=words) as caught:
         make_task("ring", effects=path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("effects: [idm, brakes]\ndt: 0.1\ndt: 0.2\n", "key 'dt' in line 2 is there twice"),
+        ("effects: [idm]\nparameters: {idm: {time_gap: 1.1, time_gap: 1.2}}\n", "key 'time_gap' in line 2 is there tw"),
+        ("effects: [idm]\nparameters: {idm: {time_gap: 1.1}, idm.time_gap: 1.2}\n", "'idm.time_gap' is given twice"),
+    ],
+)
+def test_nothing_is_given_twice(tmp_path, text, words):
+    (tmp_path / "model.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=words) as caught:
+        load_model(tmp_path / "model.yaml")
+    assert "model.yaml" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_files_that_are_no_yaml(tmp_path):

@@ -108,3 +108,35 @@ def test_bad_input_is_one_line(file: Path, tmp_path: Path) -> None:
     model.write_text("configures: model\nschema: 1\neffects: [idm, brakes, imagined]\n")
     with pytest.raises(ValueError, match="'imagined' takes an input"):
         simulate_file(Source(file), model, tmp_path / "sim")
+
+
+def test_simulate_says_what_the_model_was_fitted_on(file: Path, tmp_path: Path) -> None:
+    """Fitted, held out, partly one and partly the other, or unknown: in the report and on its page, by content."""
+    fit_file(Source(file), Options(starts=1, held_out=0.25), tmp_path / "fit")
+    saved = tmp_path / "fit" / "model.yaml"
+    model = load_model(saved)
+    runs = sorted({key.split("/")[0] for key in model.drivers})
+    table = pl.read_csv(file)
+    held = next(r for r in table["run_id"].cast(pl.String).unique() if r not in runs)
+    pl.read_csv(file).write_parquet(tmp_path / "renamed.parquet")
+    own = tmp_path / "own.yaml"
+    own.write_text("configures: model\neffects: [idm, brakes]\n")
+    for path, where, yaml, count, words in (
+        (file, f"run_id={runs[0]}", saved, 2, "m, fitted on these data: not a held-out figure."),
+        (file, f"run_id={held}", saved, 0, "m, on data that the model was not fitted on."),
+        (
+            tmp_path / "renamed.parquet",
+            None,
+            saved,
+            6,
+            "in part fitted on these data (6 of 8 episodes): not a held-out",
+        ),
+        (file, None, own, None, "does not say whether it was fitted on them"),
+    ):
+        result = simulate_file(Source(path, where=where), yaml, tmp_path / "sim")
+        assert result["fitted_on"]["episodes_fitted_on"] == count
+        page = (tmp_path / "sim" / "report.html").read_text()
+        assert words in page and "<h2>Data</h2>" in page and f"{path.name}: " in page
+        if count == 6:
+            assert f"On the others it is {result['fitted_on']['gap_rmse_of_others_m']:.2f} m." in page
+            assert result["fitted_on"]["gap_rmse_of_others_m"] != pytest.approx(result["error"]["gap_rmse_m"])

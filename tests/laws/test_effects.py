@@ -79,9 +79,9 @@ def test_an_effect_at_its_default_does_something(effect: Effect) -> None:
     inputs = inputs_for(simulator, 60, torch.zeros(N, dtype=DTYPE))
     ends = []
     for params in (simulator.defaults(dtype=DTYPE), parameters.null(simulator.effects, dtype=DTYPE)):
-        if effect.kind == "power_limit":
-            params["power_limit"]["power"] = params["power_limit"]["power"].clamp_max(2.0)
-            params["power_limit"]["power"] = params["power_limit"]["power"] if not ends else torch.tensor(1e5)
+        if effect.kind in ("power_limit", "traction"):  # what a car can is more than these drivers want
+            (p,) = effect.parameters
+            params[effect.name][p.name] = torch.tensor(p.null if ends else p.low, dtype=DTYPE)
             params["idm"]["desired_speed"] = torch.tensor(60.0, dtype=DTYPE)
         ends.append(simulator.rollout(start(simulator, params), inputs, params, 60)[0].position)
     assert (ends[0] - ends[1]).abs().max() > 1e-4
