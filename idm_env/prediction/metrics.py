@@ -3,8 +3,9 @@
 Predictions and truth are compared at 2 Hz. At a horizon T: minADE is the smallest mean distance up to T over the
 futures of an agent, minFDE the smallest distance at T; an agent is missed where no future ends within a box around
 the truth, along its heading and across it, whose size grows with T and with the initial speed. mAP is the mean over
-eight shapes of trajectories of the area under the interpolated precision-recall curve, where a future that hits is a
-true positive, only one per agent, and all others are false positives.
+shapes of trajectories of the area under the interpolated precision-recall curve, where a future that hits is a true
+positive, only one per agent, and all others are false positives. Of the eight shapes right turns and right U-turns are
+one, and among equal confidences false positives come first, as in the benchmark's own code (``motion_metrics.cc``).
 """
 
 from __future__ import annotations
@@ -136,7 +137,7 @@ def average_precision(scores: Sequence[Score], seconds: int) -> float:
             correct.append(i == first)
     if agents == 0:
         return float("nan")
-    order = np.argsort(-np.array(confidence), kind="stable")
+    order = np.lexsort((correct, -np.array(confidence)))
     true = np.cumsum(np.array(correct)[order])
     precision, recall = true / np.arange(1, len(true) + 1), true / agents
     best = np.maximum.accumulate(precision[::-1])[::-1]
@@ -152,8 +153,11 @@ def summary(scores: Sequence[Score]) -> dict[str, float | int]:
         row[f"miss_rate_{seconds}s"] = _mean(
             [0.0 if any(h) else 1.0 for item in scores if (h := item.hit[i]) is not None]
         )
-        shapes = sorted({item.shape for item in scores})
-        precisions = [average_precision([s for s in scores if s.shape == shape], seconds) for shape in shapes]
+        binned = [item.shape.replace("right U-turn", "right") for item in scores]
+        precisions = [
+            average_precision([s for s, b in zip(scores, binned, strict=True) if b == shape], seconds)
+            for shape in sorted(set(binned))
+        ]
         row[f"mAP_{seconds}s"] = _mean(precisions)
     for name in ("minADE", "minFDE", "miss_rate", "mAP"):
         row[name] = _mean([float(row[f"{name}_{seconds}s"]) for seconds in HORIZONS])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -77,6 +79,20 @@ def test_average_precision_by_hand() -> None:
     twice = case((0.0, 0.0), (0.1, 0.0), confidence=[0.6, 0.4])  # the second hit is a false positive
     assert average_precision([score(twice)], 3) == 1.0
     assert average_precision([score(case((50.0, 0.0)))], 3) == 0.0
+
+
+def test_equal_confidences_do_not_depend_on_the_order_of_agents() -> None:
+    """As in the benchmark's own code, false positives come first among equals."""
+    hit, miss = score(case((0.0, 0.0))), score(case((50.0, 0.0)))
+    for order in ([hit, miss, miss], [miss, miss, hit]):
+        assert average_precision(order, 3) == pytest.approx(1 / 3 * 1 / 3)
+
+
+def test_right_u_turns_count_with_right_turns() -> None:
+    """As in the benchmark's own code, so that one agent is not an eighth of the mean."""
+    hit, miss = score(case((0.0, 0.0))), score(case((50.0, 0.0)))
+    scores = [replace(hit, shape="right"), replace(miss, shape="right U-turn"), replace(miss, shape="straight")]
+    assert summary(scores)["mAP_3s"] == pytest.approx((1 / 2 * 1 / 2 + 0.0) / 2)
 
 
 def path(turn: float, length: float = 40.0) -> tuple[np.ndarray, np.ndarray]:
