@@ -28,6 +28,16 @@ def check_columns(frame: pl.DataFrame, source: str) -> None:
             raise DataError(f"{source}: column {name!r} is missing and {guess!r} looks like it; rename or remove it.")
 
 
+def exact(column: pl.Series, source: str) -> None:
+    """Raise DataError if identifiers are floats so large that neighbouring integers are one float."""
+    largest = column.fill_nan(None).abs().max()
+    if isinstance(largest, float) and largest >= LARGEST_ID:
+        raise DataError(
+            f"{source}: {column.name} = {largest:.17g} is a float beyond 2^53, where several identifiers become one; "
+            "write identifiers as integers or text."
+        )
+
+
 def identifiers(frame: pl.DataFrame, source: str = "table") -> pl.DataFrame:
     """Return the frame with run_id, vehicle_id and leader_id as strings; run_id "0" where the column is absent.
 
@@ -42,12 +52,7 @@ def identifiers(frame: pl.DataFrame, source: str = "table") -> pl.DataFrame:
             continue
         column = pl.col(name)
         if frame[name].dtype.is_float():
-            largest = frame[name].fill_nan(None).abs().max()
-            if isinstance(largest, float) and largest >= LARGEST_ID:
-                raise DataError(
-                    f"{source}: {name} = {largest:.17g} is a float beyond 2^53, where several identifiers become one; "
-                    "write identifiers as integers or text."
-                )
+            exact(frame[name], source)
             # A csv column of integers with empty cells arrives as floats: 12.0 is vehicle 12.
             column = pl.when(column.round() == column).then(column.cast(pl.Int64, strict=False).cast(pl.String))
             column = column.otherwise(pl.col(name).fill_nan(None).cast(pl.String))

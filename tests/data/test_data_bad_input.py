@@ -332,3 +332,22 @@ def test_identifiers_that_are_floats_beyond_2_to_the_53_are_refused(name: str) -
     fails(platoon().with_columns(large.alias(name)), name, "2^53", "write identifiers as integers or text")
     exact = platoon().with_columns(pl.col("vehicle_id", "leader_id") + 2**53)
     assert make(exact).table["vehicle_id"].n_unique() == 3
+
+
+@pytest.mark.parametrize("name", ["Vehicle_ID", "Preceding"])
+def test_identifiers_of_ngsim_are_held_to_the_same(tmp_path: Path, name: str) -> None:
+    path, feet = tmp_path / "ngsim.csv", {"position_m": "Local_Y", "speed_mps": "v_Vel", "length_m": "v_Length"}
+    table = platoon().select(
+        (pl.col("vehicle_id") + 2**53).alias("Vehicle_ID"),
+        (pl.col("time_s") * 10).round().cast(pl.Int64).alias("Frame_ID"),
+        *((pl.col(old) / 0.3048).alias(new) for old, new in feet.items()),
+        (pl.col("leader_id").fill_null(-(2**53)) + 2**53).alias("Preceding"),
+    )
+    table.write_csv(path)
+    loaded = load(path).table
+    assert loaded["vehicle_id"].n_unique() == 3
+    assert loaded["leader_id"].drop_nulls().unique().sort().to_list() == [str(2**53 + n) for n in (1, 2)]
+    table.with_columns(pl.col(name).cast(pl.Float64)).write_csv(path)
+    for read in (load, read_table):
+        with pytest.raises(DataError, match=rf"{name.lower()} = .* 2\^53.*write identifiers as integers or text"):
+            read(path)
