@@ -176,6 +176,7 @@ def _explain(
     import json
 
     from idm_env.discovery import discover, write_report
+    from idm_env.discovery.words import ERRORS
     from idm_env.report import output_folder
 
     output_folder(out)
@@ -192,12 +193,34 @@ def _explain(
         )
         write_report(found, out)
     result = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    names = [entry["effect"] or f"{entry['what']} over {entry['where']['coordinate']}" for entry in result["found"]]
-    console.print(f"Verdict: [bold]{result['verdict']}[/bold]{': ' + ', '.join(names) if names else ''}")
-    keys = ("gap_rmse_m", "gap_rmse_median_driver_m", "horizon_rmse_m", "speed_rmse_mps")
-    rows = [{"": when, **{k: result["error"][when].get(k) for k in keys}} for when in ("before", "after", "floor")]
-    _show("Errors on runs that neither fitted nor chose anything", rows)
+    console.print(f"Verdict: [bold]{result['verdict'].replace('_', ' ')}[/bold]. ", end="")
+    console.print(result["sentence"], markup=False, highlight=False)
+    before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
+    if before is not None:
+        _show("Errors on runs that neither fitted nor chose anything", [
+            _error_row(name, unit, before[key], after[key] if result["helps"] else None, result["helps"].get(key))
+            for key, (name, unit) in ERRORS.items()
+        ])  # fmt: skip
+    if result["interval"]:
+        console.print(result["interval"], style="dim", highlight=False)
+    console.print("; ".join(f"{file} is {name}" for file, name in result["models"].items()) + ".", highlight=False)
     _done(out)
+
+
+def _error_row(name: str, unit: str, before: float, after: float | None, help_of: dict[str, Any] | None) -> Any:
+    """Return one error of explain: IDM's, the other model's, and whether that is better, the same or worse."""
+    from idm_env.discovery.words import percent
+
+    row = {"error": f"{name} ({unit})", "IDM": before}
+    if after is not None:
+        known = help_of is not None and help_of["high"] is not None
+        row |= {
+            "compared": after,
+            "change": percent(after / before) if before else "",
+            "95 % interval": f"{percent(help_of['low'])} to {percent(help_of['high'])}" if help_of and known else "",
+            "verdict": help_of["verdict"] if help_of else "",
+        }
+    return row
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:
