@@ -198,28 +198,33 @@ def _explain(
     before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
     if before is not None:
         _show("Errors on runs that neither fitted nor chose anything", [
-            _error_row(name, unit, before[key], after[key] if result["helps"] else None, result["helps"].get(key))
+            _error_row(name, unit, before[key], after[key], found.judgement.titles, result["helps"].get(key))
             for key, (name, unit) in ERRORS.items()
         ])  # fmt: skip
     if result["interval"]:
         console.print(result["interval"], style="dim", highlight=False)
-    console.print("; ".join(f"{file} is {name}" for file, name in result["models"].items()) + ".", highlight=False)
+    files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
+    best = ", which predicts best" if len(files) > 1 else ""
+    console.print(
+        "; ".join(f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files)), highlight=False
+    )
     _done(out)
 
 
-def _error_row(name: str, unit: str, before: float, after: float | None, help_of: dict[str, Any] | None) -> Any:
-    """Return one error of explain: IDM's, the other model's, and whether that is better, the same or worse."""
+def _error_row(
+    name: str, unit: str, before: float, after: float, models: tuple[str, ...], compared: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Return one error of explain: that of every model, and whether the second's is better, the same or worse."""
     from idm_env.discovery.words import percent
 
-    row = {"error": f"{name} ({unit})", "IDM": before}
-    if after is not None:
-        known = help_of is not None and help_of["high"] is not None
-        row |= {
-            "compared": after,
-            "change": percent(after / before) if before else "",
-            "95 % interval": f"{percent(help_of['low'])} to {percent(help_of['high'])}" if help_of and known else "",
-            "verdict": help_of["verdict"] if help_of else "",
-        }
+    row: dict[str, Any] = {"error": f"{name} ({unit})"} | dict(zip(models, (before, after), strict=False))
+    if len(models) > 1:
+        known = compared is not None and compared["high"] is not None
+        row["change"] = percent(after / before) if before else ""
+        row["95 % interval"] = (
+            f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and known else ""
+        )
+        row["verdict"] = compared["verdict"] if compared else ""
     return row
 
 

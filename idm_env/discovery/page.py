@@ -73,8 +73,7 @@ def blocks(d: Discovery) -> Iterator[Block]:
     yield from _lights(r)
     yield from _first_picture(d)
     yield pages.heading("How sure is that")
-    for sentence in r["details"]:
-        yield pages.text(sentence)
+    yield pages.bullets(r["details"])
     yield pages.note(
         f"{r['data']['source']} · {r['data']['drivers']} groups of parameters in {r['data']['runs']} runs · "
         f"{len(r['error']['held_out_runs'])} runs kept back for the final check · seed {r['seed']}"
@@ -139,7 +138,7 @@ def _errors(d: Discovery) -> Iterator[Block]:
             row["verdict"] = help_of["verdict"] if help_of else "–"
         rows.append(row | {"noise of measurement": number(r["error"]["floor"].get(key))})
     yield pages.table(rows)
-    yield pages.terms(MEANING_OF_ERRORS | ({"95 % interval": r["interval"]} if r["interval"] else {}))
+    yield pages.terms(MEANING_OF_ERRORS | ({"interval": r["interval"]} if r["interval"] else {}))
     files = "; ".join(f"{file} is {name}" for file, name in r["models"].items())
     best = " model.yaml predicts best: the smaller geometric mean of the three errors." if r["helps"] else ""
     yield pages.note(

@@ -98,7 +98,7 @@ def report(
         "verdict": verdict.value,
         "reason": None if judged.refusal is None else judged.refusal.reason.value,
         "sentence": words.headline(verdict, [f["clause"] for f in found], judged.refusal, judged.tried, errors),
-        "details": words.details(verdict, found, judged.tried, errors, left),
+        "details": words.details(verdict, found, left),
         "found": found,
         "known": _known(final, interval_of(final, task), base),
         "helps": {
@@ -130,7 +130,7 @@ def _how(before: judge.Judged) -> str:
     count = before.squares["gap_rmse_m"][1]
     runs = np.array([run for (run, _), n in zip(before.followers, count, strict=True) if n])
     return (
-        f"95 %: bootstrap of {unit_of(runs)}, {DRAWS} draws of the logarithm of after / before, its standard error "
+        f"95 % by bootstrap of {unit_of(runs)}, {DRAWS} draws of the logarithm of after / before, its standard error "
         "widened by Student's t for so few. Better or worse: the whole interval lies on one side of no change."
     )
 

@@ -50,7 +50,7 @@ def amount(x: float, unit: str) -> str:
 
 def percent(ratio: float) -> str:
     """Return the change that a ratio means, with its sign, in percent."""
-    return f"{100.0 * (ratio - 1.0):+.1f} %".replace("-", "−")
+    return f"{100.0 * (ratio - 1.0):+.1f}\N{NO-BREAK SPACE}%".replace("-", "−")
 
 
 def plain(name: str) -> str:
@@ -59,11 +59,11 @@ def plain(name: str) -> str:
 
 
 def told(p: Parameter, estimate: float, low: float, high: float) -> str:
-    """Return a parameter with its interval and unit: ``k = −0.31 (−0.38 to −0.25)``."""
+    """Return a parameter with its unit and interval: ``k = −0.31 [−0.38, −0.25]``."""
     unit = "" if p.unit == "1" else f" {p.unit}"
     if p.role == "place":
         return f"{p.symbol or p.name} = {estimate:,.0f}{unit}".replace(",", " ")
-    return f"{p.symbol or p.name} = {number(estimate)}{unit} ({number(low)} to {number(high)})"
+    return f"{p.symbol or p.name} = {number(estimate)}{unit} [{number(low)}, {number(high)}]"
 
 
 def clause(term: Term, values: Sequence[Sequence[float]]) -> str:
@@ -119,18 +119,6 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
     }[refusal.reason]  # fmt: skip
 
 
-def effect_on(errors: Mapping[str, Comparison]) -> str:
-    """Say what became of the errors on runs kept back, error by error."""
-    parts = []
-    for key, c in errors.items():
-        name, unit = ERRORS[key]
-        interval = f", {percent(c.low)} to {percent(c.high)}" if c.high < float("inf") else ""
-        parts.append(
-            f"{name} {c.light.value} ({number(c.before)} to {number(c.after)} {unit}, {percent(c.ratio)}{interval})"
-        )
-    return "; ".join(parts)
-
-
 def headline(
     verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison]
 ) -> str:
@@ -176,10 +164,8 @@ def _but(errors: Mapping[str, Comparison]) -> str:
     return ""
 
 
-def details(
-    verdict: Verdict, found: Sequence[Mapping[str, Any]], tried: str, errors: Mapping[str, Comparison], left: float
-) -> list[str]:
-    """Say how sure it is, what it is confused with, what data would tell, and what the errors became."""
+def details(verdict: Verdict, found: Sequence[Mapping[str, Any]], left: float) -> list[str]:
+    """Say how sure it is, what it is confused with and what data would tell; ``left`` is what could still be gained."""
     parts = []
     for f in found:
         name = plain(f["effect"] or f["label"])
@@ -190,8 +176,6 @@ def details(
             parts.append(f"It is most easily confused with {', '.join(spoken(x) for x in f['looks_like'][:3])}.")
         if f["told_by"]:
             parts.append(f"What would tell: {f['told_by']}.")
-    if errors:
-        parts.append(f"On the runs kept back{'' if found else f', with {tried}'}: {effect_on(errors)}.")
     if verdict is Verdict.NONE:
         parts.append(
             f"A smooth function of the state without a name would lower the 5 s error by {100 * max(left, 0.0):.1f} % "
