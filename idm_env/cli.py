@@ -53,7 +53,9 @@ Place = Annotated[str | None, typer.Option(help="Column that names places, such 
 Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim or openacc.")]
 MaxGap = Annotated[float, typer.Option(help="Gaps above this (m) mean a lost leader and are left out.")]
 MinSeconds = Annotated[float, typer.Option(help="Shorter stretches behind one leader are left out (s).")]
-Where = Annotated[str | None, typer.Option(help='Only runs or drivers with "column=value".')]
+Where = Annotated[
+    list[str] | None, typer.Option(help='Only runs or drivers with "column=value"; given twice, both must hold.')
+]
 Window = Annotated[float | None, typer.Option(help="Cut longer stretches into windows of so many seconds.")]
 Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
 Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample, to this step (s).")]

@@ -130,8 +130,8 @@ def _how(before: judge.Judged) -> str:
     count = before.squares["gap_rmse_m"][1]
     runs = np.array([run for (run, _), n in zip(before.followers, count, strict=True) if n])
     return (
-        f"95 % by bootstrap of {unit_of(runs)}, {DRAWS} draws of the logarithm of after / before, its standard error "
-        "widened by Student's t for so few. Better or worse: the whole interval lies on one side of no change."
+        f"95 % by bootstrap of {unit_of(runs)}, {DRAWS} draws: standard error of the logarithm of after / before, "
+        "times Student's t. Better or worse: the whole interval lies on one side of no change."
     )
 
 
