@@ -13,7 +13,7 @@ import numpy as np
 
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
-from idm_env.discovery import checkpoint, judge, places, records, search, summary
+from idm_env.discovery import checkpoint, judge, places, records, search, summary, words
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.decide import Round, decide
@@ -123,7 +123,9 @@ def discover(
         by,
         seed,
     )
-    discovery.report["calibration"] = calibrated
+    report = discovery.report
+    report["calibration"] = calibrated
+    report["details"] += words.cautions(report["data"]["at_bounds"], calibrated["groups"], calibrated["converged"])
     return discovery
 
 

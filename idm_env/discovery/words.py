@@ -188,6 +188,17 @@ def details(verdict: Verdict, found: Sequence[Mapping[str, Any]], left: float) -
     return parts
 
 
+def cautions(at_bounds: Mapping[str, int], groups: int, converged: int) -> list[str]:
+    """Say what else speaks against the figures: parameters at their bounds, and calibrations without an end."""
+    parts = [
+        f"The fitted {name.replace('_', ' ')} is at its bound for {n} of {groups} groups of drivers."
+        for name, n in at_bounds.items() if n > 0.2 * groups
+    ]  # fmt: skip
+    if converged < 0.9 * groups:
+        parts.append(f"Only {converged} of {groups} groups of drivers were calibrated to an end before the search.")
+    return parts
+
+
 def spoken(item: str) -> str:
     """Return an entry of ``looks_like`` in plain words: its first word may be a candidate or a parameter."""
     first, _, rest = item.partition(" ")

@@ -175,6 +175,12 @@ def test_what_makes_every_error_worse_is_not_named(monkeypatch: pytest.MonkeyPat
     assert 'class="light worse"' in paths["report.html"].read_text()
 
 
+def test_bounds_and_unfinished_calibrations_are_told() -> None:
+    assert words.cautions({"comfort_decel": 3, "time_gap": 0}, 38, 38) == []
+    told = " ".join(words.cautions({"comfort_decel": 15, "time_gap": 0}, 38, 26))
+    assert "comfort decel is at its bound for 15 of 38" in told and "26 of 38" in told
+
+
 def test_words_of_none_claim_no_cause() -> None:
     text = words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {})
     assert "drivers' own noise" not in text + " ".join(words.details(Verdict.NONE, [], 0.01))
