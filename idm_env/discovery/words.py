@@ -55,7 +55,7 @@ def percent(ratio: float) -> str:
 
 def plain(name: str) -> str:
     """Return a candidate's plain name, or the label of what is only located, without underscores."""
-    return ALL[name].title if name in ALL else name.replace("_", " ")
+    return (name in ALL and ALL[name].title) or name.replace("_", " ")
 
 
 def told(p: Parameter, estimate: float, low: float, high: float) -> str:
@@ -80,7 +80,9 @@ def clause(term: Term, values: Sequence[Sequence[float]]) -> str:
         null = term.parameters[0].null or 0.0
         below, above = effect.wording
         text = below if len(values) <= MANY and estimates[0] < null else above
-        return f"{text or below} ({effect.title}: {effect.equation}, with {numbers})"
+        name = plain(term.effect)
+        told_as = f"{name}: {effect.equation}" if effect.equation else name
+        return f"{text or below or f'an effect is missing that {name} describes'} ({told_as}, with {numbers})"
     below, above, noun, equation = CHANGES[term.what]
     if len(values) > MANY or term.knots[2] > 2:
         return f"the {noun} depends on {_over(term)} ({equation}, with {numbers})"

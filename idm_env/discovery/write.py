@@ -8,6 +8,9 @@ from idm_env.config import save_model
 from idm_env.discovery.discover import Discovery
 from idm_env.report import output_folder, write_json, write_page
 
+OUTPUT = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
+"""Every file that a discovery may write."""
+
 
 def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
     """Write report.json, report.html (self-contained) and models into a folder; return their paths by file name.
