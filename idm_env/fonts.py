@@ -15,11 +15,12 @@ _UNFIT = ("last resort", "emoji")
 """Families that draw boxes for everything, or bitmaps that matplotlib cannot scale."""
 
 
-def legible(figure: Figure) -> dict[str, str]:
+def legible(figure: Figure, numbers: dict[str, str] | None = None) -> dict[str, str]:
     """Make every text of a figure drawable; to be called last, before it is saved.
 
     Characters that the font lacks are drawn with installed fonts that have them. A word with a character that no font
     has becomes a number, "#1"; the numbers and their words are returned, to be told where a browser chooses the font.
+    ``numbers`` are those of another figure of the same names, which stay.
     """
     from matplotlib import rcParams
     from matplotlib.font_manager import FontProperties, findfont
@@ -30,20 +31,20 @@ def legible(figure: Figure) -> dict[str, str]:
     texts = [found for found in figure.findobj(Text) if isinstance(found, Text)]
     wanted = {c for text in texts for c in text.get_text() if not c.isspace()}
     lacking = wanted - _glyphs(findfont(FontProperties()))
+    words = {word: number for number, word in (numbers or {}).items()}
     if not lacking:
-        return {}
+        return numbers or {}
     families, nowhere = _families(frozenset(lacking))
     chain = [*rcParams["font.family"], *families]
     for text in texts:
         text.set_fontfamily(chain)
     for panel in figure.axes:
         panel.tick_params(labelfontfamily=chain)
-    numbers: dict[str, str] = {}
 
     def numbered(text: str) -> str:
         def number(match: re.Match[str]) -> str:
             word = match[0]
-            return numbers.setdefault(word, f"#{len(numbers) + 1}") if set(word) & nowhere else word
+            return words.setdefault(word, f"#{len(words) + 1}") if set(word) & nowhere else word
 
         return re.sub(r"[^\s/:,;()]+", number, text)
 
@@ -53,7 +54,7 @@ def legible(figure: Figure) -> dict[str, str]:
         for axis, labels in ticks.items():
             if set(labels) & nowhere:  # drawing asks the formatter again
                 axis.set_major_formatter(_after(numbered, axis.get_major_formatter()))
-    return {number: word for word, number in numbers.items()}
+    return {number: word for word, number in words.items()}
 
 
 def _after(change: Callable[[str], str], formatter: Formatter) -> Formatter:

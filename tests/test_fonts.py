@@ -59,6 +59,18 @@ def test_a_name_that_no_font_has_becomes_a_number(monkeypatch: pytest.MonkeyPatc
     assert [said.get(labels[0]), labels[1]] == ["車両一", "b"]
 
 
+def test_a_name_has_one_number_in_the_wide_and_the_narrow_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fonts, "_families", lambda lacking: ([], set(lacking)))
+    titles = []
+    for title in ("東京 車両一", "車両二 東京"):
+        figure, axes = report.figure()
+        axes[0, 0].set_title(title)
+        titles.append((figure, axes[0, 0]))
+    caption = report.picture(titles[0][0], "Names.", titles[1][0]).text
+    said = dict(part.split(": ") for part in caption.removeprefix("Names. ").removesuffix(".").split(", "))
+    assert [" ".join(said[n] for n in axes.get_title().split()) for _, axes in titles] == ["東京 車両一", "車両二 東京"]
+
+
 def test_space_time_diagrams_have_titles_of_any_script() -> None:
     """The file's name is the title."""
     table = pl.DataFrame(

@@ -5,6 +5,7 @@ and a candidate in discovery.
 from __future__ import annotations
 
 import sys
+from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from idm_env.checks import nearest, shown
@@ -80,7 +81,8 @@ def make(kind: str, **choices: object) -> Effect:
     if kind not in ALL:
         raise ValueError(f"unknown effect {shown(kind)}.{nearest(str(kind), ALL)}")
     cls = ALL[kind]
-    known = {name: hint for name, hint in get_type_hints(cls).items() if name in cls.__dataclass_fields__}
+    hints = get_type_hints(cls)
+    known = {field.name: hints[field.name] for field in fields(cls)}
     for choice, value in choices.items():
         if choice not in known:
             raise ValueError(f"effect '{kind}' has no choice {shown(choice)}.{nearest(choice, known)}")
