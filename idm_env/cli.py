@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from idm_env.progress import OnProgress, shown
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -59,24 +58,6 @@ Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: it
 Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample, to this step (s).")]
 
 
-@contextmanager
-def progress() -> Iterator[Callable[[str, int, int, float | str], None]]:
-    """Show a bar per phase on standard error."""
-    columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TextColumn("{task.fields[value]}"), console=console, transient=False) as bars:
-        tasks: dict[str, Any] = {}
-
-        def report(phase: str, done: int, total: int, value: float | str) -> None:
-            if phase not in tasks:
-                tasks[phase] = bars.add_task(phase, total=total, value="")
-            words = value if isinstance(value, str) else f"residual {value:.3f}"
-            bars.update(tasks[phase], completed=done, total=total, value=words)
-
-        yield report
-        for task in tasks.values():
-            bars.update(task, total=bars.tasks[task].completed)
-
-
 def _show(title: str, rows: list[dict[str, Any]]) -> None:
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
@@ -119,23 +100,24 @@ def fit(
 
     Writes parameters.parquet, model.yaml, report.json and report.html.
     """
-    from idm_env.fitting.job import Options, Source, fit_file
-
-    source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
-    options = Options(
-        by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
-    )  # fmt: skip
-    with progress() as report:
+    with shown(console) as report:
+        from idm_env.fitting.job import Options, Source, fit_file
+
+        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+        options = Options(
+            by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
+        )  # fmt: skip
         result = fit_file(source, options, out, resume=resume, on_progress=report)
     rows = [{"": "fitted", **result["fit"]}]
     if result["held_out"] is not None:
         rows.append({"": "held out", **result["held_out"]})
     names = ("", "episodes", "gap_rmse_m", "gap_rmse_median_m", "gap_mae_m", "speed_rmse_mps", "collisions")
     _show("Errors in free simulation", [{n: row[n] for n in names} for row in rows])
-    _done(out)
+    console.print(result["at_bounds"], soft_wrap=True, highlight=False)
+    _done(out, result["data"]["account"])
 
 
 @app.command()
@@ -156,15 +138,19 @@ def explain(
 
     Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
     """
-    from idm_env.data import load
+    with shown(console) as report:
+        from idm_env.data import load
 
-    trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
-    if where is not None:
-        trajectories = trajectories.where(where)
-    _explain(trajectories, out, by, _names(effects), _names(known) or (), seed, resume)
+        report("reading", 0, 0, data.name)
+        trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
+        if where is not None:
+            trajectories = trajectories.where(where)
+        result = _explain(report, trajectories, out, by, _names(effects), _names(known) or (), seed, resume)
+    _explained(result, out)
 
 
 def _explain(
+    report: OnProgress,
     trajectories: Any,
     out: Path,
     by: str = "driver",
@@ -172,32 +158,31 @@ def _explain(
     known: tuple[str, ...] = (),
     seed: int = 0,
     resume: bool = False,
-) -> None:
+) -> dict[str, Any]:
     import json
 
     from idm_env.discovery import discover, write_report
     from idm_env.report import output_folder
 
     output_folder(out)
-    with progress() as report:
-        found = discover(
-            trajectories,
-            by=by,
-            effects=effects,
-            known=known,
-            out=out,
-            resume=resume,
-            seed=seed,
-            on_progress=lambda stage, candidate, done, total: report(stage, done, total, candidate),
-        )
-        write_report(found, out)
-    result = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    found = discover(
+        trajectories, by=by, effects=effects, known=known, out=out, resume=resume, seed=seed, on_progress=report
+    )
+    report("writing the report", 0, 0, "")
+    write_report(found, out)
+    result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    return result
+
+
+def _explained(result: dict[str, Any], out: Path) -> None:
+    from idm_env.report import account
+
     names = [entry["effect"] or f"{entry['what']} over {entry['where']['coordinate']}" for entry in result["found"]]
     console.print(f"Verdict: [bold]{result['verdict']}[/bold]{': ' + ', '.join(names) if names else ''}")
     keys = ("gap_rmse_m", "gap_rmse_median_driver_m", "horizon_rmse_m", "speed_rmse_mps")
     rows = [{"": when, **{k: result["error"][when].get(k) for k in keys}} for when in ("before", "after", "floor")]
     _show("Errors on runs that neither fitted nor chose anything", rows)
-    _done(out)
+    _done(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:
@@ -216,17 +201,21 @@ def demo(
 
     The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
     """
-    from idm_env.data import load, synthetic
-    from idm_env.report import output_folder
+    with shown(console) as report:
+        from idm_env.data import load, synthetic
+        from idm_env.report import output_folder
 
-    path = data
-    if path is None:
-        path = output_folder(out) / "platoon.csv"
-        made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
-        columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
-        made.table.select(columns).write_csv(path)
-        console.print(f"Ten runs of a leader and three followers: {path}")
-    _explain(load(path), out)
+        path = data
+        if path is None:
+            report("generating", 0, 0, "platoon.csv")
+            path = output_folder(out) / "platoon.csv"
+            made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
+            columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
+            made.table.select(columns).write_csv(path)
+            console.print(f"Ten runs of a leader and three followers: {path}")
+        report("reading", 0, 0, path.name)
+        result = _explain(report, load(path), out)
+    _explained(result, out)
 
 
 @app.command()
@@ -245,12 +234,13 @@ def simulate(
     where: Where = None,
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
-    from idm_env.fitting.job import Source, simulate_file
+    with shown(console) as report:
+        from idm_env.fitting.job import Source, simulate_file
 
-    source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
-    result = simulate_file(source, model, out, seed=seed)
+        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+        result = simulate_file(source, model, out, seed=seed, on_progress=report)
     _show("Errors in free simulation", [result["error"]])
-    _done(out)
+    _done(out, result["data"]["account"])
 
 
 @app.command()
@@ -278,36 +268,57 @@ def plot(
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture: png, svg or pdf.")] = Path(
         "out/space-time.png"
     ),
+    html: Annotated[
+        bool, typer.Option("--html", help="Write an interactive page too, beside the picture: zoom, and point.")
+    ] = False,
+    panels: Annotated[int, typer.Option(help="Panels at most, one per run and lane, the largest first.", min=1)] = 6,
     where: Where = None,
     seconds: Annotated[
         float, typer.Option(help="Length of a rollout, all vehicles left to their drivers (s).", min=0.1)
     ] = 300.0,
     seed: Seed = 0,
 ) -> None:
-    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout."""
-    from idm_env.diagrams import space_time
+    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
 
-    if source.suffix in (".yaml", ".yml"):
-        figure = _rollout_figure(source, seconds, seed)
-    else:
-        from idm_env.data import load
+    One panel per run and lane; controlled vehicles (of a rollout, or a column "controlled") are underlined in blue.
+    """
+    from idm_env.report import account
 
-        trajectories = load(source)
-        if where is not None:
-            trajectories = trajectories.where(where)
-        runs = len(trajectories.runs())
-        overlaid = f", {runs} runs on one axis (choose one with --where)" if runs > 1 else ""
-        figure = space_time(trajectories, title=f"{source.name}{overlaid}")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out)
-    console.print(f"Picture: [bold]{out.resolve()}[/bold]", soft_wrap=True)
+    repairs: tuple[Any, ...] = ()
+    with shown(console) as report:
+        from idm_env import diagrams
+
+        if source.suffix in (".yaml", ".yml"):
+            drawn = [_rollout_panel(source, seconds, seed, report)]
+        else:
+            from idm_env.data import load
+
+            report("reading", 0, 0, source.name)
+            trajectories = load(source)
+            if where is not None:
+                trajectories = trajectories.where(where)
+            drawn, repairs = diagrams.panels(trajectories), trajectories.repairs
+        report("drawing", 0, 0, out.name)
+        kept = drawn[:panels]
+        more = f", the largest {len(kept)} of {len(drawn)} panels" if len(drawn) > len(kept) else ""
+        title = f"{source.name}{more}" if len(kept) > 1 else f"{source.name}: {kept[0].title}{more}"
+        out.parent.mkdir(parents=True, exist_ok=True)
+        diagrams.figure_of(kept, title).savefig(out)
+        if html:
+            diagrams.write_html(out.with_suffix(".html"), kept, title)
+    if more:
+        console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
+    if source.suffix not in (".yaml", ".yml"):
+        console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, markup=False, highlight=False)
+    for path in (out, *([out.with_suffix(".html")] if html else [])):
+        console.print(f"Picture: [bold]{path.resolve()}[/bold]", soft_wrap=True)
 
 
-def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
+def _rollout_panel(config: Path, seconds: float, seed: int, report: OnProgress) -> Any:
     import torch
 
     from idm_env.config import load_environment
-    from idm_env.diagrams import space_time
+    from idm_env.diagrams import rollout_panel
     from idm_env.envs.gym import DiffIDMEnv
     from idm_env.roads import Ring
     from idm_env.simulator import Trajectory
@@ -318,16 +329,18 @@ def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
     env.reset(seed=seed)
     dt = env.task.simulator.dt
     kept = []
-    for _ in range(max(1, round(seconds / dt))):
+    steps = max(1, round(seconds / dt))
+    for step in range(steps):
         _, _, terminated, truncated, _ = env.step(None)
         state = env.batch.world.state
         kept.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
+        report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
         if terminated or truncated:
             break
     # On a ring gaps and lengths add up to the circumference.
     length = float((state.gap[0] + state.length[0]).sum()) if isinstance(env.task.simulator.road, Ring) else None
     states = Trajectory(*(torch.stack(column) for column in zip(*kept, strict=True)))
-    return space_time(states, dt=dt, ring_length=length, title=config.name)
+    return rollout_panel(states, dt=dt, ring_length=length, marked=env.task.agents)
 
 
 Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]
@@ -345,14 +358,14 @@ def filter_(
     resume: Resume = False,
 ) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
-    from idm_env.trajectories.files import filter_file
+    with shown(console) as report:
+        from idm_env.trajectories.files import filter_file
 
-    with progress() as report:
-        filter_file(
+        result = filter_file(
             data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            model=model, on_progress=lambda done, total: report("filter", done, total, ""),
+            model=model, on_progress=report,
         )  # fmt: skip
-    _done(out)
+    _done(out, result["account"])
 
 
 @app.command()
@@ -367,14 +380,14 @@ def reconstruct(
     resume: Resume = False,
 ) -> None:
     """Reconstruct dense trajectories from sparse ones, a second or more between points."""
-    from idm_env.trajectories.files import reconstruct_file
+    with shown(console) as report:
+        from idm_env.trajectories.files import reconstruct_file
 
-    with progress() as report:
-        reconstruct_file(
+        result = reconstruct_file(
             data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            model=model, on_progress=lambda done, total: report("reconstruct", done, total, ""),
+            model=model, on_progress=report,
         )  # fmt: skip
-    _done(out)
+    _done(out, result["account"])
 
 
 @app.command()
@@ -384,11 +397,11 @@ def predict(
     resume: Resume = False,
 ) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
-    from idm_env.prediction.files import predict_files
+    with shown(console) as report:
+        from idm_env.prediction.files import predict_files
 
-    with progress() as report:
-        predict_files(scenarios, out, resume=resume, on_progress=lambda done, total: report("predict", done, total, ""))
-    _done(out)
+        result = predict_files(scenarios, out, resume=resume, on_progress=report)
+    _done(out, result["account"])
 
 
 @app.command()
@@ -400,11 +413,22 @@ def bench(
     peers: Annotated[bool, typer.Option(help="Include SUMO and HighwayEnv.")] = True,
     verbose: Annotated[bool, typer.Option("--verbose", help="Say which path ran, and why.")] = False,
 ) -> None:
-    """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine."""
-    from idm_env.bench import run as measure
+    """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine.
 
+    Writes report.html and performance.json.
+    """
     numbers = [int(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
-    measure(out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, verbose=verbose)
+    with shown(console) as report:
+        from idm_env import bench as benchmark
+        from idm_env.bench import tables
+
+        result = benchmark.run(
+            out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, on_progress=report,
+            say=console.print if verbose else None,
+        )  # fmt: skip
+    for title, rows, _ in tables.of(result):
+        _show(title, rows)
+    _done(out, tables.absent(result))
 
 
 def _number(option: str, text: str, wrong: str) -> float:
@@ -414,7 +438,8 @@ def _number(option: str, text: str, wrong: str) -> float:
         raise ValueError(f"{option} = {text!r} is {wrong}.") from None
 
 
-def _done(out: Path) -> None:
+def _done(out: Path, account: str) -> None:
+    console.print(account, soft_wrap=True, markup=False, highlight=False)
     console.print(f"Report: [bold]{(out / 'report.html').resolve()}[/bold]", soft_wrap=True)
 
 

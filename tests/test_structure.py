@@ -21,10 +21,13 @@ ALLOWED = {
     "simulator": {"types", "parameters", "effects", "roads", "kernels", "compiled"},
     "compiled": {"types", "parameters", "simulator"},
     "report": set(),
+    "progress": set(),
+    "diagrams": {"report"},
     "config": {"types", "parameters", "effects", "roads", "simulator"},
     "data": set(),
     "fitting": {
         "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "report", "metrics",
+        "progress", "diagrams",
     },
 }  # fmt: skip
 """What a part may import of the package; parts that are not named may import anything but what FORBIDDEN says."""
