@@ -59,13 +59,15 @@ Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample,
 
 
 def _show(title: str, rows: list[dict[str, Any]]) -> None:
+    from idm_env.report import number
+
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
         table.add_column(
             name.replace("_", " "), overflow="fold", justify="left" if isinstance(rows[0][name], str) else "right"
         )
     for row in rows:
-        table.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()))
+        table.add_row(*(number(v) if isinstance(v, float) else str(v) for v in row.values()))
     Console().print(table)
 
 
@@ -365,7 +367,19 @@ def filter_(
             data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
             model=model, on_progress=report,
         )  # fmt: skip
+    _methods(result)
     _done(out, result["account"])
+
+
+def _methods(result: dict[str, Any]) -> None:
+    from idm_env.trajectories.report import COLUMNS
+
+    if result["left_out_points"]:
+        names = {"method": "method", "rmse_m": "RMSE (m)", "mae_m": "mean |error| (m)", "p95_m": "95 % below (m)"}
+        rows = [{title: row[name] for name, title in names.items()} for row in result["left_out_points"]]
+        _show(f"{result['left_out_points'][0]['points']} points of the file that were left out", rows)
+    rows = [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in result["methods"]]
+    _show("Methods on these data", rows)
 
 
 @app.command()
@@ -387,6 +401,7 @@ def reconstruct(
             data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
             model=model, on_progress=report,
         )  # fmt: skip
+    _methods(result)
     _done(out, result["account"])
 
 
@@ -401,6 +416,9 @@ def predict(
         from idm_env.prediction.files import predict_files
 
         result = predict_files(scenarios, out, resume=resume, on_progress=report)
+    names = {"minADE_8s": "minADE (m)", "minFDE_8s": "minFDE (m)", "miss_rate_8s": "miss rate", "mAP_8s": "mAP"}
+    rows = [{"method": r["method"], **{title: r[key] for key, title in names.items()}} for r in result["methods"]]
+    _show(f"8 s ahead, {result['agents_with_known_future']} agents", rows)
     _done(out, result["account"])
 
 
@@ -426,7 +444,7 @@ def bench(
             out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, on_progress=report,
             say=console.print if verbose else None,
         )  # fmt: skip
-    for title, rows, _ in tables.of(result):
+    for title, rows, _ in tables.of(result)[: len(numbers) + 2]:  # the rest is in the report
         _show(title, rows)
     _done(out, tables.absent(result))
 

@@ -123,7 +123,7 @@ def space_time(
         row: Which row of a batch to draw.
         ring_length: Circumference (m); positions are then drawn on one lap.
         marked: Vehicles (indices of a rollout) to underline in blue, as controlled ones.
-        fastest: Speed of the colour scale's end (m/s); None takes the fastest of the data.
+        fastest: Speed of the colour scale's end (m/s); None takes nearly the fastest of the data.
         title: Above the picture.
         most: Panels at most: one per run and lane, the largest first.
 
@@ -202,7 +202,8 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     }
     text = json.dumps(content, ensure_ascii=False).replace("<", "\\u003c")
     fragment = Path(__file__).with_name("space_time.html").read_text(encoding="utf-8").replace("{{ data }}", text)
-    words = f"One line per vehicle, coloured by speed; {len(drawn)} panel{'s' if len(drawn) > 1 else ''}, largest first."
+    several = f" {len(drawn)} panels, one per run and lane, the largest first." if len(drawn) > 1 else ""
+    words = f"One line per vehicle, coloured by speed.{several}"
     thinned = f" Every {stride}th sample is drawn." if stride > 1 else ""
     report.write_page(path, title, [report.note(words + thinned), report.html(fragment)])
 
@@ -239,8 +240,10 @@ def _range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def _fastest(drawn: Sequence[Panel]) -> float:
-    speeds = [line.speed for panel in drawn for line in panel.lines if len(line.speed)]
-    return max((float(np.nanmax(speed, initial=0.0)) for speed in speeds), default=1.0) or 1.0
+    """Return the end of the colours' scale (m/s): nearly the fastest, so that a few samples do not set it."""
+    speeds = np.concatenate([np.zeros(1), *(line.speed for panel in drawn for line in panel.lines)])
+    known = speeds[np.isfinite(speeds)]
+    return float(np.percentile(known, 99.5)) or float(known.max()) or 1.0
 
 
 def _stride(drawn: Sequence[Panel]) -> int:

@@ -81,21 +81,26 @@ def table(
 
 def _cell(value: Any, digits: int | None = None) -> dict[str, Any]:
     if isinstance(value, Cell):
-        number = value.value is not None
-        known = number and abs(value.value or 0.0) < float("inf")
-        return {"text": value.text, "number": number, "value": value.value if known else None, "marked": value.marked}
+        sorted_by, finite = value.value, value.value is not None and abs(value.value) < float("inf")
+        kept = sorted_by if finite else None
+        return {"text": value.text, "number": sorted_by is not None, "value": kept, "marked": value.marked}
     cell: dict[str, Any] = {"number": False, "value": None, "marked": False}
     if isinstance(value, bool):
         return cell | {"text": "yes" if value else "no"}
-    if isinstance(value, float) and not abs(value) < float("inf"):
-        return cell | {"text": "–", "number": True}
     if isinstance(value, float):
-        return cell | {
-            "text": f"{value:.4g}" if digits is None else f"{value:.{digits}f}", "number": True, "value": value
-        }  # fmt: skip
+        return cell | {"text": number(value, digits), "number": True, "value": value if abs(value) < float("inf") else None}
     if isinstance(value, int):
         return cell | {"text": str(value), "number": True, "value": value}
     return cell | {"text": "" if value is None else str(value)}
+
+
+def number(value: float, digits: int | None = None) -> str:
+    """Return a number as people read it: four significant digits, or ``digits`` behind the point; a dash for none."""
+    if not abs(value) < float("inf"):
+        return "–"
+    if digits is not None:
+        return f"{value:.{digits}f}"
+    return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
 
 
 def shortened(items: Sequence[str], most: int = 100) -> list[str]:

@@ -17,9 +17,8 @@ def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> 
     page.write_json(out / "report.json", report)
     left_out = report["left_out"]
     scored = f"{report['agents_with_known_future']} of them have a known future and are scored, at 2 Hz."
-    lost = f"{len(left_out)} files or agents were left out (below)." if left_out else "Nothing was left out."
     blocks = [
-        page.lead(f"{scored} {lost}"),
+        page.lead(f"{scored} {report['account']}"),
         page.note(
             "minADE and minFDE are those of the best of up to six futures; an agent is missed where no future ends in "
             "a box around the truth that grows with time and speed. mAP asks besides that confident futures be the "
