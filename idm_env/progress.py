@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 OnProgress = Callable[[str, int, int, "float | str"], None]
-"""Called with the phase, how much of it is done, of how much (0: not known), and a word on where it is or a residual."""
+"""Called with the phase, how much of it is done, of how much (0: not known), and where it is in a word or a residual."""
 
 LOG_SECONDS = 10.0
 """Where nobody watches, a line at most so often (s)."""
@@ -40,12 +40,18 @@ class _Bars:
     """Bars on a terminal."""
 
     def __init__(self, console: Console) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-        from rich.progress import TimeElapsedColumn, TimeRemainingColumn  # fmt: skip
+        from rich.progress import (  # fmt: skip
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
 
         columns = (
-            TextColumn("{task.description:<14}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(),
-            TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[words]}"),
+            TextColumn("{task.description:<14}", markup=False), BarColumn(bar_width=24), MofNCompleteColumn(),
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[words]}", markup=False),
         )  # fmt: skip
         self._bars = Progress(*columns, console=console, speed_estimate_period=600.0)
         self._tasks: dict[str, Any] = {}
@@ -102,13 +108,15 @@ class _Lines:
         if total and 0 < done < total and now - self._said >= LOG_SECONDS:
             self._said = now
             left = _clock((now - self._began) * (total - done) / done)
-            self._console.print(f"{phase} {done}/{total}, {left} left {_words(words)}".rstrip(), soft_wrap=True)
+            self._console.print(
+                f"{phase} {done}/{total}, {left} left {_words(words)}".rstrip(), soft_wrap=True, markup=False
+            )
 
     def end(self) -> None:
         done, total = self._at
         if self._phase and total:
             took = _clock(time.monotonic() - self._began)
-            self._console.print(f"{self._phase} {done}/{total} in {took}", soft_wrap=True)
+            self._console.print(f"{self._phase} {done}/{total} in {took}", soft_wrap=True, markup=False)
         self._phase, self._at = "", (0, 0)
 
     def stop(self) -> None:

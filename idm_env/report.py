@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+
 @dataclass(frozen=True)
 class Block:
     """One piece of a page: a heading, a paragraph, a list, a figure, a gallery, a table or markup of one's own."""
@@ -88,7 +89,11 @@ def _cell(value: Any, digits: int | None = None) -> dict[str, Any]:
     if isinstance(value, bool):
         return cell | {"text": "yes" if value else "no"}
     if isinstance(value, float):
-        return cell | {"text": number(value, digits), "number": True, "value": value if abs(value) < float("inf") else None}
+        return cell | {
+            "text": number(value, digits),
+            "number": True,
+            "value": value if abs(value) < float("inf") else None,
+        }
     if isinstance(value, int):
         return cell | {"text": str(value), "number": True, "value": value}
     return cell | {"text": "" if value is None else str(value)}

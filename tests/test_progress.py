@@ -29,8 +29,10 @@ def test_a_bar_tells_what_is_done_and_what_is_left() -> None:
         report("reading", 0, 0, "a.csv")
         report("fit", 1, 4, 0.5)
         report("fit", 2, 4, 0.25)
+        report("[red]", 1, 1, "a[1].csv")
     text = written.getvalue()
     assert "2/2" in text and "residual 0.250" in text and "left" in text
+    assert "[red]" in text and "a[1].csv" in text  # a user's names are no markup
     assert "reading" not in text.splitlines()[-1]
 
 

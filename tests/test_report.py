@@ -1,4 +1,4 @@
-"""The page that all reports share: sortable tables, nothing from elsewhere, no sideways scroll; and the line on data."""
+"""The page that all reports share: sortable tables, no network, no sideways scroll; and the line on data."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def run(
 
     try:
         torch.set_num_threads(1)
-        for name, weight, job in jobs:  # noqa: B007  (``tell`` reads the weight)
+        for name, weight, job in jobs:
             tell(name.replace("_", " "))
             result[name] = job()
             before += weight

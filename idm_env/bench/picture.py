@@ -9,7 +9,10 @@ from idm_env import report as page
 
 
 def draw(result: dict[str, Any], path: Path) -> page.Block:
-    """Draw forward and forward + backward, nanoseconds of one core per vehicle-step, with the triad as the floor; return it for a page."""
+    """Draw forward and forward + backward, nanoseconds of one core per vehicle-step, with the triad as the floor.
+
+    Returns the picture for a page.
+    """
     figure, grid = page.figure(1, 2, size=(10.0, 4.0))
     panels = grid[0]
     panels[1].sharey(panels[0])

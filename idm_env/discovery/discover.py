@@ -96,7 +96,9 @@ def discover(
     task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
     searching = Search(task, names, located and effects is None, saved, progress)
     progress("calibration", 0, 0, "idm")
-    theta, calibrated = calibrate(prepared.of_runs(fit_runs), by, task.prior.centre)
+    theta, calibrated = calibrate(
+        prepared.of_runs(fit_runs), by, task.prior.centre, lambda _, *state: progress("calibration", *state)
+    )
     progress("null", 0, 0, "idm")
     base = Model(tuple(_known_terms(prepared, known, trajectories)))
     null = searching.null(base, theta)

@@ -112,6 +112,6 @@ def _row(found: Fit, row: dict[str, Any]) -> dict[str, Any]:
         value, spread = row[name], row[f"{name}_error"]
         unit = "" if p.unit == "1" else f" ({p.unit})"
         # A spread that says nothing is not a number worth reading; drivers.csv has it.
-        text = f"{value:.3g} ⊣" if name in on else f"{value:.3g} ?" if name in doubtful else f"{value:.3g} ± {spread:.1g}"
-        shown[f"{p.symbol}{unit}"] = page.Cell(text, value, name in on)
+        after = "⊣" if name in on else "?" if name in doubtful else f"± {spread:.1g}"
+        shown[f"{p.symbol}{unit}"] = page.Cell(f"{value:.3g} {after}", value, name in on)
     return shown | {"converged": row["converged"]}

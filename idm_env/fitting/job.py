@@ -277,12 +277,14 @@ def simulate_file(
     progress("writing", 0, 0, "the report")
     tables = [_simulated_table(problem, simulated, row) for row in range(len(items))]
     pl.concat(tables).write_parquet(out / "simulated.parquet")
-    result = {
+    result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
         "model": str(model_path),
         "data": {
-            **trajectories.summary(), "left_out": [str(r) for r in items.left_out], "episodes": len(items),
+            **trajectories.summary(),
+            "left_out": [str(r) for r in items.left_out],
+            "episodes": len(items),
             "account": _account(trajectories, items.left_out),
         },
         "drivers_with_own_parameters": matched,

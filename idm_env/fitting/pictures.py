@@ -63,8 +63,8 @@ def residuals(problem: Problem, simulated: Simulated) -> page.Block:
         axis.grid(alpha=0.25)
     return page.picture(
         figure,
-        f"The gap's residual of all {len(problem.batch)} episodes. A model that lacks nothing leaves a band around 0 of "
-        "the same width everywhere; a slope or a bend over speed is what it lacks.",
+        f"The gap's residual of all {len(problem.batch)} episodes. A model that lacks nothing leaves a band around 0 "
+        "of the same width everywhere; a slope or a bend over speed is what it lacks.",
     )
 
 

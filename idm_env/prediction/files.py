@@ -92,9 +92,7 @@ def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
     return hashlib.sha256(repr((stats, baselines)).encode()).hexdigest()
 
 
-def _file(
-    parts: Parts, number: int, path: Path, methods: Sequence[str], on_scenario: Callable[[int], None]
-) -> None:
+def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scenario: Callable[[int], None]) -> None:
     """Predict the scenarios of one file and write its part; ``on_scenario`` is called with how many are done."""
     left_out: list[dict[str, str]] = []
     notes: list[dict[str, str]] = []

@@ -65,8 +65,8 @@ def _how(report: dict[str, Any]) -> str:
     few = (
         ""
         if whole
-        else f" They say nothing of how scenes differ, of which there are only {len(report['scenes'])}: another scene may "
-        "lie outside."
+        else f" They say nothing of how scenes differ, of which there are only {len(report['scenes'])}: another one "
+        "may lie outside."
     )
     return f"95 %: bootstrap intervals, {words}.{few} A click on a heading sorts."
 

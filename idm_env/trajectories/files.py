@@ -130,8 +130,8 @@ def run(
         else:
             recent += chunks.done(
                 parts, number, tracks, settings, plan, recent,
-                lambda share, words, b=begin, e=end: progress(  # type: ignore[misc]
-                    settings.task, b + int(share * (e - b)), everybody, words
+                lambda share, words, b=begin, e=end, n=everybody: progress(  # type: ignore[misc]
+                    settings.task, b + int(share * (e - b)), n, words
                 ),
             )  # fmt: skip
         progress(settings.task, end, everybody, "")

@@ -30,8 +30,8 @@ def space_time(written: Path, spool: Spool, bridge: float | None) -> list[page.B
     lines = []
     mine = after.filter(pl.col("vehicle_id").is_in(sorted(names)))
     for (vehicle, piece), rows in mine.group_by("vehicle_id", "piece", maintain_order=True):
-        columns = (rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps"))
-        lines.append(diagrams.Line(f"{vehicle}/{piece}", *columns))
+        time, position, speed = (rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps"))
+        lines.append(diagrams.Line(f"{vehicle}/{piece}", time, position, speed))
     fastest = 1.05 * max(float(line.speed.max()) for line in lines) or 1.0
     both = [diagrams.Panel("the data", tuple(before)), diagrams.Panel("ours", tuple(lines))]
     words = f"run {run}" + (f", lane {lane}" if lane is not None else "")
