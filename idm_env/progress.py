@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 OnProgress = Callable[[str, int, int, "float | str"], None]
-"""Called with the phase, how much of it is done, of how much (0: not known), and where it is in a word or a residual."""
+"""Called with the phase, how much of it is done, of how much (0: not known), and a word or a residual."""
 
 LOG_SECONDS = 10.0
 """Where nobody watches, a line at most so often (s)."""
@@ -51,7 +51,8 @@ class _Bars:
 
         columns = (
             TextColumn("{task.description:<14}", markup=False), BarColumn(bar_width=24), MofNCompleteColumn(),
-            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[words]}", markup=False),
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+            TextColumn("{task.fields[words]}", markup=False),
         )  # fmt: skip
         self._bars = Progress(*columns, console=console, speed_estimate_period=600.0)
         self._tasks: dict[str, Any] = {}

@@ -136,9 +136,9 @@ def run(
             )  # fmt: skip
         progress(settings.task, end, everybody, "")
     scored = []
-    if settings.task == "reconstruct" and settings.recipe == "default":
+    if settings.task == "reconstruct":
         progress("scoring", 0, 0, "points left out of the file")
-        scored = left_out.score(spool, plan)
+        scored = left_out.score(spool, plan, settings)
     progress("writing", 0, 0, "the report")
     parts.join(TRAJECTORIES, out / "trajectories.parquet")
     parts.join(PARAMETERS, out / "parameters.parquet")

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from idm_env.trajectories import baselines
-from idm_env.trajectories.chunks import OURS, Plan
+from idm_env.trajectories import baselines, paper
+from idm_env.trajectories.chunks import OURS, Plan, Settings
 from idm_env.trajectories.recipe import clock_of, recipe
 from idm_env.trajectories.scores import Motion
 from idm_env.trajectories.spool import Spool
@@ -24,18 +24,22 @@ def thinned(track: Track) -> tuple[Track, np.ndarray]:
     return track.part(np.setdiff1d(np.arange(len(track)), out)), out
 
 
-def score(spool: Spool, plan: Plan) -> list[dict[str, Any]]:
+def score(spool: Spool, plan: Plan, settings: Settings) -> list[dict[str, Any]]:
     """Return one row per method, ours first: errors (m) at every second point of some tracks, left out.
 
     Tracks of fewer than five points are not scored; no row if there is no other.
     """
-    assert plan.noise is not None
     tracks = [t for table in spool.picked(_chosen(len(spool.vehicles))) for t in Pieces(table, None) if len(t) >= 5]
     if not tracks:
         return []
     given, out = zip(*(thinned(track) for track in tracks), strict=True)
-    motions = {OURS["default"]: [f.motion for f in recipe(list(given), plan.dt, plan.noise, plan.choices)]}
-    for name in baselines.available():
+    if plan.noise is None:
+        fixed = settings.fixed_parameters
+        ours = [paper.imitate(track, plan.dt, fixed_parameters=fixed).motion for track in given]
+    else:
+        ours = [f.motion for f in recipe(list(given), plan.dt, plan.noise, plan.choices)]
+    motions = {OURS[settings.recipe]: ours}
+    for name in baselines.available() if settings.baselines else ():
         motions[name] = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in given]
     spacing = float(np.median(np.concatenate([np.diff(t.time_s) for t in given])))
     return [_row(name, found, tracks, out, spacing) for name, found in motions.items()]

@@ -47,5 +47,9 @@ def test_the_report_says_it_first(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out" / "report.json").read_text())["left_out_points"] == report["left_out_points"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.index("Points of the file that were left out") < page.index("Methods on these data")
+    sparse = tmp_path / "sparse.csv"
+    published = files.reconstruct_file(sparse, tmp_path / "paper", recipe="paper", baselines=False)
+    (row,) = published["left_out_points"]
+    assert row["method"] == "the paper's recipe" and row["points"] == rows["linear"]["points"]
     filtered = files.filter_file(lane(tmp_path / "dense.csv", seconds=10.0), tmp_path / "filtered")
     assert filtered["left_out_points"] == []
