@@ -15,7 +15,9 @@ COLOURS = np.array([(178, 24, 43), (239, 138, 98), (253, 219, 120), (120, 190, 1
 """Red at standstill, over yellow, to green at full speed; RGB in 0–255."""
 CONTROLLED = "#1e5adc"
 MOST_POINTS = 150_000
-"""A picture has at most so many points; denser tracks are thinned."""
+"""An interactive page has at most so many points; denser tracks are thinned."""
+MOST_DRAWN = 60_000
+"""A picture has at most so many: it has fewer pixels, and matplotlib draws each segment by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +160,7 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
     top = fastest or _fastest(drawn)
     scale = LinearSegmentedColormap.from_list("speed", COLOURS / 255.0)
     coloured = None
-    stride = _stride(drawn)
+    stride = _stride(drawn, MOST_DRAWN)
     for axes, panel in zip(grid, drawn, strict=False):
         for line in panel.lines:
             line = _thinned(line, stride)
@@ -193,7 +195,7 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     """Write an interactive page: choose a panel, look closer, point at a vehicle. It needs nothing from elsewhere."""
     from idm_env import report
 
-    stride, fastest = _stride(drawn), _fastest(drawn)
+    stride, fastest = _stride(drawn, MOST_POINTS), _fastest(drawn)
     content = {
         "colours": COLOURS.tolist(),
         "fastest": fastest,
@@ -246,8 +248,8 @@ def _fastest(drawn: Sequence[Panel]) -> float:
     return float(np.percentile(known, 99.5)) or float(known.max()) or 1.0
 
 
-def _stride(drawn: Sequence[Panel]) -> int:
-    return max(1, -(-sum(panel.points for panel in drawn) // MOST_POINTS))
+def _stride(drawn: Sequence[Panel], most: int) -> int:
+    return max(1, -(-sum(panel.points for panel in drawn) // most))
 
 
 def _thinned(line: Line, stride: int) -> Line:

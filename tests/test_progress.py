@@ -69,4 +69,4 @@ def test_there_is_one_protocol() -> None:
     for long in (fit, fit_file, simulate_file, discover, filter_file, reconstruct_file, predict_files, bench.run):
         assert inspect.signature(long).parameters["on_progress"].annotation == "OnProgress | None", long
     package = Path(progress.__file__).parent
-    assert [p.name for p in package.rglob("*.py") if "OnProgress =" in p.read_text()] == ["progress.py"]
+    assert [p.name for p in package.rglob("*.py") if "\nOnProgress =" in p.read_text()] == ["progress.py"]
