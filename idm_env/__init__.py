@@ -57,7 +57,8 @@ if TYPE_CHECKING:
 
 
 def _end(number: int, frame: object) -> None:
-    os.write(2, b"interrupted.\n")
+    shown = b"\x1b[?25h" if os.isatty(2) else b""  # bars hide the cursor
+    os.write(2, shown + b"interrupted.\n")
     os._exit(130)
 
 

@@ -6,18 +6,16 @@ import inspect
 import math
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 import idm_env
 from idm_env import checks, keep
+from idm_env.progress import OnProgress, shown
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -104,33 +102,16 @@ def _stop(number: int, frame: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
-@contextmanager
-def progress() -> Iterator[Callable[[str, int, int, float | str], None]]:
-    """Show a bar per phase on standard error; from here on Ctrl-C keeps what is done."""
-    _work_begins()
-    columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TextColumn("{task.fields[value]}"), console=console, transient=False) as bars:
-        tasks: dict[str, Any] = {}
-
-        def report(phase: str, done: int, total: int, value: float | str) -> None:
-            if phase not in tasks:
-                tasks[phase] = bars.add_task(phase, total=total, value="")
-            words = value if isinstance(value, str) else f"residual {value:.3f}"
-            bars.update(tasks[phase], completed=done, total=total, value=words)
-
-        yield report
-        for task in tasks.values():
-            bars.update(task, total=bars.tasks[task].completed)
-
-
 def _show(title: str, rows: list[dict[str, Any]]) -> None:
+    from idm_env.report import number
+
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
         table.add_column(
             name.replace("_", " "), overflow="fold", justify="left" if isinstance(rows[0][name], str) else "right"
         )
     for row in rows:
-        table.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()))
+        table.add_row(*(number(v) if isinstance(v, float) else str(v) for v in row.values()))
     Console().print(table)
 
 
@@ -165,24 +146,26 @@ def fit(
 
     Writes parameters.parquet, model.yaml, report.json and report.html.
     """
-    from idm_env.fitting.job import Options, Source, fit_file
-
-    source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
         checks.within("--held-out", share, 0.001, 0.999)
-    options = Options(
-        by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
-    )  # fmt: skip
-    with progress() as report:
+    with shown(console) as report:
+        from idm_env.fitting.job import Options, Source, fit_file
+
+        _work_begins()
+        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+        options = Options(
+            by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
+        )  # fmt: skip
         result = fit_file(source, options, out, resume=resume, on_progress=report)
     rows = [{"": "fitted", **result["fit"]}]
     if result["held_out"] is not None:
         rows.append({"": "held out", **result["held_out"]})
     names = ("", "episodes", "gap_rmse_m", "gap_rmse_median_m", "gap_mae_m", "speed_rmse_mps", "collisions")
     _show("Errors in free simulation", [{n: row[n] for n in names} for row in rows])
-    _done(out)
+    console.print(result["at_bounds"], soft_wrap=True, highlight=False)
+    _done(out, result["data"]["account"])
 
 
 @app.command()
@@ -203,17 +186,23 @@ def explain(
 
     Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
     """
-    from idm_env.data import load
+    with shown(console) as report:
+        from idm_env.data import load
 
     names, given = _names("--effects", effects), _names("--known", known) or ()
-    with keep.results(out, EXPLAINED, [data]):
+    with keep.results(out, EXPLAINED, [data]), shown(console) as report:
+        from idm_env.data import load
+
+        report("reading", 0, 0, data.name)
         trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
         if where is not None:
             trajectories = trajectories.where(where)
-        _explain(trajectories, out, by, names, given, seed, resume)
+        result, models = _explain(report, trajectories, out, by, names, given, seed, resume)
+    _explained(result, models, out)
 
 
 def _explain(
+    report: OnProgress,
     trajectories: Any,
     out: Path,
     by: str = "driver",
@@ -221,31 +210,32 @@ def _explain(
     known: tuple[str, ...] = (),
     seed: int = 0,
     resume: bool = False,
-) -> None:
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Write the report, and return it with the names of the models compared."""
     import json
 
     from idm_env.discovery import discover, write_report
-    from idm_env.discovery.words import ERRORS
 
-    with progress() as report:
-        found = discover(
-            trajectories,
-            by=by,
-            effects=effects,
-            known=known,
-            out=out,
-            resume=resume,
-            seed=seed,
-            on_progress=lambda stage, candidate, done, total: report(stage, done, total, candidate),
-        )
-        write_report(found, out)
-    result = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    _work_begins()
+    found = discover(
+        trajectories, by=by, effects=effects, known=known, out=out, resume=resume, seed=seed, on_progress=report
+    )
+    report("writing the report", 0, 0, "")
+    write_report(found, out)
+    result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    return result, found.judgement.titles
+
+
+def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
+    from idm_env.discovery.words import ERRORS
+    from idm_env.report import account
+
     console.print(f"Verdict: [bold]{result['verdict'].replace('_', ' ')}[/bold]. ", end="")
     console.print(result["sentence"], markup=False, highlight=False)
     before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
     if before is not None:
         _show("Errors on runs that neither fitted nor chose anything", [
-            _error_row(name, unit, before[key], after[key], found.judgement.titles, result["helps"].get(key))
+            _error_row(name, unit, before[key], after[key], models, result["helps"].get(key))
             for key, (name, unit) in ERRORS.items()
         ])  # fmt: skip
     if result["interval"]:
@@ -255,7 +245,7 @@ def _explain(
     console.print(
         "; ".join(f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files)), highlight=False
     )
-    _done(out)
+    _done(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
 
 
 def _error_row(
@@ -294,17 +284,21 @@ def demo(
 
     The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
     """
-    from idm_env.data import load, synthetic
+    names = (*EXPLAINED, *(("platoon.csv",) if data is None else ()))
+    with keep.results(out, names, [data]) as folder, shown(console) as report:
+        from idm_env.data import load, synthetic
 
-    with keep.results(out, (*EXPLAINED, *(("platoon.csv",) if data is None else ())), [data]) as folder:
         path = data
         if path is None:
+            report("generating", 0, 0, "platoon.csv")
             path = folder / "platoon.csv"
             made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
             columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
             keep.write(path, made.table.select(columns).write_csv)
             console.print(f"Ten runs of a leader and three followers: {path}")
-        _explain(load(path), out)
+        report("reading", 0, 0, path.name)
+        result, models = _explain(report, load(path), out)
+    _explained(result, models, out)
 
 
 @app.command()
@@ -323,13 +317,15 @@ def simulate(
     where: Where = None,
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
-    from idm_env.fitting.job import Source, simulate_file
+    with shown(console) as report:
+        from idm_env.fitting.job import Source, simulate_file
 
-    source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
-    result = simulate_file(source, model, out, seed=seed)
+        _work_begins()
+        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+        result = simulate_file(source, model, out, seed=seed, on_progress=report)
     _show("Errors in free simulation", [result["error"]])
     console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)
-    _done(out)
+    _done(out, result["data"]["account"])
 
 
 @app.command()
@@ -357,6 +353,12 @@ def plot(
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture: png, svg or pdf.")] = Path(
         "out/space-time.png"
     ),
+    html: Annotated[
+        bool, typer.Option("--html", help="Write an interactive page too, beside the picture: zoom, and point.")
+    ] = False,
+    panels: Annotated[
+        int, _ranged(help="Panels at most, one per run and lane, the largest first.", low=1, high=1000)
+    ] = 6,
     where: Where = None,
     seconds: Annotated[
         float,
@@ -364,54 +366,84 @@ def plot(
     ] = 300.0,
     seed: Seed = 0,
 ) -> None:
-    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout."""
-    from idm_env.diagrams import space_time
+    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
+
+    One panel per run and lane; controlled vehicles (of a rollout, or a column "controlled") are underlined in blue.
+    """
+    from idm_env.report import account
 
     if out.is_dir() or out.suffix.lower() not in PICTURES:
         told = "is a folder" if out.is_dir() else "names no kind of picture"
         raise ValueError(f"--out = {out} {told}. Give a file that ends in {', '.join(PICTURES)}.")
-    keep.not_an_input(out, [source])
-    if source.suffix in (".yaml", ".yml"):
-        figure = _rollout_figure(source, seconds, seed)
-    else:
-        from idm_env.data import load
+    written = [out, *([out.with_suffix(".html")] if html else [])]
+    for path in written:
+        keep.not_an_input(path, [source])
+    if html and written[1].exists() and 'id="diagram"' not in written[1].read_text(errors="replace"):
+        raise ValueError(f"{written[1]} was not written by idm-env plot. Move it, or give --out another name.")
+    repairs: tuple[Any, ...] = ()
+    with shown(console) as report:
+        from idm_env import diagrams, fonts
 
-        trajectories = load(source)
-        if where is not None:
-            trajectories = trajectories.where(where)
-        runs = len(trajectories.runs())
-        overlaid = f", {runs} runs on one axis (choose one with --where)" if runs > 1 else ""
-        figure = space_time(trajectories, title=f"{source.name}{overlaid}")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    keep.write(out, figure.savefig)
-    console.print(f"Picture: [bold]{out.resolve()}[/bold]", soft_wrap=True)
+        if source.suffix in (".yaml", ".yml"):
+            drawn = [_rollout_panel(source, seconds, seed, report)]
+        else:
+            from idm_env.data import load
+
+            _work_begins()
+            report("reading", 0, 0, source.name)
+            trajectories = load(source)
+            if where is not None:
+                trajectories = trajectories.where(where)
+            drawn, repairs = diagrams.panels(trajectories), trajectories.repairs
+        report("drawing", 0, 0, out.name)
+        kept = drawn[:panels]
+        more = f", the largest {len(kept)} of {len(drawn)} panels" if len(drawn) > len(kept) else ""
+        title = f"{source.name}{more}" if len(kept) > 1 else f"{source.name}: {kept[0].title}{more}"
+        out.parent.mkdir(parents=True, exist_ok=True)
+        figure = diagrams.figure_of(kept, title)
+        numbers = fonts.legible(figure)
+        keep.write(out, figure.savefig)
+        if html:
+            diagrams.write_html(out.with_suffix(".html"), kept, title)
+    if more:
+        console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
+    if numbers:
+        told = ", ".join(f"{number}: {word}" for number, word in numbers.items())
+        console.print(f"No font here has these names: {told}.", soft_wrap=True, markup=False, highlight=False)
+    if source.suffix not in (".yaml", ".yml"):
+        console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, markup=False, highlight=False)
+    for path in written:
+        console.print(f"Picture: [bold]{path.resolve()}[/bold]", soft_wrap=True)
 
 
-def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
+def _rollout_panel(config: Path, seconds: float, seed: int, report: OnProgress) -> Any:
     import torch
 
     from idm_env.config import load_environment
-    from idm_env.diagrams import space_time
+    from idm_env.diagrams import rollout_panel
     from idm_env.envs.gym import DiffIDMEnv
     from idm_env.roads import Ring
     from idm_env.simulator import Trajectory
 
+    _work_begins()
     # The picture is as long as it was asked for, whatever the limit of an episode.
     keywords = {key: value for key, value in load_environment(config).items() if key != "max_episode_steps"}
     env: Any = DiffIDMEnv(**keywords)
     env.reset(seed=seed)
     dt = env.task.simulator.dt
     kept = []
-    for _ in range(max(1, round(seconds / dt))):
+    steps = max(1, round(seconds / dt))
+    for step in range(steps):
         _, _, terminated, truncated, _ = env.step(None)
         state = env.batch.world.state
         kept.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
+        report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
         if terminated or truncated:
             break
     # On a ring gaps and lengths add up to the circumference.
     length = float((state.gap[0] + state.length[0]).sum()) if isinstance(env.task.simulator.road, Ring) else None
     states = Trajectory(*(torch.stack(column) for column in zip(*kept, strict=True)))
-    return space_time(states, dt=dt, ring_length=length, title=config.name)
+    return rollout_panel(states, dt=dt, ring_length=length, marked=env.task.agents)
 
 
 Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]
@@ -429,14 +461,27 @@ def filter_(
     resume: Resume = False,
 ) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
-    from idm_env.trajectories.files import filter_file
+    with shown(console) as report:
+        from idm_env.trajectories.files import filter_file
 
-    with progress() as report:
-        filter_file(
+        _work_begins()
+        result = filter_file(
             data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            model=model, on_progress=lambda done, total: report("filter", done, total, ""),
+            model=model, on_progress=report,
         )  # fmt: skip
-    _done(out)
+    _methods(result)
+    _done(out, result["account"])
+
+
+def _methods(result: dict[str, Any]) -> None:
+    from idm_env.trajectories.report import COLUMNS
+
+    if result["left_out_points"]:
+        names = {"method": "method", "rmse_m": "RMSE (m)", "mae_m": "mean |error| (m)", "p95_m": "95 % below (m)"}
+        rows = [{title: row[name] for name, title in names.items()} for row in result["left_out_points"]]
+        _show(f"{result['left_out_points'][0]['points']} points of the file that were left out", rows)
+    rows = [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in result["methods"]]
+    _show("Methods on these data", rows)
 
 
 @app.command()
@@ -451,14 +496,16 @@ def reconstruct(
     resume: Resume = False,
 ) -> None:
     """Reconstruct dense trajectories from sparse ones, a second or more between points."""
-    from idm_env.trajectories.files import reconstruct_file
+    with shown(console) as report:
+        from idm_env.trajectories.files import reconstruct_file
 
-    with progress() as report:
-        reconstruct_file(
+        _work_begins()
+        result = reconstruct_file(
             data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            model=model, on_progress=lambda done, total: report("reconstruct", done, total, ""),
+            model=model, on_progress=report,
         )  # fmt: skip
-    _done(out)
+    _methods(result)
+    _done(out, result["account"])
 
 
 @app.command()
@@ -468,11 +515,15 @@ def predict(
     resume: Resume = False,
 ) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
-    from idm_env.prediction.files import predict_files
+    with shown(console) as report:
+        from idm_env.prediction.files import predict_files
 
-    with progress() as report:
-        predict_files(scenarios, out, resume=resume, on_progress=lambda done, total: report("predict", done, total, ""))
-    _done(out)
+        _work_begins()
+        result = predict_files(scenarios, out, resume=resume, on_progress=report)
+    names = {"minADE_8s": "minADE (m)", "minFDE_8s": "minFDE (m)", "miss_rate_8s": "miss rate", "mAP_8s": "mAP"}
+    rows = [{"method": r["method"], **{title: r[key] for key, title in names.items()}} for r in result["methods"]]
+    _show(f"8 s ahead, {result['agents_with_known_future']} agents", rows)
+    _done(out, result["account"])
 
 
 @app.command()
@@ -484,11 +535,23 @@ def bench(
     peers: Annotated[bool, typer.Option(help="Include SUMO and HighwayEnv.")] = True,
     verbose: Annotated[bool, typer.Option("--verbose", help="Say which path ran, and why.")] = False,
 ) -> None:
-    """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine."""
-    from idm_env.bench import run as measure
+    """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine.
 
+    Writes report.html and performance.json.
+    """
     numbers = [round(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
-    measure(out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, verbose=verbose)
+    with shown(console) as report:
+        from idm_env import bench as benchmark
+        from idm_env.bench import tables
+
+        _work_begins()
+        result = benchmark.run(
+            out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, on_progress=report,
+            say=console.print if verbose else None,
+        )  # fmt: skip
+    for title, rows, _ in tables.of(result)[: len(numbers) + 2]:  # the rest is in the report
+        _show(title, rows)
+    _done(out, tables.absent(result))
 
 
 def _number(option: str, text: str, wrong: str) -> float:
@@ -498,7 +561,8 @@ def _number(option: str, text: str, wrong: str) -> float:
         raise ValueError(f"{option} = {checks.shown(text)} is {wrong}.") from None
 
 
-def _done(out: Path) -> None:
+def _done(out: Path, account: str) -> None:
+    console.print(account, soft_wrap=True, markup=False, highlight=False)
     console.print(f"Report: [bold]{(out / 'report.html').resolve()}[/bold]", soft_wrap=True)
 
 

@@ -18,56 +18,10 @@ from idm_env.keep import write_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
-<style>
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #1d2430; }
-h1 { font-size: 1.7rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
-p.lead { font-size: 1.1rem; } figure { margin: 1rem 0; } figure img { max-width: 100%; }
-figcaption, .note { color: #566; font-size: .92rem; }
-table { border-collapse: collapse; margin: .8rem 0; font-size: .92rem; display: block; overflow-x: auto; }
-th, td { padding: .25rem .8rem .25rem 0; text-align: left; border-bottom: 1px solid #dde; vertical-align: top; }
-td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
-table.first tbody tr:first-child { font-weight: 600; background: #eef5fb; }
-.lights { display: grid; grid-template-columns: repeat(auto-fit, minmax(15rem, 1fr)); gap: .6rem; margin: 1rem 0; }
-.light { border-left: .4rem solid #8a94a0; background: #f5f7f9; padding: .4rem .7rem; font-size: .92rem; }
-.light b { display: block; } .light.better { border-color: #1a7f37; } .light.worse { border-color: #b42318; }
-dl.terms { font-size: .88rem; color: #445; margin: .2rem 0 1.2rem; } dl.terms dt { font-weight: 600; float: left;
-clear: left; margin-right: .4rem; } dl.terms dd { margin: 0 0 .2rem; }
-@media (max-width: 600px) { figure { overflow-x: auto; } figure img.wide { max-width: none; width: 40rem; } }
-.gallery { display: flex; flex-wrap: wrap; gap: 1rem; } .gallery figure { flex: 1 1 26rem; margin: 0; }
-</style></head><body>
-<h1>{{ title }}</h1>
-{% for block in blocks %}
-{% if block.kind == "heading" %}<h2>{{ block.text }}</h2>
-{% elif block.kind == "lead" %}<p class="lead">{{ block.text }}</p>
-{% elif block.kind == "note" %}<p class="note">{{ block.text }}</p>
-{% elif block.kind == "text" %}<p>{{ block.text }}</p>
-{% elif block.kind == "list" %}<ul>{% for item in block.rows %}<li>{{ item }}</li>{% endfor %}</ul>
-{% elif block.kind == "figure" %}<figure><picture>{% if block.narrow %}<source media="(max-width: 600px)"
- srcset="{{ block.narrow }}">{% endif %}<img{% if not block.narrow %} class="wide"{% endif %}
- alt="{{ block.text }}" src="{{ block.image }}"></picture>
-<figcaption>{{ block.text }}</figcaption></figure>
-{% elif block.kind == "lights" %}<div class="lights">{% for name, state, words in block.rows %}
-<div class="light {{ state }}"><b>{{ name }}: {{ state }}</b>{{ words }}</div>{% endfor %}</div>
-{% elif block.kind == "terms" %}<dl class="terms">{% for name, meaning in block.rows %}
-<dt>{{ name }}:</dt><dd>{{ meaning }}</dd>{% endfor %}</dl>
-{% elif block.kind == "gallery" %}<div class="gallery">{% for item in block.rows %}<figure>
-<img alt="{{ item.text }}" src="{{ item.image }}"><figcaption>{{ item.text }}</figcaption></figure>{% endfor %}</div>
-{% elif block.kind == "table" %}<table{% if block.text %} class="{{ block.text }}"{% endif %}>
-<thead><tr>{% for name in block.columns %}<th{% if block.rows and block.rows[0][loop.index0].number %} class="number"{%
-endif %}>{{ name }}</th>{% endfor %}</tr></thead>
-<tbody>{% for row in block.rows %}<tr>{% for cell in row %}<td{% if cell.number %} class="number"{% endif %}>{{
-cell.text }} </td>{% endfor %}</tr>{% endfor %}</tbody></table>
-{% endif %}{% endfor %}
-</body></html>
-"""
-
 
 @dataclass(frozen=True)
 class Block:
-    """One piece of a page: a heading, a paragraph, a list, lights, terms, a figure, a gallery of figures or a table.
+    """One piece of a page: heading, paragraph, list, lights, terms, figure, gallery, table or markup of one's own.
 
     ``narrow`` is the figure's picture for small screens, where it has one.
     """
@@ -78,6 +32,15 @@ class Block:
     narrow: str = ""
     columns: tuple[str, ...] = ()
     rows: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table: its text, the number that it is sorted by, if any, and whether it is set off as doubtful."""
+
+    text: str
+    value: float | None = None
+    marked: bool = False
 
 
 def heading(text: str) -> Block:
@@ -114,7 +77,8 @@ def table(
 ) -> Block:
     """Return a table of rows by column name; floats with four significant digits, or ``digits`` behind the point.
 
-    ``first`` sets the first row off from the others.
+    A reader sorts it by any column; a ``Cell`` says what its text is sorted by. ``first`` sets the first row off from
+    the others.
     """
     names = tuple(columns or (rows[0] if rows else ()))
     cells = tuple(tuple(_cell(row.get(name), (digits or {}).get(name)) for name in names) for row in rows)
@@ -122,13 +86,31 @@ def table(
 
 
 def _cell(value: Any, digits: int | None = None) -> dict[str, Any]:
+    if isinstance(value, Cell):
+        sorted_by, finite = value.value, value.value is not None and abs(value.value) < float("inf")
+        kept = sorted_by if finite else None
+        return {"text": value.text, "number": sorted_by is not None, "value": kept, "marked": value.marked}
+    cell: dict[str, Any] = {"number": False, "value": None, "marked": False}
     if isinstance(value, bool):
-        return {"text": "yes" if value else "no", "number": False}
-    if isinstance(value, float) and not abs(value) < float("inf"):
-        return {"text": "–", "number": True}
+        return cell | {"text": "yes" if value else "no"}
     if isinstance(value, float):
-        return {"text": f"{value:.4g}" if digits is None else f"{value:.{digits}f}", "number": True}
-    return {"text": "" if value is None else str(value), "number": isinstance(value, int)}
+        return cell | {
+            "text": number(value, digits),
+            "number": True,
+            "value": value if abs(value) < float("inf") else None,
+        }
+    if isinstance(value, int):
+        return cell | {"text": str(value), "number": True, "value": value}
+    return cell | {"text": "" if value is None else str(value)}
+
+
+def number(value: float, digits: int | None = None) -> str:
+    """Return a number as people read it: four significant digits, or ``digits`` behind the point; a dash for none."""
+    if not abs(value) < float("inf"):
+        return "–"
+    if digits is not None:
+        return f"{value:.{digits}f}"
+    return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
 
 
 def shortened(items: Sequence[str], most: int = 100) -> list[str]:
@@ -145,6 +127,11 @@ def lights(rows: Iterable[tuple[str, str, str]]) -> Block:
 def terms(meanings: Mapping[str, str]) -> Block:
     """Return what the terms of a table mean, to stand under it."""
     return Block("terms", rows=tuple(meanings.items()))
+
+
+def html(markup: str) -> Block:
+    """Return markup that goes into the page as it is; whoever writes it escapes what a file said."""
+    return Block("html", markup)
 
 
 def gallery(figures: Iterable[Block]) -> Block:
@@ -192,7 +179,8 @@ def write_page(path: Path, title: str, blocks: Iterable[Block]) -> None:
     """Write a self-contained HTML page."""
     from jinja2 import Environment
 
-    page = Environment(autoescape=True).from_string(_PAGE).render(title=title, blocks=list(blocks))
+    template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+    page = Environment(autoescape=True).from_string(template).render(title=title, blocks=list(blocks))
     write_text(path, page)
 
 
@@ -210,6 +198,25 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not abs(value) < float("inf"):
         return None
     return value
+
+
+def account(
+    repairs: Iterable[tuple[str, int]] = (), left_out: Iterable[tuple[str, int]] = (), bad_files: Iterable[str] = ()
+) -> str:
+    """Return one line on the data: what was repaired and left out, by kind and number, and bad files by name."""
+
+    def counted(items: Iterable[tuple[str, int]]) -> str:
+        sums: dict[str, int] = {}
+        for kind, count in items:
+            sums[kind] = sums.get(kind, 0) + count
+        return ", ".join(f"{kind} {count}" for kind, count in sorted(sums.items(), key=lambda item: -item[1]))
+
+    names = list(bad_files)
+    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    files = f"{len(names)} bad file{'s' if len(names) > 1 else ''}: {shown}" if names else ""
+    parts = (("repaired: ", counted(repairs)), ("left out: ", counted(left_out)), ("", files))
+    said = "; ".join(title + words for title, words in parts if words)
+    return f"Data: {said}." if said else "Data: nothing was repaired or left out."
 
 
 def versions() -> dict[str, str]:

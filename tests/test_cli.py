@@ -115,6 +115,9 @@ def test_bad_rows_are_repaired_and_counted(frame: pl.DataFrame, tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "out" / "report.html").read_text()
     assert "10 rows repeat" in page, page[-800:]
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("Data: ")]
+    assert "duplicated time 10" in line and line.removeprefix("Data: ") in page
+    assert any(line.startswith("Bounds: ") for line in done.stderr.splitlines())
 
 
 def test_two_conditions_both_hold(tmp_path: Path) -> None:
@@ -168,6 +171,7 @@ def test_the_demo_finds_what_its_generator_hid(tmp_path: Path) -> None:
     assert report["found"][0]["parameters"]["delay"]["estimate"] == pytest.approx(0.5, abs=0.05)
     before, after = (report["error"][when]["gap_rmse_m"] for when in ("before", "after"))
     assert after < 0.4 * before
+    assert any(line.startswith("Data: ") for line in done.stderr.splitlines())
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image") >= 5 and 'src="http' not in page
     again = call("simulate", tmp_path / "platoon.csv", "--model", tmp_path / "model.yaml", "--out", tmp_path / "again")
@@ -181,8 +185,10 @@ def test_plot_and_effects(frame: pl.DataFrame, tmp_path: Path) -> None:
     ring = Path(__file__).resolve().parents[1] / "configs" / "ring.yaml"
     for source, options in ((path, ()), (ring, ("--seconds", "20"))):
         picture = tmp_path / f"{source.stem}.png"
-        done = call("plot", source, "--out", picture, *options)
+        done = call("plot", source, "--out", picture, "--html", *options)
         assert done.returncode == 0, done.stderr
+        page = picture.with_suffix(".html").read_text()
+        assert "http" not in page and '"marked": true' in page if source is ring else '"marked": false' in page
         assert picture.read_bytes().startswith(b"\x89PNG")
     listed = call("effects", env={**os.environ, "COLUMNS": "200"})
     assert "second_leader.weight" in listed.stdout

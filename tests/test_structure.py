@@ -25,11 +25,13 @@ ALLOWED = {
     "compiled": {"types", "parameters", "simulator"},
     "fonts": set(),
     "report": {"fonts", "keep"},
+    "progress": set(),
+    "diagrams": {"report", "fonts"},
     "config": {"types", "parameters", "checks", "effects", "roads", "simulator", "keep"},
     "data": set(),
     "fitting": {
         "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "report", "metrics",
-        "checks", "keep",
+        "checks", "keep", "progress", "diagrams",
     },
 }  # fmt: skip
 """What a part may import of the package; parts that are not named may import anything but what FORBIDDEN says."""

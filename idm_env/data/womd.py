@@ -111,6 +111,16 @@ def scenarios(path: str | Path) -> Iterator[Scenario]:
         raise DataError(f"{path.name} has an unknown extension; use .json, .json.gz or .tfrecord.")
 
 
+def count(path: str | Path) -> int:
+    """Return how many scenarios a file has, from the headers of its records; 1 where it cannot tell."""
+    path = Path(path)
+    if not path.is_file() or ".tfrecord" not in path.name.lower() or path.name.lower().endswith((".json", ".json.gz")):
+        return 1
+    from idm_env.data import womd_record
+
+    return max(1, womd_record.count(path))
+
+
 def read_json(path: str | Path) -> Scenario:
     """Return the scenario of one JSON file. DataError if it is no such file."""
     path = Path(path)

@@ -22,10 +22,11 @@ from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.decide import Round, decide
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
-from idm_env.discovery.search import OnProgress, Search
+from idm_env.discovery.search import Search
 from idm_env.discovery.solve import NAMES, Solution, Task
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, improves
 from idm_env.effects import ALL, CANDIDATES, IDM, Brakes
+from idm_env.progress import OnProgress, silent
 
 
 @dataclass(eq=False)
@@ -80,7 +81,7 @@ def discover(
         place: Column with the coordinate of places, if not that of ``trajectories``; a lap's wraps are noticed.
         out: Folder in which an interrupted search keeps what is done, or None.
         resume: Go on from there.
-        on_progress: Called with stage, candidate, done and total.
+        on_progress: Called with phase, done, total and the candidate; see ``idm_env.progress``.
         seed: Of the draw of the lockbox and of sign flips.
         located: Whether effects without a name are looked for too.
         lockbox: Share of the runs that neither fit nor choose.
@@ -89,7 +90,7 @@ def discover(
         ValueError: For unknown effects, or a folder left by other data.
         DataError: For data that cannot be used.
     """
-    progress: OnProgress = on_progress or (lambda *_: None)
+    progress = on_progress or silent
     names = _names(effects, known)
     prepared = prepare(trajectories, by, place)
     names, refused = terms.testable(prepared, names)
@@ -104,13 +105,16 @@ def discover(
     saved = keep.Store(None if out is None else out / keep.UNFINISHED / "explain", mark, resume)
     task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
     searching = Search(task, names, located and effects is None, saved, progress)
-    progress("calibration", "idm", 0, 1)
-    theta, calibrated = calibrate(prepared.of_runs(fit_runs), by, task.prior.centre)
-    progress("null", "idm", 0, 1)
+    progress("calibration", 0, 0, "idm")
+    theta, calibrated = calibrate(
+        prepared.of_runs(fit_runs), by, task.prior.centre, lambda _, *state: progress("calibration", *state)
+    )
+    progress("null", 0, 0, "idm")
     base = Model(tuple(_known_term(prepared, name) for name in known))
     null = searching.null(base, theta)
     null, steps, rounds = decide(searching, null, seed)
     saved.remove()
+    progress("final check", 0, 0, "runs kept for the end")
     discovery = _finish(
         trajectories,
         prepared,

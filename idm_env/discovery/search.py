@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,9 +18,7 @@ from idm_env.discovery.solve import NAMES, Prior, Solution, Task, centred, finis
 from idm_env.effects import ALL, IDM
 from idm_env.effects.base import Sought
 from idm_env.keep import Store
-
-OnProgress = Callable[[str, str, int, int], None]
-"""Called with the stage, the current candidate, candidates done and candidates in all."""
+from idm_env.progress import OnProgress
 
 POPULATION = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
 WIDTH = 0.6
@@ -72,10 +70,10 @@ class Search:
         found = []
         responses = places.respond(self.task, solution)
         for i, term in enumerate(wanted):
-            self.on_progress(f"round {number}", term.label, i, len(wanted) + 12)
+            self.on_progress(f"round {number}", i, len(wanted) + 12, term.label)
             found.append(self._nested(solution, term, before, f"{number}/{term.label}"))
         for i, scored in enumerate(self._places(solution, responses, before, number)):
-            self.on_progress(f"round {number}", scored.term.label, len(wanted) + i, len(wanted) + 12)
+            self.on_progress(f"round {number}", len(wanted) + i, len(wanted) + 12, scored.term.label)
             found.append(scored)
         return found, before
 
@@ -99,7 +97,7 @@ class Search:
     def pair(self, solution: Solution, names: tuple[str, str], before: np.ndarray, number: int) -> Scored:
         """Score two effects of the catalogue at once; the term that is named is the second."""
         first, second = (terms.simple(n) for n in names)
-        self.on_progress(f"round {number}", f"{first.label} + {second.label}", 0, 1)
+        self.on_progress(f"round {number}", 0, 1, f"{first.label} + {second.label}")
         base = replace(solution, model=solution.model.adding(first))
         # Strong starts: along the direction in which they cancel, weak ones see nothing to improve.
         starts = [np.concatenate([solution.values, a, [0.3]]) for a in first.starts]

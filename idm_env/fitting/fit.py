@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,12 +21,11 @@ from idm_env.fitting.levenberg import Normal, Progress, minimise, normal
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.problem import IDM_NAMES, Loss, Objective, Problem, group_of
 from idm_env.fitting.uncertainty import Uncertainty, uncertainty
+from idm_env.progress import OnProgress
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
 Method = Literal["lm", "adam"]
-OnProgress = Callable[[str, int, int, float], None]
-"""Called with the phase, steps done, steps at most, and the root mean square residual (m)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,8 +100,8 @@ def test_unknown_effect_is_refused() -> None:
 def test_an_interrupted_search_goes_on(tmp_path: Path) -> None:
     seen: list[str] = []
 
-    def stop(stage: str, candidate: str, done: int, total: int) -> None:
-        seen.append(candidate)
+    def stop(phase: str, done: int, total: int, candidate: float | str) -> None:
+        seen.append(str(candidate))
         if candidate == "drag":
             raise KeyboardInterrupt
 

@@ -38,7 +38,30 @@ def test_fit_writes_parameters_model_and_reports(file: Path, tmp_path: Path) -> 
     table = pl.read_parquet(tmp_path / "parameters.parquet")
     assert table.height == 5 * report["fit"]["groups"]
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 2 and "http" not in page
+    assert page.count("data:image/png;base64,") == 4 and "http" not in page
+
+
+def test_every_driver_has_a_row_and_bounds_are_counted(file: Path, tmp_path: Path) -> None:
+    """One row per driver in drivers.csv and on the page; the shares at bounds are those of the parameters."""
+    seen: list[str] = []
+    result = fit_file(
+        Source(file, smooth=True), Options(starts=1), tmp_path, on_progress=lambda phase, *_: seen.append(phase)
+    )
+    drivers = pl.read_csv(tmp_path / "drivers.csv", schema_overrides={"bounds": pl.String})
+    long = pl.read_parquet(tmp_path / "parameters.parquet")
+    assert drivers["group"].to_list() == long["group"].unique(maintain_order=True).to_list() and drivers.height == 8
+    for row in result["bounds"]:
+        mine = long.filter(pl.col("parameter") == row["parameter"])
+        assert drivers[row["parameter"]].to_list() == pytest.approx(mine["estimate"].to_list())
+        assert row["on_low"] + row["on_high"] == mine["at_bound"].sum()
+        on = drivers["bounds"].fill_null("").str.split(" ").list.contains(row["parameter"])
+        assert on.to_list() == mine["at_bound"].to_list()
+        if mine["at_bound"].sum():
+            assert f"{row['symbol']} on its bound for {mine['at_bound'].sum()} of 8" in result["at_bounds"]
+    assert result["at_bounds"] in (tmp_path / "report.html").read_text()
+    rms = (drivers["gap_rmse_m"] * drivers["episodes"]).sum() / drivers["episodes"].sum()
+    assert rms == pytest.approx(result["fit"]["gap_rmse_m"], rel=0.3)
+    assert seen[0] == "reading" and seen[-1] == "writing"
 
 
 def test_simulate_repeats_what_fit_reported(file: Path, tmp_path: Path) -> None:

@@ -270,12 +270,12 @@ def test_files_report_and_bad_input(tmp_path: Path) -> None:
     report = predict_files(
         [good, bare, lost, tmp_path / "broken.json"],
         tmp_path / "out",
-        on_progress=lambda done, total: seen.append(done),
+        on_progress=lambda phase, done, total, words: seen.append(done) if phase == "predict" else None,
     )
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
         "predictions.parquet", "parameters.parquet", "report.json", "report.html", "run.json",
     }  # fmt: skip
-    assert report["scenarios"] == 3 and report["agents"] == 4 and seen == [1, 2, 3, 4]
+    assert report["scenarios"] == 3 and report["agents"] == 4 and seen == [0, 1, 1, 2, 2, 3, 4]
     reasons = " ".join(item["reason"] for item in report["left_out"])
     assert len(report["left_out"]) == 2 and "not valid at the present" in reasons and "cannot be read" in reasons
     assert any("no lanes" in item["note"] for item in report["notes"])
@@ -292,8 +292,8 @@ def test_an_interrupted_run_goes_on_after_the_last_file(tmp_path: Path) -> None:
     paths = [write_json(tmp_path / f"{i}.json", wanted=[i]) for i in range(3)]
     whole = predict_files(paths, tmp_path / "whole")
 
-    def stop(done: int, total: int) -> None:
-        if done == 2:
+    def stop(phase: str, done: int, total: int, words: float | str) -> None:
+        if (done, words) == (2, "1.json"):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -307,8 +307,8 @@ def test_an_interrupted_run_goes_on_after_the_last_file(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         predict_files(paths, tmp_path / "out", on_progress=stop)
     seen: list[int] = []
-    report = predict_files(paths, tmp_path / "out", resume=True, on_progress=lambda done, total: seen.append(done))
-    assert report["methods"] == whole["methods"] and seen == [1, 2, 3]
+    report = predict_files(paths, tmp_path / "out", resume=True, on_progress=lambda *at: seen.append(at[1]))
+    assert report["methods"] == whole["methods"] and seen[1:-1] == [1, 2, 2, 3]
     tables = [pl.read_parquet(tmp_path / name / "predictions.parquet") for name in ("whole", "out")]
     assert tables[0].equals(tables[1]) and not (tmp_path / "out" / UNFINISHED).exists()
 

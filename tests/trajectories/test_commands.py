@@ -32,7 +32,8 @@ def test_filter_and_its_ablation(tmp_path: Path) -> None:
     done = call("filter", path, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert {p.name for p in (tmp_path / "out").iterdir()} == OUTPUT
-    assert "3/3" in done.stderr + done.stdout  # the progress bar at its end
+    assert "3/3" in done.stderr + done.stdout  # the progress at its end
+    assert "Data: nothing was repaired or left out." in done.stderr.splitlines()
     named = methods(tmp_path / "out")
     assert named[0] == "simulator, imagined leader" and {"linear", "Savitzky–Golay", "bounded spline"} <= set(named)
     assert "Driver parameters" in (tmp_path / "out" / "report.html").read_text()
@@ -62,6 +63,7 @@ def test_predict_does_the_whole_records_of_a_truncated_file(tmp_path: Path) -> N
     files = tmp_path / "cut.tfrecord", write_json(tmp_path / "old.json"), tmp_path / "missing.json"
     done = call("predict", *files, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
+    assert "Data: 2 bad files: cut.tfrecord, missing.json." in done.stderr.splitlines()
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["scenarios"] == 2 and report["agents"] == 5
     reasons = [item["reason"] for item in report["left_out"]]

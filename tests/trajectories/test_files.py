@@ -35,8 +35,10 @@ def lane(path: Path, vehicles: int = 4, seconds: float = 25.0, every: int = 1) -
 
 
 def test_filter_writes_tidy_output_and_a_report(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    report = files.filter_file(lane(tmp_path / "lane.csv"), tmp_path / "out", on_progress=lambda *at: seen.append(at))
+    seen: list[tuple[str, int, int]] = []
+    report = files.filter_file(
+        lane(tmp_path / "lane.csv"), tmp_path / "out", on_progress=lambda *at: seen.append(at[:3])
+    )
     assert {path.name for path in (tmp_path / "out").iterdir()} == OUTPUT
     table = pl.read_parquet(tmp_path / "out" / "trajectories.parquet")
     assert table.height == 4 * 251
@@ -49,9 +51,12 @@ def test_filter_writes_tidy_output_and_a_report(tmp_path: Path) -> None:
     methods = {row["method"]: row for row in report["methods"]}
     assert methods["simulator, imagined leader"]["implausible_percent"] == 0.0
     assert methods["linear"]["implausible_percent"] == 100.0
-    assert seen == [(4, 4)]
+    filtering = [at for at in seen if at[0] == "filter"]
+    assert filtering[0] == ("filter", 0, 4) and filtering[-1] == ("filter", 4, 4)
+    assert filtering == sorted(filtering) and len(filtering) > 4  # it moves within a chunk too
+    assert [at[0] for at in seen if at not in filtering] == ["compiling", "reading", "writing"]
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("data:image/png") == 5 and "Savitzky–Golay" in page
+    assert page.count("data:image/png") == 6 and "Savitzky–Golay" in page
 
 
 def test_chunks_and_resume_change_nothing(tmp_path: Path) -> None:
@@ -61,8 +66,8 @@ def test_chunks_and_resume_change_nothing(tmp_path: Path) -> None:
     class StoppedError(Exception):
         pass
 
-    def stop(done: int, total: int) -> None:
-        if done >= 4:
+    def stop(phase: str, done: int, total: int, words: float | str) -> None:
+        if phase == "filter" and done >= 4:
             raise StoppedError
 
     with pytest.raises(StoppedError):
@@ -80,8 +85,9 @@ def test_chunks_and_resume_change_nothing(tmp_path: Path) -> None:
 def test_resume_refuses_other_settings(tmp_path: Path) -> None:
     path = lane(tmp_path / "lane.csv", vehicles=2)
 
-    def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
+    def stop(phase: str, done: int, total: int, words: float | str) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         files.filter_file(path, tmp_path / "out", chunk=1, baselines=False, on_progress=stop)
