@@ -73,5 +73,6 @@ def within(name: str, value: Any, low: float, high: float, unit: str = "") -> fl
     """Return a number in ``[low, high]``; only a bound that is infinite lets an infinite number through."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         unit = f" {unit}" if unit else ""
-        raise ValueError(f"{name} = {shown(value)}{unit} is outside [{low:g}, {high:g}]{unit}.")
+        told = f"{value:g}" if isinstance(value, float) else shown(value)
+        raise ValueError(f"{name} = {told}{unit} is outside [{low:g}, {high:g}]{unit}.")
     return float(value)

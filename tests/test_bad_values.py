@@ -318,9 +318,9 @@ def test_any_bytes_as_a_scenario_are_refused_in_one_line(tmp_path: Path, content
 def test_a_full_disk_is_one_line(data: Path, tmp_path: Path, command: str) -> None:
     """Files cannot grow beyond a limit, which to a program is a full disk."""
     code = (
-        "import resource, sys; from idm_env import cli, config; from idm_env.trajectories import files\n"
-        "files._compile(); resource.setrlimit(resource.RLIMIT_FSIZE, (1200, 1200))\n"
-        "sys.argv[0] = 'idm-env'; cli.run()"
+        "import resource, sys; from idm_env import cli\n"
+        "cli.app([*sys.argv[1:-1], sys.argv[-1] + '-before'], standalone_mode=False)  # compiled loops are files too\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1200, 1200)); sys.argv[0] = 'idm-env'; cli.run()"
     )
     model = tmp_path / "model.yaml"
     model.write_text("effects: [idm, brakes]\n")

@@ -70,8 +70,11 @@ def test_mistakes_in_a_model_are_one_line(tmp_path, change, words):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("effects: [idm, brakes]\ndt: 0.1\ndt: 0.2\n", "key 'dt' in line 2 is there twice"),
-        ("effects: [idm]\nparameters: {idm: {time_gap: 1.1, time_gap: 1.2}}\n", "key 'time_gap' in line 2 is there tw"),
+        ("effects: [idm, brakes]\ndt: 0.1\ndt: 0.2\n", "line 3: key 'dt' is there twice"),
+        (
+            "effects: [idm]\nparameters: {idm: {time_gap: 1.1, time_gap: 1.2}}\n",
+            "line 2: key 'time_gap' is there twice",
+        ),
         ("effects: [idm]\nparameters: {idm: {time_gap: 1.1}, idm.time_gap: 1.2}\n", "'idm.time_gap' is given twice"),
     ],
 )

@@ -76,7 +76,7 @@ def test_predict_does_the_whole_records_of_a_truncated_file(tmp_path: Path) -> N
     [
         (("filter", "missing.csv"), "missing.csv does not exist"),
         (("filter", "lane.csv", "--recipe", "papers"), "recipe = 'papers' is unknown; use 'default' or 'paper'"),
-        (("reconstruct", "lane.csv", "--dt", "9"), "dt = 9 s is outside [0.01, 2] s"),
+        (("reconstruct", "lane.csv", "--dt", "9"), "--dt = 9 s is outside [0.01, 2] s"),
         (("predict", "broken.json"), "no scenario can be used: broken.json cannot be read"),
     ],
 )
