@@ -188,9 +188,7 @@ def record(simulator: Simulator, form: Form) -> Recording:
     try:
         after = simulator.step(state, _inputs(simulator, form, graph), _Parameters(simulator, graph))  # type: ignore[arg-type]
     except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise Untraceable(
-            f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}"
-        ) from error
+        raise Untraceable(f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}") from error
     for name in ("position", "speed", "accel"):
         recording.respond[name] = value_of(graph, getattr(after, name))
     for name in form.memories:
