@@ -33,7 +33,8 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     gradients are the business of the Gymnasium faces.
 
     Raises:
-        ValueError: In one line, for keywords that do not exist, and for actions that are missing or not finite.
+        TypeError: For a keyword that does not exist, with a suggestion.
+        ValueError: In one line, for values that cannot be, and for actions that are missing or not finite.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo declares it so)

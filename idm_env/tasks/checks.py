@@ -8,6 +8,10 @@ from collections.abc import Sequence
 from typing import Any
 
 
+class KeywordError(TypeError, ValueError):
+    """A keyword that does not exist: a TypeError as for any call, and a ValueError as for any value of a YAML file."""
+
+
 def whole(name: str, value: Any, low: int) -> int:
     """Return a whole number of at least ``low``."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):

@@ -12,6 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env, data_equivalence
 
 import idm_env  # noqa: F401
+from idm_env.tasks import make_task
 
 QUICK = {"warmup": 5}
 
@@ -119,6 +120,13 @@ def test_bad_keywords_are_errors_of_one_line(keywords, words):
     with pytest.raises(ValueError, match=words) as caught:
         quick(**keywords)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+@pytest.mark.parametrize("given", [{"vehicels": 3}, {"frameskip": 1}, {"task": make_task("ring"), "vehicles": 3}])
+def test_a_keyword_that_does_not_exist_is_a_type_error_as_gymnasiums(make, given):
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{list(given)[-1]}'"):
+        make("DiffIDM-v0", **given)
 
 
 def test_a_step_before_reset_is_an_error():
