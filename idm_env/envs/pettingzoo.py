@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pettingzoo
 import torch
 from gymnasium.spaces import Box
 from gymnasium.utils import seeding
@@ -166,3 +167,13 @@ def env(**keywords: Any) -> Any:
     """Return the environment turn by turn, with PettingZoo's check of the order of calls."""
     turns = raw_env(**keywords)
     return turns if isinstance(turns, OrderEnforcingWrapper) else OrderEnforcingWrapper(turns)
+
+
+def _register() -> None:
+    """Make ``pettingzoo.make("parallel", "diffidm_v0")`` known, from PettingZoo 1.27 on."""
+    if hasattr(pettingzoo, "register"):
+        pettingzoo.register("parallel", "diffidm_v0", f"{__name__}:parallel_env")
+        pettingzoo.register("aec", "diffidm_v0", f"{__name__}:env")
+
+
+_register()

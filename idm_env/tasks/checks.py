@@ -46,8 +46,21 @@ def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
     return first, last
 
 
+def count_of(controlled: Any, free: int) -> int:
+    """Return how many of ``free`` vehicles ``"all"``, a fraction (0 to 1, at least one vehicle) or a number means."""
+    if controlled == "all":
+        return max(1, free)
+    if isinstance(controlled, float):
+        if not 0.0 < controlled <= 1.0:
+            raise ValueError(f"controlled = {controlled} must be a fraction above 0 and up to 1, a number, or 'all'.")
+        return max(1, round(controlled * free))
+    if isinstance(controlled, str):
+        raise ValueError(f"controlled = {controlled!r} must be 'all', a number, a fraction or a list of vehicles.")
+    return whole("controlled", controlled, 1)
+
+
 def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:
-    """Return the indices of the controlled vehicles: spread evenly for a number, as given for a sequence."""
+    """Return the indices of the controlled vehicles: spread evenly for what ``count_of`` takes, as given for a list."""
     free = vehicles - first
     if isinstance(controlled, Sequence) and not isinstance(controlled, str):
         chosen = tuple(sorted(whole("controlled", i, 0) for i in controlled))
@@ -58,7 +71,7 @@ def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:
                 f"controlled = {list(controlled)} must lie in {first} … {vehicles - 1}; lower ones are recorded."
             )
         return chosen
-    count = whole("controlled", controlled, 1)
+    count = count_of(controlled, free)
     if count > free:
         raise ValueError(
             f"controlled = {count} exceeds the {free} vehicles that can be controlled of {vehicles}. "

@@ -1,5 +1,6 @@
 """The single environment: Gymnasium's own checks, keywords, actions, pickling and the JSON of its spec."""
 
+import functools
 import pickle
 import subprocess
 import sys
@@ -41,6 +42,23 @@ def test_check_env(keywords):
 def test_importing_the_package_imports_no_torch():
     code = "import sys, idm_env, gymnasium; gymnasium.spec('DiffIDM-v0'); assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("make", ["make", "make_vec"])
+def test_a_process_that_has_not_imported_the_package_finds_it_by_module(make):
+    code = f"import sys, gymnasium; assert 'idm_env' not in sys.modules; gymnasium.{make}('idm_env:DiffIDM-v0')"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_spawned_workers_find_it_by_module():
+    # A partial is pickled by names alone, so that a worker imports the package only through the module of the id.
+    make = functools.partial(gym.make, "idm_env:DiffIDM-v0", **QUICK)
+    near = gym.vector.SyncVectorEnv([make] * 2)
+    far = gym.vector.AsyncVectorEnv([make] * 2, context="spawn")
+    try:
+        np.testing.assert_array_equal(near.reset(seed=0)[0], far.reset(seed=0)[0])
+    finally:
+        far.close()
 
 
 def test_spec_survives_json_and_makes_the_same_environment():
