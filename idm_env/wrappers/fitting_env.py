@@ -17,7 +17,8 @@ class FittingEnv(gymnasium.Env):
     """``gym.make("DiffIDM-Fit-v0", trajectories="pairs.parquet", task="ring", …)``: one step, one guess.
 
     Action: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean square
-    residual. Observation: the last guess, zeros at first. Episodes have one step. ``free`` and ``objective`` are those
+    residual. Observation: the last guess, zeros at first. Info: its ``parameters`` by full name and, after a step, its
+    ``root_mean_squared_error``. Episodes have one step. ``free`` and ``objective`` are those
     of ``ParameterFitting``, with one set of parameters for all drivers; all other keywords make the environment whose
     drivers are fitted.
 
@@ -64,15 +65,20 @@ class FittingEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return the last guess."""
+        """Return the last guess, and its parameters in the info."""
         super().reset(seed=seed)
         if seed is not None:
             self._last = np.zeros_like(self._last)
-        return self._last.copy(), {}
+        return self._last.copy(), {"parameters": self._named(self.values(self._last))}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Judge a guess; the episode ends."""
+        values = self.values(action)
         with torch.no_grad():
-            error = float(self.problem.error(self.values(action)))
+            error = float(self.problem.root_mean_squared_error(values))
         self._last = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
-        return self._last.copy(), -error, True, False, {}
+        info = {"parameters": self._named(values), "root_mean_squared_error": error}
+        return self._last.copy(), -error, True, False, info
+
+    def _named(self, values: np.ndarray) -> dict[str, float]:
+        return dict(zip(self.problem.free, values.tolist(), strict=True))
