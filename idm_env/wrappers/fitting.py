@@ -132,7 +132,7 @@ class ParameterFitting:
     # -- search and use ------------------------------------------------------------------------------------------
 
     def fit(self, **options: Any) -> Fit:
-        """Search by ``idm_env.fitting`` (Levenberg–Marquardt or Adam; its options), write its result into the leaves, return it."""
+        """Search by ``idm_env.fitting`` (its options), write the result into the leaves, and return it."""
         from idm_env.fitting.fit import fit
 
         own = torch.stack([x.detach() for x in self.values().values()], dim=-1)
