@@ -30,9 +30,8 @@ def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any)
     known = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]
     for choice in choices:
         if choice not in known:
-            raise KeywordError(
-                f"task '{task}' got an unexpected keyword argument '{choice}'.{nearest(choice, [*known, *others])}"
-            )
+            like = nearest(choice, [name for name in (*known, *others) if name != choice])
+            raise KeywordError(f"task '{task}' got an unexpected keyword argument '{choice}'.{like}")
     return TASKS[task](**choices)
 
 

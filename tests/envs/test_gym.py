@@ -147,6 +147,12 @@ def test_a_keyword_that_does_not_exist_is_a_type_error_as_gymnasiums(make, given
         make("DiffIDM-v0", **given)
 
 
+def test_a_keyword_of_vectors_is_not_suggested_for_itself():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'num_envs'") as told:
+        gym.make("DiffIDM-v0", num_envs=3)
+    assert "mean 'num_envs'" not in str(told.value)
+
+
 def test_a_step_before_reset_is_an_error():
     with pytest.raises(RuntimeError, match=r"reset\(\) first"):
         quick().unwrapped.step(np.zeros(1))
