@@ -29,8 +29,9 @@ class DiffIDMVectorEnv(VectorEnv):
 
     Environment i equals a single environment seeded with ``seed + i``. ``autoreset_mode`` is ``"SameStep"`` (the
     default, which Stable-Baselines3 and TorchRL take: the returned observation is the new episode's, the last one is
-    in ``info["final_obs"]``), ``"NextStep"`` (Gymnasium's own default: the step after an end resets, with reward 0) or
-    ``"Disabled"`` (the caller resets with ``options={"reset_mask": mask}``); the attribute and ``metadata`` say which.
+    in ``info["final_obs"]``), ``"NextStep"`` (Gymnasium's own default, which its observation wrappers for vectors need:
+    the step after an end resets, with reward 0) or ``"Disabled"`` (the caller resets with ``options={"reset_mask":
+    mask}``); the attribute and ``metadata`` say which.
 
     With ``output="torch"`` observations and rewards carry their graph; the observation of a fresh episode has none, and
     ``info["final_obs"]`` is a dense tensor with the graph of the ended episodes (rows of ``_final_obs`` hold; the
