@@ -111,7 +111,7 @@ class ReplayTask(Task):
             return chosen
         most = count_of(self.controlled, self.vehicles)
         # "all" and fractions are of those that follow at one time.
-        picked = self._together(most if isinstance(self.controlled, int) else self.vehicles)
+        picked = self._following(most if isinstance(self.controlled, int) else self.vehicles)
         count = count_of(self.controlled, len(picked))
         if len(picked) < count:
             raise ValueError(
@@ -120,7 +120,7 @@ class ReplayTask(Task):
             )
         return tuple(sorted(picked[:count]))
 
-    def _together(self, most: int) -> list[int]:
+    def _following(self, most: int) -> list[int]:
         """Return up to ``most`` slots that follow recorded leaders at one time, those that follow longest first."""
         led = self.scene.led
         order = [int(i) for i in np.argsort(-led.sum(0), kind="stable") if self.scene.ids[i] != "—"]

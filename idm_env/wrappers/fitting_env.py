@@ -17,10 +17,10 @@ class FittingEnv(gymnasium.Env):
     """``gym.make("DiffIDM-Fit-v0", trajectories="pairs.parquet", task="ring", …)``: one step, one guess.
 
     Action: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean square
-    residual. Observation: the last guess, zeros at first. Info: its ``parameters`` by full name and, after a step, its
-    ``root_mean_squared_error``. Episodes have one step. ``free`` and ``objective`` are those
-    of ``ParameterFitting``, with one set of parameters for all drivers; all other keywords make the environment whose
-    drivers are fitted.
+    residual. Observation: the last guess, zeros at first. Info: its ``parameters`` by full name, after a reset also
+    their ``bounds``, what [−1, 1] spans, and after a step their ``root_mean_squared_error``. Episodes have one step.
+    ``free`` and ``objective`` are those of ``ParameterFitting``, with one set of parameters for all drivers; all other
+    keywords make the environment whose drivers are fitted.
 
     ``bounds`` narrows what [−1, 1] spans: ``{"idm.time_gap": [0.5, 3.0]}``.
     """
@@ -65,11 +65,13 @@ class FittingEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return the last guess, and its parameters in the info."""
+        """Return the last guess."""
         super().reset(seed=seed)
         if seed is not None:
             self._last = np.zeros_like(self._last)
-        return self._last.copy(), {"parameters": self._named(self.values(self._last))}
+        spans = zip(self.low.tolist(), self.high.tolist(), strict=True)
+        bounds = dict(zip(self.problem.free, spans, strict=True))
+        return self._last.copy(), {"parameters": self._named(self.values(self._last)), "bounds": bounds}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Judge a guess; the episode ends."""

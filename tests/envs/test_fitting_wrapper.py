@@ -138,6 +138,7 @@ def test_the_gymnasium_environment(recording):
     check_env(env.unwrapped, skip_render_check=True)
     _, info = env.reset(seed=0)
     assert info["parameters"] == pytest.approx(dict(zip(FREE, env.unwrapped.values(np.zeros(3)), strict=True)))
+    assert info["bounds"]["idm.time_gap"] == (0.4, 2.4)
     inner = env.unwrapped
     best = np.array([1.4, 1.1, 2.6])
     action = (2.0 * (best - inner.low) / (inner.high - inner.low) - 1.0).astype(np.float32)
