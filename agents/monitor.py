@@ -26,6 +26,8 @@ def make_logger(arguments: Arguments, done: int) -> Logger:
 class Monitor:
     """Told of every update; ``history`` holds one row per evaluation, with updates, steps and CPU seconds.
 
+    ``with Monitor(…) as monitor:`` closes the log on every way out of a training.
+
     CPU seconds count from ``began`` (a ``time.process_time()``): making the environments belongs to training, while
     evaluations, logs and checkpoints do not. ``best.pt`` is the checkpoint with the
     highest score (``evaluate.score``), the first of equals.
@@ -90,7 +92,11 @@ class Monitor:
             self._bar.write(f"{self.last}, update {update}: " + ", ".join(f"{k} {v:.3g}" for k, v in shown.items()))
         self._bar.set_postfix({k: f"{v:.3g}" for k, v in figures.items()}, refresh=False)
         self._aside += time.process_time() - begin
-        if over:
-            self._bar.close()
-            self.logger.close()
         return not over
+
+    def __enter__(self) -> Monitor:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+        self.logger.close()

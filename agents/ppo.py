@@ -190,7 +190,6 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         saved |= {"update": done - 1, "steps": done * chunk}
     # Making or loading a model seeds its environments; these are the seeds of all agents, new ones after a resume.
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
-    monitor = Monitor(name, arguments, began, saved)
 
     def store() -> None:
         keep.write(file, model.save)
@@ -198,18 +197,19 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         if isinstance(model, SAC):
             keep.write(memory, model.save_replay_buffer)
 
-    for update in range(done, arguments.updates):
-        rate = common.fall(arguments.learning_rate, update, arguments.updates)
-        model.lr_schedule = FloatSchedule(rate)
-        try:
-            model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
-        except ValueError:  # SB3 meets weights that are not finite when it draws the next action
-            check(model, update, monitor.last)
-            raise
-        copy_actor(model, policy, update, monitor.last)
-        figures = {k: float(v) for k, v in model.logger.name_to_value.items() if "loss" in k or "std" in k}
-        if not monitor.after(update, chunk, policy, {}, {**figures, "learning_rate": rate}, store):
-            break
+    with Monitor(name, arguments, began, saved) as monitor:
+        for update in range(done, arguments.updates):
+            rate = common.fall(arguments.learning_rate, update, arguments.updates)
+            model.lr_schedule = FloatSchedule(rate)
+            try:
+                model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
+            except ValueError:  # SB3 meets weights that are not finite when it draws the next action
+                check(model, update, monitor.last)
+                raise
+            copy_actor(model, policy, update, monitor.last)
+            figures = {k: float(v) for k, v in model.logger.name_to_value.items() if "loss" in k or "std" in k}
+            if not monitor.after(update, chunk, policy, {}, {**figures, "learning_rate": rate}, store):
+                break
     return monitor.history
 
 

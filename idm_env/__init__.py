@@ -1,7 +1,8 @@
 """Differentiable, vectorised lanes of Intelligent-Driver-Model vehicles, and a closed loop with measured traffic.
 
 Public names are loaded when first used, so ``import idm_env`` is quick and imports no torch; it registers the
-Gymnasium ids ``DiffIDM-v0`` and ``DiffIDM-Fit-v0``.
+Gymnasium ids ``DiffIDM-v0`` and ``DiffIDM-Fit-v0``. Gymnasium (1.1 and later) loads no plug-ins: a process that has not
+imported this package, such as a remote worker, finds them as ``"idm_env:DiffIDM-v0"``.
 """
 
 from __future__ import annotations

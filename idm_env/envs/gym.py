@@ -32,7 +32,8 @@ class DiffIDMEnv(gymnasium.Env):
     state})`` starts from a given ``State`` of shape ``(1, vehicles)``, with its graph.
 
     Raises:
-        ValueError: In one line, with value, rule and cure.
+        TypeError: For a keyword that does not exist, with a suggestion.
+        ValueError: For a value that cannot be; in one line, with value, rule and cure.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (Gymnasium declares it so)

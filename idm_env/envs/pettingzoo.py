@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pettingzoo
 import torch
 from gymnasium.spaces import Box
 from gymnasium.utils import seeding
@@ -34,7 +35,8 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     gradients are the business of the Gymnasium faces.
 
     Raises:
-        ValueError: In one line, for keywords that do not exist, and for actions that are missing or not finite.
+        TypeError: For a keyword that does not exist, with a suggestion.
+        ValueError: In one line, for values that cannot be, and for actions that are missing or not finite.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo declares it so)
@@ -169,3 +171,13 @@ def env(**keywords: Any) -> Any:
     """Return the environment turn by turn, with PettingZoo's check of the order of calls."""
     turns = raw_env(**keywords)
     return turns if isinstance(turns, OrderEnforcingWrapper) else OrderEnforcingWrapper(turns)
+
+
+def _register() -> None:
+    """Make ``pettingzoo.make("parallel", "diffidm_v0")`` known, from PettingZoo 1.27 on."""
+    if hasattr(pettingzoo, "register"):
+        pettingzoo.register("parallel", "diffidm_v0", f"{__name__}:parallel_env")
+        pettingzoo.register("aec", "diffidm_v0", f"{__name__}:env")
+
+
+_register()

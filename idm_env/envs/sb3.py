@@ -12,11 +12,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 class SB3VecEnv(VecEnv):
-    """``SB3VecEnv(gym.make_vec("DiffIDM-v0", num_envs=64, autoreset_mode="SameStep"))``.
+    """``SB3VecEnv(gym.make_vec("DiffIDM-v0", num_envs=64))``.
 
     SB3 resets within the step and expects the last observation of an episode in ``info["terminal_observation"]`` and,
     where it was cut off rather than ended, ``info["TimeLimit.truncated"]``. So the vector must be in mode
-    ``"SameStep"``, or ``"Disabled"``, in which case this adapter resets.
+    ``"SameStep"``, the default, or ``"Disabled"``, in which case this adapter resets.
 
     Raises:
         ValueError: For a vector in mode ``"NextStep"`` or with torch output.

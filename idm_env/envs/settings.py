@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 from idm_env.checks import nearest, one_of, shown
 from idm_env.config import load_environment
-from idm_env.tasks import Task, make_task
+from idm_env.tasks import KeywordError, Task, make_task
 
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -63,11 +63,15 @@ def settings(
     max_episode_steps: int | None = None,
     **choices: Any,
 ) -> Settings:
-    """Return checked settings; ValueError in one line, with a suggestion, for a misspelled keyword or value.
+    """Return checked settings.
 
     ``config`` is a YAML file that says ``configures: environment`` and gives any of these keywords; a keyword that is
     given here as well wins, but of two ``max_episode_steps`` the smaller one, as with ``gym.make``, which has one of
     its own. ``max_episode_steps`` of None or −1 leaves the limit to the task.
+
+    Raises:
+        KeywordError: A TypeError in one line, with a suggestion, for a keyword that does not exist.
+        ValueError: In one line, with a suggestion, for a value that cannot be.
     """
     own = {
         "task": task,
@@ -87,15 +91,16 @@ def settings(
         choices = {**read, **choices}
     chosen = own["task"] or "ring"
     if isinstance(chosen, Task) and choices:
-        raise ValueError(
-            f"keyword '{next(iter(choices))}' was given beside a task that is already made. Give it to the task."
+        raise KeywordError(
+            f"unexpected keyword argument '{next(iter(choices))}' beside a task that is already made. "
+            "Give it to the task."
         )
     return Settings(
         task=chosen if isinstance(chosen, Task) else make_task(cast(str, chosen), others=KEYWORDS, **choices),
         output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),
         device=_device(own["device"] or "cpu"),
         dtype=DTYPES[one_of("dtype", own["dtype"] or "float32", DTYPES)],
-        autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.NEXT_STEP),
+        autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.SAME_STEP),
         render_mode=None if own["render_mode"] is None else one_of("render_mode", own["render_mode"], RENDER_MODES),
         limit=_limit(own["max_episode_steps"]),
     )

@@ -27,22 +27,25 @@ LIMIT = 3000
 class DiffIDMVectorEnv(VectorEnv):
     """``num_envs`` environments in one batch; keywords as for ``DiffIDMEnv``.
 
-    Environment i equals a single environment seeded with ``seed + i``. ``autoreset_mode`` is ``"NextStep"`` (the step
-    after an end resets, with reward 0), ``"SameStep"`` (the returned observation is the new episode's, the last one
-    is in ``info["final_obs"]``) or ``"Disabled"`` (the caller resets with ``options={"reset_mask": mask}``).
+    Environment i equals a single environment seeded with ``seed + i``. ``autoreset_mode`` is ``"SameStep"`` (the
+    default, which Stable-Baselines3 and TorchRL take: the returned observation is the new episode's, the last one is
+    in ``info["final_obs"]``), ``"NextStep"`` (Gymnasium's own default, which its observation wrappers for vectors need:
+    the step after an end resets, with reward 0) or ``"Disabled"`` (the caller resets with ``options={"reset_mask":
+    mask}``); the attribute and ``metadata`` say which.
 
     With ``output="torch"`` observations and rewards carry their graph; the observation of a fresh episode has none, and
     ``info["final_obs"]`` is a dense tensor with the graph of the ended episodes (rows of ``_final_obs`` hold; the
     others are 0).
 
     Raises:
-        ValueError: In one line, with value, rule and cure.
+        TypeError: For a keyword that does not exist, with a suggestion.
+        ValueError: For a value that cannot be; in one line, with value, rule and cure.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (Gymnasium declares it so)
         "render_modes": list(RENDER_MODES),
         "render_fps": 10,
-        "autoreset_mode": AutoresetMode.NEXT_STEP,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
     }
 
     def __init__(
@@ -54,6 +57,7 @@ class DiffIDMVectorEnv(VectorEnv):
         self.num_envs = whole("num_envs", num_envs, 1)
         affordable(made, num_envs)
         self.render_mode = made.render_mode
+        self.autoreset_mode = made.autoreset_mode
         self.metadata = {
             **type(self).metadata,
             "render_fps": round(1.0 / self.task.simulator.dt),
@@ -132,7 +136,7 @@ class DiffIDMVectorEnv(VectorEnv):
         """Advance all environments by Δt; ``None`` as actions leaves all vehicles to their drivers."""
         if self.batch.world is None:
             raise RuntimeError("step was called before reset. Call reset() first.")
-        mode = self.settings.autoreset_mode
+        mode = self.autoreset_mode
         over = np.flatnonzero(self._ended)
         if len(over) and mode is AutoresetMode.DISABLED:
             raise RuntimeError(
@@ -166,7 +170,8 @@ class DiffIDMVectorEnv(VectorEnv):
         ended, flat = self._ended.copy(), self._out(observation)
         if not self._numpy:
             mask = torch.as_tensor(ended, device=flat.device)
-            return {"final_obs": torch.where(mask.unsqueeze(-1), flat, 0.0), "_final_obs": mask}
+            last = torch.where(mask.unsqueeze(-1), flat, 0.0)
+            return {"final_obs": last, "_final_obs": mask, "final_info": {}, "_final_info": mask.clone()}
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
             final[i] = flat[i]

@@ -38,7 +38,8 @@ class Task(abc.ABC):
 
     Args:
         vehicles: Number of vehicles, recorded ones included.
-        controlled: How many vehicles agents control, spread evenly, or which ones (indices, front first).
+        controlled: How many vehicles agents control, spread evenly: a number, a fraction such as 0.1, or ``"all"``; or
+            which ones (indices, front first).
         vehicle_length: Length of every vehicle (m).
         dt: Time step (s); None is the one of ``effects`` if that is a model file, else 0.1.
         integration: ``"ballistic"`` or ``"euler"``; None as for ``dt``.
@@ -62,7 +63,7 @@ class Task(abc.ABC):
     """
 
     vehicles: int = 22
-    controlled: int | Sequence[int] = 1
+    controlled: int | float | str | Sequence[int] = 1
     vehicle_length: float = 5.0
     dt: float | None = None
     integration: str | None = None

@@ -7,7 +7,11 @@ from typing import Any
 
 from idm_env.checks import at_least, shown, whole
 
-__all__ = ["agents_of", "at_least", "span", "whole"]
+__all__ = ["KeywordError", "agents_of", "at_least", "span", "whole"]
+
+
+class KeywordError(TypeError, ValueError):
+    """A keyword that does not exist: a TypeError as for any call, and a ValueError as for any value of a YAML file."""
 
 
 def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
@@ -21,19 +25,32 @@ def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
     return first, last
 
 
+def count_of(controlled: Any, free: int) -> int:
+    """Return how many of ``free`` vehicles ``"all"``, a fraction (0 to 1, at least one vehicle) or a number means."""
+    if controlled == "all":
+        return max(1, free)
+    if isinstance(controlled, float):
+        if not 0.0 < controlled <= 1.0:
+            raise ValueError(f"controlled = {controlled} must be a fraction above 0 and up to 1, a number, or 'all'.")
+        return max(1, round(controlled * free))
+    if isinstance(controlled, str):
+        raise ValueError(f"controlled = {shown(controlled)} must be 'all', a number, a fraction or a list of vehicles.")
+    return whole("controlled", controlled, 1)
+
+
 def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:
-    """Return the indices of the controlled vehicles: spread evenly for a number, as given for a sequence."""
+    """Return the indices of the controlled vehicles: spread evenly for what ``count_of`` takes, as given for a list."""
     free = vehicles - first
     if isinstance(controlled, Sequence) and not isinstance(controlled, str):
         chosen = tuple(sorted(whole("controlled", i, 0) for i in controlled))
         if not chosen or len(set(chosen)) < len(chosen):
-            raise ValueError(f"controlled = {list(controlled)} must name at least one vehicle, and none twice.")
+            raise ValueError(f"controlled = {shown(list(controlled))} must name at least one vehicle, and none twice.")
         if chosen[0] < first or chosen[-1] >= vehicles:
             raise ValueError(
-                f"controlled = {list(controlled)} must lie in {first} … {vehicles - 1}; lower ones are recorded."
+                f"controlled = {shown(list(controlled))} must lie in {first} … {vehicles - 1}; lower ones are recorded."
             )
         return chosen
-    count = whole("controlled", controlled, 1)
+    count = count_of(controlled, free)
     if count > free:
         raise ValueError(
             f"controlled = {count} exceeds the {free} vehicles that can be controlled of {vehicles}. "

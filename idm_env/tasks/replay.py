@@ -16,7 +16,7 @@ from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.parameters import nearest
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Bounds, Ended, Task, World
-from idm_env.tasks.checks import whole
+from idm_env.tasks.checks import count_of
 from idm_env.tasks.follow import headway_penalty
 from idm_env.tasks.random import Draw
 from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene
@@ -43,10 +43,11 @@ class ReplayTask(Task):
     Args:
         data: A trajectory file; None is a made-up scene of the project's own.
         runs: Some of its runs; None takes all, on one clock.
-        controlled: Which vehicles agents control: a number (those that follow longest), or ids, as ``"vehicle"`` or
-            ``"run/vehicle"``.
+        controlled: Which vehicles agents control: a number (those that follow longest), ``"all"`` that follow at one
+            time, a fraction of these, or ids, as ``["vehicle"]`` or ``["run/vehicle"]``.
         model: Which vehicles the drivers' model takes over: ids as for ``controlled``, or ``"all"`` with a recorded
-        leader. reward_terms: ``"imitation"`` or ``"follow"``.
+            leader.
+        reward_terms: ``"imitation"`` or ``"follow"``.
     """
 
     name: ClassVar[str] = "replay"
@@ -108,21 +109,28 @@ class ReplayTask(Task):
             if not chosen:
                 raise ValueError("controlled = [] must name at least one vehicle.")
             return chosen
-        count = whole("controlled", self.controlled, 1)
-        led = self.scene.led
-        order = [int(i) for i in np.argsort(-led.sum(0), kind="stable") if self.scene.ids[i] != "—"]
-        picked: list[int] = []
-        together = np.ones(len(led), bool)
-        for slot in order:
-            if len(picked) < count and _longest(together & led[:, slot]) >= min(HORIZON, _longest(led[:, order[0]])):
-                picked.append(slot)
-                together &= led[:, slot]
+        most = count_of(self.controlled, self.vehicles)
+        # "all" and fractions are of those that follow at one time.
+        picked = self._following(most if isinstance(self.controlled, int) else self.vehicles)
+        count = count_of(self.controlled, len(picked))
         if len(picked) < count:
             raise ValueError(
                 f"controlled = {count}, but only {len(picked)} vehicles follow recorded leaders at one time. "
                 f"Control fewer."
             )
-        return tuple(sorted(picked))
+        return tuple(sorted(picked[:count]))
+
+    def _following(self, most: int) -> list[int]:
+        """Return up to ``most`` slots that follow recorded leaders at one time, those that follow longest first."""
+        led = self.scene.led
+        order = [int(i) for i in np.argsort(-led.sum(0), kind="stable") if self.scene.ids[i] != "—"]
+        picked: list[int] = []
+        together = np.ones(len(led), bool)
+        for slot in order:
+            if len(picked) < most and _longest(together & led[:, slot]) >= min(HORIZON, _longest(led[:, order[0]])):
+                picked.append(slot)
+                together &= led[:, slot]
+        return picked
 
     def _slot(self, vehicle: Any) -> int:
         known = {key: i for i, key in enumerate(self.scene.ids) if key != "—"}

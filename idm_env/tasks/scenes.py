@@ -203,6 +203,7 @@ def _motion(track: _Track, seat: np.ndarray | None, dt: float) -> tuple[np.ndarr
     return motion, there
 
 
+@lru_cache(maxsize=4)
 def made_up_scene(dt: float, followers: int = 6, seconds: float = 600.0) -> Scene:
     """Return the project's own scene: the made-up leader, and drivers behind it who differ a little in T and a."""
     import torch

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -130,6 +131,13 @@ def test_resuming_another_agents_or_tasks_training_is_refused(quick):
         apg.train(apg.Arguments(**other, **SMALL, resume=True))
 
 
+def raising(error: type[BaseException]):
+    def fail(*given: object) -> None:
+        raise error
+
+    return fail
+
+
 def break_rewards(monkeypatch, after: int) -> None:
     plain, calls = RingTask.reward, [0]
 
@@ -162,6 +170,18 @@ def test_a_critic_that_diverges_before_the_actor_learns_is_not_kept(quick, monke
         module.train(kind(**quick, **{**small, "critic_first": 3}))
     kept = common.load(quick["out"] / "last.pt")[1]["training"]
     assert kept["update"] == 0 and all(bool(torch.isfinite(x).all()) for x in kept["critic"].values())
+
+
+@pytest.mark.parametrize("way_out", [None, KeyboardInterrupt, OSError])
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_log_is_closed_on_every_way_out(name, way_out, quick, loggers, monkeypatch):
+    module, kind, small = AGENTS[name]
+    if way_out is not None:
+        monkeypatch.setattr("agents.monitor.common.save", raising(way_out))
+    with pytest.raises(way_out) if way_out else contextlib.nullcontext():
+        module.train(kind(**{**quick, "updates": 1}, **small))
+    assert len(loggers) == 1
+    assert all(part.file.closed for part in loggers[0].output_formats)
 
 
 @pytest.mark.parametrize("name", ["apg", "shac"])

@@ -123,6 +123,12 @@ def recording(tmp_path):
     return str(path)
 
 
+def test_the_made_up_scene_is_simulated_once(monkeypatch):
+    first = make_task("replay").scene
+    monkeypatch.setattr("idm_env.simulator.Simulator.step", None)
+    assert make_task("replay", controlled=2).scene is first
+
+
 def test_a_file_is_replayed_with_its_gaps_and_changing_leaders(recording):
     task = make_task("replay", data=recording, controlled=["c"])
     scene = task.scene
