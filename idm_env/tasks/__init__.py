@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from idm_env.parameters import nearest
-from idm_env.tasks.base import Advance, Bounds, Ended, Task, World
+from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
@@ -37,7 +37,9 @@ __all__ = [
     "Bounds",
     "Draw",
     "Ended",
+    "Features",
     "FollowTask",
+    "Pay",
     "PlatoonTask",
     "ReplayTask",
     "RingTask",
