@@ -25,7 +25,7 @@ from agents.environments import first_seed, human_driving, task_of
 from idm_env.config import load_environment, number
 from idm_env.parameters import nearest
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the layout of checkpoints."""
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
@@ -232,6 +232,7 @@ def save(path: Path, policy: Policy, agent: str, environment: Mapping[str, Any],
         "agent": agent,
         "task": task.name,
         "features": list(task.bounds.names),
+        "scales": list(task.scales),
         "environment": dict(environment),
         "policy": {"made": policy.made, "state": policy.state_dict()},
         "training": dict(training),
@@ -267,10 +268,14 @@ def load(path: str | Path, task: str | None = None, agent: str | None = None) ->
             raise ValueError(
                 f"{path} is of {name} '{content[name]}', and '{wanted}' is wanted. Give a file of that {name}."
             )
-    now = list(task_of(content["environment"]).bounds.names)
-    if content["features"] != now:
+    made = task_of(content["environment"])
+    before, now = (
+        [f"{name} / {scale:g}" for name, scale in zip(names, scales, strict=False)]
+        for names, scales in ((content["features"], content["scales"]), (made.bounds.names, made.scales))
+    )
+    if before != now:
         raise ValueError(
-            f"{path} was trained by version {content['version']} on observations {', '.join(content['features'])}; "
+            f"{path} was trained by version {content['version']} on observations {', '.join(before)}; "
             f"task '{content['task']}' now gives {', '.join(now)}. Train it anew."
         )
     policy = Policy(**content["policy"]["made"])

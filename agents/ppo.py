@@ -189,6 +189,9 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     # Making or loading a model seeds its environments; these are the seeds of all agents, new ones after a resume.
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
     monitor = Monitor(name, arguments, began, saved)
+    if not saved:
+        copy_actor(model, policy, -1, monitor.last)
+        monitor.untrained(policy)
 
     def keep() -> None:
         common.write(file, model.save)

@@ -133,21 +133,22 @@ class Batch:
         assert before is not None
         normals = self._normals(before.state)
         command = None if action is None else task.command(action)
-        after = task.step(before, command, normals, self.params, live=live, advance=self.advance)
+        given = None if command is None else task.limit(before, command)
+        after = task.step(before, given, normals, self.params, live=live, advance=self.advance, limited=True)
         if command is None:
             command = after.state.speed.new_zeros(self.count, len(task.agents))
         elif live is not None:
             command = torch.where(live, command, 0.0)
         self.world = after
         terminated, truncated = task.ended(after)
-        details = self._details(before, after, None if action is None else command, terminated, live)
+        details = self._details(after, None if action is None else command, given, terminated)
         if self.limit is not None:
             truncated = truncated | (after.state.step >= self.limit).unsqueeze(-1)
         reward = task.reward(before, command, after, terminated)
         return Outcome(task.observe(after), reward, terminated, truncated, details)
 
     def _details(
-        self, before: World, after: World, command: Tensor | None, crashed: Tensor, live: Tensor | None
+        self, after: World, command: Tensor | None, given: Tensor | None, crashed: Tensor
     ) -> dict[str, Tensor]:
         """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
         task, asked, found = self.task, self.settings.info, dict[str, Tensor]()
@@ -158,11 +159,10 @@ class Batch:
             shape = (self.count, len(task.agents))
             found["command"] = after.state.accel.new_full(shape, torch.nan) if command is None else command
         if "failsafe" in asked:
-            if task.failsafe and command is not None:
-                cut = command.detach() > task.safe_command(before).detach()
-                found["failsafe"] = cut if live is None else cut & live
-            else:
+            if command is None or given is None or not task.failsafe:
                 found["failsafe"] = torch.zeros_like(crashed)
+            else:
+                found["failsafe"] = given < command
         if "crash" in asked:
             found["crash"] = crashed
         return found

@@ -47,7 +47,7 @@ def single(batch: Batch, outcome: Outcome) -> dict[str, Any]:
         if name == "crash":
             info["crash"] = bool(value.any())
         else:
-            info[name] = _out(batch, value[0])
+            info[name] = _out(batch, value)[0]
     if info.get("crash"):
         assert batch.world is not None
         info["crash_reason"] = batch.task.crash_reason(batch.world, 0)

@@ -290,10 +290,14 @@ class Task(abc.ABC):
         safe = torch.sqrt((room + half * half).clamp_min(1e-6)) - half
         return (safe - speed) / dt
 
+    def limit(self, world: World, command: Tensor) -> Tensor:
+        """Return commands (m/s²) as far as the failsafe lets them pass."""
+        return torch.minimum(command, self.safe_command(world)) if self.failsafe else command
+
     def inputs(
         self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
     ) -> Inputs:
-        """Return the inputs of one step: the command (m/s², None for nobody) as far as safe, and the noise's normals.
+        """Return the inputs of one step: the command (m/s², None for nobody) and the noise's normals.
 
         ``live`` (bool, ``(…, agents)``) says which agents still command; the others' vehicles go back to their drivers.
         """
@@ -302,8 +306,6 @@ class Task(abc.ABC):
             idle = self.constant("idle", [False] * self.vehicles, speed.device, torch.bool)
             inputs: dict[str, Any] = {"control": Command(speed.new_zeros(()), idle)}
         else:
-            if self.failsafe:
-                command = torch.minimum(command, self.safe_command(world))
             active = self.constant("active", self._is_agent, speed.device, torch.bool)
             if len(self.agents) > 1:
                 slot = self.constant("slots", self._agent_slots, speed.device, torch.int64)
@@ -324,8 +326,14 @@ class Task(abc.ABC):
         *,
         live: Tensor | None = None,
         advance: Advance | None = None,
+        limited: bool = False,
     ) -> World:
-        """Return the world Δt later. ``command`` (m/s²) has shape ``(…, agents)``, ``normals`` ``(…, vehicles)``."""
+        """Return the world Δt later. ``command`` (m/s²) has shape ``(…, agents)``, ``normals`` ``(…, vehicles)``.
+
+        ``limited`` says that ``limit`` was called already.
+        """
+        if command is not None and not limited:
+            command = self.limit(world, command)
         state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals, live), params)
         return world._replace(state=state)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -11,9 +13,10 @@ from agents.common import Policy
 from agents.evaluate import solved_at
 from agents.rollout import Driven, ring_start, uniform_speed
 from idm_env import metrics
+from idm_env.tasks.ring import SCALES
 
 RING = {"task": "ring"}
-VEHICLE: dict[str, float] = {"dt": 0.1, "max_command": 1.0, "vehicle_length": 5.0}
+VEHICLE: dict[str, Any] = {"dt": 0.1, "max_command": 1.0, "vehicle_length": 5.0, "scales": SCALES}
 
 
 def test_uniform_speed_is_the_equilibrium_of_equal_drivers():
