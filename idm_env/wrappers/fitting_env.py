@@ -19,8 +19,7 @@ class FittingEnv(gymnasium.Env):
     Action: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean square
     residual. Observation: the last guess, zeros at first. Episodes have one step. ``free`` and ``objective`` are those
     of ``ParameterFitting``, with one set of parameters for all drivers; all other keywords make the environment whose
-    drivers are fitted. Info: after a reset ``bounds``, what [−1, 1] spans, by parameter; after a step ``parameters``,
-    the values that were judged, and ``error``, their root mean square residual.
+    drivers are fitted.
 
     ``bounds`` narrows what [−1, 1] spans: ``{"idm.time_gap": [0.5, 3.0]}``.
     """
@@ -69,14 +68,11 @@ class FittingEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             self._last = np.zeros_like(self._last)
-        spans = zip(self.low.tolist(), self.high.tolist(), strict=True)
-        return self._last.copy(), {"bounds": dict(zip(self.problem.free, spans, strict=True))}
+        return self._last.copy(), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Judge a guess; the episode ends."""
         with torch.no_grad():
-            values = self.values(action)
-            error = float(self.problem.error(values))
+            error = float(self.problem.error(self.values(action)))
         self._last = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
-        judged = dict(zip(self.problem.free, values.tolist(), strict=True))
-        return self._last.copy(), -error, True, False, {"error": error, "parameters": judged}
+        return self._last.copy(), -error, True, False, {}

@@ -82,3 +82,15 @@ def test_what_is_no_number_of_steps_is_an_error(bad):
 def test_the_cost_of_a_crash_knows_the_episodes_length():
     short, long = (gym.make("DiffIDM-v0", max_episode_steps=n).unwrapped.task for n in (10, 10000))
     assert (short.cost_of_crash, long.cost_of_crash) == (121.0, 120001.0)
+
+
+def test_a_picture_is_as_long_as_it_was_asked_for(tmp_path, monkeypatch):
+    # The usual 3000 steps are no limit of it: plot's ring is drawn over 400 s.
+    from idm_env import cli, diagrams
+
+    seen = []
+    monkeypatch.setattr(diagrams, "space_time", lambda states, **_: seen.append(len(states.position)))
+    path = tmp_path / "ring.yaml"
+    path.write_text("configures: environment\ntask: ring\nvehicles: 3\nlength: 60.0\nwarmup: 1\n")
+    cli._rollout_figure(path, 310.0, 0)
+    assert seen == [3100]
