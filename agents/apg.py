@@ -54,6 +54,8 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     else:
         observation = environments.desynchronise(env)
     with Monitor("apg", arguments, began, saved) as monitor:
+        if not saved:
+            monitor.untrained(policy)
         for update in range(saved.get("update", -1) + 1, arguments.updates):
             rate = common.fall(arguments.learning_rate, update, arguments.updates)
             optimiser.param_groups[0]["lr"] = rate

@@ -25,7 +25,7 @@ from idm_env import keep
 from idm_env.checks import finite, nearest, shown
 from idm_env.config import load_environment, number, read_yaml
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the layout of checkpoints."""
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
@@ -242,6 +242,7 @@ def save(path: Path, policy: Policy, agent: str, environment: Mapping[str, Any],
         "agent": agent,
         "task": task.name,
         "features": list(task.bounds.names),
+        "scales": list(task.scales),
         "environment": dict(environment),
         "policy": {"made": policy.made, "state": policy.state_dict()},
         "training": dict(training),
@@ -276,10 +277,14 @@ def load(path: str | Path, task: str | None = None, agent: str | None = None) ->
             raise ValueError(
                 f"{path} is of {name} '{content[name]}', and '{wanted}' is wanted. Give a file of that {name}."
             )
-    now = list(task_of(content["environment"]).bounds.names)
-    if content["features"] != now:
+    made = task_of(content["environment"])
+    before, now = (
+        [f"{name} / {scale:g}" for name, scale in zip(names, scales, strict=False)]
+        for names, scales in ((content["features"], content["scales"]), (made.bounds.names, made.scales))
+    )
+    if before != now:
         raise ValueError(
-            f"{path} was trained by version {content['version']} on observations {', '.join(content['features'])}; "
+            f"{path} was trained by version {content['version']} on observations {', '.join(before)}; "
             f"task '{content['task']}' now gives {', '.join(now)}. Train it anew."
         )
     policy = Policy(**content["policy"]["made"])
@@ -299,8 +304,8 @@ def _content(path: Path) -> dict[str, Any] | None:
 def _whole(content: Any) -> bool:
     """Tell whether a checkpoint has all that ``save`` writes, each of its kind."""
     kinds = {
-        "version": str, "agent": str, "task": str, "features": list, "environment": dict, "policy": dict,
-        "training": dict,
+        "version": str, "agent": str, "task": str, "features": list, "scales": list, "environment": dict,
+        "policy": dict, "training": dict,
     }  # fmt: skip
     if not all(isinstance(content.get(name), kind) for name, kind in kinds.items()):
         return False

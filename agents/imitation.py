@@ -37,9 +37,10 @@ from idm_env.fitting.batch import Batch, windows
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import base_simulator, fit
 from idm_env.fitting.problem import group_of
+from idm_env.tasks.follow import SEEN
 from idm_env.types import Command
 
-SCALES = (40.0, 40.0, 100.0)
+SCALES = SEEN.scales
 """Of speed, leader's speed (m/s) and gap (m) in an observation, as in task ``follow``."""
 
 

@@ -198,6 +198,9 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             keep.write(memory, model.save_replay_buffer)
 
     with Monitor(name, arguments, began, saved) as monitor:
+        if not saved:
+            copy_actor(model, policy, -1, monitor.last)
+            monitor.untrained(policy)
         for update in range(done, arguments.updates):
             rate = common.fall(arguments.learning_rate, update, arguments.updates)
             model.lr_schedule = FloatSchedule(rate)

@@ -193,6 +193,8 @@ def train(a: Arguments) -> list[dict[str, Any]]:
         if saved:
             part.load_state_dict(saved[name])
     with Monitor("shac", a, began, saved) as monitor:
+        if not saved:
+            monitor.untrained(policy)
         for update in range(saved.get("update", -1) + 1, a.updates):
             rate = common.fall(a.learning_rate, update, a.updates)
             actor_steps.param_groups[0]["lr"] = rate

@@ -427,8 +427,7 @@ def _rollout_panel(config: Path, seconds: float, seed: int, report: OnProgress) 
 
     _work_begins()
     # The picture is as long as it was asked for, whatever the limit of an episode.
-    keywords = {key: value for key, value in load_environment(config).items() if key != "max_episode_steps"}
-    env: Any = DiffIDMEnv(**keywords)
+    env: Any = DiffIDMEnv(**{**load_environment(config), "max_episode_steps": -1})
     env.reset(seed=seed)
     dt = env.task.simulator.dt
     kept = []

@@ -19,11 +19,11 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from idm_env.checks import shown
-from idm_env.envs.batch import Batch
+from idm_env.envs.batch import Batch, Outcome
+from idm_env.envs.info import ids
 from idm_env.envs.settings import RENDER_MODES, settings
 from idm_env.envs.spaces import action_box, numpy_dtype, observation_box
 
-CYCLES = 3000
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 
 
@@ -46,7 +46,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         "render_fps": 10,
     }
 
-    def __init__(self, *, max_cycles: int = CYCLES, render_mode: str | None = None, **keywords: Any) -> None:
+    def __init__(self, *, max_cycles: int | None = None, render_mode: str | None = None, **keywords: Any) -> None:
         made = settings(max_episode_steps=max_cycles, render_mode=render_mode, **keywords)
         if made.output != "numpy":
             raise ValueError("output = 'torch' has no meaning for PettingZoo. Use gym.make_vec for gradients.")
@@ -82,12 +82,13 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         """
         if seed is not None or self.batch.world is None:
             self.batch.seed([0], [seeding.np_random(seed)[1]])
-        self.batch.limit = min((x for x in (self.max_cycles, self.task.horizon) if x is not None), default=None)
+        # PettingZoo's own tests set it between episodes.
+        self.batch.limit = self.max_cycles
         self.agents = list(self.possible_agents)
         seen = self.batch.reset()[0].cpu().numpy()
         if self.render_mode == "human":
             self.render()
-        return self._by_agent(seen), {agent: {} for agent in self.agents}
+        return self._by_agent(seen), {agent: self._begun(agent) for agent in self.agents}
 
     def step(
         self, actions: dict[str, np.ndarray]
@@ -108,12 +109,26 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
                 None if everybody else torch.tensor([live], device=made.device),
             )
         seen = self._by_agent(outcome.observation[0].cpu().numpy())
-        rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:])
-        infos: dict[str, dict[str, Any]] = {agent: {} for agent in self.agents}
+        rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:4])
+        infos = {agent: self._info(i, agent, outcome) for i, agent in enumerate(self.possible_agents) if live[i]}
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
         if self.render_mode == "human":
             self.render()
         return seen, rewards, terminated, truncated, infos
+
+    def _begun(self, agent: str) -> dict[str, Any]:
+        """Return the recorded id of an agent's vehicle, where there is one."""
+        known = ids(self.batch)
+        return {} if known is None else {"vehicle_id": known[self.possible_agents.index(agent)]}
+
+    def _info(self, i: int, agent: str, outcome: Outcome) -> dict[str, Any]:
+        """Return what ``idm_env.envs.info`` says of a step, as numbers of one agent."""
+        info: dict[str, Any] = {name: value[0, i].item() for name, value in outcome.details.items()}
+        if info.get("crash"):
+            assert self.batch.world is not None
+            alone = i if self.task.shares > 1 else None
+            info["crash_reason"] = self.task.crash_reason(self.batch.world, 0, alone)
+        return info | self._begun(agent)
 
     def _action(self, agent: str, actions: dict[str, np.ndarray]) -> float:
         if agent not in actions:

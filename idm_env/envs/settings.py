@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -17,6 +18,7 @@ from idm_env.tasks import KeywordError, Task, make_task
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 RENDER_MODES = ("rgb_array", "human")
+INFO = ("accel", "command", "failsafe", "crash", "vehicle_id")
 KEYWORDS = (
     "task",
     "config",
@@ -26,6 +28,7 @@ KEYWORDS = (
     "autoreset_mode",
     "render_mode",
     "max_episode_steps",
+    "info",
     "num_envs",
 )
 TENSORS, SPACES, ROW_BYTES = 25, 8, 400
@@ -39,7 +42,7 @@ class Settings:
 
     ``output`` decides between numpy arrays and torch tensors, ``dtype`` and ``device`` are those of the simulation
     and of the observations; ``autoreset_mode`` belongs to vectors; ``limit`` is the number of steps of an episode, or
-    None.
+    None; ``info`` names what infos tell (``idm_env.envs.info``).
     """
 
     task: Task
@@ -49,6 +52,7 @@ class Settings:
     autoreset_mode: AutoresetMode
     render_mode: str | None
     limit: int | None
+    info: tuple[str, ...]
 
 
 def settings(
@@ -61,13 +65,14 @@ def settings(
     autoreset_mode: str | AutoresetMode | None = None,
     render_mode: str | None = None,
     max_episode_steps: int | None = None,
+    info: str | Sequence[str] | None = None,
     **choices: Any,
 ) -> Settings:
     """Return checked settings.
 
     ``config`` is a YAML file that says ``configures: environment`` and gives any of these keywords; a keyword that is
-    given here as well wins, but of two ``max_episode_steps`` the smaller one, as with ``gym.make``, which has one of
-    its own. ``max_episode_steps`` of None or −1 leaves the limit to the task.
+    given here as well wins. ``max_episode_steps`` None leaves the limit to the task, −1 is no limit. ``info`` is one or
+    several of ``"accel", "command", "failsafe", "crash", "vehicle_id"``, ``"all"`` (which None is) or ``"none"``.
 
     Raises:
         KeywordError: A TypeError in one line, with a suggestion, for a keyword that does not exist.
@@ -81,28 +86,31 @@ def settings(
         "autoreset_mode": autoreset_mode,
         "render_mode": render_mode,
         "max_episode_steps": max_episode_steps,
+        "info": info,
     }
     if config is not None:
         read = load_environment(config)
         said = {key: read.pop(key, None) for key in own}
-        limits = [n for n in map(_limit, (max_episode_steps, said["max_episode_steps"])) if n is not None]
         own = {key: said[key] if value is None else value for key, value in own.items()}
-        own["max_episode_steps"] = min(limits, default=None)
         choices = {**read, **choices}
     chosen = own["task"] or "ring"
+    if own["max_episode_steps"] is not None:
+        choices["max_episode_steps"] = own["max_episode_steps"]
     if isinstance(chosen, Task) and choices:
         raise KeywordError(
             f"unexpected keyword argument '{next(iter(choices))}' beside a task that is already made. "
             "Give it to the task."
         )
+    made = chosen if isinstance(chosen, Task) else make_task(cast(str, chosen), others=KEYWORDS, **choices)
     return Settings(
-        task=chosen if isinstance(chosen, Task) else make_task(cast(str, chosen), others=KEYWORDS, **choices),
+        task=made,
         output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),
         device=_device(own["device"] or "cpu"),
         dtype=DTYPES[one_of("dtype", own["dtype"] or "float32", DTYPES)],
         autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.SAME_STEP),
         render_mode=None if own["render_mode"] is None else one_of("render_mode", own["render_mode"], RENDER_MODES),
-        limit=_limit(own["max_episode_steps"]),
+        limit=made.horizon,
+        info=_info(own["info"]),
     )
 
 
@@ -125,14 +133,13 @@ def _device(value: Any) -> torch.device:
     return device
 
 
-def _limit(value: Any) -> int | None:
-    if value is None or value == -1:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(
-            f"max_episode_steps = {shown(value)} must be a whole number of at least 1, or -1 for no limit."
-        )
-    return value
+def _info(value: Any) -> tuple[str, ...]:
+    if value is None or value == "all":
+        return INFO
+    if value == "none":
+        return ()
+    asked = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    return tuple(one_of("info", name, INFO) for name in asked)
 
 
 def reset_options(options: Any, known: tuple[str, ...]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from idm_env.checks import nearest, shown
-from idm_env.tasks.base import Advance, Bounds, Ended, Task, World
+from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.platoon import PlatoonTask
@@ -41,8 +41,10 @@ __all__ = [
     "Bounds",
     "Draw",
     "Ended",
+    "Features",
     "FollowTask",
     "KeywordError",
+    "Pay",
     "PlatoonTask",
     "ReplayTask",
     "RingTask",

@@ -16,6 +16,10 @@ Run = Callable[[State, "Tensor | None", Params, int], State]
 """Many steps without any control: state, normals with a leading time dimension or None, parameters, steps."""
 
 
+NOBODY = "—"
+"""Id of a slot in which no recorded vehicle is."""
+
+
 class World(NamedTuple):
     """Everything that a step carries over: the state of the traffic, and what is constant in an episode.
 
@@ -33,9 +37,25 @@ class Ended(NamedTuple):
     truncated: Tensor
 
 
+class Features(NamedTuple):
+    """What one agent observes, in SI units: names, fixed scales, and the lowest and the highest value of each."""
+
+    names: tuple[str, ...]
+    scales: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
 class Bounds(NamedTuple):
-    """Names of what one agent observes, with the lowest and the highest value of each."""
+    """Names of what one agent observes, with the lowest and the highest value of each, as it is observed."""
 
     names: tuple[str, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
+
+
+class Pay(NamedTuple):
+    """The lowest and the highest reward that a step without a crash can give."""
+
+    low: float
+    high: float

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-_EMPTY = "—"
+from idm_env.tasks.nouns import NOBODY
 
 
 class Scene(NamedTuple):
@@ -119,9 +119,9 @@ def _laid_out(tracks: list[_Track], dt: float) -> Scene:
     for track in tracks:
         if ahead[track.key] is not None:
             continue
-        slots.append((_EMPTY, None, None))
+        slots.append((NOBODY, None, None))
         if (track.leader != "").any():
-            slots.append((_EMPTY, track, _seat(track, by_key)))
+            slots.append((NOBODY, track, _seat(track, by_key)))
         last = track
         slots.append((last.key, last, None))
         while last.key in follower and ahead[follower[last.key]] == last.key:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 
+from idm_env.checks import shown
 from idm_env.wrappers.fitting import ParameterFitting
 
 
@@ -59,7 +60,7 @@ class FittingEnv(gymnasium.Env):
         """Return the parameters of an action, in the order of ``free``; ValueError for a wrong shape or NaN."""
         guess = np.asarray(action, dtype=np.float64)
         if guess.shape != self.action_space.shape or not np.isfinite(guess).all():
-            raise ValueError(f"action = {action!r} must be {len(self.low)} finite numbers in [-1, 1].")
+            raise ValueError(f"action = {shown(action)} must be {len(self.low)} finite numbers in [-1, 1].")
         return self.low + 0.5 * (np.clip(guess, -1.0, 1.0) + 1.0) * (self.high - self.low)
 
     def reset(

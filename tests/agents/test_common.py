@@ -115,12 +115,13 @@ def test_checkpoints_of_another_task_agent_version_or_kind_are_refused(tmp_path,
         common.load(path, "ring", "shac")
     content = torch.load(path, weights_only=True)
     for key, value, words in (
-        ("schema", 99, "layout 99; this version reads layout 1"),
+        ("schema", 99, "layout 99; this version reads layout 2"),
         (
             "features",
             ["speed", "gap"],
-            "on observations speed, gap; task 'ring' now gives speed, relative_speed, headway",
+            "on observations speed / 5, gap / 1; task 'ring' now gives speed / 5, relative_speed / 1, headway / 10",
         ),
+        ("scales", [15.0, 15.0, 270.0], "on observations speed / 15, relative_speed / 15, headway / 270; task"),
     ):
         torch.save({**content, key: value}, path)
         with pytest.raises(ValueError, match=words):

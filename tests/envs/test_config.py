@@ -143,9 +143,9 @@ def test_every_face_takes_a_file_and_keywords_beside_it(face):
     env.close()
 
 
-@pytest.mark.parametrize(("said", "given", "steps"), [(4, None, 4), (4, 6, 4), (6, 4, 4)])
+@pytest.mark.parametrize(("said", "given", "steps"), [(4, None, 4), (4, 6, 6), (6, 4, 4)])
 @pytest.mark.parametrize("face", FACES)
-def test_the_smaller_limit_of_file_and_keyword_holds(face, said, given, steps, tmp_path):
+def test_a_files_limit_holds_unless_a_keyword_gives_another(face, said, given, steps, tmp_path):
     path = write(tmp_path / "short.yaml", {"configures": "environment", "task": "platoon", "max_episode_steps": said})
     name = "max_cycles" if face == "parallel" else "max_episode_steps"
     env = FACES[face](config=path, **({} if given is None else {name: given}))
