@@ -53,25 +53,27 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         observation = environments.restore(env, saved["episodes"])
     else:
         observation = environments.desynchronise(env)
-    monitor = Monitor("apg", arguments, began, saved)
-    for update in range(saved.get("update", -1) + 1, arguments.updates):
-        rate = common.fall(arguments.learning_rate, update, arguments.updates)
-        optimiser.param_groups[0]["lr"] = rate
-        env.detach()
-        observation, total = observation.detach(), torch.zeros(())
-        # Seeded by the update, so that a resumed training repeats it.
-        torch.manual_seed(environments.first_seed(arguments.seed, update))
-        push = arguments.explore * rate / arguments.learning_rate * torch.randn(arguments.count, 1)
-        for _ in range(arguments.window):
-            observation, reward, *_ = env.step(policy(observation) + push)
-            total = total + reward.mean()
-        loss = -total / arguments.window
-        norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)
-        training = {"optimiser": optimiser.state_dict(), "episodes": environments.snapshot(env)}
-        steps = arguments.window * arguments.count
-        figures = {"reward": -loss.item(), "norm": norm, "learning_rate": rate}
-        if not monitor.after(update, steps, policy, training, figures):
-            break
+    with Monitor("apg", arguments, began, saved) as monitor:
+        if not saved:
+            monitor.untrained(policy)
+        for update in range(saved.get("update", -1) + 1, arguments.updates):
+            rate = common.fall(arguments.learning_rate, update, arguments.updates)
+            optimiser.param_groups[0]["lr"] = rate
+            env.detach()
+            observation, total = observation.detach(), torch.zeros(())
+            # Seeded by the update, so that a resumed training repeats it.
+            torch.manual_seed(environments.first_seed(arguments.seed, update))
+            push = arguments.explore * rate / arguments.learning_rate * torch.randn(arguments.count, 1)
+            for _ in range(arguments.window):
+                observation, reward, *_ = env.step(policy(observation) + push)
+                total = total + reward.mean()
+            loss = -total / arguments.window
+            norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)
+            training = {"optimiser": optimiser.state_dict(), "episodes": environments.snapshot(env)}
+            steps = arguments.window * arguments.count
+            figures = {"reward": -loss.item(), "norm": norm, "learning_rate": rate}
+            if not monitor.after(update, steps, policy, training, figures):
+                break
     return monitor.history
 
 

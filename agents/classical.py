@@ -34,10 +34,10 @@ class Seen(NamedTuple):
     gap: Tensor
 
 
-def seen(observation: Tensor, vehicle_length: float) -> Seen:
-    """Return what ``RingTask.observe`` packs into an observation ``(n, 3)``."""
-    speed, relative, headway = observation.unbind(-1)
-    return Seen(*(x.unsqueeze(-1) for x in (15.0 * speed, 15.0 * (speed + relative), 270.0 * headway - vehicle_length)))
+def seen(observation: Tensor, vehicle_length: float, scales: Sequence[float]) -> Seen:
+    """Return what ``RingTask.observe`` packs into an observation ``(n, 3)``, over ``RingTask.scales``."""
+    speed, relative, headway = (observation * observation.new_tensor(scales)).unbind(-1)
+    return Seen(*(x.unsqueeze(-1) for x in (speed, speed + relative, headway - vehicle_length)))
 
 
 @dataclass
@@ -47,10 +47,11 @@ class Controller:
     dt: float
     max_command: float
     vehicle_length: float
+    scales: Sequence[float]
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Return actions ``(n, 1)``."""
-        view = seen(observation, self.vehicle_length)
+        view = seen(observation, self.vehicle_length, self.scales)
         return ((self.wanted(view) - view.speed) / (self.dt * self.max_command)).clamp(-1.0, 1.0)
 
     def wanted(self, view: Seen) -> Tensor:
@@ -127,7 +128,8 @@ def controllers(
 ) -> dict[str, Callable[[], Act | None]]:
     """Return what makes each controller for rings of these lengths and draws, by the name of its row."""
     task = task_of(environment)
-    vehicle = {"dt": task.simulator.dt, "max_command": task.max_command, "vehicle_length": task.vehicle_length}
+    vehicle: dict[str, Any] = {"dt": task.simulator.dt, "max_command": task.max_command}
+    vehicle |= {"vehicle_length": task.vehicle_length, "scales": task.scales}
     uniform = uniform_speed(ring_start(environment, lengths, draws=draws)).unsqueeze(-1)
     middle = float(uniform.median())
     return {

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import io
 import itertools
 import math
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,19 +17,22 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import torch
 import tyro
-import yaml
 from torch import Tensor, nn
 
 import idm_env
 from agents.environments import first_seed, human_driving, task_of
-from idm_env.config import load_environment, number
-from idm_env.parameters import nearest
+from idm_env import keep
+from idm_env.checks import finite, nearest, shown
+from idm_env.config import load_environment, number, read_yaml
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the layout of checkpoints."""
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
 MAY_BE_ZERO = {"seed", "clone", "critic_first", "learning_starts"}
+POSITIVE = {"learning_rate", "clip"}
+KEPT = ("last.pt", "best.pt", "model.zip", "returns.pkl", "replay.pkl")
+"""What trainings keep in ``out``, beside their logs."""
 LOGS = ("csv", "tensorboard", "stdout", "json")
 MAY_CHANGE = {
     "out", "resume", "seed", "updates", "cpu_seconds", "evaluate_every", "log", "clone", "learning_rate", "window",
@@ -80,6 +83,10 @@ class Arguments:
             whole = value if isinstance(value, tuple) else (value,)
             if any(isinstance(x, int) and not isinstance(x, bool) and x < low for x in whole):
                 raise ValueError(f"{f.name} = {value} must be at least {low}.")
+            if isinstance(value, float):
+                finite(f.name, value)
+            if f.name in POSITIVE and not value > 0.0:
+                raise ValueError(f"{f.name} = {value:g} must be above 0.")
         if self.environment.get("dtype", "float32") != "float32":
             raise ValueError(f"dtype = '{self.environment['dtype']}': agents learn in float32. Leave dtype out.")
         unknown = [name for name in self.log.split(",") if name not in LOGS]
@@ -98,7 +105,14 @@ def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
     known, rest = before.parse_known_args(argv)
     default = kind() if known.config is None else load_agent(known.config, kind, agent)
     text = f"{kind.__doc__}\n\n--config FILE reads a YAML file first, such as configs/ring-apg.yaml."
-    return tyro.cli(kind, default=default, args=rest, description=text)
+    found = tyro.cli(kind, default=default, args=rest, description=text)
+    for path in (found.out / name for name in KEPT):
+        keep.not_an_input(path, (known.config, getattr(found, "data", None)))
+        if path.suffix == ".pt" and path.exists() and not found.resume and _content(path) is None:
+            raise ValueError(
+                f"{path} is not a checkpoint of an agent, or is broken. Move or delete it, or give another --out."
+            )
+    return found
 
 
 def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Sequence[str] | None = None) -> R:
@@ -123,13 +137,8 @@ def one_line() -> Iterator[None]:
 def load_agent(path: str | Path, kind: type[A], agent: str) -> A:
     """Return the arguments of an agent's YAML file; ValueError, in one line, for what does not belong in it."""
     file = Path(path)
-    if not file.is_file():
-        raise ValueError(f"{path} is not a file. Give the path of a YAML file, such as configs/ring-apg.yaml.")
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict) or content.pop("configures", None) != "agent":
+    content = read_yaml(file)
+    if content.pop("configures", None) != "agent":
         raise ValueError(f"{path}: no agent is configured here. Write 'configures: agent' in its first line.")
     if content.pop("agent", None) != agent:
         raise ValueError(f"{path}: this is not a file for {agent}. Write 'agent: {agent}', or run the agent it names.")
@@ -138,13 +147,13 @@ def load_agent(path: str | Path, kind: type[A], agent: str) -> A:
     values: dict[str, Any] = {}
     for key, value in content.items():
         if key not in fields:
-            raise ValueError(f"{path}: unknown key '{key}'.{nearest(str(key), fields)}")
+            raise ValueError(f"{path}: unknown key {shown(key)}.{nearest(str(key), fields)}")
         values[key] = _as(f"{path}: {key}", value, getattr(default, key))
     if "config" in values.get("environment", {}):
         own = dict(values["environment"])
         beside = own.pop("config")
         if not isinstance(beside, str):
-            raise ValueError(f"{path}: environment.config = {beside!r} must be the name of a file.")
+            raise ValueError(f"{path}: environment.config = {shown(beside)} must be the name of a file.")
         values["environment"] = {**load_environment(file.parent / beside), **own}
     return kind(**values)
 
@@ -153,23 +162,24 @@ def _as(name: str, value: Any, like: Any) -> Any:
     """Return a value of YAML in the type of the default; YAML reads 3e-3 as text."""
     if isinstance(like, bool) or isinstance(value, bool):
         if not (isinstance(value, bool) and isinstance(like, bool)):
-            raise ValueError(f"{name} = {value!r} must be {'true or false' if isinstance(like, bool) else 'no bool'}.")
+            rule = "true or false" if isinstance(like, bool) else "no bool"
+            raise ValueError(f"{name} = {shown(value)} must be {rule}.")
         return value
     if isinstance(like, (int, float)):
         found = number(name, value)
         if isinstance(like, int) and found != int(found):
-            raise ValueError(f"{name} = {value!r} must be a whole number.")
+            raise ValueError(f"{name} = {shown(value)} must be a whole number.")
         return type(like)(found)
     if isinstance(like, dict) and not isinstance(value, dict):
-        raise ValueError(f"{name} = {value!r} must be a mapping, such as {{task: ring}}.")
+        raise ValueError(f"{name} = {shown(value)} must be a mapping, such as {{task: ring}}.")
     if isinstance(like, tuple):
         if not isinstance(value, list):
-            raise ValueError(f"{name} = {value!r} must be a list, such as {list(like)}.")
+            raise ValueError(f"{name} = {shown(value)} must be a list, such as {list(like)}.")
         return tuple(_as(f"{name}[{i}]", x, like[0]) for i, x in enumerate(value))
     if isinstance(like, str) and not isinstance(value, (str, int, float)):
-        raise ValueError(f"{name} = {value!r} must be a text.")
+        raise ValueError(f"{name} = {shown(value)} must be a text.")
     if isinstance(like, Path) and not isinstance(value, str):
-        raise ValueError(f"{name} = {value!r} must be a path.")
+        raise ValueError(f"{name} = {shown(value)} must be a path.")
     return value if isinstance(like, dict) else type(like)(value)
 
 
@@ -232,19 +242,15 @@ def save(path: Path, policy: Policy, agent: str, environment: Mapping[str, Any],
         "agent": agent,
         "task": task.name,
         "features": list(task.bounds.names),
+        "scales": list(task.scales),
         "environment": dict(environment),
         "policy": {"made": policy.made, "state": policy.state_dict()},
         "training": dict(training),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    write(path, lambda beside: torch.save(content, beside))
-
-
-def write(path: Path, writer: Callable[[Path], Any]) -> None:
-    """Let ``writer`` write a file; one of that name is replaced only by a whole one."""
-    beside = path.with_suffix(".part")
-    writer(beside)
-    os.replace(beside, path)
+    kept = io.BytesIO()
+    torch.save(content, kept)
+    keep.write(path, lambda beside: beside.write_bytes(kept.getvalue()))
 
 
 def load(path: str | Path, task: str | None = None, agent: str | None = None) -> tuple[Policy, dict[str, Any]]:
@@ -254,28 +260,61 @@ def load(path: str | Path, task: str | None = None, agent: str | None = None) ->
     """
     if not Path(path).is_file():
         raise ValueError(f"{path} is not a file. Give the path of a checkpoint, such as runs/ring-apg/last.pt.")
-    try:
-        content = torch.load(path, weights_only=True)
-    except Exception:
-        content = None
-    if not isinstance(content, dict) or "schema" not in content:
-        raise ValueError(f"{path} is not a checkpoint of an agent. Give a file that an agent has written.")
+    content = _content(Path(path))
+    if content is None:
+        raise ValueError(
+            f"{path} is not a checkpoint of an agent, or is broken. Give a file that an agent has written, or delete "
+            "it and train anew, without --resume."
+        )
     if content["schema"] != SCHEMA:
         raise ValueError(f"{path} has layout {content['schema']}; this version reads layout {SCHEMA}. Train it anew.")
+    if not _whole(content):
+        raise ValueError(
+            f"{path} is broken (parts of a checkpoint are missing). Delete it and train anew, without --resume."
+        )
     for name, wanted in (("task", task), ("agent", agent)):
         if wanted is not None and content[name] != wanted:
             raise ValueError(
                 f"{path} is of {name} '{content[name]}', and '{wanted}' is wanted. Give a file of that {name}."
             )
-    now = list(task_of(content["environment"]).bounds.names)
-    if content["features"] != now:
+    made = task_of(content["environment"])
+    before, now = (
+        [f"{name} / {scale:g}" for name, scale in zip(names, scales, strict=False)]
+        for names, scales in ((content["features"], content["scales"]), (made.bounds.names, made.scales))
+    )
+    if before != now:
         raise ValueError(
-            f"{path} was trained by version {content['version']} on observations {', '.join(content['features'])}; "
+            f"{path} was trained by version {content['version']} on observations {', '.join(before)}; "
             f"task '{content['task']}' now gives {', '.join(now)}. Train it anew."
         )
     policy = Policy(**content["policy"]["made"])
     policy.load_state_dict(content["policy"]["state"])
     return policy, content
+
+
+def _content(path: Path) -> dict[str, Any] | None:
+    """Return what a checkpoint holds, or None for a file that is none."""
+    try:
+        content = torch.load(path, weights_only=True)
+    except Exception:
+        return None
+    return content if isinstance(content, dict) and "schema" in content else None
+
+
+def _whole(content: Any) -> bool:
+    """Tell whether a checkpoint has all that ``save`` writes, each of its kind."""
+    kinds = {
+        "version": str, "agent": str, "task": str, "features": list, "scales": list, "environment": dict,
+        "policy": dict, "training": dict,
+    }  # fmt: skip
+    if not all(isinstance(content.get(name), kind) for name, kind in kinds.items()):
+        return False
+    try:
+        policy = Policy(**content["policy"]["made"])
+        policy.load_state_dict(content["policy"]["state"])
+    except (LookupError, TypeError, ValueError, RuntimeError, AttributeError):
+        return False
+    return True
 
 
 def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[str, Any]]:

@@ -22,7 +22,7 @@ def task_of(environment: Mapping[str, Any]) -> Task:
 
 def make_env(environment: Mapping[str, Any], count: int, **keywords: Any) -> DiffIDMVectorEnv:
     """Return a vector of environments that reset within the step (final observations are in the info)."""
-    chosen: dict[str, Any] = {"autoreset_mode": "SameStep", **environment, **keywords}
+    chosen: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "none", **environment, **keywords}
     return DiffIDMVectorEnv(count, **chosen)
 
 

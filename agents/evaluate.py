@@ -211,7 +211,7 @@ def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: i
     from idm_env.diagrams import space_time
 
     chosen = {"length": 250.0} if environment.get("task", "ring") == "ring" else {}
-    env = DiffIDMEnv(**{**environment, **chosen, "warmup_pool": 0, "max_episode_steps": None})
+    env = DiffIDMEnv(**{**environment, **chosen, "warmup_pool": 0, "max_episode_steps": -1})
     observation, _ = env.reset(seed=seed)
     states = []
     for step in range(human + steps):

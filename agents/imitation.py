@@ -18,6 +18,7 @@ import dataclasses
 import os
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,9 +37,10 @@ from idm_env.fitting.batch import Batch, windows
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import base_simulator, fit
 from idm_env.fitting.problem import group_of
+from idm_env.tasks.follow import SEEN
 from idm_env.types import Command
 
-SCALES = (40.0, 40.0, 100.0)
+SCALES = SEEN.scales
 """Of speed, leader's speed (m/s) and gap (m) in an observation, as in task ``follow``."""
 
 
@@ -177,23 +179,21 @@ def train(a: Arguments) -> list[dict[str, Any]]:
         optimiser.load_state_dict(saved["optimiser"])
         first, before = saved["update"] + 1, saved["cpu_seconds"]
     batch = Batch.of(windows(training, a.window), dtype=torch.float32, substeps=1)
-    logger = make_logger(a, first)
     began, spent = time.process_time() - before, before
-    bar = tqdm(range(first, a.updates), desc="imitation", disable=None)
-    for update in bar:
-        optimiser.param_groups[0]["lr"] = common.fall(a.learning_rate, update, a.updates)
-        loss = spacing_error(simulate(policy, batch, top)[0], batch).mean()
-        norm = common.descend(loss, policy.parameters(), optimiser, a.clip, update, last)
-        spent = time.process_time() - began
-        kept = {"update": update, "cpu_seconds": spent, "optimiser": optimiser.state_dict()}
-        common.save(last, policy, "imitation", a.environment, kept)
-        for name, value in (("rmse", float(loss.detach())), ("norm", norm), ("cpu_seconds", spent)):
-            logger.record(name, value)
-        logger.dump(update)
-        bar.set_postfix(rmse=f"{float(loss.detach()):.3f}", norm=f"{norm:.2g}", refresh=False)
-        if 0.0 < a.cpu_seconds <= spent:
-            break
-    logger.close()
+    with closing(make_logger(a, first)) as logger, tqdm(range(first, a.updates), "imitation", disable=None) as bar:
+        for update in bar:
+            optimiser.param_groups[0]["lr"] = common.fall(a.learning_rate, update, a.updates)
+            loss = spacing_error(simulate(policy, batch, top)[0], batch).mean()
+            norm = common.descend(loss, policy.parameters(), optimiser, a.clip, update, last)
+            spent = time.process_time() - began
+            kept = {"update": update, "cpu_seconds": spent, "optimiser": optimiser.state_dict()}
+            common.save(last, policy, "imitation", a.environment, kept)
+            for name, value in (("rmse", float(loss.detach())), ("norm", norm), ("cpu_seconds", spent)):
+                logger.record(name, value)
+            logger.dump(update)
+            bar.set_postfix(rmse=f"{float(loss.detach()):.3f}", norm=f"{norm:.2g}", refresh=False)
+            if 0.0 < a.cpu_seconds <= spent:
+                break
     rows.append({"model": "cloning through the simulator", **judge(policy, test, top), "cpu_seconds": spent})
     return rows
 

@@ -26,9 +26,12 @@ def make_logger(arguments: Arguments, done: int) -> Logger:
 class Monitor:
     """Told of every update; ``history`` holds one row per evaluation, with updates, steps and CPU seconds.
 
+    ``with Monitor(…) as monitor:`` closes the log on every way out of a training. ``updates`` counts those that a
+    policy has had: row 0 is of the policy before any, told by ``untrained``.
+
     CPU seconds count from ``began`` (a ``time.process_time()``): making the environments belongs to training, while
-    evaluations, logs and checkpoints do not. ``best.pt`` is the checkpoint with the
-    highest score (``evaluate.score``), the first of equals.
+    evaluations, logs and checkpoints do not. ``best.pt`` is the trained checkpoint
+    with the highest score (``evaluate.score``), the first of equals.
     """
 
     def __init__(self, agent: str, arguments: Arguments, began: float, saved: Mapping[str, Any] | None = None) -> None:
@@ -50,6 +53,26 @@ class Monitor:
         """CPU seconds of training so far, those before a resume included."""
         return self.before + time.process_time() - self._begin - self._aside
 
+    def untrained(self, policy: Policy) -> None:
+        """Evaluate and log a policy before its first update: what the test gives for nothing."""
+        begin = time.process_time()
+        row = {"updates": 0, "steps": self.steps, "cpu_seconds": self.cpu_seconds}
+        row |= evaluate(policy, self.arguments.environment)
+        self.history.append(row)
+        self._log(row, row)
+        self._aside += time.process_time() - begin
+
+    def _log(self, logged: Mapping[str, Any], row: Mapping[str, Any]) -> None:
+        """Log figures, and print those of an evaluation, if there was one."""
+        for key, value in logged.items():
+            if isinstance(value, (int, float)):
+                self.logger.record(key, float(value))
+        self.logger.dump(self.steps)
+        if row:
+            shown = {k: v for k, v in row.items() if isinstance(v, (int, float)) and k not in ("updates", "steps")}
+            told = ", ".join(f"{k} {v:.3g}" for k, v in shown.items())
+            self._bar.write(f"{self.last}, after {row['updates']} updates: {told}")
+
     def after(
         self,
         update: int,
@@ -69,7 +92,7 @@ class Monitor:
         since = spent - (self.history[-1]["cpu_seconds"] if self.history else 0.0)
         row: dict[str, Any] = {}
         if over or since >= self.arguments.evaluate_every:
-            row = {"update": update, "steps": self.steps, "cpu_seconds": spent}
+            row = {"updates": update + 1, "steps": self.steps, "cpu_seconds": spent}
             row |= evaluate(policy, self.arguments.environment)
             self.history.append(row)
         kept = {**training, "update": update, "steps": self.steps, "cpu_seconds": spent, "history": self.history}
@@ -77,20 +100,17 @@ class Monitor:
         if keep is not None:
             keep()
         common.save(self.last, policy, self.agent, self.arguments.environment, kept)
-        if row and score(row) > max((score(r) for r in self.history[:-1]), default=-float("inf")):
+        if row and score(row) > max((score(r) for r in self.history[:-1] if r["updates"]), default=-float("inf")):
             common.save(self.best, policy, self.agent, self.arguments.environment, kept)
-        logged = {**figures, **row, "update": update, "steps": self.steps, "cpu_seconds": spent}
-        for key, value in logged.items():
-            if isinstance(value, (int, float)):
-                self.logger.record(key, float(value))
-        self.logger.dump(self.steps)
+        self._log({**figures, **row, "updates": update + 1, "steps": self.steps, "cpu_seconds": spent}, row)
         self._bar.update()
-        if row:
-            shown = {k: v for k, v in row.items() if isinstance(v, (int, float)) and k not in ("update", "steps")}
-            self._bar.write(f"{self.last}, update {update}: " + ", ".join(f"{k} {v:.3g}" for k, v in shown.items()))
         self._bar.set_postfix({k: f"{v:.3g}" for k, v in figures.items()}, refresh=False)
         self._aside += time.process_time() - begin
-        if over:
-            self._bar.close()
-            self.logger.close()
         return not over
+
+    def __enter__(self) -> Monitor:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+        self.logger.close()

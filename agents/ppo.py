@@ -29,9 +29,10 @@ from torch import Tensor, nn
 from agents import common, environments
 from agents.common import ACTIVATIONS, DivergedError, Policy
 from agents.monitor import Monitor
+from idm_env import keep
+from idm_env.checks import nearest
 from idm_env.envs.sb3 import SB3VecEnv
 from idm_env.envs.vector import DiffIDMVectorEnv
-from idm_env.parameters import nearest
 
 
 @dataclass
@@ -173,10 +174,11 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
     file, moments, memory = (arguments.out / f for f in ("model.zip", "returns.pkl", "replay.pkl"))
     if saved:
-        env = VecNormalize.load(str(moments), vector)
-        model: BaseAlgorithm = (SAC if name == "sac" else PPO).load(file, env=env, device="cpu")
+        kind = SAC if name == "sac" else PPO
+        env = keep.read(moments, lambda path: VecNormalize.load(str(path), vector), keep.AFRESH)
+        model: BaseAlgorithm = keep.read(file, lambda path: kind.load(path, env=env, device="cpu"), keep.AFRESH)
         if isinstance(model, SAC):
-            model.load_replay_buffer(memory)
+            keep.read(memory, model.load_replay_buffer, keep.AFRESH)
     else:
         model = make_model(arguments, env, policy)
         if arguments.clone:
@@ -188,26 +190,29 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         saved |= {"update": done - 1, "steps": done * chunk}
     # Making or loading a model seeds its environments; these are the seeds of all agents, new ones after a resume.
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
-    monitor = Monitor(name, arguments, began, saved)
 
-    def keep() -> None:
-        common.write(file, model.save)
-        common.write(moments, lambda path: env.save(str(path)))
+    def store() -> None:
+        keep.write(file, model.save)
+        keep.write(moments, lambda path: env.save(str(path)))
         if isinstance(model, SAC):
-            common.write(memory, model.save_replay_buffer)
+            keep.write(memory, model.save_replay_buffer)
 
-    for update in range(done, arguments.updates):
-        rate = common.fall(arguments.learning_rate, update, arguments.updates)
-        model.lr_schedule = FloatSchedule(rate)
-        try:
-            model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
-        except ValueError:  # SB3 meets weights that are not finite when it draws the next action
-            check(model, update, monitor.last)
-            raise
-        copy_actor(model, policy, update, monitor.last)
-        figures = {k: float(v) for k, v in model.logger.name_to_value.items() if "loss" in k or "std" in k}
-        if not monitor.after(update, chunk, policy, {}, {**figures, "learning_rate": rate}, keep):
-            break
+    with Monitor(name, arguments, began, saved) as monitor:
+        if not saved:
+            copy_actor(model, policy, -1, monitor.last)
+            monitor.untrained(policy)
+        for update in range(done, arguments.updates):
+            rate = common.fall(arguments.learning_rate, update, arguments.updates)
+            model.lr_schedule = FloatSchedule(rate)
+            try:
+                model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
+            except ValueError:  # SB3 meets weights that are not finite when it draws the next action
+                check(model, update, monitor.last)
+                raise
+            copy_actor(model, policy, update, monitor.last)
+            figures = {k: float(v) for k, v in model.logger.name_to_value.items() if "loss" in k or "std" in k}
+            if not monitor.after(update, chunk, policy, {}, {**figures, "learning_rate": rate}, store):
+                break
     return monitor.history
 
 

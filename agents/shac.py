@@ -192,25 +192,29 @@ def train(a: Arguments) -> list[dict[str, Any]]:
     for name, part in parts.items():
         if saved:
             part.load_state_dict(saved[name])
-    monitor = Monitor("shac", a, began, saved)
-    for update in range(saved.get("update", -1) + 1, a.updates):
-        rate = common.fall(a.learning_rate, update, a.updates)
-        actor_steps.param_groups[0]["lr"] = rate
-        env.detach()
-        observation, window = roll(env, policy, target, observation.detach(), a)
-        # The gain of a window is a few steps' share of an average reward: per step it has the size of a reward.
-        loss = -window.gain.mean() / ((1.0 - a.gamma) * a.window)
-        norm = 0.0
-        if update >= a.critic_first:
-            norm = common.descend(loss, policy.parameters(), actor_steps, a.clip, update, monitor.last)
-        error = learn_values(critic, critic_steps, window, a, update, monitor.last)
-        with torch.no_grad():
-            for mine, theirs in zip(target.parameters(), critic.parameters(), strict=True):
-                mine.lerp_(theirs, 1.0 - a.follow)
-        training = {name: part.state_dict() for name, part in parts.items()} | {"episodes": environments.snapshot(env)}
-        figures = {"reward": float(window.rewards.mean()), "value_error": error, "norm": norm, "learning_rate": rate}
-        if not monitor.after(update, a.window * a.count, policy, training, figures):
-            break
+    with Monitor("shac", a, began, saved) as monitor:
+        if not saved:
+            monitor.untrained(policy)
+        for update in range(saved.get("update", -1) + 1, a.updates):
+            rate = common.fall(a.learning_rate, update, a.updates)
+            actor_steps.param_groups[0]["lr"] = rate
+            env.detach()
+            observation, window = roll(env, policy, target, observation.detach(), a)
+            # The gain of a window is a few steps' share of an average reward: per step it has the size of a reward.
+            loss = -window.gain.mean() / ((1.0 - a.gamma) * a.window)
+            norm = 0.0
+            if update >= a.critic_first:
+                norm = common.descend(loss, policy.parameters(), actor_steps, a.clip, update, monitor.last)
+            error = learn_values(critic, critic_steps, window, a, update, monitor.last)
+            with torch.no_grad():
+                for mine, theirs in zip(target.parameters(), critic.parameters(), strict=True):
+                    mine.lerp_(theirs, 1.0 - a.follow)
+            training = {name: part.state_dict() for name, part in parts.items()}
+            training["episodes"] = environments.snapshot(env)
+            reward = float(window.rewards.mean())
+            figures = {"reward": reward, "value_error": error, "norm": norm, "learning_rate": rate}
+            if not monitor.after(update, a.window * a.count, policy, training, figures):
+                break
     return monitor.history
 
 

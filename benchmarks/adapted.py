@@ -17,11 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from idm_env.data import load
-from idm_env.discovery import checkpoint, judge, records, search
+from idm_env.discovery import judge, records, search
 from idm_env.discovery import model as terms
 from idm_env.discovery.discover import prepare
 from idm_env.discovery.model import Frozen, Model
 from idm_env.discovery.solve import Solution, Task
+from idm_env.keep import Store
 
 EFFECTS = ("asymmetry", "delay", "lag", "leader_acceleration", "speed_dependent_gap", "memory", "dead_zone", "gap_bias")
 
@@ -34,7 +35,7 @@ def fitted(training: records.Records) -> list[Solution]:
     found = []
     for name in (None, *EFFECTS):
         model = Model() if name is None else Model((terms.simple(name),))
-        searching = search.Search(task, (), False, checkpoint.Checkpoint(None, "", False), lambda *_: None)
+        searching = search.Search(task, (), False, Store(None, "", False), lambda *_: None)
         starts = [np.zeros(0)] if name is None else [np.array(s) for s in terms.simple(name).starts]
         found.append(min((searching.null(model, theta, s) for s in starts), key=lambda s: s.cost))
     return found

@@ -91,7 +91,7 @@ class Job:
 
 def perform(job: Job, out: Path) -> dict[str, Any] | None:
     """Return the results of a job, trained now if they are not there; None where another process works on it."""
-    from idm_env.report import write_text
+    from idm_env.keep import write_text
 
     folder = out / job.name
     result = folder / "result.json"
@@ -125,6 +125,8 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
     policy, content = load(training / "last.pt")
     best, at_best = load(training / "best.pt")
     environment, history = content["environment"], content["training"]["history"]
+    # The first evaluation is of the policy before any update: it solves nothing, whatever it passes.
+    untrained, history = history[0], history[1:]
     # What ended before its time has solved nothing.
     first = solved_at(history) if done.returncode == 0 else None
     summary = {
@@ -132,6 +134,7 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
         "cpu_seconds": None if first is None else history[first]["cpu_seconds"],
         "steps": None if first is None else history[first]["steps"],
         "ever": any(row["passed"] for row in history),
+        "untrained": untrained["passed"],
         "error": done.returncode != 0,
     }
     result = {

@@ -48,7 +48,7 @@ def adam(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) ->
     optimiser = torch.optim.Adam(problem.parameters(), lr=0.1)
     while True:
         optimiser.zero_grad()
-        loss = problem.loss()
+        loss = problem.mean_squared_error()
         loss.backward()
         meter.add(float(loss.detach()) ** 0.5, 3.0)
         optimiser.step()
@@ -115,7 +115,7 @@ def main() -> None:
     best = ParameterFitting(task, measured)
     best.fit(starts=4)
     with torch.no_grad():
-        target = TOLERANCE * float(best.loss()) ** 0.5
+        target = TOLERANCE * float(best.root_mean_squared_error())
     print(
         f"{len(best.episodes)} drivers, target {target:.3f} m, {best.vehicle_steps / 1e6:.2f} M vehicle-steps a rollout"
     )

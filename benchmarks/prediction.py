@@ -1,69 +1,119 @@
-"""Metrics of prediction over scenario files, per scene, against three single futures.
+"""Metrics of prediction over scenario files against single futures: by scene, and by kind and pace of all agents.
 
-    python benchmarks/prediction.py FILE… [--all-moving]
+    python -m benchmarks.prediction FILE… [--shares]
 
-``--all-moving`` adds every agent that will have moved by 3 m to those that the files name.
+Shares of the ways in which agents go on (``idm_env.prediction.shares``) are fitted to all scenes but the one that is
+predicted, so every figure is held out. ``--shares`` prints those fitted to all scenes, which the package ships.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from idm_env.data.womd import Scenario, scenarios
-from idm_env.prediction.files import case_of
+from idm_env.prediction.files import OURS, case_of
 from idm_env.prediction.metrics import Score, score, summary
-from idm_env.prediction.predict import METHODS
+from idm_env.prediction.predict import METHODS, Mixture, Prediction, chosen, mixture
 from idm_env.prediction.scene import Scene
+from idm_env.prediction.shares import SHARES, Seen, Shares, fit_shares, seen
+
+STRAIGHT = "constant velocity"
+LEAST_S = 3
+"""Agents whose future is known up to here (s) are scored; later horizons where they are known too."""
 
 
-def moving(scenario: Scenario) -> list[int]:
-    chosen, now = set(scenario.to_predict), scenario.present
+@dataclass(frozen=True, eq=False)
+class Known:
+    """An agent whose future is known: what it may do, and how far each way of going on hit the truth."""
+
+    scene: Scene
+    mixture: Mixture
+    seen: Seen
+
+    @property
+    def asked_for(self) -> bool:
+        """Whether the file names it among the tracks to predict."""
+        return self.mixture.agent in self.scene.scenario.to_predict
+
+    def scored(self, prediction: Prediction) -> Score:
+        """Return the score of a prediction of this agent."""
+        return score(case_of(self.scene.scenario, prediction))
+
+
+def known_agents(scenario: Scenario) -> list[Known]:
+    """Return the agents of a scene that are valid at the present and at ``LEAST_S``."""
+    scene, found = Scene(scenario), []
     for index, agent in enumerate(scenario.agents):
-        later = now + np.flatnonzero(agent.valid[now:])
-        if agent.valid[now] and len(later) > 50:
-            moved = agent.position[later[-1]] - agent.position[now]
-            chosen |= {index} if np.hypot(*moved) > 3.0 else set()
-    return sorted(chosen)
+        known = agent.valid[scenario.present] and agent.valid[scenario.present + 10 * LEAST_S]
+        if known:
+            one = mixture(scene, index)
+            case = case_of(scenario, chosen(scene, one))
+            hit = seen(case, one.futures, one.weights)
+            assert hit is not None
+            found.append(Known(scene, one, hit))
+    return found
 
 
-def show(title: str, cases: dict[str, list[Score]]) -> None:
-    print(f"{title}: {len(next(iter(cases.values())))} agents")
-    print(f"  {'method':24s} {'minADE 3/5/8 s (m)':>24s} {'minFDE 3/5/8 s (m)':>24s} {'miss 3/5/8 s':>18s} {'mAP':>6s}")
-    for name, items in cases.items():
+def held_out(scenes: Sequence[Sequence[Known]]) -> list[tuple[Known, Shares]]:
+    """Return every agent with the shares fitted to the other scenes."""
+    return [
+        (one, fit_shares(other.seen for scene in scenes if scene is not own for other in scene))
+        for own in scenes
+        for one in own
+    ]
+
+
+def show(title: str, rows: dict[str, list[Score]]) -> None:
+    """Print the metrics of some agents by every method."""
+    print(f"{title}: {len(next(iter(rows.values())))} agents")
+    print(f"  {'method':24s} {'minADE 3/5/8 s (m)':>22s} {'minFDE 3/5/8 s (m)':>22s} {'miss 3/5/8 s':>16s} {'mAP':>6s}")
+    for name, items in rows.items():
         row = summary(items)
         columns = [
-            "/".join(f"{row[f'{what}_{s}s']:{form}}" for s in (3, 5, 8))
-            for what, form in (("minADE", "7.2f"), ("minFDE", "7.2f"), ("miss_rate", "5.2f"))
+            " / ".join(f"{row[f'{what}_{s}s']:.2f}" for s in (3, 5, 8)) for what in ("minADE", "minFDE", "miss_rate")
         ]
-        print(f"  {name:24s} {columns[0]:>24s} {columns[1]:>24s} {columns[2]:>18s} {row['mAP']:6.3f}")
+        print(f"  {name:24s} {columns[0]:>22s} {columns[1]:>22s} {columns[2]:>16s} {row['mAP']:6.3f}")
+
+
+def compared(agents: Iterable[tuple[Known, Shares]], methods: Sequence[str]) -> dict[str, list[Score]]:
+    """Return scores by method; ours with the shares that are held out."""
+    kept = list(agents)
+    single: dict[str, Callable[[Scene, int], Prediction]] = {n: m for n, m in METHODS.items() if n in methods}
+    return {OURS: [one.scored(chosen(one.scene, one.mixture, shares)) for one, shares in kept]} | {
+        name: [one.scored(method(one.scene, one.mixture.agent)) for one, _ in kept] for name, method in single.items()
+    }
 
 
 def main() -> None:
+    """Score the scenes of the files."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="+", type=Path)
-    parser.add_argument("--all-moving", action="store_true")
+    parser.add_argument("--shares", action="store_true", help="print the shares fitted to all scenes, and nothing else")
     options = parser.parse_args()
-    every: dict[str, list[Score]] = {name: [] for name in METHODS}
-    spent = dict.fromkeys(METHODS, 0.0)
-    for path in options.files:
-        for scenario in scenarios(path):
-            scene = Scene(scenario)
-            here: dict[str, list[Score]] = {name: [] for name in METHODS}
-            wanted = moving(scenario) if options.all_moving else scenario.to_predict
-            for index in (i for i in wanted if scenario.agents[i].valid[scenario.present]):
-                for name, method in METHODS.items():
-                    begin = time.perf_counter()
-                    here[name].append(score(case_of(scenario, method(scene, index))))
-                    spent[name] += time.perf_counter() - begin
-            show(scenario.id, here)
-            for name, cases in here.items():
-                every[name] += cases
-    show("all scenes", every)
-    print("ms per agent: " + ", ".join(f"{name} {1e3 * spent[name] / len(every[name]):.0f}" for name in METHODS))
+    begin = time.perf_counter()
+    scenes = [known_agents(scenario) for path in options.files for scenario in scenarios(path)]
+    if options.shares:
+        for (kind, pace), values in fit_shares(one.seen for scene in scenes for one in scene).items():
+            count = sum((one.seen.kind, one.seen.pace) == (kind, pace) for scene in scenes for one in scene)
+            print(f'    ("{kind}", "{pace}"): ({", ".join(f"{x:.3f}" for x in values)}),  # {count} agents')
+        return
+    spent = (time.perf_counter() - begin) / max(sum(len(scene) for scene in scenes), 1)
+    agents = held_out(scenes)
+    wanted = [item for item in agents if item[0].asked_for]
+    singles = [name for name in METHODS if name != OURS]
+    show("all scenes, tracks to predict", compared(wanted, singles))
+    for name in dict.fromkeys(one.scene.scenario.id for one, _ in wanted):
+        here = [item for item in wanted if item[0].scene.scenario.id == name]
+        show(f"scene {name}, tracks to predict", compared(here, singles))
+    for group in (None, *SHARES):
+        here = [item for item in agents if group in (None, (item[0].seen.kind, item[0].seen.pace))]
+        if here:
+            show("all agents" if group is None else f"all agents, {group[0]}, {group[1]}", compared(here, [STRAIGHT]))
+    print(f"{1e3 * spent:.0f} ms per agent")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 import idm_env  # registers DiffIDM-v0
 from idm_env.envs.sb3 import SB3VecEnv
 
-vector = gymnasium.make_vec("DiffIDM-v0", num_envs=32, task="ring", autoreset_mode="SameStep", max_episode_steps=200)
+vector = gymnasium.make_vec("DiffIDM-v0", num_envs=32, task="ring", max_episode_steps=200)
 env = VecMonitor(SB3VecEnv(vector))
 model = PPO("MlpPolicy", env, n_steps=100, batch_size=800, gamma=0.999, policy_kwargs={"log_std_init": -2.0}, seed=0)
 model.learn(4 * 3200)

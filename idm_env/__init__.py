@@ -1,12 +1,17 @@
 """Differentiable, vectorised lanes of Intelligent-Driver-Model vehicles, and a closed loop with measured traffic.
 
 Public names are loaded when first used, so ``import idm_env`` is quick and imports no torch; it registers the
-Gymnasium ids ``DiffIDM-v0`` and ``DiffIDM-Fit-v0``.
+Gymnasium ids ``DiffIDM-v0`` and ``DiffIDM-Fit-v0``. Gymnasium (1.1 and later) loads no plug-ins: a process that has not
+imported this package, such as a remote worker, finds them as ``"idm_env:DiffIDM-v0"``.
 """
 
 from __future__ import annotations
 
 import importlib
+import os
+import signal
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -52,6 +57,20 @@ if TYPE_CHECKING:
     from idm_env.types import Command, Record, State
 
 
+def _end(number: int, frame: object) -> None:
+    shown = b"\x1b[?25h" if os.isatty(2) else b""  # bars hide the cursor
+    os.write(2, shown + b"interrupted.\n")
+    os._exit(130)
+
+
+def _end_quietly() -> None:
+    """Let Ctrl-C end the command ``idm-env`` in one line while imports run; ``cli`` takes over when work begins."""
+    name = sys.argv[0] if sys.argv else ""  # "-m" while python -m looks for its module
+    command = Path(name).stem == "idm-env" or (name == "-m" and "idm_env" in sys.orig_argv)
+    if command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end)
+
+
 def _register() -> None:
     """Register the environment ids; entry points are text, so that nothing heavy is imported here."""
     from gymnasium.envs.registration import register, registry
@@ -61,7 +80,7 @@ def _register() -> None:
             id="DiffIDM-v0",
             entry_point="idm_env.envs.gym:DiffIDMEnv",
             vector_entry_point="idm_env.envs.vector:DiffIDMVectorEnv",
-            max_episode_steps=3000,
+            # Each task has its own number of steps: the environment cuts episodes off, and its own spec says when.
             # The checker's wrapper costs more than a step; tests run the full checker instead.
             disable_env_checker=True,
         )
@@ -74,6 +93,7 @@ def _register() -> None:
         )
 
 
+_end_quietly()
 _register()
 
 

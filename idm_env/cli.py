@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import inspect
+import math
+import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+import idm_env
+from idm_env import checks, keep
+from idm_env.progress import OnProgress, shown
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -25,12 +28,13 @@ app = typer.Typer(
     "speed_mps, length_m and run_id are used where present. Ctrl-C keeps what is done: add `--resume` to go on.",
 )
 console = Console(stderr=True)
+EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
+"""What ``explain`` writes."""
+PICTURES = (".png", ".svg", ".pdf")
 
 
 def _version(wanted: bool) -> None:
     if wanted:
-        import idm_env
-
         print(idm_env.__version__)
         raise typer.Exit
 
@@ -44,47 +48,70 @@ def _options(
     pass
 
 
+def _ranged(*names: str, help: str, low: float, high: float, unit: str = "") -> Any:
+    """Return an option whose number must lie in ``[low, high]``: all flags' numbers are checked here."""
+
+    def check(param: typer.CallbackParam, value: float | None) -> float | None:
+        if value is not None:
+            checks.within(param.opts[0], value, low, high, unit)
+        return value
+
+    return typer.Option(*names, help=help, callback=check)
+
+
 Data = Annotated[Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if missing.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.")]
-RingLength = Annotated[float | None, typer.Option(help="Circumference (m), if the traffic runs on a ring.")]
+Seed = Annotated[int, _ranged(help="Seed of everything random.", low=0, high=1e9)]
+RingLength = Annotated[
+    float | None, _ranged(help="Circumference (m), if the traffic runs on a ring.", low=1.0, high=1e6, unit="m")
+]
 Place = Annotated[str | None, typer.Option(help="Column that names places, such as track_s_m on a lap.")]
 Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim or openacc.")]
-MaxGap = Annotated[float, typer.Option(help="Gaps above this (m) mean a lost leader and are left out.")]
-MinSeconds = Annotated[float, typer.Option(help="Shorter stretches behind one leader are left out (s).")]
-Where = Annotated[str | None, typer.Option(help='Only runs or drivers with "column=value".')]
-Window = Annotated[float | None, typer.Option(help="Cut longer stretches into windows of so many seconds.")]
+MaxGap = Annotated[
+    float,
+    _ranged(help="Gaps above this (m) mean a lost leader and are left out.", low=0.1, high=math.inf, unit="m"),
+]
+MinSeconds = Annotated[
+    float, _ranged(help="Shorter stretches behind one leader are left out (s).", low=0.0, high=1e6, unit="s")
+]
+Where = Annotated[
+    list[str] | None, typer.Option(help='Only runs or drivers with "column=value"; given twice, both must hold.')
+]
+Window = Annotated[
+    float | None, _ranged(help="Cut longer stretches into windows of so many seconds.", low=1.0, high=1e6, unit="s")
+]
 Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
-Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample, to this step (s).")]
+Step = Annotated[
+    float | None, _ranged("--dt", help="Use every n-th sample, to this step (s).", low=0.001, high=100.0, unit="s")
+]
 
 
-@contextmanager
-def progress() -> Iterator[Callable[[str, int, int, float | str], None]]:
-    """Show a bar per phase on standard error."""
-    columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TextColumn("{task.fields[value]}"), console=console, transient=False) as bars:
-        tasks: dict[str, Any] = {}
+_stopped: list[int] = []
+"""Signals that have ended the work."""
 
-        def report(phase: str, done: int, total: int, value: float | str) -> None:
-            if phase not in tasks:
-                tasks[phase] = bars.add_task(phase, total=total, value="")
-            words = value if isinstance(value, str) else f"residual {value:.3f}"
-            bars.update(tasks[phase], completed=done, total=total, value=words)
 
-        yield report
-        for task in tasks.values():
-            bars.update(task, total=bars.tasks[task].completed)
+def _work_begins() -> None:
+    """Make Ctrl-C an exception, so that what is done is kept; while modules are imported it could crash them."""
+    if signal.getsignal(signal.SIGINT) is idm_env._end:
+        signal.signal(signal.SIGINT, _stop)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    _stopped.append(number)
+    raise KeyboardInterrupt
 
 
 def _show(title: str, rows: list[dict[str, Any]]) -> None:
+    from idm_env.report import number
+
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
         table.add_column(
             name.replace("_", " "), overflow="fold", justify="left" if isinstance(rows[0][name], str) else "right"
         )
     for row in rows:
-        table.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()))
+        table.add_row(*(number(v) if isinstance(v, float) else str(v) for v in row.values()))
     Console().print(table)
 
 
@@ -99,9 +126,9 @@ def fit(
     loss: Annotated[str, typer.Option(help="rmse (mean over episodes) or mse (all samples alike).")] = "rmse",
     method: Annotated[str, typer.Option(help="lm (Levenberg-Marquardt) or adam (as in the paper).")] = "lm",
     integration: Annotated[str, typer.Option(help="ballistic, or euler as in the paper.")] = "ballistic",
-    starts: Annotated[int, typer.Option(help="Starts per group.", min=1)] = 4,
+    starts: Annotated[int, _ranged(help="Starts per group.", low=1, high=1000)] = 4,
     substeps: Annotated[
-        int | None, typer.Option(help="Simulated steps per sample; default: steps of 25 ms.", min=1)
+        int | None, _ranged(help="Simulated steps per sample; default: steps of 25 ms.", low=1, high=1000)
     ] = None,
     model: Corrected = None,
     seed: Seed = 0,
@@ -119,23 +146,26 @@ def fit(
 
     Writes parameters.parquet, model.yaml, report.json and report.html.
     """
-    from idm_env.fitting.job import Options, Source, fit_file
-
-    source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
-    options = Options(
-        by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
-    )  # fmt: skip
-    with progress() as report:
+        checks.within("--held-out", share, 0.001, 0.999)
+    with shown(console) as report:
+        from idm_env.fitting.job import Options, Source, fit_file
+
+        _work_begins()
+        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+        options = Options(
+            by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
+        )  # fmt: skip
         result = fit_file(source, options, out, resume=resume, on_progress=report)
     rows = [{"": "fitted", **result["fit"]}]
     if result["held_out"] is not None:
         rows.append({"": "held out", **result["held_out"]})
     names = ("", "episodes", "gap_rmse_m", "gap_rmse_median_m", "gap_mae_m", "speed_rmse_mps", "collisions")
     _show("Errors in free simulation", [{n: row[n] for n in names} for row in rows])
-    _done(out)
+    console.print(result["at_bounds"], soft_wrap=True, highlight=False)
+    _done(out, result["data"]["account"])
 
 
 @app.command()
@@ -156,15 +186,23 @@ def explain(
 
     Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
     """
-    from idm_env.data import load
+    with shown(console) as report:
+        from idm_env.data import load
 
-    trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
-    if where is not None:
-        trajectories = trajectories.where(where)
-    _explain(trajectories, out, by, _names(effects), _names(known) or (), seed, resume)
+    names, given = _names("--effects", effects), _names("--known", known) or ()
+    with keep.results(out, EXPLAINED, [data]), shown(console) as report:
+        from idm_env.data import load
+
+        report("reading", 0, 0, data.name)
+        trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
+        if where is not None:
+            trajectories = trajectories.where(where)
+        result, models = _explain(report, trajectories, out, by, names, given, seed, resume)
+    _explained(result, models, out)
 
 
 def _explain(
+    report: OnProgress,
     trajectories: Any,
     out: Path,
     by: str = "driver",
@@ -172,36 +210,66 @@ def _explain(
     known: tuple[str, ...] = (),
     seed: int = 0,
     resume: bool = False,
-) -> None:
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Write the report, and return it with the names of the models compared."""
     import json
 
     from idm_env.discovery import discover, write_report
-    from idm_env.report import output_folder
 
-    output_folder(out)
-    with progress() as report:
-        found = discover(
-            trajectories,
-            by=by,
-            effects=effects,
-            known=known,
-            out=out,
-            resume=resume,
-            seed=seed,
-            on_progress=lambda stage, candidate, done, total: report(stage, done, total, candidate),
+    _work_begins()
+    found = discover(
+        trajectories, by=by, effects=effects, known=known, out=out, resume=resume, seed=seed, on_progress=report
+    )
+    report("writing the report", 0, 0, "")
+    write_report(found, out)
+    result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    return result, found.judgement.titles
+
+
+def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
+    from idm_env.discovery.words import ERRORS
+    from idm_env.report import account
+
+    console.print(f"Verdict: [bold]{result['verdict'].replace('_', ' ')}[/bold]. ", end="")
+    console.print(result["sentence"], markup=False, highlight=False)
+    before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
+    if before is not None:
+        _show("Errors on runs that neither fitted nor chose anything", [
+            _error_row(name, unit, before[key], after[key], models, result["helps"].get(key))
+            for key, (name, unit) in ERRORS.items()
+        ])  # fmt: skip
+    if result["interval"]:
+        console.print(result["interval"], style="dim", highlight=False)
+    files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
+    best = ", which predicts best" if len(files) > 1 else ""
+    console.print(
+        "; ".join(f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files)), highlight=False
+    )
+    _done(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
+
+
+def _error_row(
+    name: str, unit: str, before: float, after: float, models: tuple[str, ...], compared: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Return one error of explain: that of every model, and whether the second's is better, the same or worse."""
+    from idm_env.discovery.words import percent
+
+    row: dict[str, Any] = {"error": f"{name} ({unit})"} | dict(zip(models, (before, after), strict=False))
+    if len(models) > 1:
+        known = compared is not None and compared["high"] is not None
+        row["change"] = percent(after / before) if before else ""
+        row["95 % interval"] = (
+            f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and known else ""
         )
-        write_report(found, out)
-    result = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    names = [entry["effect"] or f"{entry['what']} over {entry['where']['coordinate']}" for entry in result["found"]]
-    console.print(f"Verdict: [bold]{result['verdict']}[/bold]{': ' + ', '.join(names) if names else ''}")
-    keys = ("gap_rmse_m", "gap_rmse_median_driver_m", "horizon_rmse_m", "speed_rmse_mps")
-    rows = [{"": when, **{k: result["error"][when].get(k) for k in keys}} for when in ("before", "after", "floor")]
-    _show("Errors on runs that neither fitted nor chose anything", rows)
-    _done(out)
+        row["verdict"] = compared["verdict"] if compared else ""
+    return row
 
 
-def _names(text: str | None) -> tuple[str, ...] | None:
-    return None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+def _names(option: str, text: str | None) -> tuple[str, ...] | None:
+    found = None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+    if found == ():
+        raise ValueError(f"{option} = {checks.shown(text)} names nothing. Give names by comma, or leave {option} out.")
+    return found
 
 
 @app.command()
@@ -210,23 +278,27 @@ def demo(
         Path | None, typer.Option(help="Your own file; default: generated data with a hidden effect.")
     ] = None,
     out: Out = Path("out/demo"),
-    seed: Annotated[int, typer.Option(help="Seed of the generated data.")] = 7,
+    seed: Annotated[int, _ranged(help="Seed of the generated data.", low=0, high=1e9)] = 7,
 ) -> None:
     """Show the main job: a platoon whose generator has an effect that the fitted model is not told of.
 
     The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
     """
-    from idm_env.data import load, synthetic
-    from idm_env.report import output_folder
+    names = (*EXPLAINED, *(("platoon.csv",) if data is None else ()))
+    with keep.results(out, names, [data]) as folder, shown(console) as report:
+        from idm_env.data import load, synthetic
 
-    path = data
-    if path is None:
-        path = output_folder(out) / "platoon.csv"
-        made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
-        columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
-        made.table.select(columns).write_csv(path)
-        console.print(f"Ten runs of a leader and three followers: {path}")
-    _explain(load(path), out)
+        path = data
+        if path is None:
+            report("generating", 0, 0, "platoon.csv")
+            path = folder / "platoon.csv"
+            made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
+            columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
+            keep.write(path, made.table.select(columns).write_csv)
+            console.print(f"Ten runs of a leader and three followers: {path}")
+        report("reading", 0, 0, path.name)
+        result, models = _explain(report, load(path), out)
+    _explained(result, models, out)
 
 
 @app.command()
@@ -245,12 +317,15 @@ def simulate(
     where: Where = None,
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
-    from idm_env.fitting.job import Source, simulate_file
+    with shown(console) as report:
+        from idm_env.fitting.job import Source, simulate_file
 
-    source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
-    result = simulate_file(source, model, out, seed=seed)
+        _work_begins()
+        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+        result = simulate_file(source, model, out, seed=seed, on_progress=report)
     _show("Errors in free simulation", [result["error"]])
-    _done(out)
+    console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)
+    _done(out, result["data"]["account"])
 
 
 @app.command()
@@ -278,56 +353,96 @@ def plot(
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture: png, svg or pdf.")] = Path(
         "out/space-time.png"
     ),
+    html: Annotated[
+        bool, typer.Option("--html", help="Write an interactive page too, beside the picture: zoom, and point.")
+    ] = False,
+    panels: Annotated[
+        int, _ranged(help="Panels at most, one per run and lane, the largest first.", low=1, high=1000)
+    ] = 6,
     where: Where = None,
     seconds: Annotated[
-        float, typer.Option(help="Length of a rollout, all vehicles left to their drivers (s).", min=0.1)
+        float,
+        _ranged(help="Length of a rollout, all vehicles left to their drivers (s).", low=0.1, high=1e5, unit="s"),
     ] = 300.0,
     seed: Seed = 0,
 ) -> None:
-    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout."""
-    from idm_env.diagrams import space_time
+    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
 
-    if source.suffix in (".yaml", ".yml"):
-        figure = _rollout_figure(source, seconds, seed)
-    else:
-        from idm_env.data import load
+    One panel per run and lane; controlled vehicles (of a rollout, or a column "controlled") are underlined in blue.
+    """
+    from idm_env.report import account
 
-        trajectories = load(source)
-        if where is not None:
-            trajectories = trajectories.where(where)
-        runs = len(trajectories.runs())
-        overlaid = f", {runs} runs on one axis (choose one with --where)" if runs > 1 else ""
-        figure = space_time(trajectories, title=f"{source.name}{overlaid}")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out)
-    console.print(f"Picture: [bold]{out.resolve()}[/bold]", soft_wrap=True)
+    if out.is_dir() or out.suffix.lower() not in PICTURES:
+        told = "is a folder" if out.is_dir() else "names no kind of picture"
+        raise ValueError(f"--out = {out} {told}. Give a file that ends in {', '.join(PICTURES)}.")
+    written = [out, *([out.with_suffix(".html")] if html else [])]
+    for path in written:
+        keep.not_an_input(path, [source])
+    if html and written[1].exists() and 'id="diagram"' not in written[1].read_text(errors="replace"):
+        raise ValueError(f"{written[1]} was not written by idm-env plot. Move it, or give --out another name.")
+    repairs: tuple[Any, ...] = ()
+    with shown(console) as report:
+        from idm_env import diagrams, fonts
+
+        if source.suffix in (".yaml", ".yml"):
+            drawn = [_rollout_panel(source, seconds, seed, report)]
+        else:
+            from idm_env.data import load
+
+            _work_begins()
+            report("reading", 0, 0, source.name)
+            trajectories = load(source)
+            if where is not None:
+                trajectories = trajectories.where(where)
+            drawn, repairs = diagrams.panels(trajectories), trajectories.repairs
+        report("drawing", 0, 0, out.name)
+        kept = drawn[:panels]
+        more = f", the largest {len(kept)} of {len(drawn)} panels" if len(drawn) > len(kept) else ""
+        title = f"{source.name}{more}" if len(kept) > 1 else f"{source.name}: {kept[0].title}{more}"
+        out.parent.mkdir(parents=True, exist_ok=True)
+        figure = diagrams.figure_of(kept, title)
+        numbers = fonts.legible(figure)
+        keep.write(out, figure.savefig)
+        if html:
+            diagrams.write_html(out.with_suffix(".html"), kept, title)
+    if more:
+        console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
+    if numbers:
+        told = ", ".join(f"{number}: {word}" for number, word in numbers.items())
+        console.print(f"No font here has these names: {told}.", soft_wrap=True, markup=False, highlight=False)
+    if source.suffix not in (".yaml", ".yml"):
+        console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, markup=False, highlight=False)
+    for path in written:
+        console.print(f"Picture: [bold]{path.resolve()}[/bold]", soft_wrap=True)
 
 
-def _rollout_figure(config: Path, seconds: float, seed: int) -> Any:
+def _rollout_panel(config: Path, seconds: float, seed: int, report: OnProgress) -> Any:
     import torch
 
     from idm_env.config import load_environment
-    from idm_env.diagrams import space_time
+    from idm_env.diagrams import rollout_panel
     from idm_env.envs.gym import DiffIDMEnv
     from idm_env.roads import Ring
     from idm_env.simulator import Trajectory
 
+    _work_begins()
     # The picture is as long as it was asked for, whatever the limit of an episode.
-    keywords = {key: value for key, value in load_environment(config).items() if key != "max_episode_steps"}
-    env: Any = DiffIDMEnv(**keywords)
+    env: Any = DiffIDMEnv(**{**load_environment(config), "max_episode_steps": -1})
     env.reset(seed=seed)
     dt = env.task.simulator.dt
     kept = []
-    for _ in range(max(1, round(seconds / dt))):
+    steps = max(1, round(seconds / dt))
+    for step in range(steps):
         _, _, terminated, truncated, _ = env.step(None)
         state = env.batch.world.state
         kept.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
+        report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
         if terminated or truncated:
             break
     # On a ring gaps and lengths add up to the circumference.
     length = float((state.gap[0] + state.length[0]).sum()) if isinstance(env.task.simulator.road, Ring) else None
     states = Trajectory(*(torch.stack(column) for column in zip(*kept, strict=True)))
-    return space_time(states, dt=dt, ring_length=length, title=config.name)
+    return rollout_panel(states, dt=dt, ring_length=length, marked=env.task.agents)
 
 
 Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]
@@ -345,21 +460,34 @@ def filter_(
     resume: Resume = False,
 ) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
-    from idm_env.trajectories.files import filter_file
+    with shown(console) as report:
+        from idm_env.trajectories.files import filter_file
 
-    with progress() as report:
-        filter_file(
+        _work_begins()
+        result = filter_file(
             data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            model=model, on_progress=lambda done, total: report("filter", done, total, ""),
+            model=model, on_progress=report,
         )  # fmt: skip
-    _done(out)
+    _methods(result)
+    _done(out, result["account"])
+
+
+def _methods(result: dict[str, Any]) -> None:
+    from idm_env.trajectories.report import COLUMNS
+
+    if result["left_out_points"]:
+        names = {"method": "method", "rmse_m": "RMSE (m)", "mae_m": "mean |error| (m)", "p95_m": "95 % below (m)"}
+        rows = [{title: row[name] for name, title in names.items()} for row in result["left_out_points"]]
+        _show(f"{result['left_out_points'][0]['points']} points of the file that were left out", rows)
+    rows = [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in result["methods"]]
+    _show("Methods on these data", rows)
 
 
 @app.command()
 def reconstruct(
     data: Data,
     out: Out = Path("out/reconstruct"),
-    dt: Annotated[float, typer.Option(help="Step of the dense trajectories (s).")] = 0.1,
+    dt: Annotated[float, _ranged(help="Step of the dense trajectories (s).", low=0.01, high=2.0, unit="s")] = 0.1,
     recipe: Recipe = "default",
     fixed_parameters: FixedParameters = False,
     model: Corrected = None,
@@ -367,14 +495,16 @@ def reconstruct(
     resume: Resume = False,
 ) -> None:
     """Reconstruct dense trajectories from sparse ones, a second or more between points."""
-    from idm_env.trajectories.files import reconstruct_file
+    with shown(console) as report:
+        from idm_env.trajectories.files import reconstruct_file
 
-    with progress() as report:
-        reconstruct_file(
+        _work_begins()
+        result = reconstruct_file(
             data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            model=model, on_progress=lambda done, total: report("reconstruct", done, total, ""),
+            model=model, on_progress=report,
         )  # fmt: skip
-    _done(out)
+    _methods(result)
+    _done(out, result["account"])
 
 
 @app.command()
@@ -384,37 +514,54 @@ def predict(
     resume: Resume = False,
 ) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
-    from idm_env.prediction.files import predict_files
+    with shown(console) as report:
+        from idm_env.prediction.files import predict_files
 
-    with progress() as report:
-        predict_files(scenarios, out, resume=resume, on_progress=lambda done, total: report("predict", done, total, ""))
-    _done(out)
+        _work_begins()
+        result = predict_files(scenarios, out, resume=resume, on_progress=report)
+    names = {"minADE_8s": "minADE (m)", "minFDE_8s": "minFDE (m)", "miss_rate_8s": "miss rate", "mAP_8s": "mAP"}
+    rows = [{"method": r["method"], **{title: r[key] for key, title in names.items()}} for r in result["methods"]]
+    _show(f"8 s ahead, {result['agents_with_known_future']} agents", rows)
+    _done(out, result["account"])
 
 
 @app.command()
 def bench(
     out: Out = Path("out/bench"),
     sizes: Annotated[str, typer.Option(help="Numbers of vehicles, by comma.")] = "2000,20000,200000,2000000",
-    rounds: Annotated[int, typer.Option(help="Interleaved rounds; minimum and median are reported.", min=1)] = 5,
+    rounds: Annotated[int, _ranged(help="Interleaved rounds; minimum and median are reported.", low=1, high=1000)] = 5,
     compiled: Annotated[bool, typer.Option(help="Include the step compiled by inductor.")] = True,
     peers: Annotated[bool, typer.Option(help="Include SUMO and HighwayEnv.")] = True,
     verbose: Annotated[bool, typer.Option("--verbose", help="Say which path ran, and why.")] = False,
 ) -> None:
-    """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine."""
-    from idm_env.bench import run as measure
+    """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine.
 
-    numbers = [int(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
-    measure(out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, verbose=verbose)
+    Writes report.html and performance.json.
+    """
+    numbers = [round(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
+    with shown(console) as report:
+        from idm_env import bench as benchmark
+        from idm_env.bench import tables
+
+        _work_begins()
+        result = benchmark.run(
+            out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, on_progress=report,
+            say=console.print if verbose else None,
+        )  # fmt: skip
+    for title, rows, _ in tables.of(result)[: len(numbers) + 2]:  # the rest is in the report
+        _show(title, rows)
+    _done(out, tables.absent(result))
 
 
 def _number(option: str, text: str, wrong: str) -> float:
     try:
-        return float(text)
+        return checks.finite(option, float(text))
     except ValueError:
-        raise ValueError(f"{option} = {text!r} is {wrong}.") from None
+        raise ValueError(f"{option} = {checks.shown(text)} is {wrong}.") from None
 
 
-def _done(out: Path) -> None:
+def _done(out: Path, account: str) -> None:
+    console.print(account, soft_wrap=True, markup=False, highlight=False)
     console.print(f"Report: [bold]{(out / 'report.html').resolve()}[/bold]", soft_wrap=True)
 
 
@@ -425,19 +572,29 @@ def run() -> None:
         if code == 130:
             _interrupted()
         sys.exit(code if isinstance(code, int) else 0)
-    except (KeyboardInterrupt, typer.Abort):
-        _interrupted()
-    except (ValueError, ImportError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(1)
     except Exception as error:
+        # A library may turn an interruption into an error of another kind; typer makes EOFError an Abort.
+        cause = error.__cause__ if isinstance(error, typer.Abort) else error
+        if _stopped or not isinstance(cause, Exception):
+            _interrupted()
+        if isinstance(cause, (ValueError, ImportError, OSError, EOFError, MemoryError)) or keep.full(cause):
+            _failed(cause)
         if not hasattr(error, "show"):
             raise
         error.show()  # a usage error: typer's own message, with the usage line
         sys.exit(getattr(error, "exit_code", 2))
+    except KeyboardInterrupt:
+        _interrupted()
 
 
-def _interrupted() -> None:
+def _failed(error: Exception) -> NoReturn:
+    """End with one line that says what is wrong, never longer than a terminal can take."""
+    text = " ".join((keep.full(error) or str(error) or type(error).__name__).split())
+    print(f"error: {text if len(text) <= 1000 else text[:1000] + ' …'}", file=sys.stderr)
+    sys.exit(1)
+
+
+def _interrupted() -> NoReturn:
     """End after Ctrl-C; only some commands are long enough to go on with."""
     commands = {c.name or c.callback.__name__: c.callback for c in app.registered_commands if c.callback}
     command = commands.get(sys.argv[1]) if len(sys.argv) > 1 else None

@@ -37,7 +37,7 @@ class Compiled(Simulator):
     def _compiled(self) -> Callable[[State, Inputs, Params], State]:
         plain = Simulator(self.road, self.effects, self.dt, self.integration)
         # Filled here, because the tracer does not enter the lock of a cached property.
-        _ = plain.by_name, plain._following, plain._hooks, plain._needs
+        _ = plain.by_name, plain._following, plain._hooks, plain._needs, plain._unspoken
         made: Callable[[State, Inputs, Params], State] = torch.compile(
             plain.step, backend=self.backend, dynamic=self.dynamic, fullgraph=True
         )

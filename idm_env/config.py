@@ -10,6 +10,8 @@
 
 ``by`` says what the keys of ``drivers`` are, as in ``fit``: ``driver`` (run/vehicle), ``run_id``, ``vehicle_id`` or a
 column. ``substeps`` is there where a fit chose another number of simulated steps per sample than the default.
+``fitted_on`` holds the name of the file and a digest of every track that the model was fitted on, so that ``simulate``
+can tell a fitted from a held-out figure.
 
 Unknown keys are errors with a suggestion, in one line.
 """
@@ -28,18 +30,33 @@ from torch import Tensor
 
 from idm_env import effects as catalogue
 from idm_env import parameters
-from idm_env.effects import Effect
-from idm_env.parameters import nearest
-from idm_env.roads import Road
+from idm_env.checks import nearest, one_of, shown, whole
+from idm_env.effects import CarFollowing, Effect
+from idm_env.keep import write_text
+from idm_env.roads import Lane, Road
 from idm_env.simulator import INTEGRATORS, Integration, Simulator
 
 SCHEMA = 1
 """Version of the layout of ``model.yaml``."""
 
+MOST_BYTES, DEEPEST, LONGEST = 20_000_000, 20, 500
+"""Bytes of a YAML file, nesting in it, and characters of a plain value (without quotes)."""
+
 Numbers = dict[str, dict[str, float]]
 """Effect name → parameter name → number."""
 
-_MODEL_KEYS = ("configures", "schema", "dt", "integration", "effects", "parameters", "by", "drivers", "substeps")
+_MODEL_KEYS = (
+    "configures",
+    "schema",
+    "dt",
+    "integration",
+    "effects",
+    "parameters",
+    "by",
+    "drivers",
+    "substeps",
+    "fitted_on",
+)
 
 
 @dataclass(frozen=True)
@@ -57,20 +74,22 @@ class Model:
     drivers: dict[str, Numbers] = field(default_factory=dict)
     by: str = "driver"
     substeps: int | None = None
+    fitted_on: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.integration not in INTEGRATORS:
-            raise ValueError(f"integration = '{self.integration}' is unknown.{nearest(self.integration, INTEGRATORS)}")
-        if not self.dt > 0.0:
+        one_of("integration", self.integration, INTEGRATORS)
+        if any(isinstance(effect, CarFollowing) for effect in self.effects):
+            Simulator(Lane(), self.effects, self.dt, self.integration)  # its rules on effects and dt
+        elif not self.dt > 0.0:
             raise ValueError(f"dt = {self.dt} s must be positive.")
-        if self.substeps is not None and (not isinstance(self.substeps, int) or self.substeps < 1):
-            raise ValueError(f"substeps = {self.substeps!r} must be a whole number of at least 1.")
+        if self.substeps is not None:
+            whole("substeps", self.substeps, 1, 1000)
         parameters.check(self.effects, self.params(dtype=torch.float64))
         for key in self.drivers:
             try:
                 parameters.check(self.effects, self.params(key, dtype=torch.float64))
             except ValueError as error:
-                raise ValueError(f"driver '{key}': {error}") from None
+                raise ValueError(f"driver {shown(key)}: {error}") from None
 
     def simulator(self, road: Road) -> Simulator:
         """Return the simulator of this model on a road."""
@@ -81,7 +100,7 @@ class Model:
     ) -> dict[str, dict[str, Tensor]]:
         """Return the parameters as scalar tensors, those of one driver where he is named."""
         if driver is not None and driver not in self.drivers:
-            raise ValueError(f"driver '{driver}' is not in this model.{nearest(driver, self.drivers)}")
+            raise ValueError(f"driver {shown(driver)} is not in this model.{nearest(driver, self.drivers)}")
         values = parameters.defaults(self.effects, dtype=dtype, device=device)
         layers = [self.parameters] + ([] if driver is None else [self.drivers[driver]])
         for layer in layers:
@@ -93,7 +112,7 @@ class Model:
 
 def load_model(path: str | Path) -> Model:
     """Return the model of a ``model.yaml``; ValueError, in one line, for everything that does not belong in it."""
-    content = _read(path)
+    content = read_yaml(path)
     try:
         return _model(content)
     except ValueError as error:
@@ -103,9 +122,11 @@ def load_model(path: str | Path) -> Model:
 def _model(content: dict[str, Any]) -> Model:
     _known(content, _MODEL_KEYS, "key")
     if content.get("configures", "model") != "model":
-        raise ValueError(f"configures = '{content['configures']}', and a model is wanted. Write 'configures: model'.")
+        raise ValueError(
+            f"configures = {shown(content['configures'])}, and a model is wanted. Write 'configures: model'."
+        )
     if content.get("schema", SCHEMA) != SCHEMA:
-        raise ValueError(f"schema = {content['schema']} is unknown; this version reads schema {SCHEMA}.")
+        raise ValueError(f"schema = {shown(content['schema'])} is unknown; this version reads schema {SCHEMA}.")
     if not content.get("effects"):
         raise ValueError("a model needs effects, and none are given. Write 'effects: [idm, brakes]'.")
     return Model(
@@ -114,12 +135,21 @@ def _model(content: dict[str, Any]) -> Model:
         dt=number("dt", content.get("dt", 0.1)),
         integration=content.get("integration", "ballistic"),
         drivers={
-            str(key): numbers(_mapping(f"drivers.{key}", value))
+            str(key): numbers(_mapping(f"drivers.{shown(key)}", value))
             for key, value in _mapping("drivers", content.get("drivers") or {}).items()
         },
-        by=str(content.get("by", "driver")),
+        by=_text("by", content.get("by", "driver")),
         substeps=content.get("substeps"),
+        fitted_on=_fitted_on(content.get("fitted_on") or {}),
     )
+
+
+def _fitted_on(value: Any) -> dict[str, Any]:
+    _known(_mapping("fitted_on", value), ("source", "tracks"), "key of fitted_on")
+    tracks = value.get("tracks", [])
+    if not isinstance(tracks, list):
+        raise ValueError("fitted_on.tracks must be a list of digests, as fit writes it. Remove fitted_on if in doubt.")
+    return {"source": str(value.get("source", "")), "tracks": [str(track) for track in tracks]} if value else {}
 
 
 def save_model(path: str | Path, model: Model) -> None:
@@ -140,18 +170,20 @@ def save_model(path: str | Path, model: Model) -> None:
             key: {e: {n: float(x) for n, x in values.items()} for e, values in layer.items()}
             for key, layer in model.drivers.items()
         }
+    if model.fitted_on:
+        content["fitted_on"] = model.fitted_on
     text = _yaml().safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
-    Path(path).write_text(text, encoding="utf-8")
+    write_text(Path(path), text)
 
 
 def load_environment(path: str | Path) -> dict[str, Any]:
     """Return the keyword arguments of an environment's YAML file; it must say ``configures: environment``."""
-    content = _read(path)
+    content = read_yaml(path)
     if content.pop("configures", None) != "environment":
         raise ValueError(
             f"{path}: no environment is configured here. Write 'configures: environment' in its first line."
         )
-    return content
+    return {str(key): value for key, value in content.items()}
 
 
 def describe(effect: Effect) -> str | dict[str, Any]:
@@ -167,7 +199,7 @@ def describe(effect: Effect) -> str | dict[str, Any]:
 def make_effects(descriptions: Iterable[str | Mapping[str, Any] | Effect]) -> tuple[Effect, ...]:
     """Return effects from names, mappings ``{effect: name, choice: value}``, or effects as they are."""
     if isinstance(descriptions, (str, Mapping)) or not isinstance(descriptions, Iterable):
-        raise ValueError(f"effects = {descriptions!r} must be a list, such as [idm, brakes].")
+        raise ValueError(f"effects = {shown(descriptions)} must be a list, such as [idm, brakes].")
     made = []
     for description in descriptions:
         if isinstance(description, Effect):
@@ -175,10 +207,13 @@ def make_effects(descriptions: Iterable[str | Mapping[str, Any] | Effect]) -> tu
         elif isinstance(description, str):
             made.append(catalogue.make(description))
         elif isinstance(description, Mapping) and "effect" in description:
-            choices = {k: v for k, v in description.items() if k != "effect"}
-            made.append(catalogue.make(str(description["effect"]), **choices))
+            choices = {str(k): v for k, v in description.items() if k != "effect"}
+            try:
+                made.append(catalogue.make(_text("effect", description["effect"]), **choices))
+            except (TypeError, ArithmeticError) as error:
+                raise ValueError(f"effect {shown(description)} has a choice of a wrong type ({error}).") from None
         else:
-            raise ValueError(f"effect {description!r} must be a name or a mapping with the key 'effect'.")
+            raise ValueError(f"effect {shown(description)} must be a name or a mapping with the key 'effect'.")
     return tuple(made)
 
 
@@ -192,12 +227,16 @@ def nested(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     result: dict[str, dict[str, Any]] = {}
     for key, value in _mapping("parameters", values).items():
         if isinstance(value, Mapping):
-            result.setdefault(str(key), {}).update(value)
+            part, effect = {str(name): x for name, x in value.items()}, str(key)
         elif "." in str(key):
             effect, name = str(key).split(".", 1)
-            result.setdefault(effect, {})[name] = value
+            part = {name: value}
         else:
-            raise ValueError(f"parameters.{key} = {value!r} must be a mapping, such as {{time_gap: 1.2}}.")
+            raise ValueError(f"parameters.{shown(key)} = {shown(value)} must be a mapping, such as {{time_gap: 1.2}}.")
+        for name in part:
+            if name in result.get(effect, {}):
+                raise ValueError(f"parameter {shown(f'{effect}.{name}')} is given twice. Remove one of them.")
+        result.setdefault(effect, {}).update(part)
     return result
 
 
@@ -206,36 +245,80 @@ def number(name: str, value: Any) -> float:
     try:
         result = float(value)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} = {value!r} must be a number.") from None
+        raise ValueError(f"{name} = {shown(value)} must be a number.") from None
+    except OverflowError:  # a whole number beyond 1e308
+        result = math.inf
     if isinstance(value, bool) or not math.isfinite(result):
-        raise ValueError(f"{name} = {value!r} must be a finite number.")
+        raise ValueError(f"{name} = {shown(value)} must be a finite number.")
     return result
 
 
 def _mapping(name: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise ValueError(f"{name} = {value!r} must be a mapping.")
+        raise ValueError(f"{name} = {shown(value)} must be a mapping.")
+    return value
+
+
+def _text(name: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{name} = {shown(value)} must be a text.")
     return value
 
 
 def _known(content: Mapping[str, Any], known: Iterable[str], what: str) -> None:
     for key in content:
         if key not in known:
-            raise ValueError(f"unknown {what} '{key}'.{nearest(str(key), known)}")
+            raise ValueError(f"unknown {what} {shown(key)}.{nearest(str(key), known)}")
 
 
-def _read(path: str | Path) -> dict[str, Any]:
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """Return the mapping of a YAML file; ValueError, in one line, for everything else, whatever its bytes."""
     yaml = _yaml()
     file = Path(path)
     if not file.is_file():
         raise ValueError(f"{path} is not a file. Give the path of a YAML file.")
+    if file.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{path} has {file.stat().st_size} bytes, and {MOST_BYTES} are the most. Is it a YAML file?")
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+        text = file.read_text(encoding="utf-8")
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        _harmless(yaml, text, loader)
+        content = yaml.load(text, loader)
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError) as error:
+        # What stands for no value of its kind, such as 2001-99-99 for a day, is not always a YAMLError.
+        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())[:200]}") from None
     if not isinstance(content, dict):
         raise ValueError(f"{path} must hold a mapping, one 'key: value' per line.")
     return content
+
+
+def _harmless(yaml: Any, text: str, loader: Any) -> None:
+    """Raise ValueError for aliases, deep nesting and long numbers, by which a small file grows, and for equal keys."""
+    keys: list[set[str] | None] = []  # of every open collection; None for a list
+    waits: list[bool] = []  # whether the next node in it is a key
+    for event in yaml.parse(text, loader):
+        line = f"line {event.start_mark.line + 1}"
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"{line}: aliases (*) are not taken; write the value out.")
+        if isinstance(event, yaml.CollectionEndEvent):
+            keys.pop(), waits.pop()
+            continue
+        if not isinstance(event, yaml.NodeEvent):
+            continue
+        known = keys[-1] if keys and waits[-1] else None
+        if keys:
+            waits[-1] = not waits[-1]
+        if isinstance(event, yaml.CollectionStartEvent):
+            keys.append(set() if isinstance(event, yaml.MappingStartEvent) else None)
+            waits.append(True)
+            if len(keys) > DEEPEST:
+                raise ValueError(f"{line}: nested deeper than {DEEPEST}.")
+        elif event.style is None and len(event.value) > LONGEST:
+            raise ValueError(f"{line}: a value of {len(event.value)} characters; quote it.")
+        elif known is not None and event.value in known:
+            raise ValueError(f"{line}: key {shown(event.value)} is there twice. Remove one of them.")
+        elif known is not None:
+            known.add(event.value)
 
 
 def _yaml() -> Any:

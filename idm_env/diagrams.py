@@ -1,13 +1,109 @@
-"""Space-time diagrams with matplotlib, and the colours of speeds that all pictures share."""
+"""Space-time diagrams, one panel per run and lane, and the colours of speeds that all pictures share."""
 
 from __future__ import annotations
 
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from idm_env.fonts import legible
+
 COLOURS = np.array([(178, 24, 43), (239, 138, 98), (253, 219, 120), (120, 190, 110), (26, 120, 80)], float)
 """Red at standstill, over yellow, to green at full speed; RGB in 0–255."""
+CONTROLLED = "#1e5adc"
+MOST_POINTS = 150_000
+"""An interactive page has at most so many points; denser tracks are thinned."""
+MOST_DRAWN = 60_000
+"""A picture has at most so many: it has fewer pixels, and matplotlib draws each segment by itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One vehicle: time (s), position (m) and speed (m/s), each [T], by rising time; ``marked`` where controlled."""
+
+    name: str
+    time: np.ndarray
+    position: np.ndarray
+    speed: np.ndarray
+    marked: bool = False
+
+    def whole(self, ring_length: float | None) -> np.ndarray:
+        """Return [T − 1] where two samples belong to one line: not across a hole in time or the end of a lap."""
+        step = np.diff(self.time)
+        joined = step < 1.5 * (np.median(step) if len(step) else 1.0)
+        if ring_length is not None:
+            joined &= np.abs(np.diff(self.position % ring_length)) < 0.5 * ring_length
+        return np.asarray(joined)
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """The vehicles of one run and lane."""
+
+    title: str
+    lines: tuple[Line, ...]
+    ring_length: float | None = None
+
+    @property
+    def points(self) -> int:
+        """Samples of all vehicles."""
+        return sum(len(line.time) for line in self.lines)
+
+
+def panels(data: Any, *, ring_length: float | None = None) -> list[Panel]:
+    """Return the panels of a table or of ``idm_env.data.Trajectories``: one per run and lane, most samples first.
+
+    Needs ``vehicle_id, time_s, position_m, speed_mps``; uses ``run_id``, ``lane``, ``ring_length_m`` and
+    ``controlled`` where they are. Tables of polars and of pandas do. ValueError if a column is missing.
+    """
+    table = getattr(data, "table", data)
+    needed = ("vehicle_id", "time_s", "position_m", "speed_mps")
+    missing = [name for name in needed if name not in table.columns]
+    if missing:
+        raise ValueError(f"the table has no column '{missing[0]}'. A diagram needs {', '.join(needed)}.")
+    count = len(table)
+    runs, lanes, vehicles = (
+        np.asarray(table[name]).astype(str) if name in table.columns else np.full(count, "")
+        for name in ("run_id", "lane", "vehicle_id")
+    )
+    time, position, speed = (np.asarray(table[name], float) for name in needed[1:])
+    marked = np.asarray(table["controlled"], bool) if "controlled" in table.columns else np.zeros(count, bool)
+    rings = np.asarray(table["ring_length_m"], float) if "ring_length_m" in table.columns else np.full(count, np.nan)
+    order = np.lexsort((time, vehicles, lanes, runs))
+    edges = np.flatnonzero(_changes(runs[order]) | _changes(lanes[order]) | _changes(vehicles[order]))
+    found: dict[tuple[str, str], list[Line]] = {}
+    lengths: dict[tuple[str, str], float | None] = {}
+    for at in np.split(order, edges[1:]):
+        key = str(runs[at[0]]), str(lanes[at[0]])
+        line = Line(str(vehicles[at[0]]), time[at], position[at], speed[at], bool(marked[at].any()))
+        found.setdefault(key, []).append(line)
+        known = rings[at][np.isfinite(rings[at])]
+        lengths[key] = ring_length or (float(known[0]) if len(known) else None)
+    several = len({run for run, _ in found}) > 1
+    made = []
+    for (run, lane), lines in found.items():
+        where = [f"run {run}"] * several + [f"lane {lane}"] * (lane not in ("", "None", "nan"))
+        told = f"{len(lines)} vehicle{'s' if len(lines) > 1 else ''}"
+        made.append(Panel(", ".join([*where, told]), tuple(lines), lengths[run, lane]))
+    return sorted(made, key=lambda panel: -panel.points)
+
+
+def rollout_panel(
+    data: Any, *, dt: float = 0.1, row: int = 0, ring_length: float | None = None, marked: Sequence[int] = ()
+) -> Panel:
+    """Return the panel of what a rollout keeps (position and speed, time first, vehicles last)."""
+    position, speed = (np.asarray(x.detach().cpu(), float) for x in (data.position, data.speed))
+    while position.ndim > 2:
+        index = row if position.ndim == 3 else 0
+        position, speed = position[:, index], speed[:, index]
+    time = dt * np.arange(1, len(position) + 1)
+    lines = [Line(str(i), time, position[:, i], speed[:, i], i in marked) for i in range(position.shape[1])]
+    return Panel(f"{len(lines)} vehicles", tuple(lines), ring_length)
 
 
 def space_time(
@@ -19,24 +115,39 @@ def space_time(
     marked: tuple[int, ...] = (),
     fastest: float | None = None,
     title: str = "",
+    most: int = 6,
 ) -> Any:
     """Return a matplotlib figure: position over time, one line per vehicle, coloured by speed.
 
     Args:
         data: What a rollout keeps (``Trajectory``: position and speed, time first, vehicles last, perhaps a batch
-            between), a table with ``vehicle_id, time_s, position_m, speed_mps`` (polars or pandas), or
-            ``idm_env.data.Trajectories``.
+            between), a table with ``vehicle_id, time_s, position_m, speed_mps`` (polars or pandas),
+            ``idm_env.data.Trajectories``, or panels.
         dt: Time step of a rollout (s).
         row: Which row of a batch to draw.
         ring_length: Circumference (m); positions are then drawn on one lap.
-        marked: Vehicles (indices of a rollout) to underline in blue.
-        fastest: Speed of the colour scale's end (m/s); None takes the fastest of the data.
+        marked: Vehicles (indices of a rollout) to underline in blue, as controlled ones.
+        fastest: Speed of the colour scale's end (m/s); None takes nearly the fastest of the data.
         title: Above the picture.
+        most: Panels at most: one per run and lane, the largest first.
 
     Raises:
         ValueError: If the table lacks a column.
         ImportError: If matplotlib is missing, with the command that installs it.
     """
+    if isinstance(data, list):
+        drawn = data
+    elif hasattr(data, "position") and hasattr(data, "speed"):
+        drawn = [rollout_panel(data, dt=dt, row=row, ring_length=ring_length, marked=marked)]
+    else:
+        drawn = panels(data, ring_length=ring_length)
+    figure = figure_of(drawn[:most], title, fastest)
+    legible(figure)
+    return figure
+
+
+def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = None, columns: int | None = None) -> Any:
+    """Return a matplotlib figure of panels, in one column up to three of them, else in two; not yet ``legible``."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import LineCollection
@@ -44,57 +155,114 @@ def space_time(
         from matplotlib.figure import Figure
     except ImportError:
         raise ImportError("diagrams need matplotlib. Install it with: pip install 'idm-env[data]'") from None
-    tracks = _tracks(data, dt, row)
-    figure = Figure(figsize=(9.0, 4.8), dpi=120, layout="constrained")
+    columns = columns or (1 if len(drawn) <= 3 else 2)
+    rows = max(1, -(-len(drawn) // columns))
+    height = 4.8 if rows == 1 else 0.8 + 3.0 * rows
+    figure = Figure(figsize=(9.0 if columns == 1 else 12.0, height), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    top = fastest or max((float(speed.max()) for _, _, speed in tracks if len(speed)), default=1.0) or 1.0
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    top = fastest or _fastest(drawn)
     scale = LinearSegmentedColormap.from_list("speed", COLOURS / 255.0)
-    drawn = None
-    for index, (time, position, speed) in enumerate(tracks):
-        place = position if ring_length is None else position % ring_length
-        points = np.stack((time, place), axis=-1)
-        segments: Any = np.stack((points[:-1], points[1:]), axis=1)
-        # A lap that ends, or a hole in time, is not a line across the picture.
-        step = np.median(np.diff(time)) if len(time) > 1 else 1.0
-        whole = np.diff(time) < 1.5 * step
-        if ring_length is not None:
-            whole &= np.abs(np.diff(place)) < 0.5 * ring_length
-        if index in marked:
-            axes.add_collection(LineCollection(segments[whole], colors="#1e5adc", linewidths=3.0))
-        lines = LineCollection(segments[whole], cmap=scale, linewidths=1.0)
-        lines.set_array(speed[1:][whole])
-        lines.set_clim(0.0, top)
-        drawn = axes.add_collection(lines)
-    axes.autoscale()
-    axes.margins(0.01)
-    place_label = "position (m)" if ring_length is None else "position on the ring (m)"
-    axes.set(xlabel="time (s)", ylabel=place_label, title=title)
-    if drawn is not None:
-        figure.colorbar(drawn, ax=axes, label="speed (m/s)")
+    coloured = None
+    stride = _stride(drawn, MOST_DRAWN)
+    for axes, panel in zip(grid, drawn, strict=False):
+        for line in panel.lines:
+            line = _thinned(line, stride)
+            place = line.position if panel.ring_length is None else line.position % panel.ring_length
+            points = np.stack((line.time, place), axis=-1)
+            segments: Any = np.stack((points[:-1], points[1:]), axis=1)
+            whole = line.whole(panel.ring_length)
+            if line.marked:
+                axes.add_collection(LineCollection(segments[whole], colors=CONTROLLED, linewidths=3.0))
+            lines = LineCollection(segments[whole], cmap=scale, linewidths=1.0)
+            lines.set_array(line.speed[1:][whole])
+            lines.set_clim(0.0, top)
+            coloured = axes.add_collection(lines)
+        axes.autoscale()
+        axes.margins(0.01)
+        axes.set(xlabel="time (s)", ylabel=place_label(panel.ring_length))
+        if any(line.marked for line in panel.lines):
+            axes.plot([], [], color=CONTROLLED, lw=3.0, label="controlled")
+            axes.legend(loc="upper left", fontsize=8, framealpha=0.9)
+        if len(drawn) > 1:
+            axes.set_title(panel.title, fontsize=10)
+    for axes in grid[len(drawn) :]:
+        axes.set_visible(False)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    if coloured is not None:
+        figure.colorbar(coloured, ax=list(grid), label="speed (m/s)")
     return figure
 
 
-def _tracks(data: Any, dt: float, row: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return (time, position, speed) of every vehicle."""
-    if hasattr(data, "position") and hasattr(data, "speed"):
-        position, speed = (np.asarray(x.detach().cpu(), float) for x in (data.position, data.speed))
-        while position.ndim > 2:
-            index = row if position.ndim == 3 else 0
-            position, speed = position[:, index], speed[:, index]
-        time = dt * np.arange(1, len(position) + 1)
-        return [(time, position[:, i], speed[:, i]) for i in range(position.shape[1])]
-    table = getattr(data, "table", data)
-    needed = ("vehicle_id", "time_s", "position_m", "speed_mps")
-    missing = [name for name in needed if name not in table.columns]
-    if missing:
-        raise ValueError(f"the table has no column '{missing[0]}'. A diagram needs {', '.join(needed)}.")
-    runs = np.asarray(table["run_id"]).astype(str) if "run_id" in table.columns else np.full(len(table), "")
-    keys = np.char.add(np.char.add(runs, "/"), np.asarray(table["vehicle_id"]).astype(str))
-    columns = [np.asarray(table[name], float) for name in needed[1:]]
-    tracks = []
-    for key in dict.fromkeys(keys.tolist()):
-        time, position, speed = (column[keys == key] for column in columns)
-        order = np.argsort(time)
-        tracks.append((time[order], position[order], speed[order]))
-    return tracks
+def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
+    """Write an interactive page: choose a panel, look closer, point at a vehicle. It needs nothing from elsewhere."""
+    from idm_env import report
+
+    stride, fastest = _stride(drawn, MOST_POINTS), _fastest(drawn)
+    content = {
+        "colours": COLOURS.tolist(),
+        "fastest": fastest,
+        "place_label": place_label(drawn[0].ring_length if drawn else None),
+        "panels": [_packed(panel, stride, fastest) for panel in drawn],
+    }
+    text = json.dumps(content, ensure_ascii=False).replace("<", "\\u003c")
+    fragment = Path(__file__).with_name("space_time.html").read_text(encoding="utf-8").replace("{{ data }}", text)
+    several = f" {len(drawn)} panels, one per run and lane, the largest first." if len(drawn) > 1 else ""
+    words = f"One line per vehicle, coloured by speed.{several}"
+    thinned = f" Every {stride}th sample is drawn." if stride > 1 else ""
+    report.write_page(path, title, [report.note(words + thinned), report.html(fragment)])
+
+
+def place_label(ring_length: float | None) -> str:
+    """Return what the axis of positions is called."""
+    return "position (m)" if ring_length is None else "position on the ring (m)"
+
+
+def _packed(panel: Panel, stride: int, fastest: float) -> dict[str, Any]:
+    """Return a panel for the page: numbers as 16 bits of their range in the panel, base64."""
+    lines = [_thinned(line, stride) for line in panel.lines]
+    places = [x.position if panel.ring_length is None else x.position % panel.ring_length for x in lines]
+    time = _range([line.time for line in lines])
+    place = _range(places)
+    packed = []
+    for line, at in zip(lines, places, strict=True):
+        packed.append({
+            "name": line.name, "marked": line.marked, "time": _bits(line.time, *time), "place": _bits(at, *place),
+            "speed": _bits(line.speed, 0.0, fastest),
+            "breaks": (np.flatnonzero(~line.whole(panel.ring_length)) + 1).tolist(),
+        })  # fmt: skip
+    return {"title": panel.title, "time": time, "place": place, "vehicles": packed}
+
+
+def _bits(values: np.ndarray, low: float, high: float) -> str:
+    share = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return base64.b64encode((65535 * np.nan_to_num(share)).round().astype("<u2").tobytes()).decode()
+
+
+def _range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
+    low, high = min(float(a.min()) for a in arrays), max(float(a.max()) for a in arrays)
+    return low, high if high > low else low + 1.0
+
+
+def _fastest(drawn: Sequence[Panel]) -> float:
+    """Return the end of the colours' scale (m/s): nearly the fastest, so that a few samples do not set it."""
+    speeds = np.concatenate([np.zeros(1), *(line.speed for panel in drawn for line in panel.lines)])
+    known = speeds[np.isfinite(speeds)]
+    return float(np.percentile(known, 99.5)) or float(known.max()) or 1.0
+
+
+def _stride(drawn: Sequence[Panel], most: int) -> int:
+    return max(1, -(-sum(panel.points for panel in drawn) // most))
+
+
+def _thinned(line: Line, stride: int) -> Line:
+    if stride == 1 or len(line.time) < 3:
+        return line
+    at = np.unique(np.append(np.arange(0, len(line.time), stride), len(line.time) - 1))
+    return Line(line.name, line.time[at], line.position[at], line.speed[at], line.marked)
+
+
+def _changes(values: np.ndarray) -> np.ndarray:
+    """Return [N]: where a value differs from the one before; the first one does."""
+    return np.concatenate([np.ones(min(1, len(values)), bool), values[1:] != values[:-1]])

@@ -7,7 +7,6 @@ tensors (``defaults``, ``sample``, ``null``), moves tensors in and out of their 
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -17,6 +16,8 @@ from torch import Tensor
 from torch.distributions import biject_to, constraints
 from torch.distributions.transforms import Transform
 
+from idm_env.checks import nearest as nearest
+from idm_env.checks import shown
 from idm_env.types import Params
 
 Role = Literal["strength", "shape", "threshold", "place"]
@@ -28,7 +29,8 @@ class Parameter:
 
     ``null`` is the value at which the effect is absent (None where the effect is never absent). ``role`` says how it
     is found: a *strength* has a gradient at its null; a *shape* matters only once the strength does; a *threshold* or
-    a *place* has to be searched, from ``starts`` where given.
+    a *place* has to be searched, from ``starts`` where given. ``searched`` are bounds of the search for a missing
+    effect, where these are other than (low, high): wider than plausible, narrower than where IDM would collide.
     """
 
     name: str
@@ -40,6 +42,7 @@ class Parameter:
     null: float | None = None
     role: Role = "strength"
     starts: tuple[float, ...] = ()
+    searched: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.low < self.high or not self.low <= self.default <= self.high:
@@ -60,16 +63,6 @@ class HasParameters(Protocol):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Declared parameters."""
-
-
-def nearest(word: str, known: Iterable[str]) -> str:
-    """Return ' Did you mean …?' for the nearest known word, or the list of all when none is near."""
-    known = list(known)
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    if not close and "." in word:
-        close = difflib.get_close_matches(word.split(".")[-1], [k.split(".")[-1] for k in known], n=1, cutoff=0.4)
-        close = [k for k in known if close and k.split(".")[-1] == close[0]][:1]
-    return f" Did you mean '{close[0]}'?" if close else f" Known: {', '.join(sorted(known)) or 'none'}."
 
 
 def catalogue(effects: Iterable[HasParameters]) -> dict[str, Parameter]:
@@ -138,10 +131,10 @@ def check(effects: Iterable[HasParameters], params: Params) -> None:
     names = {e.name for e in effects}
     for effect, values in params.items():
         if effect not in names:
-            raise ValueError(f"unknown effect '{effect}' in parameters.{nearest(effect, names)}")
+            raise ValueError(f"unknown effect {shown(effect)} in parameters.{nearest(effect, names)}")
         for name in values:
             if f"{effect}.{name}" not in known:
-                raise ValueError(f"unknown parameter '{effect}.{name}'.{nearest(f'{effect}.{name}', known)}")
+                raise ValueError(f"unknown parameter {shown(f'{effect}.{name}')}.{nearest(f'{effect}.{name}', known)}")
     for full, p in known.items():
         effect, name = full.split(".")
         if effect not in params or name not in params[effect]:

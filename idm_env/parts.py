@@ -2,59 +2,59 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from idm_env.data import DataError
-from idm_env.report import write_json
+from idm_env import keep
+from idm_env.report import plain
 
 
 class Parts:
-    """Numbered parts in ``out/parts``: tables as parquet, and a JSON file that marks a part as done.
+    """Numbered parts in a ``Store``: tables as parquet, and a summary that marks a part as done.
 
-    The folder belongs to one run, told by a fingerprint of its data and settings; without ``resume`` it is emptied.
-    DataError if ``resume`` finds the parts of another run.
+    ValueError for what ``Store`` refuses, and for a table of a finished part that is not what was written.
     """
 
-    def __init__(self, out: Path, fingerprint: str, resume: bool) -> None:
-        self.folder = out / "parts"
-        mark = self.folder / "run.json"
-        if self.folder.exists() and resume and mark.exists():
-            if json.loads(mark.read_text())["fingerprint"] != fingerprint:
-                raise DataError(
-                    f"{self.folder} was left by a run on other data or settings; leave out resume to start afresh."
-                )
-            return
-        if self.folder.exists():
-            shutil.rmtree(self.folder)
-        self.folder.mkdir(parents=True)
-        write_json(mark, {"fingerprint": fingerprint})
+    def __init__(self, folder: Path, fingerprint: str, resume: bool) -> None:
+        self.store = keep.Store(folder, fingerprint, resume)
+        self.folder = folder
 
     def path(self, number: int, name: str) -> Path:
         """Return the file of a part's table."""
         return self.folder / f"{number:06d}.{name}.parquet"
 
+    def write(self, number: int, name: str, table: pl.DataFrame) -> None:
+        """Write a table of a part."""
+        keep.write(self.path(number, name), table.write_parquet)
+
     def done(self, number: int) -> bool:
-        """Tell whether a part is finished."""
-        return (self.folder / f"{number:06d}.json").exists()
+        """Tell whether a part is finished, with its tables as they were written."""
+        found = self.store.get_json(f"{number:06d}")
+        if found is None:
+            return False
+        for name, digest in found["tables"].items():
+            path = self.folder / name
+            if not path.is_file() or keep.fingerprint(path) != digest:
+                raise ValueError(f"{path} is broken (not what was written). {keep.AFRESH}")
+        return True
 
     def finish(self, number: int, summary: dict[str, Any]) -> None:
         """Mark a part as done, with what is to be remembered of it; its tables must have been written before."""
-        write_json(self.folder / f"{number:06d}.json", summary)
+        tables = {p.name: keep.fingerprint(p) for p in self.folder.glob(f"{number:06d}.*.parquet")}
+        self.store.put_json(f"{number:06d}", {"summary": plain(summary), "tables": tables})
 
     def summaries(self) -> list[dict[str, Any]]:
         """Return what is remembered of all parts, in their order."""
-        return [json.loads(p.read_text()) for p in sorted(self.folder.glob("[0-9]*.json"))]
+        return [self.store.get_json(key)["summary"] for key in self.store.kept()]
 
     def join(self, name: str, target: Path) -> None:
         """Write the tables of all parts as one, without holding them in memory."""
         paths = sorted(self.folder.glob(f"[0-9]*.{name}.parquet"))
-        pl.scan_parquet(paths, missing_columns="insert", extra_columns="ignore").sink_parquet(target)
+        whole = pl.scan_parquet(paths, missing_columns="insert", extra_columns="ignore")
+        keep.write(target, whole.sink_parquet)
 
     def remove(self) -> None:
         """Remove the folder: the run has ended."""
-        shutil.rmtree(self.folder)
+        self.store.remove()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import platform
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,53 +13,34 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from idm_env.keep import write_text
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
-<style>
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #1d2430; }
-h1 { font-size: 1.7rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
-p.lead { font-size: 1.1rem; } figure { margin: 1rem 0; } figure img { max-width: 100%; }
-figcaption, .note { color: #566; font-size: .92rem; }
-table { border-collapse: collapse; margin: .8rem 0; font-size: .92rem; display: block; overflow-x: auto; }
-th, td { padding: .25rem .8rem .25rem 0; text-align: left; border-bottom: 1px solid #dde; vertical-align: top; }
-td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
-table.first tbody tr:first-child { font-weight: 600; background: #eef5fb; }
-.gallery { display: flex; flex-wrap: wrap; gap: 1rem; } .gallery figure { flex: 1 1 26rem; margin: 0; }
-</style></head><body>
-<h1>{{ title }}</h1>
-{% for block in blocks %}
-{% if block.kind == "heading" %}<h2>{{ block.text }}</h2>
-{% elif block.kind == "lead" %}<p class="lead">{{ block.text }}</p>
-{% elif block.kind == "note" %}<p class="note">{{ block.text }}</p>
-{% elif block.kind == "text" %}<p>{{ block.text }}</p>
-{% elif block.kind == "list" %}<ul>{% for item in block.rows %}<li>{{ item }}</li>{% endfor %}</ul>
-{% elif block.kind == "figure" %}<figure><img alt="{{ block.text }}" src="{{ block.image }}">
-<figcaption>{{ block.text }}</figcaption></figure>
-{% elif block.kind == "gallery" %}<div class="gallery">{% for item in block.rows %}<figure>
-<img alt="{{ item.text }}" src="{{ item.image }}"><figcaption>{{ item.text }}</figcaption></figure>{% endfor %}</div>
-{% elif block.kind == "table" %}<table{% if block.text %} class="{{ block.text }}"{% endif %}>
-<thead><tr>{% for name in block.columns %}<th{% if block.rows and block.rows[0][loop.index0].number %} class="number"{%
-endif %}>{{ name }}</th>{% endfor %}</tr></thead>
-<tbody>{% for row in block.rows %}<tr>{% for cell in row %}<td{% if cell.number %} class="number"{% endif %}>{{
-cell.text }} </td>{% endfor %}</tr>{% endfor %}</tbody></table>
-{% endif %}{% endfor %}
-</body></html>
-"""
 
 
 @dataclass(frozen=True)
 class Block:
-    """One piece of a page: a heading, a paragraph, a list, a figure, a gallery of figures or a table."""
+    """One piece of a page: heading, paragraph, list, lights, terms, figure, gallery, table or markup of one's own.
+
+    ``narrow`` is the figure's picture for small screens, where it has one.
+    """
 
     kind: str
     text: str = ""
     image: str = ""
+    narrow: str = ""
     columns: tuple[str, ...] = ()
     rows: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table: its text, the number that it is sorted by, if any, and whether it is set off as doubtful."""
+
+    text: str
+    value: float | None = None
+    marked: bool = False
 
 
 def heading(text: str) -> Block:
@@ -97,7 +77,8 @@ def table(
 ) -> Block:
     """Return a table of rows by column name; floats with four significant digits, or ``digits`` behind the point.
 
-    ``first`` sets the first row off from the others.
+    A reader sorts it by any column; a ``Cell`` says what its text is sorted by. ``first`` sets the first row off from
+    the others.
     """
     names = tuple(columns or (rows[0] if rows else ()))
     cells = tuple(tuple(_cell(row.get(name), (digits or {}).get(name)) for name in names) for row in rows)
@@ -105,13 +86,31 @@ def table(
 
 
 def _cell(value: Any, digits: int | None = None) -> dict[str, Any]:
+    if isinstance(value, Cell):
+        sorted_by, finite = value.value, value.value is not None and abs(value.value) < float("inf")
+        kept = sorted_by if finite else None
+        return {"text": value.text, "number": sorted_by is not None, "value": kept, "marked": value.marked}
+    cell: dict[str, Any] = {"number": False, "value": None, "marked": False}
     if isinstance(value, bool):
-        return {"text": "yes" if value else "no", "number": False}
-    if isinstance(value, float) and not abs(value) < float("inf"):
-        return {"text": "–", "number": True}
+        return cell | {"text": "yes" if value else "no"}
     if isinstance(value, float):
-        return {"text": f"{value:.4g}" if digits is None else f"{value:.{digits}f}", "number": True}
-    return {"text": "" if value is None else str(value), "number": isinstance(value, int)}
+        return cell | {
+            "text": number(value, digits),
+            "number": True,
+            "value": value if abs(value) < float("inf") else None,
+        }
+    if isinstance(value, int):
+        return cell | {"text": str(value), "number": True, "value": value}
+    return cell | {"text": "" if value is None else str(value)}
+
+
+def number(value: float, digits: int | None = None) -> str:
+    """Return a number as people read it: four significant digits, or ``digits`` behind the point; a dash for none."""
+    if not abs(value) < float("inf"):
+        return "–"
+    if digits is not None:
+        return f"{value:.{digits}f}"
+    return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
 
 
 def shortened(items: Sequence[str], most: int = 100) -> list[str]:
@@ -120,20 +119,48 @@ def shortened(items: Sequence[str], most: int = 100) -> list[str]:
     return [*items[:most], *([f"… and {more} more, in report.json."] if more > 0 else [])]
 
 
+def lights(rows: Iterable[tuple[str, str, str]]) -> Block:
+    """Return one light per (name, ``better``, ``same`` or ``worse``, words); the state is a word and a colour."""
+    return Block("lights", rows=tuple(rows))
+
+
+def terms(meanings: Mapping[str, str]) -> Block:
+    """Return what the terms of a table mean, to stand under it."""
+    return Block("terms", rows=tuple(meanings.items()))
+
+
+def html(markup: str) -> Block:
+    """Return markup that goes into the page as it is; whoever writes it escapes what a file said."""
+    return Block("html", markup)
+
+
 def gallery(figures: Iterable[Block]) -> Block:
     """Return figures side by side, as many in a row as there is room for."""
     return Block("gallery", rows=tuple(figures))
 
 
-def picture(figure: Figure, caption: str) -> Block:
-    """Return a matplotlib figure as a block; the picture travels inside the page. The figure is closed."""
+def picture(figure: Figure, caption: str, narrow: Figure | None = None) -> Block:
+    """Return a matplotlib figure as a block; the picture travels inside the page. Figures are closed.
+
+    ``narrow`` is shown instead where the screen is less than 600 pixels wide.
+    """
+    from idm_env.fonts import legible
+
+    numbers = legible(figure)
+    if narrow is not None:
+        numbers = legible(narrow, numbers)
+    if numbers:
+        caption += " " + ", ".join(f"{number}: {word}" for number, word in numbers.items()) + "."
+    return Block("figure", caption, _encoded(figure), narrow="" if narrow is None else _encoded(narrow))
+
+
+def _encoded(figure: Figure) -> str:
     import matplotlib.pyplot as plt
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
     plt.close(figure)
-    image = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
-    return Block("figure", caption, image)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (9.0, 3.4)) -> tuple[Figure, Any]:
@@ -152,38 +179,44 @@ def write_page(path: Path, title: str, blocks: Iterable[Block]) -> None:
     """Write a self-contained HTML page."""
     from jinja2 import Environment
 
-    page = Environment(autoescape=True).from_string(_PAGE).render(title=title, blocks=list(blocks))
+    template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+    page = Environment(autoescape=True).from_string(template).render(title=title, blocks=list(blocks))
     write_text(path, page)
 
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON; NaN and infinities, which JSON does not have, become null."""
-    write_text(path, json.dumps(_finite(content), indent=1, ensure_ascii=False) + "\n")
+    write_text(path, json.dumps(plain(content), indent=1, ensure_ascii=False) + "\n")
 
 
-def _finite(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: NaN and infinities are null."""
     if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, float) and not abs(value) < float("inf"):
         return None
     return value
 
 
-def write_text(path: Path, content: str) -> None:
-    """Write a file in one piece: whoever is killed in between leaves the old one."""
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(content, encoding="utf-8")
-    os.replace(beside, path)
+def account(
+    repairs: Iterable[tuple[str, int]] = (), left_out: Iterable[tuple[str, int]] = (), bad_files: Iterable[str] = ()
+) -> str:
+    """Return one line on the data: what was repaired and left out, by kind and number, and bad files by name."""
 
+    def counted(items: Iterable[tuple[str, int]]) -> str:
+        sums: dict[str, int] = {}
+        for kind, count in items:
+            sums[kind] = sums.get(kind, 0) + count
+        return ", ".join(f"{kind} {count}" for kind, count in sorted(sums.items(), key=lambda item: -item[1]))
 
-def output_folder(out: Path) -> Path:
-    """Return ``out`` as a folder that exists; ValueError if a file is in the way."""
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out} is a file. Give --out a folder.")
-    out.mkdir(parents=True, exist_ok=True)
-    return out
+    names = list(bad_files)
+    shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    files = f"{len(names)} bad file{'s' if len(names) > 1 else ''}: {shown}" if names else ""
+    parts = (("repaired: ", counted(repairs)), ("left out: ", counted(left_out)), ("", files))
+    said = "; ".join(title + words for title, words in parts if words)
+    return f"Data: {said}." if said else "Data: nothing was repaired or left out."
 
 
 def versions() -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -120,6 +120,14 @@ def _leaves(value: Any) -> Iterable[Any]:
     return (value,) if isinstance(value, Tensor) else value
 
 
+def stacked(values: Sequence[Any]) -> Any:
+    """Return inputs of single steps as one input with a leading time dimension."""
+    if isinstance(values[0], Tensor):
+        return torch.stack(tuple(values))
+    columns = zip(*values, strict=True)
+    return type(values[0])(*(None if column[0] is None else torch.stack(column) for column in columns))
+
+
 def _unbind(value: Any) -> list[Any]:
     """Split an input along time into one value per step, keeping its tuple type."""
     if isinstance(value, Tensor):
@@ -129,4 +137,4 @@ def _unbind(value: Any) -> list[Any]:
     return [type(value)(*row) for row in zip(*columns, strict=True)]
 
 
-__all__ = ["INTEGRATORS", "Integration", "Simulator", "Trajectory", "ballistic", "euler", "half_ahead"]
+__all__ = ["INTEGRATORS", "Integration", "Simulator", "Trajectory", "ballistic", "euler", "half_ahead", "stacked"]

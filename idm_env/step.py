@@ -17,6 +17,7 @@ from torch import Tensor
 
 from idm_env import parameters
 from idm_env.effects.base import CarFollowing, Effect, Hook
+from idm_env.effects.limits import unspoken
 from idm_env.history import PAST, History
 from idm_env.roads.base import Road
 from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
@@ -38,7 +39,10 @@ class Stepping:
     scene taken half a step ahead, by the accelerations of the step before: second order for one evaluation a step. The
     other two act on the past half step, a hidden delay of Δt/2 that a search for missing effects would find.
 
-    ValueError: two effects of one name, or not exactly one car-following effect.
+    Where an effect can add to what the driver wants, the sum is held to what tyres can (``effects.Traction``, by its
+    default unless it is named).
+
+    ValueError: two effects of one name, not exactly one car-following effect, or a step longer than any time gap.
     """
 
     road: Road
@@ -60,8 +64,11 @@ class Stepping:
         if self.integration not in INTEGRATORS:
             hint = parameters.nearest(self.integration, INTEGRATORS)
             raise ValueError(f"integration = '{self.integration}' is unknown.{hint}")
-        if not self.dt > 0:
-            raise ValueError(f"dt = {self.dt} s must be positive.")
+        longest = next((p.high for p in self._following.parameters if p.name == "time_gap"), float("inf"))
+        if not 0.0 < self.dt <= longest:
+            raise ValueError(
+                f"dt = {self.dt:g} s is outside (0, {longest:g}] s: no step may be longer than a driver's time gap."
+            )
 
     # -- composition ---------------------------------------------------------------------------------------------
 
@@ -91,9 +98,13 @@ class Stepping:
             hook: tuple(e for e in self.effects if e.hook == hook)
             for hook in ("perceive", "adapt", "accelerate", "limit", "place")
         }
-        for hook in ("perceive", "limit"):
-            hooks[hook] = tuple(sorted(hooks[hook], key=lambda e: e.rank))
+        hooks["perceive"] = tuple(sorted(hooks["perceive"], key=lambda e: e.rank))
+        hooks["limit"] = tuple(sorted((*hooks["limit"], *unspoken(self.effects)), key=lambda e: e.rank))
         return hooks
+
+    @cached_property
+    def _unspoken(self) -> dict[str, dict[str, float]]:
+        return {e.name: {p.name: p.default for p in e.parameters} for e in unspoken(self.effects)}
 
     @cached_property
     def looks_back(self) -> float:
@@ -109,8 +120,18 @@ class Stepping:
         return parameters.defaults(self.effects, **kind)
 
     def check(self, params: Params, inputs: Inputs | None = None) -> None:
-        """Raise ValueError, in one line, for parameters or inputs that do not belong to this simulator."""
+        """Raise ValueError, in one line, for parameters or inputs that do not belong to this simulator.
+
+        A step must not be longer than the shortest time gap T: whoever cannot react within T drives into his leader.
+        """
         parameters.check(self.effects, params)
+        time_gap = self._following.driver(dict(params[self._following.name])).time_gap
+        shortest = float(torch.as_tensor(time_gap).detach().min())
+        if self.dt > shortest * (1.0 + 1e-6):
+            raise ValueError(
+                f"dt = {self.dt:g} s is longer than the shortest time gap, {self._following.name}.time_gap = "
+                f"{shortest:g} s: a driver must react within it. Take dt = {shortest:g} s or less."
+            )
         for name in inputs or {}:
             if name not in self.by_name:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
@@ -211,7 +232,8 @@ class Stepping:
         assert accel is not None  # the car-following effect accelerates
         for effect in self._hooks["limit"]:
             view = scene if effect.sees_truth else seen
-            accel = effect.limit(accel, view, driver, params[effect.name])  # type: ignore[arg-type]
+            given = self._unspoken.get(effect.name) or params[effect.name]
+            accel = effect.limit(accel, view, driver, given)  # type: ignore[arg-type]
         return accel, scene, driver
 
     def acceleration(self, state: State, inputs: Inputs, params: Params) -> Tensor:

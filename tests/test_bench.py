@@ -5,7 +5,7 @@ import json
 import pytest
 
 from idm_env import bench
-from idm_env.bench import memory, peers
+from idm_env.bench import memory, peers, tables
 from idm_env.bench.measure import Case, measure
 
 
@@ -26,15 +26,22 @@ def test_growth_is_the_slope():
 def test_a_small_run_writes_json_and_picture(tmp_path, monkeypatch):
     for name in ("recorded_leaders", "rings", "discovery"):
         monkeypatch.setattr(bench.fits, name, lambda *_: {})
-    lines = []
+    lines, seen = [], []
     result = bench.run(
-        tmp_path, sizes=(100, 200), rounds=1, compiled=False, others=False, verbose=True, say=lines.append
-    )
+        tmp_path, sizes=(100, 200), rounds=1, compiled=False, others=False, verbose=True, say=lines.append,
+        on_progress=lambda *at: seen.append(at),
+    )  # fmt: skip
     written = json.loads((tmp_path / "performance.json").read_text())
     assert written["one_core"].keys() == {"100", "200"} == result["one_core"].keys()
+    page = (tmp_path / "report.html").read_text()
+    assert "200 vehicles, one core" in page and "{&#34;" not in page and "{'" not in page
+    titles = [title for title, _, _ in tables.of(result)]
+    assert titles[:3] == ["200 vehicles, one core", "100 vehicles, one core", titles[2]] and "wall time" in titles[2]
+    assert seen[0][1] == 0 and [at[1] for at in seen] == sorted(at[1] for at in seen) and seen[-1][1:3] == (100, 100)
+    assert tables.absent(result).startswith("Not measured: ")
     assert (tmp_path / "performance.png").stat().st_size > 5_000
     assert any("kernels run" in line or "kernels do not run:" in line for line in lines)
-    assert any("diffidm" in line or "eager" in line for line in lines)
+    assert any("eager" in row["path"] for row in tables.of(result)[0][1])
     assert result["gradient_error"]["kernel float64"] < 1e-10
 
 

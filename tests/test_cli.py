@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from idm_env import keep
 from idm_env.data import synthetic
 
 
@@ -114,6 +115,23 @@ def test_bad_rows_are_repaired_and_counted(frame: pl.DataFrame, tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "out" / "report.html").read_text()
     assert "10 rows repeat" in page, page[-800:]
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("Data: ")]
+    assert "duplicated time 10" in line and line.removeprefix("Data: ") in page
+    assert any(line.startswith("Bounds: ") for line in done.stderr.splitlines())
+
+
+def test_two_conditions_both_hold(tmp_path: Path) -> None:
+    """Each condition narrows what the others left."""
+    made, _ = synthetic.generate(3, runs=3, followers=2, seconds=30.0)
+    site, weather = ({"1": a, "2": b, "3": c} for a, b, c in (("a", "a", "b"), ("dry", "wet", "wet")))
+    run = pl.col("run_id")
+    table = made.table.with_columns(run.replace_strict(site).alias("site"), run.replace_strict(weather).alias("sky"))
+    path = tmp_path / "two.parquet"
+    table.write_parquet(path)
+    out = tmp_path / "out"
+    done = call("fit", path, "--where", "site=a", "--where", "sky=wet", "--starts", "1", "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((out / "report.json").read_text())["fit"]["episodes"] == 2
 
 
 def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
@@ -128,13 +146,14 @@ def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
             [sys.executable, "-m", "idm_env", "fit", str(path), *options, str(out)], stderr=subprocess.PIPE, text=True
         )
         deadline = time.monotonic() + 120
-        while not (out / "fit.resume.pt").exists() and running.poll() is None and time.monotonic() < deadline:
+        kept = out / keep.UNFINISHED / "fit" / "adam.kept"
+        while not kept.exists() and running.poll() is None and time.monotonic() < deadline:
             time.sleep(0.01)
         os.kill(running.pid, number)
         _, words = running.communicate(timeout=60)
         if number == signal.SIGINT:
             assert running.returncode == 130 and "--resume" in words
-        assert (out / "fit.resume.pt").exists()
+        assert kept.exists()
         assert call("fit", path, *options, out, "--resume").returncode == 0
         whole, resumed = (pl.read_parquet(folder / "parameters.parquet") for folder in (tmp_path / "whole", out))
         assert whole.equals(resumed)
@@ -152,6 +171,7 @@ def test_the_demo_finds_what_its_generator_hid(tmp_path: Path) -> None:
     assert report["found"][0]["parameters"]["delay"]["estimate"] == pytest.approx(0.5, abs=0.05)
     before, after = (report["error"][when]["gap_rmse_m"] for when in ("before", "after"))
     assert after < 0.4 * before
+    assert any(line.startswith("Data: ") for line in done.stderr.splitlines())
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image") >= 5 and 'src="http' not in page
     again = call("simulate", tmp_path / "platoon.csv", "--model", tmp_path / "model.yaml", "--out", tmp_path / "again")
@@ -165,8 +185,10 @@ def test_plot_and_effects(frame: pl.DataFrame, tmp_path: Path) -> None:
     ring = Path(__file__).resolve().parents[1] / "configs" / "ring.yaml"
     for source, options in ((path, ()), (ring, ("--seconds", "20"))):
         picture = tmp_path / f"{source.stem}.png"
-        done = call("plot", source, "--out", picture, *options)
+        done = call("plot", source, "--out", picture, "--html", *options)
         assert done.returncode == 0, done.stderr
+        page = picture.with_suffix(".html").read_text()
+        assert "http" not in page and '"marked": true' in page if source is ring else '"marked": false' in page
         assert picture.read_bytes().startswith(b"\x89PNG")
     listed = call("effects", env={**os.environ, "COLUMNS": "200"})
     assert "second_leader.weight" in listed.stdout

@@ -14,17 +14,24 @@ PACKAGE = ROOT / "idm_env"
 
 ALLOWED = {
     "types": set(),
-    "parameters": {"types"},
-    "effects": {"types", "parameters"},
+    "checks": set(),
+    "keep": set(),
+    "parameters": {"types", "checks"},
+    "effects": {"types", "parameters", "checks"},
     "roads": {"types"},
     "kernels": {"types", "parameters", "effects", "roads", "simulator"},
-    "simulator": {"types", "parameters", "effects", "roads", "kernels", "compiled"},
+    "history": {"types"},
+    "simulator": {"types", "parameters", "checks", "effects", "roads", "history", "kernels", "compiled"},
     "compiled": {"types", "parameters", "simulator"},
-    "report": set(),
-    "config": {"types", "parameters", "effects", "roads", "simulator"},
+    "fonts": set(),
+    "report": {"fonts", "keep"},
+    "progress": set(),
+    "diagrams": {"report", "fonts"},
+    "config": {"types", "parameters", "checks", "effects", "roads", "simulator", "keep"},
     "data": set(),
     "fitting": {
         "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "report", "metrics",
+        "checks", "keep", "progress", "diagrams",
     },
 }  # fmt: skip
 """What a part may import of the package; parts that are not named may import anything but what FORBIDDEN says."""
@@ -70,6 +77,19 @@ def test_the_simulator_does_not_know_the_model() -> None:
     """The word IDM does not occur in the simulator: behaviour is effects."""
     text = (PACKAGE / "simulator.py").read_text().replace("idm_env", "")
     assert "IDM" not in text.replace("Add IDM() or drop one", "") and "idm" not in text
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "discovery").glob("*.py")), ids=lambda p: p.name)
+def test_discovery_knows_no_effect_by_name(path: Path) -> None:
+    """What is known of an effect stands beside its equation; the compiled twin alone repeats equations."""
+    from idm_env.effects import CANDIDATES
+
+    words = {
+        word
+        for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Constant) and type(node.value) is str
+        for word in node.value.split(".")
+    }  # fmt: skip
+    assert path.name == "march.py" or not words & set(CANDIDATES)
 
 
 def test_importing_the_package_imports_no_torch_and_registers_the_environment() -> None:

@@ -6,7 +6,6 @@ thread; two-core figures are wall time.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,15 +13,15 @@ from typing import Any
 
 import torch
 
-from idm_env import kernels
-from idm_env.bench import fits, memory, peers, traffic
+from idm_env import keep, kernels
+from idm_env.bench import fits, memory, peers, tables, traffic
 from idm_env.bench.measure import Case, machine, measure
 from idm_env.kernels import dispatch
+from idm_env.progress import OnProgress, silent
+from idm_env.report import write_json
 
+OUTPUT = ("performance.json", "performance.png", "report.html")
 SIZES = (2_000, 20_000, 200_000, 2_000_000)
-BYTES = 4 * (3 + 6 + 4)
-"""What one step of one vehicle has to read (state, parameters) and write (state, acceleration) in float32."""
-
 Say = Callable[[str], None]
 
 
@@ -34,46 +33,74 @@ def run(
     compiled: bool = True,
     others: bool = True,
     verbose: bool = False,
-    say: Say = print,
+    say: Say | None = None,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
-    """Run everything, say a table, and write ``performance.json`` and ``performance.png`` into the folder ``out``.
+    """Run everything; write ``performance.json``, ``performance.png`` and ``report.html`` into the folder ``out``.
 
     ``sizes`` are numbers of vehicles, multiples of 50; ``compiled`` includes ``Simulator.compile()`` (which takes half
-    a minute to warm up); ``others`` includes SUMO and HighwayEnv; ``verbose`` says which path ran, and why. Returns
-    what the JSON holds. ValueError for sizes that are not multiples of 50.
+    a minute to warm up); ``others`` includes SUMO and HighwayEnv; ``verbose`` tells ``say`` which path ran, and why.
+    Returns what the JSON holds; ``tables.of`` makes tables of it. ValueError for sizes that are not multiples of 50.
     """
     for size in sizes:
         if size <= 0 or size % traffic.LANE:
             raise ValueError(f"size {size} is no multiple of {traffic.LANE}, the length of a lane. Take {SIZES}.")
+    if out is not None:
+        with keep.results(out, OUTPUT):  # what is in the way is told before anything is measured
+            pass
+    say = say or print
     threads = torch.get_num_threads()
     result: dict[str, Any] = {"machine": machine(), "physics": " ".join((traffic.__doc__ or "").split())}
-    say(f"{result['machine']}")
+    numba = kernels.available()
+
+    def lanes() -> dict[str, Any]:
+        done = {}
+        for i, n in enumerate(sizes):
+            tell(f"{n:,} vehicles, one core", i / len(sizes))
+            done[str(n)] = _lanes(n, rounds, compiled, verbose, say)
+        return done
+
+    # Each takes about as long as the number beside it, relative to the others.
+    jobs: list[tuple[str, float, Callable[[], object]]] = [
+        ("one_core", 4.0 * len(sizes), lanes),
+        ("growth", 0.0, lambda: growth(result["one_core"])),
+        ("memory_mb_100_steps", 2.0, lambda: memory.peaks(sizes, 100)),
+        ("gradient_error", 1.0, lambda: traffic.accuracy() if numba else {}),
+        ("fit", 6.0, lambda: fits.recorded_leaders(rounds) if numba else {}),
+        ("rings", 2.0, lambda: fits.rings() if numba else {}),
+        ("discovery", 6.0, lambda: fits.discovery() if numba else {}),
+    ]
+    if others:
+        jobs.append(("peers", 3.0, lambda: {"sumo": peers.sumo(), "highway": peers.highway()}))
+    jobs.append(("all_cores", 4.0, lambda: _all_cores(threads, max(sizes), rounds)))
+    whole = sum(weight for _, weight, _ in jobs)
+    progress, before, weight = on_progress or silent, 0.0, 0.0
+
+    def tell(words: str, share: float = 0.0) -> None:
+        progress("bench", round(100 * (before + share * weight) / whole), 100, words)
+
     try:
         torch.set_num_threads(1)
-        result["one_core"] = {str(n): _lanes(n, rounds, compiled, verbose, say) for n in sizes}
-        result["growth"] = growth(result["one_core"])
-        result["memory_mb_100_steps"] = memory.peaks(sizes, 100)
-        result["gradient_error"] = traffic.accuracy() if kernels.available() else {}
-        result["fit"] = fits.recorded_leaders(rounds) if kernels.available() else {}
-        result["rings"] = fits.rings() if kernels.available() else {}
-        result["discovery"] = fits.discovery() if kernels.available() else {}
-        if others:
-            result["peers"] = {"sumo": peers.sumo(), "highway": peers.highway()}
-        torch.set_num_threads(threads)
-        result["all_cores"] = {"threads": threads, **_lanes(max(sizes), rounds, False, False, lambda _: None)}
+        for name, weight, job in jobs:
+            tell(name.replace("_", " "))
+            result[name] = job()
+            before += weight
     finally:
         torch.set_num_threads(threads)
+    tell("gpu" if torch.cuda.is_available() else "the report")
     result["gpu"] = _gpu(sizes, rounds) if torch.cuda.is_available() else None
-    for line in summary(result):
-        say(line)
     if out is not None:
         from idm_env.bench.picture import draw
 
-        folder = Path(out)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "performance.json").write_text(json.dumps(result, indent=1))
-        draw(result, folder / "performance.png")
+        with keep.results(out, OUTPUT) as folder:
+            write_json(folder / "performance.json", result)
+            tables.write(folder, result, draw(result, folder / "performance.png"))
     return result
+
+
+def _all_cores(threads: int, vehicles: int, rounds: int) -> dict[str, Any]:
+    torch.set_num_threads(threads)
+    return {"threads": threads, **_lanes(vehicles, rounds, False, False, lambda _: None)}
 
 
 def _lanes(vehicles: int, rounds: int, compiled: bool, verbose: bool, say: Say) -> dict[str, Any]:
@@ -136,35 +163,4 @@ def growth(one_core: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def summary(result: dict[str, Any]) -> list[str]:
-    """Return the lines of the table."""
-    lines = ["", "CPU ms per step, one core (min; median), and how many times diffidm's min"]
-    for size, part in result["one_core"].items():
-        lines.append(f"{int(size):,} vehicles (triad {part['triad_gb_s']:.1f} GB/s)")
-        lines += _rows(part["times_ms_per_step"], "cpu")
-    every = result["all_cores"]
-    lines.append(f"wall ms per step, {every['threads']} threads (triad {every['triad_gb_s']:.1f} GB/s)")
-    lines += _rows(every["times_ms_per_step"], "wall")
-    size = max(int(n) for n in result["one_core"])
-    for name in ("kernel forward", "kernel forward, one step per call"):
-        if name in every["times_ms_per_step"]:
-            rate = size * BYTES / every["times_ms_per_step"][name]["wall_min_ms"] / 1e6
-            lines.append(f"  {name}: {BYTES} B per vehicle-step make {rate:.1f} GB/s, {rate / every['triad_gb_s']:.0%}")
-    for name in ("growth", "memory_mb_100_steps", "gradient_error", "fit", "rings", "discovery", "peers", "gpu"):
-        if result.get(name):
-            lines.append(f"{name}: {json.dumps(result[name])}")
-    return lines
-
-
-def _rows(times: dict[str, dict[str, float]], clock: str) -> list[str]:
-    rows = []
-    for name, t in times.items():
-        theirs = times.get("diffidm forward+backward" if "backward" in name else "diffidm forward")
-        ratio = (
-            "" if theirs is None or name == "triad" else f"{theirs[f'{clock}_min_ms'] / t[f'{clock}_min_ms']:6.1f} ×"
-        )
-        rows.append(f"  {name:36s} {t[f'{clock}_min_ms']:9.3f} {t[f'{clock}_median_ms']:9.3f} {ratio}")
-    return rows
-
-
-__all__ = ["SIZES", "growth", "run", "summary"]
+__all__ = ["SIZES", "growth", "run"]

@@ -5,15 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from idm_env import keep
+from idm_env import report as page
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    """Draw forward and forward + backward, nanoseconds of one core per vehicle-step, with the triad as the floor."""
-    import matplotlib
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
+def draw(result: dict[str, Any], path: Path) -> page.Block:
+    """Draw forward and forward + backward, nanoseconds of one core per vehicle-step, with the triad as the floor.
 
-    figure, panels = plt.subplots(1, 2, figsize=(10, 4), sharey=True)
+    Returns the picture for a page.
+    """
+    figure, grid = page.figure(1, 2, size=(10.0, 4.0))
+    panels = grid[0]
+    panels[1].sharey(panels[0])
     sizes = [int(n) for n in result["one_core"]]
     for panel, kind in zip(panels, ("forward", "forward+backward"), strict=True):
         for name in ("diffidm", "eager", "compiled", "kernel"):
@@ -30,6 +33,5 @@ def draw(result: dict[str, Any], path: Path) -> None:
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("ns per vehicle-step")
     panels[1].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    keep.write(path, lambda beside: figure.savefig(beside, dpi=120))
+    return page.picture(figure, "Time of one core per vehicle-step over the number of vehicles; lower is faster.")

@@ -7,6 +7,8 @@ import polars as pl
 from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
 from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TIDY, TRACK
 
+LARGEST_ID = 2.0**53
+"""Floats tell whole numbers apart below this only."""
 NO_LEADER = ("", "0", "-1", "nan", "none", "null", "na")
 MISSING_WORDS = ("", "na", "n/a", "nan", "null", "none", "-", "inf", "-inf", "+inf", "infinity", "-infinity")
 
@@ -26,8 +28,22 @@ def check_columns(frame: pl.DataFrame, source: str) -> None:
             raise DataError(f"{source}: column {name!r} is missing and {guess!r} looks like it; rename or remove it.")
 
 
-def identifiers(frame: pl.DataFrame) -> pl.DataFrame:
-    """Return the frame with run_id, vehicle_id and leader_id as strings; run_id "0" where the column is absent."""
+def exact(column: pl.Series, source: str) -> None:
+    """Raise DataError if identifiers are floats so large that neighbouring integers are one float."""
+    largest = column.fill_nan(None).abs().max()
+    if isinstance(largest, float) and largest >= LARGEST_ID:
+        raise DataError(
+            f"{source}: {column.name} = {largest:.17g} is a float beyond 2^53, where several identifiers become one; "
+            "write identifiers as integers or text."
+        )
+
+
+def identifiers(frame: pl.DataFrame, source: str = "table") -> pl.DataFrame:
+    """Return the frame with run_id, vehicle_id and leader_id as strings; run_id "0" where the column is absent.
+
+    Raises:
+        DataError: If identifiers are floats so large that neighbouring integers are one float.
+    """
     if "run_id" not in frame.columns:
         frame = frame.with_columns(pl.lit("0").alias("run_id"))
     changes = []
@@ -36,6 +52,7 @@ def identifiers(frame: pl.DataFrame) -> pl.DataFrame:
             continue
         column = pl.col(name)
         if frame[name].dtype.is_float():
+            exact(frame[name], source)
             # A csv column of integers with empty cells arrives as floats: 12.0 is vehicle 12.
             column = pl.when(column.round() == column).then(column.cast(pl.Int64, strict=False).cast(pl.String))
             column = column.otherwise(pl.col(name).fill_nan(None).cast(pl.String))

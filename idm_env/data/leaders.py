@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
+from idm_env.data import units
 from idm_env.data.clean import NO_LEADER
 from idm_env.data.errors import DataError, Repair, listed
 from idm_env.data.schema import TRACK
@@ -78,7 +79,7 @@ def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     with them. Otherwise gap = leader's position − leader's length − position, around the ring where there is one.
 
     Raises:
-        DataError: If most leaders are behind their followers.
+        DataError: If most leaders are behind their followers, or gaps and positions are in different units.
     """
     if "gap_m" not in frame.columns:
         frame = frame.with_columns(pl.lit(None, pl.Float64).alias("gap_m"))
@@ -92,6 +93,7 @@ def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
         headway = pl.when(ring.is_not_null()).then(headway % ring).otherwise(headway)
     joined = joined.with_columns(headway.alias("headway"))
     _check_ahead(joined, source)
+    units.check_gaps(joined, source)
     gap = pl.when(pl.col("gap_measured")).then(pl.col("gap_m")).otherwise(pl.col("headway") - pl.col("lead_length"))
     gap = pl.when(pl.col("leader_id").is_not_null()).then(gap)
     joined = joined.with_columns(gap.alias("gap_m")).drop("lead_position", "lead_length", "headway")

@@ -59,7 +59,7 @@ def read(path: str | Path, *, layout: str = "auto") -> tuple[pl.DataFrame, list[
     try:
         if layout == "openacc" or (layout == "auto" and above is not None):
             above = openacc.HEADER_LINES if above is None else above
-            table = _table(path, extension, skip=above)
+            table = _once(_table(path, extension, skip=above), path.name)
             return openacc.read(table, lines[:above], path.name.split(".")[0], path.name)
         return _plain_layout(_table(path, extension), layout, path.name)
     except pl.exceptions.PolarsError as error:
@@ -119,7 +119,7 @@ def _pieces(path: Path, extension: str) -> Iterator[pl.DataFrame]:
 
 
 def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.DataFrame, list[Repair]]:
-    table = table.rename({name: name.strip() for name in table.columns})
+    table = _once(table, source)
     if layout == "ngsim" or (layout == "auto" and ngsim.matches(table.columns)):
         return ngsim.read(table, source)
     if layout == "auto" and not tidy.matches(table.columns):
@@ -135,6 +135,17 @@ def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.Dat
             f"needs vehicle_id, time_s and position_m.{cure}"
         )
     return tidy.read(table)
+
+
+def _once(table: pl.DataFrame, source: str) -> pl.DataFrame:
+    """Return the table with names without blanks around them, or raise DataError where one is there twice."""
+    names = [name.strip() for name in table.columns]
+    # polars numbers the repeats of a csv's columns: x, x_duplicated_0
+    plain = [re.sub(r"_duplicated_\d+$", "", name).strip() for name in names]
+    for name, base in zip(names, plain, strict=True):
+        if names.count(name) > 1 or (name != base and base in names):
+            raise DataError(f"{source}: column {base!r} is there twice; remove or rename one of them.")
+    return table.rename(dict(zip(table.columns, names, strict=True)))
 
 
 def _checked(path: Path) -> tuple[str, list[str]]:

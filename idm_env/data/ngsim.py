@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import polars as pl
 
+from idm_env.data.clean import exact
 from idm_env.data.errors import DataError, Repair, missing_column
 
 FOOT_M = 0.3048
@@ -39,13 +40,14 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
     """Return the tidy table of an NGSIM table, in SI units.
 
     Raises:
-        DataError: If a column that is needed is missing.
+        DataError: If a column that is needed is missing, or identifiers are floats too large to be told apart.
     """
     frame = frame.rename({name: _plain(name) for name in frame.columns})
     for name in ("vehicle_id", "local_y"):
         if name not in frame.columns:
             raise missing_column(name, frame.columns, source)
-    frame = frame.with_columns(_number(frame, name) for name in (*_NUMBERS, "preceding") if name in frame.columns)
+    names = [name for name in (*_NUMBERS, "preceding") if name in frame.columns]
+    frame = frame.with_columns(_number(frame, name, source) for name in names)
     run = (
         pl.col("location").cast(pl.String).str.strip_chars().fill_null("ngsim") if "location" in frame.columns else None
     )
@@ -67,12 +69,16 @@ def _plain(name: str) -> str:
     return name.strip().lower().replace(" ", "_")
 
 
-def _number(frame: pl.DataFrame, name: str) -> pl.Expr:
+def _number(frame: pl.DataFrame, name: str, source: str) -> pl.Expr:
     column = pl.col(name)
+    whole = name in ("vehicle_id", "frame_id", "global_time", "total_frames", "lane_id", "preceding")
+    if whole and frame[name].dtype.is_integer():
+        return column.cast(pl.Int64, strict=False)
     if frame[name].dtype == pl.String:
         column = column.str.replace_all(",", "").str.strip_chars()
-    whole = name in ("vehicle_id", "frame_id", "global_time", "total_frames", "lane_id", "preceding")
     column = column.cast(pl.Float64, strict=False)
+    if name in ("vehicle_id", "preceding"):
+        exact(frame.select(column)[name], source)
     return (column.round().cast(pl.Int64, strict=False) if whole else column).alias(name)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from idm_env.data import clean, clock, leaders, schema, speeds, units
+from idm_env.data import clean, clock, directions, leaders, schema, speeds, units
 from idm_env.data.errors import DataError, Repair
 
 
@@ -23,8 +23,9 @@ def prepare(
         return result[0]
 
     clean.check_columns(frame, source)
-    frame = then(clean.numbers(clean.identifiers(frame), source))
+    frame = then(clean.numbers(clean.identifiers(frame, source), source))
     frame = then(clean.without_empty(_with_ring(frame, ring_length, source), source))
+    frame = then(directions.one_way(frame))
     frame = then(clean.ordered(frame, source))
     units.check(frame, source)
     frame = then(units.implausible(frame))

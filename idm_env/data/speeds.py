@@ -43,10 +43,14 @@ def lengths(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     if filled:
         text = f"{filled} missing values of length_m were taken from other rows of the same vehicle."
         repairs.append(Repair("length filled", filled, text))
-    if without:
-        text = f"{without} vehicles have no length_m; {DEFAULT_LENGTH_M} m is assumed."
-        repairs.append(Repair("length assumed", without, text))
+    repairs += length_assumed(without)
     return frame.with_columns(pl.col("length_m").fill_null(DEFAULT_LENGTH_M)), repairs
+
+
+def length_assumed(without: int) -> list[Repair]:
+    """Return what is to be said of so many vehicles without a length."""
+    text = f"{without} vehicles have no length_m; {DEFAULT_LENGTH_M} m is assumed."
+    return [Repair("length assumed", without, text)] if without else []
 
 
 def complete(frame: pl.DataFrame, steps: dict[str, float]) -> tuple[pl.DataFrame, list[Repair]]:

@@ -11,6 +11,7 @@ from idm_env.data.schema import HIGHEST_SPEED_MPS, LONGEST_LENGTH_M, LOWEST_SPEE
 
 LONGEST_MEDIAN_LENGTH_M = 12.0
 LONGEST_STEP_S = 2.0
+FOOT = 3.281
 # speed_mps divided by the change of position_m over the change of time_s, if one of the three is in another unit
 _MISTAKES = (
     (3.6, "speed_mps looks like km/h; divide it by 3.6"),
@@ -86,6 +87,26 @@ def _check_ratio(frame: pl.DataFrame, source: str, step: float | None) -> None:
         raise DataError(
             f"{source}: speed_mps is {ratio:.2f} times the change of position_m per second; check their units."
         )
+
+
+def check_gaps(joined: pl.DataFrame, source: str) -> None:
+    """Raise DataError if measured gaps are in feet and positions in metres, or the other way round.
+
+    ``joined`` has gap_m, gap_measured, headway (front bumper to front bumper, from positions) and lead_length. Gaps of
+    other origin than positions (radar, antennas) may differ from theirs by metres, but not by one factor.
+    """
+    pairs = joined.filter(pl.col("gap_measured")).select(
+        pl.col("gap_m").alias("given"), (pl.col("headway") - pl.col("lead_length")).alias("derived")
+    )
+    pairs = pairs.filter((pl.col("given") > 2.0) & (pl.col("derived") > 2.0))
+    if pairs.height < 20:
+        return
+    low, ratio, high = (pairs.select((pl.col("given") / pl.col("derived")).quantile(q)).item() for q in (0.2, 0.5, 0.8))
+    for factor, wrong in ((FOOT, "gap_m looks like feet"), (1.0 / FOOT, "position_m looks like feet")):
+        if 0.9 * factor < low <= high < 1.1 * factor:
+            raise DataError(
+                f"{source}: gap_m is {ratio:.2f} times the gap between the positions; {wrong}: multiply it by 0.3048."
+            )
 
 
 def implausible(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:

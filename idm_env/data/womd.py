@@ -111,6 +111,16 @@ def scenarios(path: str | Path) -> Iterator[Scenario]:
         raise DataError(f"{path.name} has an unknown extension; use .json, .json.gz or .tfrecord.")
 
 
+def count(path: str | Path) -> int:
+    """Return how many scenarios a file has, from the headers of its records; 1 where it cannot tell."""
+    path = Path(path)
+    if not path.is_file() or ".tfrecord" not in path.name.lower() or path.name.lower().endswith((".json", ".json.gz")):
+        return 1
+    from idm_env.data import womd_record
+
+    return max(1, womd_record.count(path))
+
+
 def read_json(path: str | Path) -> Scenario:
     """Return the scenario of one JSON file. DataError if it is no such file."""
     path = Path(path)
@@ -118,13 +128,15 @@ def read_json(path: str | Path) -> Scenario:
     try:
         with opener(path, "rt", encoding="utf-8") as file:
             content = json.load(file)
-    except (OSError, EOFError, ValueError) as error:
+    except (OSError, EOFError, ValueError, RecursionError) as error:
         raise DataError(f"{path.name} cannot be read ({str(error)[:120]}); is it complete JSON?") from None
     if not isinstance(content, dict) or not content.get("objects"):
         raise DataError(f"{path.name} has no 'objects'; it must be a scenario in the layout of Nocturne or GPUDrive.")
     try:
         return _scenario(content, path.name)
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        if isinstance(error, DataError):
+            raise
         text = f"{path.name} lacks what a scenario needs ({type(error).__name__}: {error}); is it in Nocturne's layout?"
         raise DataError(text) from None
 

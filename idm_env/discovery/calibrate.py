@@ -11,19 +11,22 @@ from idm_env.discovery.solve import BOUNDS, NAMES
 from idm_env.fitting.batch import windows
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import fit
+from idm_env.progress import OnProgress, silent
 
 LONGEST_S = 180.0
 """Longer episodes are simulated in windows of this length, each from its own measured state."""
 
 
-def calibrate(records: Records, by: str, centre: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+def calibrate(
+    records: Records, by: str, centre: np.ndarray, on_progress: OnProgress = silent
+) -> tuple[np.ndarray, dict[str, Any]]:
     """Calibrate IDM to these records and return log θ [groups, 5], and what a report says of it.
 
     Free simulation behind the replayed measured leader, Levenberg–Marquardt on the spacing with forward-mode Jacobians
     of the simulator (``idm_env.fitting``). Groups without a record here keep ``centre`` [5].
     """
     items = windows(records.episodes, LONGEST_S)
-    found = fit(items, by=by, loss="mse", starts=1, iterations=25, substeps=1)
+    found = fit(items, by=by, loss="mse", starts=1, iterations=25, substeps=1, on_progress=on_progress)
     error, _ = errors(found.problem, found.own, found.shared)
     order = [found.names.index(f"idm.{name}") for name in NAMES]
     own = np.log(found.own.numpy()[:, order])

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 
 from idm_env.discovery import model as terms
 from idm_env.discovery import noise as noises
 from idm_env.discovery import places
-from idm_env.discovery.checkpoint import Checkpoint
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out
 from idm_env.discovery.solve import NAMES, Prior, Solution, Task, centred, finish, linearise, solve, with_noise
-from idm_env.effects import IDM
-
-OnProgress = Callable[[str, str, int, int], None]
-"""Called with the stage, the current candidate, candidates done and candidates in all."""
+from idm_env.effects import ALL, IDM
+from idm_env.effects.base import Sought
+from idm_env.keep import Store
+from idm_env.progress import OnProgress
 
 POPULATION = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
 WIDTH = 0.6
@@ -44,7 +44,7 @@ class Search:
     task: Task
     names: Sequence[str]
     located: bool
-    saved: Checkpoint
+    saved: Store
     on_progress: OnProgress
     base: Model = field(default_factory=Model)
 
@@ -66,14 +66,14 @@ class Search:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [runs]."""
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
-        wanted = [terms.simple(n) for n in self.names if n in terms.STARTS and n not in have]
+        wanted = [terms.simple(n) for n in self._sought("anywhere") if n not in have]
         found = []
         responses = places.respond(self.task, solution)
         for i, term in enumerate(wanted):
-            self.on_progress(f"round {number}", term.label, i, len(wanted) + 12)
+            self.on_progress(f"round {number}", i, len(wanted) + 12, term.label)
             found.append(self._nested(solution, term, before, f"{number}/{term.label}"))
         for i, scored in enumerate(self._places(solution, responses, before, number)):
-            self.on_progress(f"round {number}", scored.term.label, len(wanted) + i, len(wanted) + 12)
+            self.on_progress(f"round {number}", len(wanted) + i, len(wanted) + 12, scored.term.label)
             found.append(scored)
         return found, before
 
@@ -97,7 +97,7 @@ class Search:
     def pair(self, solution: Solution, names: tuple[str, str], before: np.ndarray, number: int) -> Scored:
         """Score two effects of the catalogue at once; the term that is named is the second."""
         first, second = (terms.simple(n) for n in names)
-        self.on_progress(f"round {number}", f"{first.label} + {second.label}", 0, 1)
+        self.on_progress(f"round {number}", 0, 1, f"{first.label} + {second.label}")
         base = replace(solution, model=solution.model.adding(first))
         # Strong starts: along the direction in which they cancel, weak ones see nothing to improve.
         starts = [np.concatenate([solution.values, a, [0.3]]) for a in first.starts]
@@ -115,18 +115,22 @@ class Search:
         model = solution.model.adding(term)
         kept = self.saved.get(key)
         if kept is not None:
-            theta, values = kept["theta"], kept["values"]
+            theta, values = kept["theta"].numpy(), kept["values"].numpy()
             task = centred(self.task, theta)
             linear = linearise(task, model, theta, values)
-            best = finish(task, model, theta, values, linear, float(kept["cost"]))
+            best = finish(task, model, theta, values, linear, kept["cost"])
         else:
             starts = starts or [np.append(solution.values, s) for s in term.starts]
             first = [solve(self.task, model, solution.theta, s, iterations=5) for s in starts]
             best = min(first, key=lambda s: s.cost)
             best = solve(self.task, model, best.theta, best.values, iterations=iterations)
-            self.saved.put(key, theta=best.theta, values=best.values, cost=np.array(best.cost))
+            arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
+            self.saved.put(key, {**arrays, "cost": float(best.cost)})
         gains = 0.5 * np.log(before / held_out(self.task, best))
         return Scored(term, best, gains)
+
+    def _sought(self, what: Sought) -> list[str]:
+        return [n for n in self.names if ALL[n].sought == what]
 
     # -- where and when ----------------------------------------------------------------------------------------------
 
@@ -177,12 +181,12 @@ class Search:
             )
 
         position = _knots(responses.coordinates["position"], 80.0, 48, period)
-        if "grade" in self.names:
-            curve_of(terms.grade(*position, period), "position")
-        if "speed_zone" in self.names:
-            interval_of("desired_speed", "position", named="speed_zone")
-        if "regime_shift" in self.names:
-            interval_of("time_gap", "time", open_end=True, named="regime_shift")
+        for name in self._sought("profile"):
+            curve_of(terms.unknown_profile(name, *position, period), "position")
+        for name in self._sought("interval"):
+            interval_of(ALL[name].changes, "position", named=name)
+        for name in self._sought("step"):
+            interval_of(ALL[name].changes, "time", open_end=True, named=name)
         if not self.located:
             return result
         for what in ("time_gap", "accel_and_decel", "acceleration"):
@@ -213,12 +217,11 @@ class Search:
 
 
 def _interval_term(what: str, coordinate: str, found: places.Found, open_end: bool, named: str, period: float) -> Term:
-    if named == "speed_zone":
-        # The response is that of (v/v0)⁴, whose factor f^−4 is known to all orders.
-        factor = float(np.clip(1.0 - 4.0 * found.amount, 0.3, 100.0)) ** -0.25
-        return terms.speed_zone(found.begin, found.end, min(max(factor, 0.25), 1.9), period)
-    if named == "regime_shift":
-        return terms.regime_shift(found.begin, float(np.clip(found.amount, -0.6, 1.5)))
+    if named:
+        strength = ALL[named].strength_of(found.amount)
+        if open_end:
+            return terms.placed(named, strength, found.begin)
+        return terms.placed(named, strength, found.begin, found.end, period=period)
     limit = 3.0 if what == "acceleration" else 0.6
     amount = float(np.clip(found.amount, -limit, limit))
     term = terms.interval(what, coordinate, found.begin, 1e6 if open_end else found.end, amount,

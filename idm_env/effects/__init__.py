@@ -4,23 +4,28 @@ and a candidate in discovery.
 
 from __future__ import annotations
 
+import sys
+from dataclasses import fields
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from idm_env.checks import nearest, shown
 from idm_env.effects.actions import Control, Replay
 from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
 from idm_env.effects.base import CarFollowing, Effect
 from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
-from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit
+from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
 from idm_env.effects.neighbours import BrakeLight, Follower, Lateral, LeaderAcceleration, SecondLeader
 from idm_env.effects.noise import Noise
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.surroundings import Drag, Grade
-from idm_env.parameters import nearest
 
 ALL: dict[str, type[Effect]] = {
     effect.kind: effect
     for effect in (
         IDM,
         Brakes,
+        Traction,
         Control,
         Replay,
         Delay,
@@ -74,13 +79,33 @@ CANDIDATES: tuple[str, ...] = (
 def make(kind: str, **choices: object) -> Effect:
     """Build an effect from its name in ``ALL`` and its static choices; ValueError names the nearest known one."""
     if kind not in ALL:
-        raise ValueError(f"unknown effect '{kind}'.{nearest(kind, ALL)}")
+        raise ValueError(f"unknown effect {shown(kind)}.{nearest(str(kind), ALL)}")
     cls = ALL[kind]
-    known = list(cls.__dataclass_fields__)
-    for choice in choices:
+    hints = get_type_hints(cls)
+    known = {field.name: hints[field.name] for field in fields(cls)}
+    for choice, value in choices.items():
         if choice not in known:
-            raise ValueError(f"effect '{kind}' has no choice '{choice}'.{nearest(choice, known)}")
+            raise ValueError(f"effect '{kind}' has no choice {shown(choice)}.{nearest(choice, known)}")
+        if not _fits(value, known[choice]):
+            hint = cls.__dataclass_fields__[choice].type
+            raise ValueError(f"effect '{kind}': {choice} = {shown(value)} must be of the kind {hint}, and finite.")
     return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in choices.items()})  # type: ignore[arg-type]
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Tell whether a static choice is of the kind that its effect declares."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is tuple:
+        return isinstance(value, (list, tuple)) and all(_fits(x, inner[0]) for x in value)
+    if origin is Literal:
+        return isinstance(value, str) and value in inner
+    if inner:  # this or that
+        return any(_fits(value, each) for each in inner)
+    if isinstance(value, bool) or hint is bool:
+        return isinstance(value, bool) and hint is bool
+    if hint is float:
+        return isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
+    return isinstance(value, hint)
 
 
 __all__ = [
@@ -114,5 +139,7 @@ __all__ = [
     "SecondLeader",
     "SpeedDependentGap",
     "SpeedZone",
+    "Traction",
     "make",
+    "unspoken",
 ]

@@ -20,6 +20,7 @@ class Control(Effect):
     """
 
     kind: ClassVar[str] = "control"
+    adds: ClassVar[bool] = False
     rank: ClassVar[int] = 35
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:

@@ -1,7 +1,8 @@
-"""What the vehicle can: asymmetry, action points, power, lag and brakes (hook ``limit``, chained by rank)."""
+"""What the vehicle can: asymmetry, action points, power, lag, brakes and tyres (hook ``limit``, chained by rank)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -19,8 +20,20 @@ class Asymmetry(Effect):
     """Weaker acceleration than braking: ``a > 0: (1 − k) a``, ``a < 0: (1 + k) a`` (Newell; Laval and Leclercq)."""
 
     kind: ClassVar[str] = "asymmetry"
+    title: ClassVar[str] = "asymmetry"
+    equation: ClassVar[str] = "a > 0: (1 − k) a, a < 0: (1 + k) a"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers accelerate harder and brake softer than IDM",
+        "drivers accelerate softer and brake harder than IDM",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("brake_light", "max_accel and comfort_decel together")
+    told_by: ClassVar[str] = (
+        "accelerating and braking on a free road, where no leader sets the pace, tells asymmetry from brake lights"
+    )
     rank: ClassVar[int] = 10
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("strength", "k", "1", 0.3, -0.9, 0.9, null=0.0),)
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("strength", "k", "1", 0.3, -0.9, 0.9, null=0.0, starts=(0.05,)),
+    )
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return a − k |a|."""
@@ -35,6 +48,19 @@ class ActionPoint(Effect):
     """
 
     kind: ClassVar[str] = "action_point"
+    adds: ClassVar[bool] = False
+    title: ClassVar[str] = "action points"
+    equation: ClassVar[str] = "a is held until the wanted one differs by Δa"
+    wording: ClassVar[tuple[str, str]] = (
+        "",
+        "drivers hold an acceleration until a clearly different one is wanted, where IDM adjusts all the time",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("lag", "leader_acceleration")
+    told_by: ClassVar[str] = (
+        "accelerations measured at 10 Hz or more (steps, and stretches without change) tell action points from lag"
+    )
+    changes: ClassVar[str] = "response"
+    wind_up_s: ClassVar[float] = 2.0
     rank: ClassVar[int] = 30
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "Δa", "m/s²", 0.3, 0.0, 2.0, null=0.0, role="threshold", starts=(0.15, 0.4)),
@@ -50,10 +76,30 @@ class PowerLimit(Effect):
     """``a ≤ (P/m) / v`` with specific power P/m (W/kg); absent at its null, a power that no car has."""
 
     kind: ClassVar[str] = "power_limit"
+    adds: ClassVar[bool] = False
+    title: ClassVar[str] = "power limit"
+    equation: ClassVar[str] = "a ≤ (P/m) / v"
+    wording: ClassVar[tuple[str, str]] = (
+        "vehicles accelerate less at high speed than IDM, as an engine's power allows",
+        "",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("drag", "desired_speed")
+    told_by: ClassVar[str] = "free starts from standstill to above 25 m/s tell power from drag and v0"
     rank: ClassVar[int] = 40
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("power", "P/m", "W/kg", 15.0, 2.0, 100.0, null=1e5, role="threshold", starts=(8.0, 16.0)),
+        Parameter(
+            "power",
+            "P/m",
+            "W/kg",
+            15.0,
+            2.0,
+            100.0,
+            null=1e5,
+            role="threshold",
+            starts=(10.0, 18.0),
+            searched=(2.0, 60.0),
+        ),
     )
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -69,10 +115,22 @@ class Lag(Effect):
     """
 
     kind: ClassVar[str] = "lag"
+    adds: ClassVar[bool] = False
+    title: ClassVar[str] = "response lag"
+    equation: ClassVar[str] = "τ dA/dt = a − A"
+    wording: ClassVar[tuple[str, str]] = (
+        "",
+        "vehicles take longer than IDM to reach the acceleration that is wanted",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("delay", "leader_acceleration with the other sign")
+    told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells lag from delay"
+    latency: ClassVar[bool] = True
+    changes: ClassVar[str] = "response"
+    wind_up_s: ClassVar[float] = 2.0
     rank: ClassVar[int] = 50
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("lag", "τ", "s", 0.5, 0.0, 3.0, null=0.0, starts=(0.3, 0.8)),
+        Parameter("lag", "τ", "s", 0.5, 0.0, 3.0, null=0.0, starts=(0.3, 0.8), searched=(0.0, 2.0)),
     )
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -94,6 +152,7 @@ class Brakes(Effect):
     """
 
     kind: ClassVar[str] = "brakes"
+    adds: ClassVar[bool] = False
     rank: ClassVar[int] = 60
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (Parameter("max_decel", "b_max", "m/s²", 9.0, 1.0, 15.0, role="shape"),)
@@ -110,3 +169,32 @@ class Brakes(Effect):
         above = torch.relu(accel - floor)
         part = above.clamp_max(self.width)
         return floor + part * part * (2.0 * self.width - part) * (1.0 / self.width**2) + (above - part)
+
+
+@dataclass(frozen=True)
+class Traction(Effect):
+    """Tyres hold no more than ``a ≤ μ g``, whatever was added: the last word on every acceleration.
+
+    The default is a friction coefficient of about 1, dry asphalt (Rajamani 2012, Vehicle Dynamics and Control, ch. 13).
+    A simulator with an effect that can add to what the driver wants has this one without being told; it is named to
+    give another maximum, or its null to be rid of it. Below the maximum it changes no bit; above, its gradient is zero.
+    """
+
+    kind: ClassVar[str] = "traction"
+    rank: ClassVar[int] = 90
+    sees_truth: ClassVar[bool] = True
+    adds: ClassVar[bool] = False
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("max_accel", "μ g", "m/s²", 10.0, 1.0, 15.0, null=1e5, role="threshold"),
+    )
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the acceleration that the tyres allow."""
+        return accel.clamp_max(p["max_accel"])  # type: ignore[arg-type]
+
+
+def unspoken(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Return the physics that these effects need and do not name: tyres, where something adds accelerations."""
+    effects = tuple(effects)
+    named = any(isinstance(effect, Traction) for effect in effects)
+    return (Traction(),) if not named and any(effect.adds for effect in effects) else ()

@@ -23,7 +23,7 @@ class Noise(Effect):
 
     kind: ClassVar[str] = "noise"
     sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("sigma", "σ", "m/s²", 0.1, 0.0, 5.0, null=0.0),)
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("sigma", "σ", "m/s²", 0.1, 0.0, 2.0, null=0.0),)
     correlated: bool = False
 
     @property

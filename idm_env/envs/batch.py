@@ -24,12 +24,13 @@ _NORMALS_AT_ONCE = 1 << 12
 
 
 class Outcome(NamedTuple):
-    """What a step gives: observations ``(n, agents, features)``, the others ``(n, agents)``."""
+    """What a step gives: observations ``(n, agents, features)``, the others ``(n, agents)``, by name in ``details``."""
 
     observation: Tensor
     reward: Tensor
     terminated: Tensor
     truncated: Tensor
+    details: Mapping[str, Tensor]
 
 
 class Batch:
@@ -40,10 +41,8 @@ class Batch:
         self.task = made.task
         self.count = count
         self.params: Params = self.task.params(made.dtype, made.device)
-        self.advance = advance_of(self.task.simulator, made.output, made.device, made.dtype)
-        self._run = getattr(self.advance, "run", None)
-        limits = [x for x in (made.limit, self.task.horizon) if x is not None]
-        self.limit = min(limits) if limits else None
+        self.advance = advance_of(self.task.simulator, made.output, made.device)
+        self.limit = made.limit
         self.seeds = np.zeros(count, dtype=np.int64)
         self.episodes = np.full(count, -1, dtype=np.int64)
         self.world: World | None = None
@@ -87,11 +86,11 @@ class Batch:
 
     def _begin(self, draw: Draw) -> World:
         if not self.task.warmup_pool:
-            return self.task.reset(draw, self.params, self._run)
+            return self.task.reset(draw, self.params)
         if self._pool is None:
             size, device = self.task.warmup_pool, self.settings.device
             seeds = torch.arange(size, device=device)
-            self._pool = self.task.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params, self._run)
+            self._pool = self.task.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params)
         picked = (draw.uniforms(_POOL_STREAM, 1, torch.float64).squeeze(-1) * self.task.warmup_pool).long()
         return _map(lambda pooled: pooled[picked], self._pool)
 
@@ -133,16 +132,39 @@ class Batch:
         assert before is not None
         normals = self._normals(before.state)
         command = None if action is None else task.command(action)
-        after = task.step(before, command, normals, self.params, live=live, advance=self.advance)
+        given = None if command is None else task.limit(before, command)
+        after = task.step(before, given, normals, self.params, live=live, advance=self.advance, limited=True)
         if command is None:
             command = after.state.speed.new_zeros(self.count, len(task.agents))
         elif live is not None:
             command = torch.where(live, command, 0.0)
         self.world = after
         terminated, truncated = task.ended(after)
+        details = self._details(after, None if action is None else command, given, terminated)
         if self.limit is not None:
             truncated = truncated | (after.state.step >= self.limit).unsqueeze(-1)
-        return Outcome(task.observe(after), task.reward(before, command, after), terminated, truncated)
+        reward = task.reward(before, command, after, terminated)
+        return Outcome(task.observe(after), reward, terminated, truncated, details)
+
+    def _details(
+        self, after: World, command: Tensor | None, given: Tensor | None, crashed: Tensor
+    ) -> dict[str, Tensor]:
+        """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
+        task, asked, found = self.task, self.settings.info, dict[str, Tensor]()
+        if "accel" in asked:
+            # A copy: what is told of a step is not the state itself.
+            found["accel"] = task.pick(after.state.accel).clone()
+        if "command" in asked:
+            shape = (self.count, len(task.agents))
+            found["command"] = after.state.accel.new_full(shape, torch.nan) if command is None else command
+        if "failsafe" in asked:
+            if command is None or given is None or not task.failsafe:
+                found["failsafe"] = torch.zeros_like(crashed)
+            else:
+                found["failsafe"] = given < command
+        if "crash" in asked:
+            found["crash"] = crashed
+        return found
 
     def detach(self) -> None:
         """Cut the graph behind the present state, for truncated back-propagation."""

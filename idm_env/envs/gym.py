@@ -3,20 +3,58 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import inspect
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from torch import Tensor
 
 from idm_env.envs.batch import Batch, Outcome
-from idm_env.envs.settings import RENDER_MODES, settings
+from idm_env.envs.info import begun, single
+from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_box, action_tensor, observation_box
+from idm_env.tasks import Task
 from idm_env.types import Params, State
 
+LIMIT = "max_episode_steps"
 
-class DiffIDMEnv(gymnasium.Env):
+
+def asked_of_make() -> int | None:
+    """Return the ``max_episode_steps`` given to a ``gym.make`` that is making this environment; None if there is none.
+
+    Gymnasium keeps it for its own TimeLimit and tells the environment nothing, but a task must know the end: starts in
+    a record, the cost of a crash and whether the record is long enough all depend on it. So it is read where it stands.
+    """
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_code is not gymnasium.make.__code__:
+        frame = frame.f_back
+    if frame is None:
+        return None
+    given = frame.f_locals.get(LIMIT)
+    return getattr(frame.f_locals.get("env_spec"), LIMIT, None) if given is None else given
+
+
+class TrueSpec:
+    """Mixin: an environment whose ``spec`` says after how many steps its episodes are cut off."""
+
+    task: Task
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium made this environment from, with the ``max_episode_steps`` in force."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = None if spec is None else dataclasses.replace(spec, max_episode_steps=self.task.horizon)
+
+
+class DiffIDMEnv(TrueSpec, gymnasium.Env):
     """One environment: ``gym.make("DiffIDM-v0", task="ring", …)``.
 
     ``task`` is one of ``idm_env.tasks.TASKS``; its docstring defines the task, and its fields are further keywords,
@@ -26,13 +64,17 @@ class DiffIDMEnv(gymnasium.Env):
     With ``output="numpy"`` observations are arrays and rewards floats. With ``output="torch"`` they are tensors that
     carry the graph from actions, parameters and the initial state; ``detach()`` cuts it. Actions are a float32 box of
     [−1, 1], scaled by ``max_command``; values beyond are clipped and have no gradient; ``None`` as an action leaves
-    all vehicles to their drivers.
+    all vehicles to their drivers. ``info`` tells commands, what became of them, and crashes (``idm_env.envs.info``).
+
+    Episodes are cut off after ``max_episode_steps``, or the task's own number of steps, which ``spec`` tells; a task
+    that cannot have so many raises ValueError.
 
     ``reset(seed=s)`` begins the first episode of seed s, ``reset()`` the next one. ``reset(options={"state":
     state})`` starts from a given ``State`` of shape ``(1, vehicles)``, with its graph.
 
     Raises:
-        ValueError: In one line, with value, rule and cure.
+        TypeError: For a keyword that does not exist, with a suggestion.
+        ValueError: For a value that cannot be; in one line, with value, rule and cure.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (Gymnasium declares it so)
@@ -41,7 +83,8 @@ class DiffIDMEnv(gymnasium.Env):
     }
 
     def __init__(self, render_mode: str | None = None, **keywords: Any) -> None:
-        made = settings(render_mode=render_mode, **keywords)
+        asked = asked_of_make()
+        made = settings(render_mode=render_mode, **(keywords if asked is None else {**keywords, LIMIT: asked}))
         self.settings = made
         self.render_mode = made.render_mode
         self.batch = Batch(made, 1)
@@ -56,17 +99,18 @@ class DiffIDMEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for ``seed`` and ``options``."""
+        given = reset_options(options, ("state",))
         super().reset(seed=seed)
         if seed is not None or self.batch.world is None:
             # Without any seed the one that Gymnasium draws from the operating system is used.
             self.batch.seed([0], [self.np_random_seed if seed is None else seed])
-        observation = self.batch.reset(state=(options or {}).get("state"))
+        observation = self.batch.reset(state=given.get("state"))
         if self.render_mode == "human":
             self.render()
-        return self._out(observation), {}
+        return self._out(observation), begun(self.batch)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Advance by Δt; return observation, reward, terminated, truncated and an empty info."""
+        """Advance by Δt; return observation, reward, terminated, truncated and info."""
         if self.batch.world is None:
             raise RuntimeError("step was called before reset. Call reset() first.")
         tensor = None if action is None else action_tensor(action, self._shape, self.settings).unsqueeze(0)
@@ -77,7 +121,8 @@ class DiffIDMEnv(gymnasium.Env):
             self.render()
         terminated, truncated = single_ends(outcome)
         value = reward.item() if self._numpy else reward
-        return self._out(outcome.observation), value, terminated.item() is True, truncated.item() is True, {}
+        ends = terminated.item() is True, truncated.item() is True
+        return self._out(outcome.observation), value, *ends, single(self.batch, outcome)
 
     def _out(self, observation: Tensor) -> Any:
         flat = observation.reshape(-1)

@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pettingzoo
 import torch
 from gymnasium.spaces import Box
 from gymnasium.utils import seeding
@@ -17,11 +18,12 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from idm_env.envs.batch import Batch
+from idm_env.checks import shown
+from idm_env.envs.batch import Batch, Outcome
+from idm_env.envs.info import ids
 from idm_env.envs.settings import RENDER_MODES, settings
 from idm_env.envs.spaces import action_box, numpy_dtype, observation_box
 
-CYCLES = 3000
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 
 
@@ -33,7 +35,8 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     gradients are the business of the Gymnasium faces.
 
     Raises:
-        ValueError: In one line, for keywords that do not exist, and for actions that are missing or not finite.
+        TypeError: For a keyword that does not exist, with a suggestion.
+        ValueError: In one line, for values that cannot be, and for actions that are missing or not finite.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo declares it so)
@@ -43,7 +46,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         "render_fps": 10,
     }
 
-    def __init__(self, *, max_cycles: int = CYCLES, render_mode: str | None = None, **keywords: Any) -> None:
+    def __init__(self, *, max_cycles: int | None = None, render_mode: str | None = None, **keywords: Any) -> None:
         made = settings(max_episode_steps=max_cycles, render_mode=render_mode, **keywords)
         if made.output != "numpy":
             raise ValueError("output = 'torch' has no meaning for PettingZoo. Use gym.make_vec for gradients.")
@@ -73,15 +76,19 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise."""
+        """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise.
+
+        There are no options; PettingZoo's own tests give some, so they are left aside without a word.
+        """
         if seed is not None or self.batch.world is None:
             self.batch.seed([0], [seeding.np_random(seed)[1]])
-        self.batch.limit = min((x for x in (self.max_cycles, self.task.horizon) if x is not None), default=None)
+        # PettingZoo's own tests set it between episodes.
+        self.batch.limit = self.max_cycles
         self.agents = list(self.possible_agents)
         seen = self.batch.reset()[0].cpu().numpy()
         if self.render_mode == "human":
             self.render()
-        return self._by_agent(seen), {agent: {} for agent in self.agents}
+        return self._by_agent(seen), {agent: self._begun(agent) for agent in self.agents}
 
     def step(
         self, actions: dict[str, np.ndarray]
@@ -102,20 +109,34 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
                 None if everybody else torch.tensor([live], device=made.device),
             )
         seen = self._by_agent(outcome.observation[0].cpu().numpy())
-        rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:])
-        infos: dict[str, dict[str, Any]] = {agent: {} for agent in self.agents}
+        rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:4])
+        infos = {agent: self._info(i, agent, outcome) for i, agent in enumerate(self.possible_agents) if live[i]}
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
         if self.render_mode == "human":
             self.render()
         return seen, rewards, terminated, truncated, infos
 
+    def _begun(self, agent: str) -> dict[str, Any]:
+        """Return the recorded id of an agent's vehicle, where there is one."""
+        known = ids(self.batch)
+        return {} if known is None else {"vehicle_id": known[self.possible_agents.index(agent)]}
+
+    def _info(self, i: int, agent: str, outcome: Outcome) -> dict[str, Any]:
+        """Return what ``idm_env.envs.info`` says of a step, as numbers of one agent."""
+        info: dict[str, Any] = {name: value[0, i].item() for name, value in outcome.details.items()}
+        if info.get("crash"):
+            assert self.batch.world is not None
+            alone = i if self.task.shares > 1 else None
+            info["crash_reason"] = self.task.crash_reason(self.batch.world, 0, alone)
+        return info | self._begun(agent)
+
     def _action(self, agent: str, actions: dict[str, np.ndarray]) -> float:
         if agent not in actions:
             raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
-        action = np.asarray(actions[agent], dtype=float)
-        if action.shape != (1,) or not np.isfinite(action).all():
+        action = np.asarray(actions[agent])
+        if action.shape != (1,) or action.dtype.kind not in "fiu" or not np.isfinite(action).all():
             raise ValueError(
-                f"action of '{agent}' = {actions[agent]!r} must be one finite number, as an array of shape (1,)."
+                f"action of '{agent}' = {shown(actions[agent])} must be one finite number, as an array of shape (1,)."
             )
         return float(action[0])
 
@@ -165,3 +186,13 @@ def env(**keywords: Any) -> Any:
     """Return the environment turn by turn, with PettingZoo's check of the order of calls."""
     turns = raw_env(**keywords)
     return turns if isinstance(turns, OrderEnforcingWrapper) else OrderEnforcingWrapper(turns)
+
+
+def _register() -> None:
+    """Make ``pettingzoo.make("parallel", "diffidm_v0")`` known, from PettingZoo 1.27 on."""
+    if hasattr(pettingzoo, "register"):
+        pettingzoo.register("parallel", "diffidm_v0", f"{__name__}:parallel_env")
+        pettingzoo.register("aec", "diffidm_v0", f"{__name__}:env")
+
+
+_register()

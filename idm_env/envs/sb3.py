@@ -10,13 +10,16 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import VecEnv
 
+from idm_env.checks import shown
+from idm_env.envs.info import row
+
 
 class SB3VecEnv(VecEnv):
-    """``SB3VecEnv(gym.make_vec("DiffIDM-v0", num_envs=64, autoreset_mode="SameStep"))``.
+    """``SB3VecEnv(gym.make_vec("DiffIDM-v0", num_envs=64))``.
 
     SB3 resets within the step and expects the last observation of an episode in ``info["terminal_observation"]`` and,
     where it was cut off rather than ended, ``info["TimeLimit.truncated"]``. So the vector must be in mode
-    ``"SameStep"``, or ``"Disabled"``, in which case this adapter resets.
+    ``"SameStep"``, the default, or ``"Disabled"``, in which case this adapter resets.
 
     Raises:
         ValueError: For a vector in mode ``"NextStep"`` or with torch output.
@@ -40,8 +43,8 @@ class SB3VecEnv(VecEnv):
         """Begin episodes in all environments, with the seeds of ``seed()`` if it was called."""
         options = self._options[0] if self._options and self._options[0] else None
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        observation, _ = self.vector_env.reset(seed=seeds, options=options)  # type: ignore[arg-type]
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        observation, info = self.vector_env.reset(seed=seeds, options=options)  # type: ignore[arg-type]
+        self.reset_infos = [row(info, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return np.asarray(observation)
@@ -54,14 +57,18 @@ class SB3VecEnv(VecEnv):
         """Step, and reset what ended; return observations, rewards, dones and one info per environment."""
         observation, reward, terminated, truncated, info = self.vector_env.step(self._actions)
         done = terminated | truncated
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos = [row(info, i) for i in range(self.num_envs)]
         if done.any():
             last = info["final_obs"] if self._same_step else observation
-            for i in np.flatnonzero(done):
+            for i in np.flatnonzero(done).tolist():
+                if self._same_step:
+                    self.reset_infos[i], infos[i] = infos[i], row(info["final_info"], i)
                 infos[i]["terminal_observation"] = np.array(last[i])
                 infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             if not self._same_step:
-                observation, _ = self.vector_env.reset(options={"reset_mask": done})
+                observation, fresh = self.vector_env.reset(options={"reset_mask": done})
+                for i in np.flatnonzero(done).tolist():
+                    self.reset_infos[i] = row(fresh, i)
         return np.asarray(observation), np.asarray(reward, np.float32), done, infos
 
     def close(self) -> None:
@@ -87,7 +94,7 @@ class SB3VecEnv(VecEnv):
     def _all(self, indices: Any, what: str) -> None:
         if indices is not None and len(set(self._get_indices(indices))) != self.num_envs:
             raise ValueError(
-                f"{what} belongs to the whole batch, and indices = {indices!r} names a part. Leave indices out."
+                f"{what} belongs to the whole batch, and indices = {shown(indices)} names a part. Leave indices out."
             )
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 import torch
 from gymnasium.vector import AutoresetMode
 
+from idm_env.checks import nearest, one_of, shown
 from idm_env.config import load_environment
-from idm_env.parameters import nearest
-from idm_env.tasks import Task, make_task
+from idm_env.tasks import KeywordError, Task, make_task
 
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 RENDER_MODES = ("rgb_array", "human")
+INFO = ("accel", "command", "failsafe", "crash", "vehicle_id")
 KEYWORDS = (
     "task",
     "config",
@@ -24,8 +28,11 @@ KEYWORDS = (
     "autoreset_mode",
     "render_mode",
     "max_episode_steps",
+    "info",
     "num_envs",
 )
+TENSORS, SPACES, ROW_BYTES = 25, 8, 400
+"""Memory of one environment: tensors per vehicle, arrays per observed feature, and bytes besides, as measured."""
 _MODES = {"NextStep": AutoresetMode.NEXT_STEP, "SameStep": AutoresetMode.SAME_STEP, "Disabled": AutoresetMode.DISABLED}
 
 
@@ -35,7 +42,7 @@ class Settings:
 
     ``output`` decides between numpy arrays and torch tensors, ``dtype`` and ``device`` are those of the simulation
     and of the observations; ``autoreset_mode`` belongs to vectors; ``limit`` is the number of steps of an episode, or
-    None.
+    None; ``info`` names what infos tell (``idm_env.envs.info``).
     """
 
     task: Task
@@ -45,6 +52,7 @@ class Settings:
     autoreset_mode: AutoresetMode
     render_mode: str | None
     limit: int | None
+    info: tuple[str, ...]
 
 
 def settings(
@@ -57,13 +65,18 @@ def settings(
     autoreset_mode: str | AutoresetMode | None = None,
     render_mode: str | None = None,
     max_episode_steps: int | None = None,
+    info: str | Sequence[str] | None = None,
     **choices: Any,
 ) -> Settings:
-    """Return checked settings; ValueError in one line, with a suggestion, for a misspelled keyword or value.
+    """Return checked settings.
 
     ``config`` is a YAML file that says ``configures: environment`` and gives any of these keywords; a keyword that is
-    given here as well wins, but of two ``max_episode_steps`` the smaller one, as with ``gym.make``, which has one of
-    its own. ``max_episode_steps`` of None or −1 leaves the limit to the task.
+    given here as well wins. ``max_episode_steps`` None leaves the limit to the task, −1 is no limit. ``info`` is one or
+    several of ``"accel", "command", "failsafe", "crash", "vehicle_id"``, ``"all"`` (which None is) or ``"none"``.
+
+    Raises:
+        KeywordError: A TypeError in one line, with a suggestion, for a keyword that does not exist.
+        ValueError: In one line, with a suggestion, for a value that cannot be.
     """
     own = {
         "task": task,
@@ -73,42 +86,40 @@ def settings(
         "autoreset_mode": autoreset_mode,
         "render_mode": render_mode,
         "max_episode_steps": max_episode_steps,
+        "info": info,
     }
     if config is not None:
         read = load_environment(config)
         said = {key: read.pop(key, None) for key in own}
-        limits = [n for n in map(_limit, (max_episode_steps, said["max_episode_steps"])) if n is not None]
         own = {key: said[key] if value is None else value for key, value in own.items()}
-        own["max_episode_steps"] = min(limits, default=None)
         choices = {**read, **choices}
     chosen = own["task"] or "ring"
+    if own["max_episode_steps"] is not None:
+        choices["max_episode_steps"] = own["max_episode_steps"]
     if isinstance(chosen, Task) and choices:
-        raise ValueError(
-            f"keyword '{next(iter(choices))}' was given beside a task that is already made. Give it to the task."
+        raise KeywordError(
+            f"unexpected keyword argument '{next(iter(choices))}' beside a task that is already made. "
+            "Give it to the task."
         )
+    made = chosen if isinstance(chosen, Task) else make_task(cast(str, chosen), others=KEYWORDS, **choices)
     return Settings(
-        task=chosen if isinstance(chosen, Task) else make_task(cast(str, chosen), others=KEYWORDS, **choices),
-        output=cast(Any, _one_of("output", own["output"] or "numpy", OUTPUTS)),
+        task=made,
+        output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),
         device=_device(own["device"] or "cpu"),
-        dtype=DTYPES[_one_of("dtype", own["dtype"] or "float32", DTYPES)],
-        autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.NEXT_STEP),
-        render_mode=None if own["render_mode"] is None else _one_of("render_mode", own["render_mode"], RENDER_MODES),
-        limit=_limit(own["max_episode_steps"]),
+        dtype=DTYPES[one_of("dtype", own["dtype"] or "float32", DTYPES)],
+        autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.SAME_STEP),
+        render_mode=None if own["render_mode"] is None else one_of("render_mode", own["render_mode"], RENDER_MODES),
+        limit=made.horizon,
+        info=_info(own["info"]),
     )
-
-
-def _one_of(name: str, value: Any, known: Any) -> str:
-    if value not in known:
-        raise ValueError(f"{name} = {value!r} is unknown.{nearest(str(value), known)}")
-    return str(value)
 
 
 def _mode(value: Any) -> AutoresetMode:
     if isinstance(value, AutoresetMode):
         return value
     spelled = {**_MODES, **{mode.value: mode for mode in AutoresetMode}, **{mode.name: mode for mode in AutoresetMode}}
-    if value not in spelled:
-        raise ValueError(f"autoreset_mode = {value!r} is unknown.{nearest(str(value), _MODES)}")
+    if not isinstance(value, str) or value not in spelled:
+        raise ValueError(f"autoreset_mode = {shown(value)} is unknown.{nearest(shown(value), _MODES)}")
     return spelled[value]
 
 
@@ -118,13 +129,42 @@ def _device(value: Any) -> torch.device:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, TypeError):
         known = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-        raise ValueError(f"device = {value!r} is unknown or not there. Available: {', '.join(known)}.") from None
+        raise ValueError(f"device = {shown(value)} is unknown or not there. Available: {', '.join(known)}.") from None
     return device
 
 
-def _limit(value: Any) -> int | None:
-    if value is None or value == -1:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"max_episode_steps = {value!r} must be a whole number of at least 1, or -1 for no limit.")
-    return value
+def _info(value: Any) -> tuple[str, ...]:
+    if value is None or value == "all":
+        return INFO
+    if value == "none":
+        return ()
+    asked = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    return tuple(one_of("info", name, INFO) for name in asked)
+
+
+def reset_options(options: Any, known: tuple[str, ...]) -> dict[str, Any]:
+    """Return the options of a reset; ValueError for one that does not exist."""
+    if options is None:
+        return {}
+    if not isinstance(options, dict):
+        raise ValueError(f"options = {shown(options)} must be a mapping, such as {{'state': state}}.")
+    for name in options:
+        if name not in known:
+            raise ValueError(f"unknown reset option {shown(name)}.{nearest(str(name), known)}")
+    return options
+
+
+def affordable(made: Settings, count: int) -> None:
+    """Raise ValueError where ``count`` environments would need more memory than the device has."""
+    task, size = made.task, made.dtype.itemsize
+    features = len(task.bounds.names) * len(task.agents)
+    needed = count * (size * (TENSORS * task.vehicles + SPACES * features) + ROW_BYTES)
+    if made.device.type == "cuda":
+        there = torch.cuda.get_device_properties(made.device).total_memory
+    else:
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else sys.maxsize
+    if needed > there:
+        raise ValueError(
+            f"num_envs = {count} would take about {needed / 1e9:,.0f} GB, and {made.device} has {there / 1e9:,.0f} GB. "
+            f"Take at most {int(count * there / needed / 2)}."
+        )

@@ -36,6 +36,8 @@ def action_tensor(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor
     ValueError for a wrong shape, or values that are not finite; float32 and float64, numpy and torch are all accepted.
     """
     if isinstance(action, Tensor):
+        if action.dtype == torch.bool or action.is_complex():
+            raise ValueError(f"an action of type {action.dtype} is not a number. Give floats in [-1, 1].")
         tensor = action
     else:
         array = np.asarray(action)

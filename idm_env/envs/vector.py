@@ -13,46 +13,47 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from idm_env.envs.batch import Batch
-from idm_env.envs.gym import single_ends
-from idm_env.envs.settings import RENDER_MODES, settings
+from idm_env.checks import shown, whole
+from idm_env.envs.batch import Batch, Outcome
+from idm_env.envs.gym import TrueSpec, single_ends
+from idm_env.envs.info import Rows
+from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
 from idm_env.envs.spaces import action_box, action_tensor, observation_box
-from idm_env.tasks.checks import whole
 from idm_env.types import Params, State
 
-LIMIT = 3000
-"""Steps of an episode where nothing else is said, as for the registered id."""
 
-
-class DiffIDMVectorEnv(VectorEnv):
+class DiffIDMVectorEnv(TrueSpec, VectorEnv):
     """``num_envs`` environments in one batch; keywords as for ``DiffIDMEnv``.
 
-    Environment i equals a single environment seeded with ``seed + i``. ``autoreset_mode`` is ``"NextStep"`` (the step
-    after an end resets, with reward 0), ``"SameStep"`` (the returned observation is the new episode's, the last one
-    is in ``info["final_obs"]``) or ``"Disabled"`` (the caller resets with ``options={"reset_mask": mask}``).
+    Environment i equals a single environment seeded with ``seed + i``. ``autoreset_mode`` is ``"SameStep"`` (the
+    default, which Stable-Baselines3 and TorchRL take: the returned observation is the new episode's, the last one is
+    in ``info["final_obs"]``), ``"NextStep"`` (Gymnasium's own default, which its observation wrappers for vectors need:
+    the step after an end resets, with reward 0) or ``"Disabled"`` (the caller resets with ``options={"reset_mask":
+    mask}``); the attribute and ``metadata`` say which.
 
     With ``output="torch"`` observations and rewards carry their graph; the observation of a fresh episode has none, and
     ``info["final_obs"]`` is a dense tensor with the graph of the ended episodes (rows of ``_final_obs`` hold; the
     others are 0).
 
     Raises:
-        ValueError: In one line, with value, rule and cure.
+        TypeError: For a keyword that does not exist, with a suggestion.
+        ValueError: For a value that cannot be; in one line, with value, rule and cure.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (Gymnasium declares it so)
         "render_modes": list(RENDER_MODES),
         "render_fps": 10,
-        "autoreset_mode": AutoresetMode.NEXT_STEP,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
     }
 
-    def __init__(
-        self, num_envs: int = 1, render_mode: str | None = None, max_episode_steps: int | None = LIMIT, **keywords: Any
-    ) -> None:
-        made = settings(render_mode=render_mode, max_episode_steps=max_episode_steps, **keywords)
+    def __init__(self, num_envs: int = 1, render_mode: str | None = None, **keywords: Any) -> None:
+        made = settings(render_mode=render_mode, **keywords)
         self.settings = made
         self.task = made.task
         self.num_envs = whole("num_envs", num_envs, 1)
+        affordable(made, num_envs)
         self.render_mode = made.render_mode
+        self.autoreset_mode = made.autoreset_mode
         self.metadata = {
             **type(self).metadata,
             "render_fps": round(1.0 / self.task.simulator.dt),
@@ -64,6 +65,7 @@ class DiffIDMVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.batch = Batch(made, num_envs)
+        self._rows = Rows(self.batch)
         self._shape = (num_envs, agents)
         self._numpy = made.output == "numpy"
         self._ended = np.zeros(num_envs, dtype=bool)
@@ -79,13 +81,16 @@ class DiffIDMVectorEnv(VectorEnv):
         A number seeds environment i with ``seed + i``; a sequence gives every one its own. ``options["state"]`` is a
         ``State`` to start from, one row per environment that is reset.
         """
-        rows = self._masked((options or {}).get("reset_mask"))
+        given = reset_options(options, ("state", "reset_mask"))
+        rows = self._masked(given.get("reset_mask"))
         self._seed(seed, rows)
-        observation = self.batch.reset(rows, (options or {}).get("state"))
+        observation = self.batch.reset(rows, given.get("state"))
         self._ended[rows] = False
         if self.render_mode == "human":
             self.render()
-        return self._out(observation), {}
+        begun = np.zeros(self.num_envs, dtype=bool)
+        begun[rows] = True
+        return self._out(observation), self._rows.begun(begun)
 
     def _masked(self, mask: Any) -> np.ndarray:
         if mask is None:
@@ -93,7 +98,7 @@ class DiffIDMVectorEnv(VectorEnv):
         mask = mask.cpu().numpy() if isinstance(mask, Tensor) else mask
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ValueError(
-                f"options['reset_mask'] = {mask!r} must be a bool array of shape ({self.num_envs},) with at "
+                f"options['reset_mask'] = {shown(mask)} must be a bool array of shape ({self.num_envs},) with at "
                 f"least one True."
             )
         if self.batch.world is None and not mask.all():
@@ -130,7 +135,7 @@ class DiffIDMVectorEnv(VectorEnv):
         """Advance all environments by Δt; ``None`` as actions leaves all vehicles to their drivers."""
         if self.batch.world is None:
             raise RuntimeError("step was called before reset. Call reset() first.")
-        mode = self.settings.autoreset_mode
+        mode = self.autoreset_mode
         over = np.flatnonzero(self._ended)
         if len(over) and mode is AutoresetMode.DISABLED:
             raise RuntimeError(
@@ -141,15 +146,19 @@ class DiffIDMVectorEnv(VectorEnv):
             outcome = self.batch.step(tensor)
             observation, reward = outcome.observation, outcome.reward.mean(-1)
             terminated, truncated = single_ends(outcome)
+            # Episodes that ended with the step before begin in this one: it is no step of theirs.
+            stepped = ~self._ended
             if len(over):
                 observation = self.batch.reset(over)
                 begun = torch.as_tensor(self._ended, device=reward.device)
                 reward = torch.where(begun, 0.0, reward)
                 terminated, truncated = terminated & ~begun, truncated & ~begun
             self._ended = (terminated | truncated).cpu().numpy()
-            info: dict[str, Any] = {}
-            if mode is AutoresetMode.SAME_STEP and self._ended.any():
-                info = self._final(observation)
+            same = mode is AutoresetMode.SAME_STEP and bool(self._ended.any())
+            info = self._rows.stepped(outcome, ~self._ended if same else stepped)
+            info |= self._rows.begun(np.ones_like(stepped))
+            if same:
+                info |= self._final(observation, outcome)
                 observation = self.batch.reset(np.flatnonzero(self._ended))
                 self._ended = np.zeros(self.num_envs, dtype=bool)
         if self.render_mode == "human":
@@ -159,16 +168,18 @@ class DiffIDMVectorEnv(VectorEnv):
         ends = terminated.cpu().numpy(), truncated.cpu().numpy()
         return self._out(observation), reward.cpu().numpy().astype(np.float64), *ends, info
 
-    def _final(self, observation: Tensor) -> dict[str, Any]:
-        """Return the last observations of the episodes that ended, as Gymnasium lays them out, or dense for torch."""
+    def _final(self, observation: Tensor, outcome: Outcome) -> dict[str, Any]:
+        """Return the last observations and infos of the episodes that ended, as Gymnasium does; dense for torch."""
         ended, flat = self._ended.copy(), self._out(observation)
+        last = self._rows.stepped(outcome, ended) | self._rows.begun(ended)
         if not self._numpy:
             mask = torch.as_tensor(ended, device=flat.device)
-            return {"final_obs": torch.where(mask.unsqueeze(-1), flat, 0.0), "_final_obs": mask}
-        final = np.full(self.num_envs, None, dtype=object)
+            final = torch.where(mask.unsqueeze(-1), flat, 0.0)
+            return {"final_obs": final, "_final_obs": mask, "final_info": last, "_final_info": mask.clone()}
+        kept = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
-            final[i] = flat[i]
-        return {"final_obs": final, "_final_obs": ended, "final_info": {}, "_final_info": ended.copy()}
+            kept[i] = flat[i]
+        return {"final_obs": kept, "_final_obs": ended, "final_info": last, "_final_info": ended.copy()}
 
     def _out(self, observation: Tensor) -> Any:
         flat = observation.reshape(self.num_envs, -1)

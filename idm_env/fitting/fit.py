@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +12,7 @@ import torch
 from scipy.stats import qmc
 from torch import Tensor
 
+from idm_env import keep
 from idm_env.data import Episode
 from idm_env.effects import IDM, Brakes, Replay
 from idm_env.fitting.adam import adam
@@ -22,12 +21,11 @@ from idm_env.fitting.levenberg import Normal, Progress, minimise, normal
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.problem import IDM_NAMES, Loss, Objective, Problem, group_of
 from idm_env.fitting.uncertainty import Uncertainty, uncertainty
+from idm_env.progress import OnProgress
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
 Method = Literal["lm", "adam"]
-OnProgress = Callable[[str, int, int, float], None]
-"""Called with the phase, steps done, steps at most, and the root mean square residual (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,51 +79,16 @@ def base_simulator(dt: float = 0.1, **choices: Any) -> Simulator:
     return Simulator(Lane(), (IDM(), Replay(), Brakes()), dt=dt, **choices)
 
 
-class Checkpoint:
-    """Finished phases and the running one of a fit in one file, replaced atomically after every iteration.
-
-    A file that belongs to other data or options is refused with ValueError; without ``resume`` it is overwritten.
-    """
-
-    def __init__(self, path: Path | None, fingerprint: str, resume: bool) -> None:
-        self.path = path
-        self.content: dict[str, Any] = {"fingerprint": fingerprint, "phases": {}}
-        if path is None or not resume or not path.exists():
-            return
-        saved = torch.load(path, weights_only=True)
-        if saved["fingerprint"] != fingerprint:
-            raise ValueError(f"{path} was left by a run on other data or options. Leave out --resume to start afresh.")
-        self.content = saved
-
-    def get(self, phase: str) -> dict[str, Any] | None:
-        """Return what was last saved of a phase."""
-        found: dict[str, Any] | None = self.content["phases"].get(phase)
-        return found
-
-    def put(self, phase: str, content: dict[str, Any]) -> None:
-        """Save a phase."""
-        self.content["phases"][phase] = content
-        if self.path is not None:
-            beside = self.path.with_suffix(".part")
-            torch.save(self.content, beside)
-            os.replace(beside, self.path)
-
-    def done(self) -> None:
-        """Remove the file: the fit has ended."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
-
-
 def fingerprint(problem: Problem, *options: object) -> str:
     """Return a digest of everything that determines a fit."""
-    digest = hashlib.sha256(repr((problem.simulator, problem.own, problem.shared, problem.groups, options)).encode())
-    digest.update(repr((problem.objective, problem.relative, problem.loss, problem.skip)).encode())
-    digest.update(repr(sorted(problem.fixed.items())).encode())
-    if problem.prior is not None:
-        digest.update(problem.prior.centre.numpy().tobytes() + problem.prior.deviation.numpy().tobytes())
-        digest.update(repr(problem.prior.noise).encode())
-    digest.update(problem.batch.gap.numpy().tobytes() + problem.batch.position.numpy().tobytes())
-    return digest.hexdigest()
+    prior = problem.prior
+    return keep.fingerprint(
+        (problem.simulator, problem.own, problem.shared, problem.groups, options),
+        (problem.objective, problem.relative, problem.loss, problem.skip, sorted(problem.fixed.items())),
+        *(() if prior is None else (prior.centre, prior.deviation, prior.noise)),
+        problem.batch.gap,
+        problem.batch.position,
+    )
 
 
 def fit(
@@ -158,7 +121,7 @@ def fit(
     mode, learning rate 0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead;
     ``fixed`` gives parameters that are not free another value than their default. ``prior`` makes it a maximum
     a posteriori, from the prior's centre unless ``start`` is given.
-    ``checkpoint`` names the file that makes an interrupted fit resumable with the same result. ValueError and
+    ``checkpoint`` names the folder that makes an interrupted fit resumable with the same result. ValueError and
     DataError for what cannot be fitted.
     """
     if method not in ("lm", "adam"):
@@ -174,7 +137,7 @@ def fit(
         simulator, batch, tuple(free), tuple(shared), group, names,
         objective=objective, relative=relative, loss=loss, skip=skip, fixed=dict(fixed or {}), prior=prior,
     )  # fmt: skip
-    saved = Checkpoint(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)
+    saved = keep.Store(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)
     begin = start or (_defaults(problem, problem.own).expand(len(names), -1), _defaults(problem, problem.shared))
     if method == "adam":
         own, common, converged, count = _adam(problem, *begin, saved, on_progress)
@@ -183,7 +146,7 @@ def fit(
             problem, begin, starts if start is None else 1, iterations, seed, saved, on_progress
         )
     result = Fit(problem, own, common, uncertainty(problem, own, common), converged, count, method)
-    saved.done()
+    saved.remove()
     return result
 
 
@@ -200,7 +163,7 @@ def _defaults(problem: Problem, names: Sequence[str]) -> Tensor:
 
 
 def _adam(
-    problem: Problem, own: Tensor, shared: Tensor, saved: Checkpoint, on_progress: OnProgress | None
+    problem: Problem, own: Tensor, shared: Tensor, saved: keep.Store, on_progress: OnProgress | None
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     steps = 500
 
@@ -218,7 +181,7 @@ def _adam(
 
 
 def _levenberg(
-    problem: Problem, begin: tuple[Tensor, Tensor], starts: int, iterations: int, seed: int, saved: Checkpoint,
+    problem: Problem, begin: tuple[Tensor, Tensor], starts: int, iterations: int, seed: int, saved: keep.Store,
     on_progress: OnProgress | None,
 ) -> tuple[Tensor, Tensor, Tensor, int]:  # fmt: skip
     own, shared = begin
@@ -248,7 +211,7 @@ def _spread(problem: Problem, own: Tensor, starts: int, seed: int) -> Tensor:
 
 
 def _phase(
-    name: str, problem: Problem, own: Tensor, shared: Tensor, iterations: int, saved: Checkpoint,
+    name: str, problem: Problem, own: Tensor, shared: Tensor, iterations: int, saved: keep.Store,
     on_progress: OnProgress | None,
 ) -> tuple[Progress, Normal]:  # fmt: skip
     found = saved.get(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,24 +11,32 @@ from typing import Any
 import polars as pl
 import torch
 
+from idm_env import keep
 from idm_env import report as page
 from idm_env.config import Model, Numbers, load_model, save_model
-from idm_env.data import LEADER_LOST_GAP_M, DataError, Episodes, Trajectories, episodes, load
+from idm_env.data import LEADER_LOST_GAP_M, DataError, Episodes, Repair, Trajectories, episodes, load
+from idm_env.data.fingerprint import fingerprints, fitted_on
 from idm_env.effects import Effect, Replay
-from idm_env.fitting import pictures
+from idm_env.fitting import drivers, pictures
 from idm_env.fitting.batch import Batch, windows
 from idm_env.fitting.evaluate import Errors, errors, own_for
-from idm_env.fitting.fit import Fit, Method, OnProgress, base_simulator, fit
+from idm_env.fitting.fit import Fit, Method, base_simulator, fit
 from idm_env.fitting.problem import Loss, Objective, Problem, Simulated, group_of
+from idm_env.progress import OnProgress, silent
 from idm_env.roads import Lane
 from idm_env.simulator import Integration, Simulator
+
+FITTED = ("parameters.parquet", "drivers.csv", "model.yaml", "report.json", "report.html")
+SIMULATED = ("simulated.parquet", "report.json", "report.html")
+"""What ``fit_file`` and ``simulate_file`` write."""
 
 
 @dataclass(frozen=True)
 class Source:
     """How a file is read: see ``idm_env.data.load`` and ``episodes``.
 
-    ``where`` (``column=value``) selects runs or drivers; ``window`` (s) cuts long episodes.
+    ``where`` (``column=value``, or several that must all hold) selects runs or drivers; ``window`` (s) cuts long
+    episodes.
     """
 
     path: Path
@@ -39,7 +48,7 @@ class Source:
     dt: float | None = None
     smooth: bool = False
     window: float | None = None
-    where: str | None = None
+    where: str | Sequence[str] | None = None
 
     def trajectories(self) -> Trajectories:
         """Read and check the file."""
@@ -95,13 +104,21 @@ def _behind_records(model: Model) -> tuple[Effect, ...]:
 def fit_file(
     source: Source, options: Options, out: Path, *, resume: bool = False, on_progress: OnProgress | None = None
 ) -> dict[str, Any]:
-    """Fit IDM to a file; write parameters.parquet, model.yaml, report.json and report.html; return the report.
+    """Fit IDM to a file and return the report; write it, the parameters and the model.
+
+    Writes ``parameters.parquet`` (one row per group and parameter), ``drivers.csv`` (one row per group),
+    ``model.yaml``, ``report.json`` and ``report.html``.
 
     Held-out runs take no part in the fit. Where their group was fitted they are simulated with its parameters,
     otherwise with those of a pooled fit of the fitting runs. DataError and ValueError for what cannot be read or
     fitted.
     """
-    page.output_folder(out)
+    with keep.results(out, FITTED, (source.path, options.model)):
+        return _fit_file(source, options, out, resume, on_progress or silent)
+
+
+def _fit_file(source: Source, options: Options, out: Path, resume: bool, progress: OnProgress) -> dict[str, Any]:
+    progress("reading", 0, 0, source.path.name)
     trajectories = source.trajectories()
     fitting, held = trajectories, None
     if options.held_out is not None:
@@ -109,15 +126,19 @@ def fit_file(
     chosen = source.episodes(fitting)
     simulator, kept = options.simulator()
 
-    def run(by: str, checkpoint: str) -> Fit:
+    def run(by: str, checkpoint: str, before: str = "") -> Fit:
         return fit(
             chosen, by=by, simulator=simulator, objective=options.objective, relative=options.relative,
             loss=options.loss, method=options.method, starts=options.starts, seed=options.seed,
-            substeps=options.substeps, fixed=kept, checkpoint=out / checkpoint, resume=resume, on_progress=on_progress,
+            substeps=options.substeps, fixed=kept, checkpoint=out / keep.UNFINISHED / checkpoint, resume=resume,
+            on_progress=lambda phase, *state: progress(before + phase, *state),
         )  # fmt: skip
 
-    found = run(options.by, "fit.resume.pt")
+    found = run(options.by, "fit")
+    progress("errors", 0, 0, "in free simulation")
     error, simulated = errors(found.problem, found.own, found.shared)
+    left_out = list(chosen.left_out)
+    bounds = drivers.bounds(found)
     result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
@@ -130,23 +151,42 @@ def fit_file(
             "iterations": found.iterations,
         },
         "held_out": None,
+        "at_bounds": drivers.sentence(bounds),
+        "bounds": bounds,
         "parameters": found.table(),
         "versions": page.versions(),
     }
     if held is not None:
-        pooled = found if options.by == "all" else run("all", "pooled.resume.pt")
-        result["held_out"] = _held_out(source, options, held, found, pooled)
-    pl.DataFrame(result["parameters"]).write_parquet(out / "parameters.parquet")
-    save_model(out / "model.yaml", dataclasses.replace(model_of(found, options.by), substeps=options.substeps))
+        pooled = found if options.by == "all" else run("all", "pooled", "held out: ")
+        result["held_out"], lost = _held_out(source, options, held, found, pooled)
+        left_out += lost
+    result["data"]["account"] = _account(trajectories, left_out)
+    progress("writing", 0, 0, "the report")
+    table = drivers.table(found, error)
+    keep.write(out / "drivers.csv", pl.DataFrame(table).write_csv)
+    keep.write(out / "parameters.parquet", pl.DataFrame(result["parameters"]).write_parquet)
+    marked = fitted_on(trajectories, _drivers(chosen))
+    model = dataclasses.replace(model_of(found, options.by), substeps=options.substeps, fitted_on=marked)
+    save_model(out / "model.yaml", model)
     page.write_json(out / "report.json", result)
     page.write_page(
-        out / "report.html", f"IDM fitted to {source.path.name}", _fit_page(result, found, error, simulated)
+        out / "report.html", f"IDM fitted to {source.path.name}", _fit_page(result, found, error, simulated, table)
     )
     return result
 
 
-def _held_out(source: Source, options: Options, held: Trajectories, found: Fit, pooled: Fit) -> dict[str, Any]:
-    """Return the errors on runs that the fit has not seen."""
+def _drivers(items: Episodes) -> list[tuple[str, str]]:
+    return [(episode.run_id, episode.vehicle_id) for episode in items]
+
+
+def _account(trajectories: Trajectories, left_out: Iterable[Repair]) -> str:
+    return page.account(((r.kind, r.count) for r in trajectories.repairs), ((r.kind, r.count) for r in left_out))
+
+
+def _held_out(
+    source: Source, options: Options, held: Trajectories, found: Fit, pooled: Fit
+) -> tuple[dict[str, Any], tuple[Repair, ...]]:
+    """Return the errors on runs that the fit has not seen, and what of them was left out."""
     items = source.episodes(held)
     batch = Batch.of(items, substeps=options.substeps)
     group, names = group_of(batch.episodes, options.by)
@@ -162,7 +202,7 @@ def _held_out(source: Source, options: Options, held: Trajectories, found: Fit, 
         "runs": held.runs(),
         "groups_not_fitted": len(unseen),
         "left_out": [str(r) for r in items.left_out],
-    }
+    }, items.left_out
 
 
 def model_of(found: Fit, by: str = "driver") -> Model:
@@ -192,14 +232,9 @@ def model_of(found: Fit, by: str = "driver") -> Model:
     )
 
 
-def _fit_page(result: dict[str, Any], found: Fit, error: Errors, simulated: Simulated) -> list[page.Block]:
-    doubtful = [
-        f"{row['group']}: {row['parameter']} = {row['estimate']:.3g} {row['unit']}"
-        + (" sits on its bound" if row["at_bound"] else " is not identified by these data")
-        for row in result["parameters"]
-        if row["at_bound"] or not row["identified"]
-    ]
-    repairs = [*(r["text"] for r in result["data"]["repairs"]), *result["data"]["left_out"]]
+def _fit_page(
+    result: dict[str, Any], found: Fit, error: Errors, simulated: Simulated, table: list[dict[str, Any]]
+) -> list[page.Block]:
     held = result["held_out"]
     lead = (
         f"{result['fit']['episodes']} episodes of {result['fit']['groups']} groups: mean gap RMSE "
@@ -209,49 +244,107 @@ def _fit_page(result: dict[str, Any], found: Fit, error: Errors, simulated: Simu
     if held is not None:
         lead += f" On {held['episodes']} episodes held out: {held['gap_rmse_m']:.2f} m."
     rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": "held out", **held}])
-    names = ("", "gap_rmse_m", "gap_rmse_median_m", "gap_mae_m", "speed_rmse_mps", "collisions", "episodes")
+    names = {
+        "": "", "gap_rmse_m": "gap RMSE (m)", "gap_rmse_median_m": "median gap RMSE (m)",
+        "gap_mae_m": "mean |gap error| (m)", "speed_rmse_mps": "speed RMSE (m/s)", "collisions": "collisions",
+        "episodes": "episodes",
+    }  # fmt: skip
     return [
         page.lead(lead),
-        page.table(rows, names),
+        page.lead(result["at_bounds"]),
+        page.table([{title: row[name] for name, title in names.items()} for row in rows]),
         page.note(
-            f"{result['fit']['converged']} of {result['fit']['groups']} groups converged. Standard errors allow for "
-            "correlated residuals, not for a wrong model."
+            f"{result['fit']['converged']} of {result['fit']['groups']} groups converged. A value on its bound is not "
+            "an estimate: the data would have it beyond."
         ),
         page.heading("Measured and simulated"),
         pictures.examples(found.problem, error, simulated),
+        page.heading("Residuals"),
+        pictures.residuals(found.problem, simulated),
+        page.heading("In space and time"),
+        *pictures.space_time(found.problem, simulated),
         page.heading("Parameters"),
         *([pictures.parameters(found)] if len(found.problem.groups) > 1 else []),
-        page.table(result["parameters"][:200]),
-        *([page.note("The first 200 rows of parameters.parquet.")] if len(result["parameters"]) > 200 else []),
-        page.heading(f"Doubtful parameters: {len(doubtful)} of {len(result['parameters'])}"),
-        page.bullets(doubtful[:40] or ["none"]),
-        page.heading("Data"),
-        page.bullets(repairs or ["Nothing was repaired or left out."]),
+        *drivers.blocks(found, table, result["bounds"]),
+        *_data_section(result),
     ]
 
 
-def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0) -> dict[str, Any]:
+def _data_section(result: dict[str, Any]) -> list[page.Block]:
+    """Return what the data are, and what was repaired or left out."""
+    data = result["data"]
+    size = (
+        f"{data['source']}: {data['rows']} rows, {data['vehicles']} vehicles in {data['runs']} runs, "
+        f"{data['followers']} followers, {data['episodes']} episodes."
+    )
+    return [
+        page.heading("Data"),
+        page.text(size),
+        page.text(data["account"]),
+        page.bullets([*(r["text"] for r in data["repairs"]), *data["left_out"]]),
+    ]
+
+
+def _seen(model: Model, trajectories: Trajectories, items: Episodes, error: Errors) -> dict[str, Any]:
+    """Return how many episodes are of tracks that the model was fitted on, the error on the others, and it in words."""
+    tracks = fingerprints(trajectories, _drivers(items))
+    known = set(model.fitted_on.get("tracks", ()))
+    new = torch.tensor([tracks[driver] not in known for driver in _drivers(items)])
+    count, others = int((~new).sum()), float(error.gap_rmse[new].mean()) if new.any() else None
+    if not known:
+        words = "of which the model does not say whether it was fitted on them."
+    elif others is None:
+        words = "fitted on these data: not a held-out figure."
+    elif count:
+        words = (
+            f"in part fitted on these data ({count} of {len(items)} episodes): not a held-out figure. On the others it "
+            f"is {others:.2f} m."
+        )
+    else:
+        words = "on data that the model was not fitted on."
+    return {
+        "source": model.fitted_on.get("source"), "episodes_fitted_on": count if known else None,
+        "gap_rmse_of_others_m": others if known else None, "words": words,
+    }  # fmt: skip
+
+
+def simulate_file(
+    source: Source, model_path: Path, out: Path, *, seed: int = 0, on_progress: OnProgress | None = None
+) -> dict[str, Any]:
     """Roll a saved model behind the measured leaders; write simulated.parquet, report.json and report.html.
 
     A driver takes the parameters of ``drivers`` whose key is his, by the model's ``by``, otherwise the model's own.
     Noise is drawn with ``seed``.
     """
-    page.output_folder(out)
+    with keep.results(out, SIMULATED, (source.path, model_path)):
+        return _simulate_file(source, model_path, out, seed, on_progress or silent)
+
+
+def _simulate_file(source: Source, model_path: Path, out: Path, seed: int, progress: OnProgress) -> dict[str, Any]:
     model = load_model(model_path)
+    progress("reading", 0, 0, source.path.name)
     trajectories = source.trajectories()
     items = source.episodes(trajectories)
+    progress("simulating", 0, 0, f"{len(items)} episodes")
     problem, values, matched = problem_of(model, items, seed)
     with torch.no_grad():
         error, simulated = errors(problem, values, torch.zeros(0, dtype=values.dtype))
+    progress("writing", 0, 0, "the report")
     tables = [_simulated_table(problem, simulated, row) for row in range(len(items))]
-    pl.concat(tables).write_parquet(out / "simulated.parquet")
-    result = {
+    keep.write(out / "simulated.parquet", pl.concat(tables).write_parquet)
+    result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
         "model": str(model_path),
-        "data": {**trajectories.summary(), "left_out": [str(r) for r in items.left_out], "episodes": len(items)},
+        "data": {
+            **trajectories.summary(),
+            "left_out": [str(r) for r in items.left_out],
+            "episodes": len(items),
+            "account": _account(trajectories, items.left_out),
+        },
         "drivers_with_own_parameters": matched,
         "error": error.summary(),
+        "fitted_on": _seen(model, trajectories, items, error),
         "seed": seed,
         "versions": page.versions(),
     }
@@ -259,10 +352,16 @@ def simulate_file(source: Source, model_path: Path, out: Path, *, seed: int = 0)
     blocks = [
         page.lead(
             f"{len(items)} episodes simulated behind their measured leaders: mean gap RMSE "
-            f"{error.summary()['gap_rmse_m']:.2f} m. {matched} of them have driver parameters of their own."
+            f"{error.summary()['gap_rmse_m']:.2f} m, {result['fitted_on']['words']} {matched} of them have driver "
+            "parameters of their own."
         ),
         page.table([error.summary()]),
         pictures.examples(problem, error, simulated),
+        page.heading("Residuals"),
+        pictures.residuals(problem, simulated),
+        page.heading("In space and time"),
+        *pictures.space_time(problem, simulated),
+        *_data_section(result),
     ]
     page.write_page(out / "report.html", f"{model_path.name} behind the leaders of {source.path.name}", blocks)
     return result

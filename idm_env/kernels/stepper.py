@@ -34,7 +34,7 @@ class Stepper:
 
     def __init__(self, simulator: Stepping) -> None:
         self.simulator = simulator
-        self._kernels: dict[Form, TileKernel] = {}
+        self._kernels: dict[Form, TileKernel | str] = {}
         self._packed_of: list[tuple[Tensor, int]] = []
         self._packed: list[tuple[Array, Strides]] = []
         self._packed_for: tuple[Any, ...] = ()
@@ -45,7 +45,9 @@ class Stepper:
 
     def run(self, state: State, inputs: Inputs, params: Params, steps: int, *, threads: int | None = None) -> State:
         """Return the state some steps later; inputs have a leading time dimension, as for ``Simulator.rollout``."""
-        kernel = self._kernel(state, inputs)
+        kernel = self.kernel(state, inputs)
+        if isinstance(kernel, str):
+            raise ValueError(f"this simulator has no kernel: {kernel}. Use simulator.step.")
         program, shape, kind = kernel.program, tuple(state.speed.shape), state.speed.dtype
         *batch, size = shape
         made = self._static(kernel, state, params)
@@ -76,14 +78,12 @@ class Stepper:
             out.append(past_tensor(after, slots, shape))
         return state_after(program, state, out, steps)
 
-    def _kernel(self, state: State, inputs: Inputs) -> TileKernel:
+    def kernel(self, state: State, inputs: Inputs) -> TileKernel | str:
+        """Return the kernel for these inputs, or why there is none."""
         form = Form.of(state, inputs)
         found = self._kernels.get(form)
         if found is None:
-            made = tile_kernel(self.simulator, form)
-            if isinstance(made, str):
-                raise ValueError(f"this simulator has no kernel: {made}. Use simulator.step.")
-            found = self._kernels[form] = made
+            found = self._kernels[form] = tile_kernel(self.simulator, form)
         return found
 
     def _static(self, kernel: TileKernel, state: State, params: Params) -> list[tuple[Array, Strides]]:

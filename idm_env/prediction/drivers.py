@@ -23,6 +23,7 @@ from idm_env.fitting.levenberg import normal
 from idm_env.fitting.prior import Prior
 from idm_env.prediction.lanes import Route
 from idm_env.prediction.rollout import DT, Ahead, Drivers, bend_speed
+from idm_env.prediction.shares import STANDING_MPS
 from idm_env.prediction.stops import Stop
 
 URBAN_LIMIT = 13.4
@@ -36,8 +37,8 @@ SURPRISE = 0.25
 """Share of drivers who are about to stop for something that is not on the map (a crossing, a turn, a parking space)."""
 CRUISING = 0.25
 """Share of drivers who already go at the speed that they want."""
-STAYING, STANDING_MPS = 0.4, 0.5
-"""Share of standing vehicles (slower than this, m/s) that stay for the time being: parked, loading, waiting."""
+STAYING = 0.4
+"""Share of standing vehicles on a lane that stay for the time being: parked, loading, waiting."""
 OBEYING = {"sign": 0.8, "red": 0.9}
 """Share of drivers who stop at a stop line that the map or a signal tells."""
 WAIT_S, WAIT_DEVIATION = 1.0, 0.8

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,19 +10,20 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from idm_env import keep
 from idm_env import report as page
 from idm_env.data import DataError
-from idm_env.data.womd import Scenario, scenarios
+from idm_env.data.womd import Scenario, count, scenarios
 from idm_env.parts import Parts
 from idm_env.prediction import report as written
-from idm_env.prediction.metrics import Case, Score, score, shape_of, summary
+from idm_env.prediction.metrics import Case, Score, intervals, score, shape_of, summary
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import METHODS, Prediction, available
 from idm_env.prediction.scene import Scene
+from idm_env.progress import OnProgress, silent
 
-OnProgress = Callable[[int, int], None]
-"""Called with files done and files in all."""
 OURS = "drivers on routes"
+OUTPUT = ("predictions.parquet", "parameters.parquet", "report.json", "report.html")
 MOST_PICTURES = 24
 SCHEMA = {
     "scenario_id": pl.String, "agent_id": pl.Int64, "kind": pl.String, "source": pl.String, "future": pl.Int32,
@@ -57,14 +57,27 @@ def predict_files(
     Raises:
         DataError: If no file holds a scenario that can be used, or ``resume`` finds a run on other files or settings.
     """
-    out = page.output_folder(Path(out))
     files = [Path(path) for path in paths]
-    parts = Parts(out, _fingerprint(files, baselines), resume)
+    with keep.results(out, OUTPUT, files) as folder:
+        return _predict_files(files, folder, baselines, resume, on_progress or silent)
+
+
+def _predict_files(
+    files: Sequence[Path], out: Path, baselines: bool, resume: bool, progress: OnProgress
+) -> dict[str, Any]:
+    parts = Parts(out / keep.UNFINISHED / "predict", _fingerprint(files, baselines), resume)
+    progress("counting", 0, 0, "scenarios")
+    counts = [count(path) for path in files]
+    everything, before = sum(counts), 0
     for number, path in enumerate(files):
         if not parts.done(number):
-            _file(parts, number, path, [name for name in available() if baselines or name == OURS])
-        if on_progress is not None:
-            on_progress(number + 1, len(files))
+            names = [name for name in available() if baselines or name == OURS]
+            _file(parts, number, path, names, lambda done, b=before, p=path: progress(  # type: ignore[misc]
+                "predict", b + done, everything, p.name
+            ))  # fmt: skip
+        before += counts[number]
+        progress("predict", before, everything, path.name)
+    progress("writing", 0, 0, "the report")
     report, pictures = _report(parts.summaries())
     if not report["scenarios"]:
         first = report["left_out"][0]["reason"] if report["left_out"] else "no file was given"
@@ -82,11 +95,11 @@ def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
     stats = [
         (path.name, path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else path.name for path in files
     ]
-    return hashlib.sha256(repr((stats, baselines)).encode()).hexdigest()
+    return keep.fingerprint(stats, baselines)
 
 
-def _file(parts: Parts, number: int, path: Path, methods: Sequence[str]) -> None:
-    """Predict the scenarios of one file and write its part."""
+def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scenario: Callable[[int], None]) -> None:
+    """Predict the scenarios of one file and write its part; ``on_scenario`` is called with how many are done."""
     left_out: list[dict[str, str]] = []
     notes: list[dict[str, str]] = []
     scores: list[dict[str, Any]] = []
@@ -95,6 +108,7 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str]) -> None
     pictures: list[dict[str, str]] = []
     found = 0
     for scenario in _readable(path, left_out):
+        on_scenario(found)
         found += 1
         scene = Scene(scenario)
         notes += [{"scenario": scenario.id, "note": note} for note in _notes(scenario)]
@@ -112,8 +126,8 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str]) -> None
             if len(pictures) < MOST_PICTURES:
                 block = page.picture(*scene_picture(scenario, ours))
                 pictures.append({"text": block.text, "image": block.image})
-    pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]).write_parquet(parts.path(number, "predictions"))
-    pl.DataFrame(rows, schema=PARAMETERS).write_parquet(parts.path(number, "parameters"))
+    parts.write(number, "predictions", pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]))
+    parts.write(number, "parameters", pl.DataFrame(rows, schema=PARAMETERS))
     parts.finish(
         number,
         {
@@ -128,7 +142,7 @@ def _readable(path: str | Path, left_out: list[dict[str, str]]) -> Iterator[Scen
     try:
         yield from scenarios(path)
     except DataError as error:
-        left_out.append({"what": str(path), "reason": str(error)})
+        left_out.append({"what": str(path), "reason": str(error), "file": Path(path).name})
 
 
 def _notes(scenario: Scenario) -> list[str]:
@@ -200,15 +214,26 @@ def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.
         ]  # fmt: skip
         return [{"method": name, **summary([kept[name] for kept in chosen])} for name in names]
 
+    def with_intervals() -> list[dict[str, Any]]:
+        scenes = [where for where, _ in scores]
+        between = {name: intervals([kept[name] for _, kept in scores], scenes) for name in names}
+        return [{**row, "intervals": between[row["method"]]} for row in rows()]
+
+    left_out = [item for part in parts for item in part["left_out"]]
     pictures = [page.Block("figure", **item) for part in parts for item in part["pictures"]]
     return {
         "scenarios": sum(part["scenarios"] for part in parts),
         "agents": sum(part["agents"] for part in parts),
         "agents_with_known_future": len(scores),
-        "methods": rows(),
+        "methods": with_intervals(),
         "scenes": {name: rows(scene=name) for name in sorted({where for where, _ in scores})},
         "kinds": {kind: rows(kind=kind) for kind in sorted({kept[OURS].kind for _, kept in scores})},
-        "left_out": [item for part in parts for item in part["left_out"]],
+        "left_out": left_out,
+        "account": page.account(
+            (),
+            [("agents", 1) for item in left_out if "file" not in item],
+            [item["file"] for item in left_out if "file" in item],
+        ),
         "notes": [item for part in parts for item in part["notes"]],
         "versions": page.versions(),
     }, pictures[:MOST_PICTURES]

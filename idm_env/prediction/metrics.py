@@ -3,8 +3,9 @@
 Predictions and truth are compared at 2 Hz. At a horizon T: minADE is the smallest mean distance up to T over the
 futures of an agent, minFDE the smallest distance at T; an agent is missed where no future ends within a box around
 the truth, along its heading and across it, whose size grows with T and with the initial speed. mAP is the mean over
-eight shapes of trajectories of the area under the interpolated precision-recall curve, where a future that hits is a
-true positive, only one per agent, and all others are false positives.
+shapes of trajectories of the area under the interpolated precision-recall curve, where a future that hits is a true
+positive, only one per agent, and all others are false positives. Of the eight shapes right turns and right U-turns are
+one, and among equal confidences false positives come first, as in the benchmark's own code (``motion_metrics.cc``).
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ MISS_M = {3: (1.0, 2.0), 5: (1.8, 3.6), 8: (3.0, 6.0)}
 SLOW, FAST = 1.4, 11.0
 """Speeds (m/s) between which the bounds grow from half to full."""
 PER_SECOND = 2
+ENOUGH_SCENES = 10
+"""From so many scenes on, intervals draw whole scenes."""
 SHAPES = (
     "stationary", "straight", "straight left", "straight right", "left", "left U-turn", "right", "right U-turn",
 )  # fmt: skip
@@ -136,7 +139,7 @@ def average_precision(scores: Sequence[Score], seconds: int) -> float:
             correct.append(i == first)
     if agents == 0:
         return float("nan")
-    order = np.argsort(-np.array(confidence), kind="stable")
+    order = np.lexsort((correct, -np.array(confidence)))
     true = np.cumsum(np.array(correct)[order])
     precision, recall = true / np.arange(1, len(true) + 1), true / agents
     best = np.maximum.accumulate(precision[::-1])[::-1]
@@ -152,12 +155,90 @@ def summary(scores: Sequence[Score]) -> dict[str, float | int]:
         row[f"miss_rate_{seconds}s"] = _mean(
             [0.0 if any(h) else 1.0 for item in scores if (h := item.hit[i]) is not None]
         )
-        shapes = sorted({item.shape for item in scores})
-        precisions = [average_precision([s for s in scores if s.shape == shape], seconds) for shape in shapes]
+        binned = [item.shape.replace("right U-turn", "right") for item in scores]
+        precisions = [
+            average_precision([s for s, b in zip(scores, binned, strict=True) if b == shape], seconds)
+            for shape in sorted(set(binned))
+        ]
         row[f"mAP_{seconds}s"] = _mean(precisions)
     for name in ("minADE", "minFDE", "miss_rate", "mAP"):
         row[name] = _mean([float(row[f"{name}_{seconds}s"]) for seconds in HORIZONS])
     return row
+
+
+def intervals(
+    scores: Sequence[Score], scenes: Sequence[str], *, draws: int = 200, seed: int = 0
+) -> dict[str, tuple[float, float]]:
+    """Return 95 % bootstrap intervals of what ``summary`` returns at each horizon, by name such as ``minADE_8s``.
+
+    Whole scenes are drawn where there are at least ``ENOUGH_SCENES``, since agents of a scene are alike, else agents.
+    NaN where there is no truth, or a single agent.
+    """
+    names = np.unique(np.asarray(scenes), return_inverse=True)[1] if len(scenes) else np.zeros(0, int)
+    unit = names if len(np.unique(names)) >= ENOUGH_SCENES else np.arange(len(scores))
+    count = len(np.unique(unit))
+    generator = np.random.default_rng(seed)
+    drawn = [np.bincount(generator.integers(count, size=count), minlength=count) for _ in range(draws)]
+    weights = np.stack(drawn)[:, unit].astype(float) if count > 1 else np.zeros((0, len(scores)))
+    found: dict[str, tuple[float, float]] = {}
+    for i, seconds in enumerate(HORIZONS):
+        missed = [None if (h := item.hit[i]) is None else float(not any(h)) for item in scores]
+        for name, values in (
+            ("minADE", [item.ade[i] for item in scores]), ("minFDE", [item.fde[i] for item in scores]),
+            ("miss_rate", missed),
+        ):  # fmt: skip
+            found[f"{name}_{seconds}s"] = _between(_weighted_means(values, weights))
+        found[f"mAP_{seconds}s"] = _between(_weighted_map(scores, seconds, weights))
+    return found
+
+
+def _weighted_means(values: Sequence[float | None], weights: np.ndarray) -> np.ndarray:
+    """Return the mean of what is known under every row of weights [draws, agents]."""
+    numbers = np.array([np.nan if v is None else v for v in values], float)
+    known = np.isfinite(numbers)
+    total = weights[:, known].sum(1)
+    sums = weights[:, known] @ numbers[known]
+    return np.divide(sums, total, out=np.full(len(weights), np.nan), where=total > 0)
+
+
+def _weighted_map(scores: Sequence[Score], seconds: int, weights: np.ndarray) -> np.ndarray:
+    """Return the mean average precision over shapes under every row of weights [draws, agents]."""
+    horizon = HORIZONS.index(seconds)
+    kept = [n for n, item in enumerate(scores) if item.hit[horizon] is not None]
+    shapes = sorted({scores[n].shape for n in kept})
+    each = np.full((len(shapes), len(weights)), np.nan)
+    for s, shape in enumerate(shapes):
+        agents, confidence, correct = [], [], []
+        for n in kept:
+            item, hit = scores[n], scores[n].hit[horizon] or []
+            if item.shape != shape:
+                continue
+            first = next((i for i in np.argsort(-np.array(item.confidence), kind="stable") if hit[i]), None)
+            agents += [n] * len(hit)
+            confidence += item.confidence
+            correct += [i == first for i in range(len(hit))]
+        order = np.argsort(-np.array(confidence), kind="stable")
+        index, true = np.array(agents)[order], np.array(correct)[order]
+        unique = np.unique(index)
+        for d, weight in enumerate(weights):
+            every = weight[index]
+            total = weight[unique].sum()
+            if total > 0:
+                hits, all_of = np.cumsum(every * true), np.cumsum(every)
+                precision = np.divide(hits, all_of, out=np.zeros_like(hits), where=all_of > 0)
+                best = np.maximum.accumulate(precision[::-1])[::-1]
+                each[s, d] = float(np.sum(np.diff(np.concatenate([[0.0], hits / total])) * best))
+    known = np.isfinite(each)
+    total = known.sum(0)
+    return np.divide(np.where(known, each, 0.0).sum(0), total, out=np.full(len(weights), np.nan), where=total > 0)
+
+
+def _between(values: np.ndarray) -> tuple[float, float]:
+    known = values[np.isfinite(values)]
+    if len(known) < 2:
+        return float("nan"), float("nan")
+    low, high = np.percentile(known, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def _mean(values: Sequence[float | None]) -> float:

@@ -9,14 +9,13 @@ import numpy as np
 
 from idm_env.effects import IDM
 from idm_env.prediction.drivers import posterior
-from idm_env.prediction.free import constant_velocity, free_futures
+from idm_env.prediction.free import constant_velocity, free_futures, kept_velocity
 from idm_env.prediction.lanes import Route
 from idm_env.prediction.rollout import DT, Course, Drivers, roll
 from idm_env.prediction.scene import STEPS, Scene
 from idm_env.prediction.select import select
+from idm_env.prediction.shares import SHARES, Shares, share_of
 
-OFF_LANE = 0.1
-"""Share of the futures of a vehicle on a lane that leave the lanes: driveways, parking, what the map lacks."""
 LATERAL_S = 4.0
 """Time in which a vehicle returns to the middle of its lane (s)."""
 
@@ -35,35 +34,63 @@ class Prediction:
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def predict(scene: Scene, index: int) -> Prediction:
-    """Return up to six futures of an agent. ValueError if it is not valid at the present.
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """What an agent may do, in the order of ``shares.WAYS``: futures [N, S, 2] and weights [N] of every way.
 
-    On lanes, the drivers of every route are fitted to the last second (``drivers.posterior``) and rolled out; a share
-    of the futures leaves the lanes. Pedestrians, and whoever is on no lane, keep their motion (``free_futures``).
+    Without lanes the last way is empty. ``parameters`` as in ``Prediction``.
+    """
+
+    agent: int
+    futures: tuple[np.ndarray, ...]
+    weights: tuple[np.ndarray, ...]
+    parameters: dict[str, tuple[float, float]]
+
+
+def mixture(scene: Scene, index: int) -> Mixture:
+    """Return the futures of an agent by all ways. ValueError if it is not valid at the present.
+
+    Everybody may keep the velocity (``kept_velocity``) or the motion, loosely (``free_futures``: driveways, parking,
+    what the map lacks). On lanes, the drivers of every route are fitted to the last second (``drivers.posterior``) and
+    rolled out.
     """
     agent = scene.valid(index)
-    speed = scene.speed(agent)
-    loose = free_futures(agent, scene.present, STEPS)
-    samples, weights = [loose], [np.full(len(loose), 1.0 / len(loose))]
+    futures = [kept_velocity(agent, scene.present, STEPS), free_futures(agent, scene.present, STEPS)]
+    weights = [np.full(len(one), 1.0 / len(one)) for one in futures]
     routes = scene.routes(agent)
-    parameters: dict[str, tuple[float, float]] = {}
-    if routes:
-        around = [scene.ahead(index, route) for route in routes]
-        seconds = [scene.second(agent, route, past) for route, (past, _) in zip(routes, around, strict=True)]
-        drawn = posterior(seconds)
-        courses = [
-            Course(route, one, future, route.begin)
-            for route, (_, future), (one, _) in zip(routes, around, drawn, strict=True)
-        ]
-        rolled = roll(courses, speed, STEPS, 0.5 * agent.length)
-        mass = [route.weight * weight for route, (_, weight) in zip(routes, drawn, strict=True)]
-        total = sum(float(weight.sum()) for weight in mass)
-        samples += [lifted(route, part[0].T) for route, part in zip(routes, rolled, strict=True)]
-        weights = [OFF_LANE * weights[0], *((1.0 - OFF_LANE) / total * weight for weight in mass)]
-        shares = np.concatenate(mass) / total
-        parameters = {p.name: _moments(p.name, [one for one, _ in drawn], shares) for p in IDM.declared}
-    futures, confidence = select(np.concatenate(samples), np.concatenate(weights), speed)
-    return Prediction(index, futures, confidence, "lane" if routes else "free", parameters)
+    if not routes:
+        return Mixture(index, (*futures, np.empty((0, STEPS, 2))), (*weights, np.empty(0)), {})
+    around = [scene.ahead(index, route) for route in routes]
+    seconds = [scene.second(agent, route, past) for route, (past, _) in zip(routes, around, strict=True)]
+    drawn = posterior(seconds)
+    courses = [
+        Course(route, one, future, route.begin)
+        for route, (_, future), (one, _) in zip(routes, around, drawn, strict=True)
+    ]
+    rolled = roll(courses, scene.speed(agent), STEPS, 0.5 * agent.length)
+    mass = np.concatenate([route.weight * weight for route, (_, weight) in zip(routes, drawn, strict=True)])
+    futures.append(np.concatenate([lifted(route, part[0].T) for route, part in zip(routes, rolled, strict=True)]))
+    weights.append(mass / mass.sum())
+    parameters = {p.name: _moments(p.name, [one for one, _ in drawn], weights[-1]) for p in IDM.declared}
+    return Mixture(index, tuple(futures), tuple(weights), parameters)
+
+
+def chosen(scene: Scene, found: Mixture, shares: Shares = SHARES) -> Prediction:
+    """Return up to six futures of an agent's mixture, and their confidences, with these shares of the ways.
+
+    Constant velocity is always one of them, so that no agent is predicted worse than by it.
+    """
+    agent = scene.valid(found.agent)
+    speed, on_lane = scene.speed(agent), len(found.weights[-1]) > 0
+    share = share_of(shares, agent.kind, speed, on_lane)
+    weight = np.concatenate([part * one for part, one in zip(share, found.weights, strict=True)])
+    futures, confidence = select(np.concatenate(found.futures), weight, speed)
+    return Prediction(found.agent, futures, confidence, "lane" if on_lane else "free", found.parameters)
+
+
+def predict(scene: Scene, index: int) -> Prediction:
+    """Return up to six futures of an agent. ValueError if it is not valid at the present."""
+    return chosen(scene, mixture(scene, index))
 
 
 def _moments(name: str, drawn: list[Drivers], shares: np.ndarray) -> tuple[float, float]:

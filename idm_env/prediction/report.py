@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from idm_env import report as page
-from idm_env.prediction.metrics import HORIZONS
+from idm_env.prediction.metrics import ENOUGH_SCENES, HORIZONS
 
 WHAT = (("minADE", "minADE (m)"), ("minFDE", "minFDE (m)"), ("miss_rate", "miss rate"), ("mAP", "mAP"))
 
@@ -17,9 +17,8 @@ def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> 
     page.write_json(out / "report.json", report)
     left_out = report["left_out"]
     scored = f"{report['agents_with_known_future']} of them have a known future and are scored, at 2 Hz."
-    lost = f"{len(left_out)} files or agents were left out (below)." if left_out else "Nothing was left out."
     blocks = [
-        page.lead(f"{scored} {lost}"),
+        page.lead(f"{scored} {report['account']}"),
         page.note(
             "minADE and minFDE are those of the best of up to six futures; an agent is missed where no future ends in "
             "a box around the truth that grows with time and speed. mAP asks besides that confident futures be the "
@@ -27,12 +26,14 @@ def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> 
         ),
         page.heading("All agents"),
         metrics(report["methods"]),
+        page.note(_how(report)),
+        *_groups("By kind", "kind", report["kinds"]),
+        *_groups("By scene", "scene", report["scenes"]),
+        page.heading("From above"),
+        page.gallery(pictures),
+        page.heading("Data"),
+        page.text(report["account"]),
     ]
-    for title, groups in (("By scene", report["scenes"]), ("By kind", report["kinds"])):
-        blocks.append(page.heading(title))
-        for name, rows in groups.items():
-            blocks += [page.text(name), metrics(rows)]
-    blocks += [page.heading("From above"), page.gallery(pictures)]
     if left_out:
         items = [f"{item['what']}: {item['reason']}" for item in left_out]
         blocks += [page.heading("Left out"), page.bullets(page.shortened(items))]
@@ -44,13 +45,43 @@ def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> 
 
 
 def metrics(rows: Sequence[dict[str, Any]]) -> page.Block:
-    """Return the table of methods; of each metric the three horizons in one cell."""
-    columns = [f"{title} at {', '.join(str(s) for s in HORIZONS)} s" for _, title in WHAT]
+    """Return the table of methods, one row per horizon and one figure a column, with intervals."""
     table = []
-    for row in rows:
-        cells: dict[str, Any] = {"method": row["method"], "agents": row["agents"]}
-        for (name, _), column in zip(WHAT, columns, strict=True):
-            values = [row[f"{name}_{s}s"] for s in HORIZONS]
-            cells[column] = " · ".join(f"{v:.2f}" if v == v else "–" for v in values)
-        table.append(cells)
-    return page.table(table, first=True)
+    for seconds in reversed(HORIZONS):
+        for row in rows:
+            cells: dict[str, Any] = {"method": row["method"], "agents": row["agents"], "seconds ahead": seconds}
+            for name, title in WHAT:
+                low, high = row["intervals"][f"{name}_{seconds}s"]
+                cells[title] = row[f"{name}_{seconds}s"]
+                known = low == low
+                cells[f"{title}: 95 %"] = page.Cell(f"{low:.2f} … {high:.2f}" if known else "–", low)
+            table.append(cells)
+    return page.table(table, digits={title: 2 for _, title in WHAT}, first=True)
+
+
+def _how(report: dict[str, Any]) -> str:
+    whole = len(report["scenes"]) >= ENOUGH_SCENES
+    words = f"whole scenes drawn anew ({len(report['scenes'])})" if whole else "agents drawn anew"
+    few = (
+        ""
+        if whole
+        else f" They say nothing of how scenes differ, of which there are only {len(report['scenes'])}: another one "
+        "may lie outside."
+    )
+    return f"95 %: bootstrap intervals, {words}.{few} A click on a heading sorts."
+
+
+def _groups(title: str, what: str, groups: dict[str, list[dict[str, Any]]]) -> list[page.Block]:
+    """Return the table of methods by kind or scene at the longest horizon, one figure a column."""
+    last = HORIZONS[-1]
+    rows = [
+        {
+            what: name, "method": row["method"], "agents": row["agents"],
+            **{f"{words} {last} s": row[f"{key}_{last}s"] for key, words in WHAT},
+        }
+        for name, methods in groups.items() for row in methods
+    ]  # fmt: skip
+    if not rows:
+        return []
+    digits = {f"{words} {last} s": 2 for _, words in WHAT}
+    return [page.heading(title), page.table(rows, digits=digits)]

@@ -12,12 +12,11 @@ from idm_env.prediction.drivers import Second, middle, passing
 from idm_env.prediction.free import motion_now
 from idm_env.prediction.lanes import LaneGraph, Route, turn
 from idm_env.prediction.rollout import DT, Ahead, Course, nobody, roll
+from idm_env.prediction.shares import STANDING_MPS
 from idm_env.prediction.stops import StopLines
 
 SECONDS = 8
 STEPS = SECONDS * 10
-STANDING_MPS = 0.5
-"""Slower vehicles stand (m/s)."""
 LEAST_ROUTE = 0.02
 """Routes that are less plausible than this share of the best are not followed."""
 YAW_SIGMA = 0.2

@@ -15,19 +15,18 @@ def select(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return up to six futures [F, S, 2] and their confidences [F] from samples [N, S, 2].
 
-    The first is the likeliest to hit in the sense of the benchmark (``chances``). Then greedy: each choice lowers most
-    the expected loss over the samples, were one of them to come true. Half of the loss of a sample is its distance d to
-    the nearest choice in units of the benchmark's box, at most 1, so that what is missed anyway does not pull; the
+    The first sample is always among them, so that nobody is predicted worse than by it. Then greedy: each choice lowers
+    most the expected loss over the samples, were one of them to come true. Half of the loss of a sample is its distance
+    d to the nearest choice in units of the benchmark's box, at most 1, so that what is missed anyway does not pull; the
     other half is ``d / (d + c)`` with c the mean distance between samples, so that a choice also comes near what it
     cannot hit.
     """
     if len(futures) > MOST_SAMPLES:
-        keep = np.argsort(-weight, kind="stable")[:MOST_SAMPLES]
+        keep = np.argsort(-np.concatenate([[np.inf], weight[1:]]), kind="stable")[:MOST_SAMPLES]
         futures, weight = futures[keep], weight[keep]
     weight = weight / weight.sum()
     loss = _loss(futures, speed)
-    likeliest = int(np.argmax(np.einsum("n,hnf->f", weight, _hits(futures, futures, speed))))
-    chosen, best = [likeliest], loss[:, likeliest]
+    chosen, best = [0], loss[:, 0]
     for _ in range(min(most, len(futures)) - 1):
         gain = (weight[:, None] * np.maximum(best[:, None] - loss, 0.0)).sum(0)
         pick = int(np.argmax(gain))

@@ -6,8 +6,9 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-from idm_env.parameters import nearest
-from idm_env.tasks.base import Advance, Bounds, Ended, Task, World
+from idm_env.checks import nearest, shown
+from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
+from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
@@ -18,16 +19,19 @@ TASKS: dict[str, type[Task]] = {task.name: task for task in (RingTask, FollowTas
 
 
 def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any) -> Task:
-    """Return a task by name with its static choices; ValueError with a suggestion for a misspelled one.
+    """Return a task by name with its static choices; ``others``, which the caller takes himself, are suggested too.
 
-    ``others`` are keywords that the caller takes himself: they are suggested too.
+    Raises:
+        KeywordError: A TypeError, with a suggestion, for a keyword that does not exist.
+        ValueError: For an unknown task, or a value that cannot be.
     """
-    if task not in TASKS:
-        raise ValueError(f"unknown task {task!r}.{nearest(str(task), TASKS)}")
+    if not isinstance(task, str) or task not in TASKS:
+        raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), TASKS)}")
     known = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]
     for choice in choices:
         if choice not in known:
-            raise ValueError(f"task '{task}' has no keyword '{choice}'.{nearest(choice, [*known, *others])}")
+            like = nearest(str(choice), [name for name in (*known, *others) if name != choice])
+            raise KeywordError(f"task '{task}' got an unexpected keyword argument {shown(choice)}.{like}")
     return TASKS[task](**choices)
 
 
@@ -37,7 +41,10 @@ __all__ = [
     "Bounds",
     "Draw",
     "Ended",
+    "Features",
     "FollowTask",
+    "KeywordError",
+    "Pay",
     "PlatoonTask",
     "ReplayTask",
     "RingTask",

@@ -2,7 +2,7 @@
 
 A task knows nothing of Gymnasium, of automatic resets or of where gradients are cut; agents that differentiate
 through a rollout call it directly. Everything random comes in: as keys (``Draw``) at reset and as normals at every
-step.
+step. A crash is worse than any survival: see ``idm_env.tasks.crash``.
 """
 
 from __future__ import annotations
@@ -17,18 +17,21 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from idm_env.checks import one_of, shown
 from idm_env.effects import Control, Effect, Noise
 from idm_env.roads import Road
-from idm_env.simulator import Simulator
+from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
 from idm_env.tasks.checks import agents_of, at_least, whole
-from idm_env.tasks.nouns import Advance, Bounds, Ended, Run, World
+from idm_env.tasks.crash import contact, lawful_cost
+from idm_env.tasks.nouns import Advance, Bounds, Ended, Features, Pay, World
 from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params, State
 
 _NORMALS_AT_ONCE = 1 << 16
 _STANDSTILL = 1.0
 """Gap that the failsafe leaves (m)."""
+OBSERVATIONS = ("scaled", "raw")
 _TAKE_INPUTS = {"control", "replay", "imagined", "lateral"}
 
 
@@ -38,7 +41,8 @@ class Task(abc.ABC):
 
     Args:
         vehicles: Number of vehicles, recorded ones included.
-        controlled: How many vehicles agents control, spread evenly, or which ones (indices, front first).
+        controlled: How many vehicles agents control, spread evenly: a number, a fraction such as 0.1, or ``"all"``; or
+            which ones (indices, front first).
         vehicle_length: Length of every vehicle (m).
         dt: Time step (s); None is the one of ``effects`` if that is a model file, else 0.1.
         integration: ``"ballistic"`` or ``"euler"``; None as for ``dt``.
@@ -56,13 +60,18 @@ class Task(abc.ABC):
             who brakes as hard are cut, and may then brake beyond ``max_command``; 0 is none. Rewards are for the
             command as it was given. See ``safe_command``.
         failsafe_time: Time (s) that the failsafe allows for before braking begins, as SUMO's tau.
+        max_episode_steps: Steps after which an episode is cut off; None is the task's own number, −1 is no limit.
+        observation: ``"scaled"``: each entry over a fixed scale that the task documents, about unit size; ``"raw"``: in
+            SI units (m, m/s). Both are clipped to ``bounds``.
+        crash_cost: What a crash costs; None is the smallest that makes it worse than any survival
+            (``idm_env.tasks.crash``).
 
     Raises:
         ValueError: In one line, with value, rule and cure.
     """
 
     vehicles: int = 22
-    controlled: int | Sequence[int] = 1
+    controlled: int | float | str | Sequence[int] = 1
     vehicle_length: float = 5.0
     dt: float | None = None
     integration: str | None = None
@@ -74,6 +83,9 @@ class Task(abc.ABC):
     max_command: float = 1.0
     failsafe: float = 0.0
     failsafe_time: float = 1.0
+    max_episode_steps: int | None = None
+    observation: str = "scaled"
+    crash_cost: float | None = None
 
     name: ClassVar[str]
     road: ClassVar[Road]
@@ -96,7 +108,19 @@ class Task(abc.ABC):
         at_least("max_command", self.max_command, 1e-3, "m/s²")
         at_least("failsafe", self.failsafe, 0.0, "m/s²")
         at_least("failsafe_time", self.failsafe_time, 0.0, "s")
+        self._check_episode()
         self.params(torch.float64, "cpu")
+
+    def _check_episode(self) -> None:
+        """Check what every task says of its episodes, observations and crashes."""
+        steps = self.max_episode_steps
+        if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or (steps < 1 and steps != -1)):
+            raise ValueError(
+                f"max_episode_steps = {shown(steps)} must be a whole number of at least 1, or -1 for no limit."
+            )
+        one_of("observation", self.observation, OBSERVATIONS)
+        if self.crash_cost is not None:
+            at_least("crash_cost", self.crash_cost, 0.0)
 
     # -- static facts --------------------------------------------------------------------------------------------
 
@@ -106,9 +130,33 @@ class Task(abc.ABC):
         return agents_of(self.controlled, self.vehicles, self.first_free)
 
     @property
+    def usual_steps(self) -> int:
+        """Steps of an episode where nothing else is said."""
+        return 3000
+
+    @property
     def horizon(self) -> int | None:
-        """Steps after which the task itself cuts an episode; None leaves that to ``max_episode_steps``."""
-        return None
+        """Steps after which an episode is cut off, or None."""
+        if self.max_episode_steps is None:
+            return self.usual_steps
+        return None if self.max_episode_steps == -1 else self.max_episode_steps
+
+    @property
+    @abc.abstractmethod
+    def pay(self) -> Pay:
+        """The lowest (at most 0) and the highest (at least 0) reward of a step without a crash."""
+
+    @cached_property
+    def cost_of_crash(self) -> float:
+        """What an agent pays for a crash: ``crash_cost``, or the smallest that makes it worse than any survival."""
+        if self.crash_cost is not None:
+            return self.crash_cost
+        return self.shares * lawful_cost(self.pay, self.horizon or self.usual_steps)
+
+    @property
+    def shares(self) -> int:
+        """Agents among whose rewards the mean spreads the cost of a crash: 1 where all crash together."""
+        return 1
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -117,8 +165,19 @@ class Task(abc.ABC):
 
     @property
     @abc.abstractmethod
+    def features(self) -> Features:
+        """What one agent observes, in SI units."""
+
+    @cached_property
+    def scales(self) -> tuple[float, ...]:
+        """What each entry of an observation is divided by: 1 for raw ones."""
+        return self.features.scales if self.observation == "scaled" else (1.0,) * len(self.features.scales)
+
+    @cached_property
     def bounds(self) -> Bounds:
-        """What one agent observes; observations are clipped to it, and what is clipped has no gradient."""
+        """The space of observations: they are clipped to it, and what is clipped has no gradient."""
+        low, high = (tuple(x / scale for x, scale in zip(ends, self.scales, strict=True)) for ends in self.features[2:])
+        return Bounds(self.features.names, low, high)
 
     @cached_property
     def _behaviour(self) -> Behaviour:
@@ -162,8 +221,10 @@ class Task(abc.ABC):
         return found
 
     def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
-        """Return the parameters as tensors (a number: scalar; a list: one per vehicle; a tensor: as it is)."""
-        return self._behaviour.params(self.vehicles, dtype, device)
+        """Return checked parameters as tensors (a number: scalar; a list: one per vehicle; a tensor: as it is)."""
+        values = self._behaviour.params(self.vehicles, dtype, device)
+        self.simulator.check(values)
+        return values
 
     def _is_agent(self) -> list[bool]:
         return [i in self.agents for i in range(self.vehicles)]
@@ -183,23 +244,27 @@ class Task(abc.ABC):
     def begin(self, draw: Draw, params: Params) -> World:
         """Return the worlds before the warm-up, with ``state.step = −warmup``."""
 
-    def reset(self, draw: Draw, params: Params, run: Run | None = None) -> World:
-        """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control.
-
-        ``run`` does many steps at once, for tasks without records; None repeats ``step``.
-        """
+    def reset(self, draw: Draw, params: Params) -> World:
+        """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control."""
         world = self.begin(draw, params)
         rows, width = world.state.speed.shape
         block = max(16, _NORMALS_AT_ONCE // max(rows * width, 1))
         for first in range(0, self.warmup, block):
             steps = min(block, self.warmup - first)
-            normals = draw.normals(world.state.step, steps, width, world.state.speed.dtype) if self.noisy else None
-            if run is not None:
-                world = world._replace(state=run(world.state, normals, params, steps))
-                continue
-            for t in range(steps):
-                world = self.step(world, None, None if normals is None else normals[t], params)
+            inputs = self._idle(world, steps)
+            if self.noisy:
+                inputs["noise"] = draw.normals(world.state.step, steps, width, world.state.speed.dtype)
+            world = world._replace(state=self.simulator.rollout(world.state, inputs, params, steps, keep=None)[0])
         return world
+
+    def _idle(self, world: World, steps: int) -> dict[str, Any]:
+        """Return the inputs of some steps without any command, time first."""
+        state = world.state
+        if len(self.machinery) == 1:
+            still = torch.zeros(steps, self.vehicles, dtype=torch.bool, device=state.speed.device)
+            return {"control": Command(state.speed.new_zeros(steps, 1), still)}
+        every = [self.inputs(world._replace(state=state._replace(step=state.step + t)), None, None) for t in range(steps)]
+        return {name: stacked([inputs[name] for inputs in every]) for name in every[0]}
 
     def command(self, action: Tensor) -> Tensor:
         """Return the commanded accelerations (m/s²) of actions, which are clipped to [−1, 1] (no gradient beyond)."""
@@ -231,10 +296,14 @@ class Task(abc.ABC):
         safe = torch.sqrt((room + half * half).clamp_min(1e-6)) - half
         return (safe - speed) / dt
 
+    def limit(self, world: World, command: Tensor) -> Tensor:
+        """Return commands (m/s²) as far as the failsafe lets them pass."""
+        return torch.minimum(command, self.safe_command(world)) if self.failsafe else command
+
     def inputs(
         self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
     ) -> Inputs:
-        """Return the inputs of one step: the command (m/s², None for nobody) as far as safe, and the noise's normals.
+        """Return the inputs of one step: the command (m/s², None for nobody) and the noise's normals.
 
         ``live`` (bool, ``(…, agents)``) says which agents still command; the others' vehicles go back to their drivers.
         """
@@ -243,8 +312,6 @@ class Task(abc.ABC):
             idle = self.constant("idle", [False] * self.vehicles, speed.device, torch.bool)
             inputs: dict[str, Any] = {"control": Command(speed.new_zeros(()), idle)}
         else:
-            if self.failsafe:
-                command = torch.minimum(command, self.safe_command(world))
             active = self.constant("active", self._is_agent, speed.device, torch.bool)
             if len(self.agents) > 1:
                 slot = self.constant("slots", self._agent_slots, speed.device, torch.int64)
@@ -265,8 +332,14 @@ class Task(abc.ABC):
         *,
         live: Tensor | None = None,
         advance: Advance | None = None,
+        limited: bool = False,
     ) -> World:
-        """Return the world Δt later. ``command`` (m/s²) has shape ``(…, agents)``, ``normals`` ``(…, vehicles)``."""
+        """Return the world Δt later. ``command`` (m/s²) has shape ``(…, agents)``, ``normals`` ``(…, vehicles)``.
+
+        ``limited`` says that ``limit`` was called already.
+        """
+        if command is not None and not limited:
+            command = self.limit(world, command)
         state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals, live), params)
         return world._replace(state=state)
 
@@ -275,23 +348,52 @@ class Task(abc.ABC):
         """Return what the agents observe, shape ``(…, agents, features)``, within ``bounds``."""
 
     @abc.abstractmethod
-    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
-        """Return the rewards of a step, shape ``(…, agents)``; ``command`` in m/s²."""
+    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return the rewards of a step without a crash, within ``pay``, shape ``(…, agents)``; ``command`` in m/s²."""
+
+    def reward(self, before: World, command: Tensor, after: World, crashed: Tensor | None = None) -> Tensor:
+        """Return the rewards of a step, shape ``(…, agents)``: what is ``earned``, or ``−cost_of_crash``.
+
+        ``command`` in m/s²; ``crashed``, where the caller has it already, is ``self.crashed(after)``.
+        """
+        crashed = self.crashed(after) if crashed is None else crashed
+        return torch.where(crashed, -self.cost_of_crash, self.earned(before, command, after))
+
+    def crashed(self, world: World) -> Tensor:
+        """Return whose episodes end in a crash: those of all, where any two vehicles have touched (a gap ≤ 0)."""
+        crashed = world.state.gap.amin(-1, keepdim=True) <= 0.0
+        return crashed.expand(-1, len(self.agents)) if len(self.agents) > 1 else crashed
 
     def ended(self, world: World) -> Ended:
-        """Return whether it is over: terminated for all agents where any two vehicles have touched (a gap ≤ 0)."""
-        crashed = world.state.gap.amin(-1, keepdim=True) <= 0.0
-        if len(self.agents) > 1:
-            crashed = crashed.expand(-1, len(self.agents))
+        """Return whether it is over: terminated by a crash, truncated where records end (never, without any)."""
+        crashed = self.crashed(world)
         return Ended(crashed, torch.zeros_like(crashed))
 
-    def clip(self, features: list[Tensor], scales: tuple[float, ...]) -> Tensor:
-        """Stack features of shape ``(…, agents)``, divide them by their scales, and clip them to ``bounds``."""
+    # -- words -----------------------------------------------------------------------------------------------------
+
+    @property
+    def vehicle_ids(self) -> tuple[str, ...] | None:
+        """Recorded ids of all vehicles, or None where nothing is recorded but leaders."""
+        return None
+
+    def crash_reason(self, world: World, row: int, agent: int | None = None) -> str:
+        """Return who touched whom in one environment that has crashed, when and how deep; ``agent`` asks for its own.
+
+        Of several contacts the deepest one is named.
+        """
+        gap = world.state.gap[row].detach()
+        vehicle = int(gap.argmin()) if agent is None else self.agents[agent]
+        ids = self.vehicle_ids or tuple(str(i) for i in range(self.vehicles))
+        seconds = float(world.state.step[row]) * self.simulator.dt
+        return contact(ids, self.agents, vehicle, float(gap[vehicle]), seconds)
+
+    def clip(self, features: list[Tensor]) -> Tensor:
+        """Stack features of shape ``(…, agents)`` in SI units, over their ``scales`` and clipped to ``bounds``."""
         seen = torch.stack(features, dim=-1)
         device, dtype = seen.device, seen.dtype
         low = self.constant("low", lambda: self.bounds.low, device, dtype)
         high = self.constant("high", lambda: self.bounds.high, device, dtype)
-        return (seen / self.constant("scales", scales, device, dtype)).clamp(low, high)
+        return (seen / self.constant("scales", lambda: self.scales, device, dtype)).clamp(low, high)
 
 
-__all__ = ["Advance", "Bounds", "Draw", "Ended", "Run", "Task", "World"]
+__all__ = ["Advance", "Bounds", "Draw", "Ended", "Features", "Pay", "Task", "World"]

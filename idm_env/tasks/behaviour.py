@@ -14,7 +14,6 @@ from idm_env import parameters
 from idm_env.config import load_model, make_effects, nested, number
 from idm_env.effects import CarFollowing, Effect
 from idm_env.simulator import Integration
-from idm_env.types import Params
 
 
 @dataclass(frozen=True)
@@ -27,12 +26,11 @@ class Behaviour:
     integration: Integration
 
     def params(self, vehicles: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
-        """Return checked tensors; a list must have one value per vehicle."""
+        """Return tensors; a list must have one value per vehicle."""
         values = parameters.defaults(self.effects, dtype=dtype, device=device)
         for effect, part in self.parameters.items():
             for name, value in part.items():
                 values.setdefault(effect, {})[name] = _tensor(f"{effect}.{name}", value, vehicles, dtype, device)
-        parameters.check(self.effects, cast(Params, values))
         return values
 
 

@@ -1,60 +1,56 @@
-"""Checks of keyword arguments: one line that names the value, the rule and the cure."""
+"""Checks of tasks' keyword arguments: one line that names the value, the rule and the cure."""
 
 from __future__ import annotations
 
-import math
-import numbers
 from collections.abc import Sequence
 from typing import Any
 
+from idm_env.checks import at_least, shown, whole
 
-def whole(name: str, value: Any, low: int) -> int:
-    """Return a whole number of at least ``low``."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-        raise ValueError(f"{name} = {value!r} must be a whole number.")
-    if value < low:
-        raise ValueError(f"{name} = {value} must be at least {low}.")
-    return int(value)
+__all__ = ["KeywordError", "agents_of", "at_least", "span", "whole"]
 
 
-def finite(name: str, value: Any, unit: str = "") -> float:
-    """Return a finite number."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
-        raise ValueError(f"{name} = {value!r} must be a finite number{' of ' + unit if unit else ''}.")
-    return float(value)
-
-
-def at_least(name: str, value: Any, low: float, unit: str = "") -> float:
-    """Return a finite number of at least ``low``."""
-    if finite(name, value, unit) < low:
-        raise ValueError(f"{name} = {value:g}{' ' + unit if unit else ''} must be at least {low:g}.")
-    return float(value)
+class KeywordError(TypeError, ValueError):
+    """A keyword that does not exist: a TypeError as for any call, and a ValueError as for any value of a YAML file."""
 
 
 def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
     """Return a range from one number or from ``[lowest, highest]``."""
     ends = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value, value]
     if len(ends) != 2:
-        raise ValueError(f"{name} = {value!r} must be one number or [lowest, highest] ({unit}).")
+        raise ValueError(f"{name} = {shown(value)} must be one number or [lowest, highest] ({unit}).")
     first, last = (at_least(name, end, low, unit) for end in ends)
     if first > last:
-        raise ValueError(f"{name} = {value!r} must rise: write [{last:g}, {first:g}] ({unit}).")
+        raise ValueError(f"{name} = {shown(value)} must rise: write [{last:g}, {first:g}] ({unit}).")
     return first, last
 
 
+def count_of(controlled: Any, free: int) -> int:
+    """Return how many of ``free`` vehicles ``"all"``, a fraction (0 to 1, at least one vehicle) or a number means."""
+    if controlled == "all":
+        return max(1, free)
+    if isinstance(controlled, float):
+        if not 0.0 < controlled <= 1.0:
+            raise ValueError(f"controlled = {controlled} must be a fraction above 0 and up to 1, a number, or 'all'.")
+        return max(1, round(controlled * free))
+    if isinstance(controlled, str):
+        raise ValueError(f"controlled = {shown(controlled)} must be 'all', a number, a fraction or a list of vehicles.")
+    return whole("controlled", controlled, 1)
+
+
 def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:
-    """Return the indices of the controlled vehicles: spread evenly for a number, as given for a sequence."""
+    """Return the indices of the controlled vehicles: spread evenly for what ``count_of`` takes, as given for a list."""
     free = vehicles - first
     if isinstance(controlled, Sequence) and not isinstance(controlled, str):
         chosen = tuple(sorted(whole("controlled", i, 0) for i in controlled))
         if not chosen or len(set(chosen)) < len(chosen):
-            raise ValueError(f"controlled = {list(controlled)} must name at least one vehicle, and none twice.")
+            raise ValueError(f"controlled = {shown(list(controlled))} must name at least one vehicle, and none twice.")
         if chosen[0] < first or chosen[-1] >= vehicles:
             raise ValueError(
-                f"controlled = {list(controlled)} must lie in {first} … {vehicles - 1}; lower ones are recorded."
+                f"controlled = {shown(list(controlled))} must lie in {first} … {vehicles - 1}; lower ones are recorded."
             )
         return chosen
-    count = whole("controlled", controlled, 1)
+    count = count_of(controlled, free)
     if count > free:
         raise ValueError(
             f"controlled = {count} exceeds the {free} vehicles that can be controlled of {vehicles}. "

@@ -13,13 +13,18 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Bounds, Ended, Task, World
+from idm_env.tasks.base import Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import whole
+from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import Leaders, equilibrium_gap, head, made_up_leader, queue, recorded_leaders, starts
 from idm_env.types import Inputs, Params
 
 HORIZON = 1000
+SEEN = Features(("speed", "lead_speed", "gap"), (40.0, 40.0, 100.0), (0.0, 0.0, -10.0), (100.0, 100.0, 1000.0))
+"""What an agent behind a record observes, here and in ``replay``: speeds up to 100 m/s, gaps up to 1000 m."""
+KNEE, LOWEST, HIGHEST = -2.0, -4.0, 1.0
+"""Reward from which it saturates, and what it never leaves."""
 _NEAREST, _FARTHEST, _SHORTEST = 7.0, 120.0, 1.0
 _GALLONS_PER_HOUR = 0.951
 """1 mL/s in US gallons per hour."""
@@ -45,11 +50,13 @@ class FollowTask(Task):
     from trajectory data", ICRA, and its public code: Δt 0.1 s, horizon 1000, humans with a = 1.3, b = 2, v0 = 45, T =
     1, s0 = 2, everybody in equilibrium at the start.
 
-    Observation, per agent: ``v/40, v_lead/40, gap/100``.
-    Reward, per agent: ``1 − fuel/10 − 0.002 u² − 2 p − 50 [crash]``; fuel is the mean rate of the agent and everybody
-    behind it (US gallons per hour; the source's own energy model is not public, ``metrics.fuel`` stands in), u its
-    command (m/s²), p in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap below 1 s.
-    Terminated where vehicles touch; truncated after 1000 steps or at the end of the record.
+    Observation, per agent: ``v/40, v_lead/40, gap/100`` (m/s and m; raw: without the scales).
+    Reward, per agent: ``1 − fuel/10 − 0.002 u² − 2 p``; fuel is the mean rate of the agent and everybody behind it (US
+    gallons per hour; the source's own energy model is not public, ``metrics.fuel`` stands in), u its command (m/s²), p
+    in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap below 1 s. Below −2 it saturates towards
+    −4 (``floored``). Terminated where vehicles touch, which pays ``−crash_cost`` instead: 5001 by default, so that a
+    crash is worse than any survival (``idm_env.tasks.crash``); the source takes 50. Truncated at the end of the record,
+    and after ``max_episode_steps``: 1000, or what the longest record has.
 
     Args:
         leader: A trajectory file; every leader that somebody follows in it may be drawn. None is the project's own
@@ -72,12 +79,22 @@ class FollowTask(Task):
     def __post_init__(self) -> None:
         whole("vehicles", self.vehicles, 2)
         super().__post_init__()
-        _ = self.leaders
+        longest = self._longest
+        if (self.max_episode_steps or 0) > longest:
+            raise ValueError(
+                f"max_episode_steps = {self.max_episode_steps} exceeds the {longest} steps of the longest record after "
+                f"the warm-up. Take at most {longest}, or a longer record."
+            )
+
+    @cached_property
+    def _longest(self) -> int:
+        """Steps that the longest record has after the warm-up, at least 1."""
+        return max(int(self.leaders.steps.max()) - 1 - self.warmup, 1)
 
     @property
-    def horizon(self) -> int:
-        """1000 steps."""
-        return HORIZON
+    def usual_steps(self) -> int:
+        """1000 steps, or what the longest record has."""
+        return min(HORIZON, self._longest)
 
     @cached_property
     def leaders(self) -> Leaders:
@@ -86,16 +103,21 @@ class FollowTask(Task):
         return made_up_leader(dt) if self.leader is None else recorded_leaders(str(self.leader), dt)
 
     @property
-    def bounds(self) -> Bounds:
+    def features(self) -> Features:
         """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
-        return Bounds(("speed", "lead_speed", "gap"), (0.0, 0.0, -0.1), (2.5, 2.5, 10.0))
+        return SEEN
+
+    @property
+    def pay(self) -> Pay:
+        """From −4 to 1."""
+        return Pay(LOWEST, HIGHEST)
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return a queue in equilibrium behind a drawn stretch of a drawn leader."""
         like = params["idm"]["max_accel"]
         device = draw.key.device
         steps = self.constant("steps", self.leaders.steps, device, torch.int64)
-        trace, start = starts(draw, steps, self.horizon + self.warmup)
+        trace, start = starts(draw, steps, (self.horizon or self.usual_steps) + self.warmup)
         episode = {"trace": trace, "start": start + self.warmup}
         first = self._motion(episode, torch.full_like(start, -self.warmup), like.dtype)
         speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()
@@ -129,20 +151,19 @@ class FollowTask(Task):
         """Return ``v/40, v_lead/40, gap/100`` of every agent."""
         state = world.state
         seen = [self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)]
-        return self.clip(seen, (40.0, 40.0, 100.0))
+        return self.clip(seen)
 
-    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
-        """Return ``1 − fuel/10 − 0.002 u² − 2 p − 50 [crash]``."""
+    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return ``1 − fuel/10 − 0.002 u² − 2 p``, saturated below −2."""
         state = after.state
         fuel = metrics.fuel(state.speed, state.accel) * _GALLONS_PER_HOUR
         # Running means from the back: of every vehicle and those behind it.
         count = self.constant("count", list(range(self.vehicles, 0, -1)), fuel.device, fuel.dtype)
         behind = fuel.flip(-1).cumsum(-1).flip(-1) / count
         gap, speed = self.pick(state.gap), self.pick(state.speed)
-        crash = (state.gap[..., 1:] <= 0.0).any(-1, keepdim=True).to(fuel.dtype)
-        return (
-            1.0 - 0.1 * self.pick(behind) - 0.002 * command * command - 2.0 * headway_penalty(gap, speed) - 50.0 * crash
-        )
+        penalty = headway_penalty(gap, speed)
+        reward = 1.0 - 0.1 * self.pick(behind) - 0.002 * command * command - 2.0 * penalty
+        return floored(reward, KNEE, LOWEST)
 
     def ended(self, world: World) -> Ended:
         """Return whether vehicles have touched, or the record is at its end."""

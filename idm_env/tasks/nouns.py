@@ -12,8 +12,8 @@ from idm_env.types import Inputs, Params, State
 Advance = Callable[[State, Inputs, Params], State]
 """One step of a simulator: ``Simulator.step``, or a fused kernel that gives the same."""
 
-Run = Callable[[State, "Tensor | None", Params, int], State]
-"""Many steps without any control: state, normals with a leading time dimension or None, parameters, steps."""
+NOBODY = "—"
+"""Id of a slot in which no recorded vehicle is."""
 
 
 class World(NamedTuple):
@@ -33,9 +33,25 @@ class Ended(NamedTuple):
     truncated: Tensor
 
 
+class Features(NamedTuple):
+    """What one agent observes, in SI units: names, fixed scales, and the lowest and the highest value of each."""
+
+    names: tuple[str, ...]
+    scales: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
 class Bounds(NamedTuple):
-    """Names of what one agent observes, with the lowest and the highest value of each."""
+    """Names of what one agent observes, with the lowest and the highest value of each, as it is observed."""
 
     names: tuple[str, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
+
+
+class Pay(NamedTuple):
+    """The lowest and the highest reward that a step without a crash can give."""
+
+    low: float
+    high: float

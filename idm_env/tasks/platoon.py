@@ -13,14 +13,16 @@ from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Bounds, Task, World
+from idm_env.tasks.base import Features, Pay, Task, World
 from idm_env.tasks.checks import at_least, span, whole
+from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import equilibrium_gap, head, queue
 from idm_env.types import Inputs, Params
 
 _WAVE_STREAM = 21
 _WAVES = 3
+_KNEE, _LOWEST = -4.0, -8.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,11 +34,13 @@ class PlatoonTask(Task):
     String stability (Swaroop and Hedrick 1996, IEEE Trans. Autom. Control 41) is ``metrics.amplification`` of the
     speeds.
 
-    Observation, per agent: ``v/30, (v_lead − v)/10, gap/100, (v − v̄)/10``.
+    Observation, per agent: ``v/30, (v_lead − v)/10, gap/100, (v − v̄)/10`` (m/s and m; raw: without the scales).
     Reward, per agent: ``−((v_i − v̄)² + (v_last − v̄)²) / (2 A²) − 0.1 u² − 2 max(0, 1 − time gap / 0.8 s)
     − max(0, time gap / 4 s − 1)``, A the disturbance, u its command (m/s²): the usual quadratic costs of speed and
     effort, and bounds on the time gap so that nobody hides far behind. The humans (a = 0.6, b = 1.5, T = 1, s0 = 2,
-    v0 = 30) amplify waves of 40–90 s at 10 m/s, by a quarter over ten vehicles. Terminated where vehicles touch.
+    v0 = 30) amplify waves of 40–90 s at 10 m/s, by a quarter over ten vehicles. Below −4 the reward saturates towards
+    −8 (``floored``). Terminated where vehicles touch, which pays ``−crash_cost`` instead: 24 001 by default, so that a
+    crash is worse than any survival (``idm_env.tasks.crash``). Cut off after 3000 steps.
 
     Args:
         speed: Mean speed v̄ of the head (m/s).
@@ -67,10 +71,15 @@ class PlatoonTask(Task):
         span("period", self.period, 1.0, "s")
 
     @property
-    def bounds(self) -> Bounds:
-        """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
-        low = (0.0, -10.0, -0.1, -10.0)
-        return Bounds(("speed", "relative_speed", "gap", "deviation"), low, (4.0, 10.0, 10.0, 10.0))
+    def features(self) -> Features:
+        """Speeds up to 120 m/s, gaps from an overlap to 1000 m."""
+        names, scales = ("speed", "relative_speed", "gap", "deviation"), (30.0, 10.0, 100.0, 10.0)
+        return Features(names, scales, (0.0, -100.0, -10.0, -100.0), (120.0, 100.0, 1000.0, 100.0))
+
+    @property
+    def pay(self) -> Pay:
+        """Costs only."""
+        return Pay(_LOWEST, 0.0)
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return a platoon in equilibrium at v̄, with drawn waves ahead of it."""
@@ -98,7 +107,8 @@ class PlatoonTask(Task):
     def _motion(self, waves: Tensor, step: Tensor) -> Tensor:
         """Return position, speed and acceleration of the head at a step, shape ``(n, 3)``."""
         frequency, phase, amplitude = waves.unbind(1)
-        t = ((step + self.warmup) * self.simulator.dt).to(waves.dtype).unsqueeze(-1)
+        # Integers times dt are float32 until they are told otherwise.
+        t = (step + self.warmup).to(waves.dtype).unsqueeze(-1) * self.simulator.dt
         angle, fade = frequency * t + phase, torch.exp(-0.1 * t)
         start = phase.cos()
         moved = (angle.sin() - phase.sin()) / frequency - start * 10.0 * (1.0 - fade)
@@ -122,17 +132,18 @@ class PlatoonTask(Task):
         state = world.state
         speed, lead_speed = self.pick(state.speed), self.lead_speed(state)
         gap = self.pick(state.gap)
-        return self.clip([speed, lead_speed - speed, gap, speed - self.speed], (30.0, 10.0, 100.0, 10.0))
+        return self.clip([speed, lead_speed - speed, gap, speed - self.speed])
 
-    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
+    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return minus the quadratic costs of speed and effort, and of time gaps out of bounds."""
         state = after.state
         speed, last = self.pick(state.speed), state.speed[..., -1:]
         off, off_last = speed - self.speed, last - self.speed
         time_gap = self.pick(state.gap) / speed.clamp_min(1.0)
-        return (
+        reward = (
             -(off * off + off_last * off_last) / (2.0 * self.disturbance**2)
             - 0.1 * command * command
             - 2.0 * torch.relu(1.0 - time_gap / 0.8)
             - torch.relu(time_gap / 4.0 - 1.0)
         )
+        return floored(reward, _KNEE, _LOWEST)

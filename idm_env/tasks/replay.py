@@ -12,12 +12,14 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
+from idm_env.checks import nearest, one_of, shown
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
-from idm_env.parameters import nearest
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Bounds, Ended, Task, World
-from idm_env.tasks.checks import whole
-from idm_env.tasks.follow import headway_penalty
+from idm_env.tasks.base import Ended, Features, Pay, Task, World
+from idm_env.tasks.checks import count_of
+from idm_env.tasks.crash import floored
+from idm_env.tasks.follow import HIGHEST, KNEE, LOWEST, SEEN, headway_penalty
+from idm_env.tasks.nouns import NOBODY
 from idm_env.tasks.random import Draw
 from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene
 from idm_env.types import Inputs, Params, Record
@@ -25,6 +27,7 @@ from idm_env.types import Inputs, Params, Record
 HORIZON = 300
 REWARDS = ("imitation", "follow")
 _START_STREAM = 31
+_FARTHEST = -10.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,19 +37,23 @@ class ReplayTask(Task):
     An episode begins at a drawn time at which all agents are there, behind recorded leaders. Recorded vehicles do not
     react to those that are handed over. A vehicle that is handed over and comes later begins from its record.
 
-    Observation, per agent: ``v/40, v_lead/40, gap/100`` (a missing leader: the own speed, gap 1000 m).
-    Reward, per agent: ``"imitation"``: ``−|x − x_record|/10``; ``"follow"``: ``1 − fuel/10 − 0.002 u² − 2 p − 50
-    [crash]``, the terms of task ``follow`` with the agent's own fuel.
+    Observation, per agent: ``v/40, v_lead/40, gap/100`` (m/s and m; raw: without the scales; a missing leader: the own
+    speed, gap 1000 m).
+    Reward, per agent: ``"imitation"``: ``−|x − x_record|/10``; ``"follow"``: ``1 − fuel/10 − 0.002 u² − 2 p``, the
+    terms of task ``follow`` with the agent's own fuel. Below −5 and −2 they saturate towards −10 and −4 (``floored``).
     Each agent for itself: terminated where it touches its leader, truncated where its record ends. All are truncated
-    after 300 steps.
+    after ``max_episode_steps``: 300, or for as long as the record of any agent goes on. A crash pays ``−crash_cost``
+    instead, by default 3001 (imitation) or 1501 (follow) times the number of agents, whose mean a single environment
+    pays, so that it is worse than any survival (``idm_env.tasks.crash``).
 
     Args:
         data: A trajectory file; None is a made-up scene of the project's own.
         runs: Some of its runs; None takes all, on one clock.
-        controlled: Which vehicles agents control: a number (those that follow longest), or ids, as ``"vehicle"`` or
-            ``"run/vehicle"``.
+        controlled: Which vehicles agents control: a number (those that follow longest), ``"all"`` that follow at one
+            time, a fraction of these, or ids, as ``["vehicle"]`` or ``["run/vehicle"]``.
         model: Which vehicles the drivers' model takes over: ids as for ``controlled``, or ``"all"`` with a recorded
-        leader. reward_terms: ``"imitation"`` or ``"follow"``.
+            leader.
+        reward_terms: ``"imitation"`` or ``"follow"``.
     """
 
     name: ClassVar[str] = "replay"
@@ -68,19 +75,44 @@ class ReplayTask(Task):
             raise ValueError(f"vehicles = {self.vehicles}, but the file of task 'replay' decides. Leave it out.")
         if self.warmup:
             raise ValueError(f"warmup = {self.warmup}, but a replay begins from its record. Leave it out.")
-        if self.reward_terms not in REWARDS:
-            raise ValueError(
-                f"reward_terms = {self.reward_terms!r} is unknown.{nearest(str(self.reward_terms), REWARDS)}"
-            )
+        one_of("reward_terms", self.reward_terms, REWARDS)
         # The simulator needs no number of vehicles; everything that does comes after this line.
         object.__setattr__(self, "vehicles", len(self.scene.ids))
+        self._check_episode()
         self.params(torch.float64, "cpu")
         _ = self.agents, self._simulated, self._starts
+        if (self.max_episode_steps or 0) > self._longest:
+            raise ValueError(
+                f"max_episode_steps = {self.max_episode_steps} exceeds the {self._longest} steps that the agents' "
+                f"records go on. Take at most {self._longest}, or control others."
+            )
 
     @property
-    def horizon(self) -> int:
-        """300 steps."""
-        return HORIZON
+    def usual_steps(self) -> int:
+        """300 steps, or what the agents' records have."""
+        return min(HORIZON, self._longest)
+
+    @property
+    def _wanted(self) -> int:
+        """Steps for which agents should be there: those asked for, else 300."""
+        return HORIZON if self.max_episode_steps in (None, -1) else int(self.max_episode_steps or 0)
+
+    @cached_property
+    def _longest(self) -> int:
+        """Most steps from any beginning until the last of the agents has left."""
+        there = self.scene.present[:, list(self.agents)]
+        remaining = np.zeros(there.shape[1], int)
+        longest = 1
+        for t in range(len(there) - 1, -1, -1):
+            remaining = (remaining + 1) * there[t]
+            if self._together[t]:
+                longest = max(longest, int(remaining.max()) - 1)
+        return longest
+
+    @cached_property
+    def _together(self) -> np.ndarray:
+        """Time steps at which all agents follow recorded leaders, bool."""
+        return np.asarray(np.all(self.scene.led[:, list(self.agents)], axis=1))
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -88,9 +120,24 @@ class ReplayTask(Task):
         return self.scene.lane
 
     @property
-    def bounds(self) -> Bounds:
+    def vehicle_ids(self) -> tuple[str, ...]:
+        """The recorded id of each slot."""
+        return self.scene.ids
+
+    @property
+    def features(self) -> Features:
         """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
-        return Bounds(("speed", "lead_speed", "gap"), (0.0, 0.0, -0.1), (2.5, 2.5, 10.0))
+        return SEEN
+
+    @property
+    def pay(self) -> Pay:
+        """Distances are costs only; the terms of ``follow`` lie in −4 … 1."""
+        return Pay(_FARTHEST, 0.0) if self.reward_terms == "imitation" else Pay(LOWEST, HIGHEST)
+
+    @property
+    def shares(self) -> int:
+        """The number of agents: one of them ends the episode of a single environment, which pays their mean."""
+        return len(self.agents)
 
     @cached_property
     def scene(self) -> Scene:
@@ -108,24 +155,32 @@ class ReplayTask(Task):
             if not chosen:
                 raise ValueError("controlled = [] must name at least one vehicle.")
             return chosen
-        count = whole("controlled", self.controlled, 1)
-        led = self.scene.led
-        order = [int(i) for i in np.argsort(-led.sum(0), kind="stable") if self.scene.ids[i] != "—"]
-        picked: list[int] = []
-        together = np.ones(len(led), bool)
-        for slot in order:
-            if len(picked) < count and _longest(together & led[:, slot]) >= min(HORIZON, _longest(led[:, order[0]])):
-                picked.append(slot)
-                together &= led[:, slot]
+        most = count_of(self.controlled, self.vehicles)
+        # "all" and fractions are of those that follow at one time.
+        picked = self._following(most if isinstance(self.controlled, int) else self.vehicles)
+        count = count_of(self.controlled, len(picked))
         if len(picked) < count:
             raise ValueError(
                 f"controlled = {count}, but only {len(picked)} vehicles follow recorded leaders at one time. "
                 f"Control fewer."
             )
-        return tuple(sorted(picked))
+        return tuple(sorted(picked[:count]))
+
+    def _following(self, most: int) -> list[int]:
+        """Return up to ``most`` slots that follow recorded leaders at one time, those that follow longest first."""
+        led = self.scene.led
+        order = [int(i) for i in np.argsort(-led.sum(0), kind="stable") if self.scene.ids[i] != NOBODY]
+        picked: list[int] = []
+        together = np.ones(len(led), bool)
+        enough = min(self._wanted, _longest(led[:, order[0]]))
+        for slot in order:
+            if len(picked) < most and _longest(together & led[:, slot]) >= enough:
+                picked.append(slot)
+                together &= led[:, slot]
+        return picked
 
     def _slot(self, vehicle: Any) -> int:
-        known = {key: i for i, key in enumerate(self.scene.ids) if key != "—"}
+        known = {key: i for i, key in enumerate(self.scene.ids) if key != NOBODY}
         found = [i for key, i in known.items() if str(vehicle) in (key, key.rsplit("/", 1)[-1])]
         if not found:
             raise ValueError(
@@ -142,9 +197,9 @@ class ReplayTask(Task):
         """Slots that are not replayed, bool."""
         mine = np.zeros(self.vehicles, bool)
         if self.model == "all":
-            mine |= self.scene.led.any(0) & (np.array(self.scene.ids) != "—")
+            mine |= self.scene.led.any(0) & (np.array(self.scene.ids) != NOBODY)
         elif isinstance(self.model, str):
-            raise ValueError(f"model = {self.model!r} must be 'all' or a list of vehicles.")
+            raise ValueError(f"model = {shown(self.model)} must be 'all' or a list of vehicles.")
         else:
             mine[[self._slot(vehicle) for vehicle in self.model]] = True
         mine[list(self.agents)] = True
@@ -153,7 +208,7 @@ class ReplayTask(Task):
     @cached_property
     def _starts(self) -> np.ndarray:
         """Time steps at which an episode may begin: all agents follow for the horizon, or for as long as any do."""
-        together: np.ndarray = np.all(self.scene.led[:, list(self.agents)], axis=1)
+        together = self._together
         remaining = np.zeros(len(together) + 1, int)
         for t in range(len(together) - 1, -1, -1):
             remaining[t] = remaining[t + 1] + 1 if together[t] else 0
@@ -161,7 +216,7 @@ class ReplayTask(Task):
         if longest < 2:
             ids = [self.scene.ids[i] for i in self.agents[:4]]
             raise ValueError(f"vehicles {ids} never follow recorded leaders at one time. Control others or fewer.")
-        return np.flatnonzero(remaining[:-1] >= min(HORIZON + 1, longest))
+        return np.flatnonzero(remaining[:-1] >= min(self._wanted + 1, longest))
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return the recorded road at a drawn time."""
@@ -205,18 +260,17 @@ class ReplayTask(Task):
         """Return ``v/40, v_lead/40, gap/100`` of every agent."""
         state = world.state
         seen = [self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)]
-        return self.clip(seen, (40.0, 40.0, 100.0))
+        return self.clip(seen)
 
-    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
+    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return minus the distance to the record (10 m), or the terms of ``follow``."""
         state = after.state
         if self.reward_terms == "imitation":
-            return -0.1 * self.distance(after)
+            return floored(-0.1 * self.distance(after), 0.5 * _FARTHEST, _FARTHEST)
         speed, gap = self.pick(state.speed), self.pick(state.gap)
         fuel = 0.951 * metrics.fuel(speed, self.pick(state.accel))
-        crash = (gap <= 0.0).to(gap.dtype)
         far = torch.where(gap < 1e3, headway_penalty(gap, speed), 0.0)
-        return 1.0 - 0.1 * fuel - 0.002 * command * command - 2.0 * far - 50.0 * crash
+        return floored(1.0 - 0.1 * fuel - 0.002 * command * command - 2.0 * far, KNEE, LOWEST)
 
     def distance(self, world: World) -> Tensor:
         """Return how far the agents are from their records (m), 0 where these have ended, shape ``(…, agents)``."""
@@ -224,12 +278,21 @@ class ReplayTask(Task):
         motion, present = self._recorded(world.episode["start"] + state.step, state.speed.dtype)
         return self.pick((state.position - motion[..., 0]).abs() * present)
 
+    def crashed(self, world: World) -> Tensor:
+        """Return which agents touch their leaders."""
+        return self.pick(world.state.gap) <= 0.0
+
+    def crash_reason(self, world: World, row: int, agent: int | None = None) -> str:
+        """Return which agent touched its leader: recorded vehicles may overlap, and nobody minds."""
+        own = int(self.pick(world.state.gap[row].detach()).argmin()) if agent is None else agent
+        return super().crash_reason(world, row, own)
+
     def ended(self, world: World) -> Ended:
         """Return, for each agent, whether it touches its leader, and whether its record has ended."""
         state = world.state
         assert state.present is not None
         over = world.episode["start"] + state.step + 1 >= len(self.scene.present)
-        return Ended(self.pick(state.gap) <= 0.0, (self.pick(state.present) <= 0) | over.unsqueeze(-1))
+        return Ended(self.crashed(world), (self.pick(state.present) <= 0) | over.unsqueeze(-1))
 
 
 def _longest(mask: np.ndarray) -> int:

@@ -12,16 +12,23 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
+from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Effect
-from idm_env.parameters import nearest
 from idm_env.roads import Ring, Road
-from idm_env.tasks.base import Bounds, Task, World
+from idm_env.tasks.base import Features, Pay, Task, World
 from idm_env.tasks.checks import at_least, span
+from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.types import Params
 
 STARTS = ("uniform", "wave")
+SCALES = (5.0, 1.0, 10.0)
+"""Of speed, relative speed (m/s) and headway (m) in an observation: what they are about in a grown wave."""
 _LENGTH_STREAM = 1
+_FASTEST = 40.0
+"""Speed (m/s) up to which a vehicle's own is observed and the mean is paid."""
+_FUEL = 5.0
+"""Fuel rate (mL/s) from which its term saturates: hard acceleration at motorway speed."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,10 +39,14 @@ class RingTask(Task):
     with its figures: length from 220–270 m, Δt 0.1 s, warm-up 750 steps, horizon 3000, IDM v0 = 30, T = 1, a = 1, b =
     1.5, δ = 4, s0 = 2, noise 0.2, command ±1 m/s². In the warm-up everybody is a human driver.
 
-    Observation, per agent: ``v/15, (v_lead − v)/15, headway/270``, headway from front bumper to front bumper.
-    Reward, the same for all agents: ``4 mean(v)/20 − 4 mean|u|``, v of all vehicles after the step, u the commands
-    (m/s²); less ``tailgating · max(0, 1 − time gap / tailgating_below)``, each agent's own, and ``fuel · mean fuel
-    rate (mL/s)``. Terminated where vehicles touch.
+    Observation, per agent: ``v/5, (v_lead − v)/1, headway/10`` (m/s, m/s, m), headway from front bumper to front
+    bumper; raw: without the scales. Flow divides by 15, 15 and 270, so that its entries vary by 0.04, 0.004 and 0.002.
+    Speeds are clipped to 40 m/s, their difference to ±20 m/s, headways to −10 m … the longest ring.
+    Reward, the same for all agents: ``4 mean(v)/20 − 4 mean|u|``, v of all vehicles after the step (at most 40 m/s), u
+    the commands (m/s²); less ``tailgating · max(0, 1 − time gap / tailgating_below)``, each agent's own, and ``fuel ·
+    mean fuel rate (mL/s)``, which saturates from 5 to 10 mL/s. At least ``−4 max_command`` (less what has a weight) and
+    at most 8. Terminated where vehicles touch, which pays ``−crash_cost`` instead: 36 001 by default, so that a crash
+    is worse than any survival (``idm_env.tasks.crash``). Flow pays 0 there, which is more than a slow ring.
 
     Args:
         length: Circumference (m), or ``[lowest, highest]`` to be drawn for every episode.
@@ -69,17 +80,26 @@ class RingTask(Task):
                 f"{self.vehicles} vehicles of {self.vehicle_length:g} m and half a metre each do not fit a ring of "
                 f"{shortest:g} m. Take fewer vehicles or a longer ring."
             )
-        if self.start not in STARTS:
-            raise ValueError(f"start = {self.start!r} is unknown.{nearest(str(self.start), STARTS)}")
+        one_of("start", self.start, STARTS)
         at_least("tailgating", self.tailgating, 0.0)
         at_least("tailgating_below", self.tailgating_below, 0.1, "s")
         at_least("fuel", self.fuel, 0.0)
 
     @property
-    def bounds(self) -> Bounds:
-        """Speeds up to 100 m/s, headways from an overlap to the longest ring."""
-        longest = span("length", self.length, 1.0, "m")[1] / 270.0
-        return Bounds(("speed", "relative_speed", "headway"), (0.0, -7.0, -0.1), (7.0, 7.0, longest + 0.1))
+    def features(self) -> Features:
+        """Own speed, that of the leader relative to it, and the headway."""
+        longest = span("length", self.length, 1.0, "m")[1]
+        names = ("speed", "relative_speed", "headway")
+        return Features(names, SCALES, (0.0, -20.0, -10.0), (_FASTEST, 20.0, longest + 10.0))
+
+    @property
+    def pay(self) -> Pay:
+        """From full commands and every weighted term at its worst to a ring at 40 m/s."""
+        return Pay(self._worst() - _FUEL * self.fuel, 0.2 * _FASTEST)
+
+    def _worst(self) -> float:
+        """Return the reward below which the fuel's term saturates; without its weight none lies below."""
+        return -4.0 * self.max_command - self.tailgating - _FUEL * self.fuel
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return rings of drawn lengths: standing at equal gaps, or in a wave."""
@@ -107,12 +127,12 @@ class RingTask(Task):
         return World(state, {})
 
     def observe(self, world: World) -> Tensor:
-        """Return ``v/15, (v_lead − v)/15, headway/270`` of every agent."""
+        """Return speed, the leader's relative to it, and headway of every agent."""
         state = world.state
         speed = self.pick(state.speed)
         lead_speed = self._pick_lead(state.speed)
         headway = self.pick(state.gap) + self._pick_lead(state.length)
-        return self.clip([speed, lead_speed - speed, headway], (15.0, 15.0, 270.0))
+        return self.clip([speed, lead_speed - speed, headway])
 
     @cached_property
     def _leaders(self) -> tuple[int, ...]:
@@ -123,13 +143,13 @@ class RingTask(Task):
             return x[..., self._leaders[0] : self._leaders[0] + 1]
         return x.index_select(-1, self.constant("leaders", self._leaders, x.device, torch.int64))
 
-    def reward(self, before: World, command: Tensor, after: World) -> Tensor:
+    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``4 mean(v)/20 − 4 mean|u|``, less the terms that have a weight."""
         state = after.state
         effort = command.abs()
         if len(self.agents) > 1:
             effort = effort.mean(-1, keepdim=True)
-        reward = 0.2 * state.speed.mean(-1, keepdim=True) - 4.0 * effort
+        reward = 0.2 * state.speed.mean(-1, keepdim=True).clamp_max(_FASTEST) - 4.0 * effort
         if self.fuel:
             reward = reward - self.fuel * metrics.fuel(state.speed, state.accel).mean(-1, keepdim=True)
         if len(self.agents) > 1:
@@ -137,4 +157,4 @@ class RingTask(Task):
         if self.tailgating:
             time_gap = metrics.time_gap(self.pick(state.gap), self.pick(state.speed))
             reward = reward - self.tailgating * torch.relu(1.0 - time_gap / self.tailgating_below)
-        return reward
+        return floored(reward, self._worst(), self.pay.low) if self.fuel else reward

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-_EMPTY = "—"
+from idm_env.tasks.nouns import NOBODY
 
 
 class Scene(NamedTuple):
@@ -119,9 +119,9 @@ def _laid_out(tracks: list[_Track], dt: float) -> Scene:
     for track in tracks:
         if ahead[track.key] is not None:
             continue
-        slots.append((_EMPTY, None, None))
+        slots.append((NOBODY, None, None))
         if (track.leader != "").any():
-            slots.append((_EMPTY, track, _seat(track, by_key)))
+            slots.append((NOBODY, track, _seat(track, by_key)))
         last = track
         slots.append((last.key, last, None))
         while last.key in follower and ahead[follower[last.key]] == last.key:
@@ -203,6 +203,7 @@ def _motion(track: _Track, seat: np.ndarray | None, dt: float) -> tuple[np.ndarr
     return motion, there
 
 
+@lru_cache(maxsize=4)
 def made_up_scene(dt: float, followers: int = 6, seconds: float = 600.0) -> Scene:
     """Return the project's own scene: the made-up leader, and drivers behind it who differ a little in T and a."""
     import torch

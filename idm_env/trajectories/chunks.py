@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -68,9 +68,16 @@ class Plan:
 
 
 def done(
-    parts: Parts, number: int, tracks: list[Track], settings: Settings, plan: Plan, recent: Sequence[Filtered]
-) -> list[Filtered]:
-    """Do one chunk and write its part: the table, the parameters, and last the tallies, which mark it done."""
+    parts: Parts, number: int, tracks: list[Track], settings: Settings, plan: Plan, recent: Sequence[Filtered],
+    on_stage: Callable[[float, str], None] = lambda share, words: None,
+) -> list[Filtered]:  # fmt: skip
+    """Do one chunk and write its part: the table, the parameters, and last the tallies, which mark it done.
+
+    ``on_stage`` is called with the share that is done and what comes next.
+    """
+    others = baselines.available() if settings.baselines else ()
+    stages = 2 + len(others)
+    on_stage(0.0, "filtering")
     tallies: dict[str, Tally] = {}
     begin = time.perf_counter()
     rows: list[dict[str, Any]]
@@ -81,16 +88,18 @@ def done(
         assert plan.noise is not None
         filtered = recipe(tracks, plan.dt, plan.noise, plan.choices, recent) if tracks else []
         seconds = time.perf_counter() - begin
+        on_stage(1 / stages, "drivers' parameters")
         rows = [] if settings.fixed_parameters else parameter_rows(filtered, recent, settings.model)
         calibration = time.perf_counter() - begin - seconds
     tallies[OURS[settings.recipe]] = _tally([f.motion for f in filtered], tracks, seconds)
-    for name in baselines.available() if settings.baselines else ():
+    for i, name in enumerate(others):
+        on_stage((2 + i) / stages, f"to compare: {name}")
         begin = time.perf_counter()
         motions = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in tracks]
         tallies[name] = _tally(motions, tracks, time.perf_counter() - begin)
     total, new = overlaps(filtered, recent)
-    _table(filtered).write_parquet(parts.path(number, TRAJECTORIES))
-    pl.DataFrame(rows, schema=PARAMETER_SCHEMA).write_parquet(parts.path(number, PARAMETERS))
+    parts.write(number, TRAJECTORIES, _table(filtered))
+    parts.write(number, PARAMETERS, pl.DataFrame(rows, schema=PARAMETER_SCHEMA))
     parts.finish(
         number,
         {

@@ -7,20 +7,21 @@ on disk (``parts.py``), and the parts are joined at the end without being read a
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 
+from idm_env import keep
 from idm_env.data import DataError
 from idm_env.parts import Parts
-from idm_env.report import output_folder, versions
-from idm_env.trajectories import chunks, paper
+from idm_env.progress import OnProgress, silent
+from idm_env.report import account, versions
+from idm_env.trajectories import chunks, left_out, paper, pictures
 from idm_env.trajectories.chunks import CHUNK, OURS, PARAMETERS, TRAJECTORIES, Plan, Recipe, Settings
 from idm_env.trajectories.noise import fit_noise, is_dense
 from idm_env.trajectories.recipe import Filtered, recipe
@@ -30,8 +31,7 @@ from idm_env.trajectories.smoother import Noise
 from idm_env.trajectories.spool import Spool
 from idm_env.trajectories.tracks import Pieces, Track
 
-OnProgress = Callable[[int, int], None]
-"""Called with vehicles done and vehicles in all."""
+OUTPUT = ("trajectories.parquet", "parameters.parquet", "report.json", "report.html")
 SAMPLED = 64
 """Vehicles that noise and step are taken from."""
 SHOWN = 4
@@ -102,9 +102,19 @@ def run(
     """Do what ``filter_file`` and ``reconstruct_file`` say."""
     if settings.recipe not in OURS:
         raise DataError(f"recipe = {settings.recipe!r} is unknown; use 'default' or 'paper'.")
+    progress = on_progress or silent
+    progress("compiling", 0, 0, "the loops")
     _compile()
-    out = output_folder(Path(out))
-    parts = Parts(out, _fingerprint(Path(path), settings, layout), resume)
+    with keep.results(out, OUTPUT, (path, settings.model)) as folder:
+        return _run(Path(path), folder, settings, layout, resume, progress)
+
+
+def _run(
+    path: Path, out: Path, settings: Settings, layout: str, resume: bool, progress: OnProgress
+) -> dict[str, Any]:  # fmt: skip
+    progress("reading", 0, 0, path.name)
+    model = None if settings.model is None else Path(settings.model)
+    parts = Parts(out / keep.UNFINISHED / settings.task, keep.fingerprint(settings, layout, path, model), resume)
     try:
         spool = Spool(path, parts.folder / "spool", layout, settings.chunk)
         bridge = 2.0 if settings.task == "filter" else None
@@ -121,16 +131,28 @@ def run(
         lost += pieces.left_out
         notes += pieces.notes
         recent = [f for f in recent if tracks and _reaches(f, tracks)]
+        begin, everybody = number * settings.chunk, len(spool.vehicles)
+        end = min(begin + settings.chunk, everybody)
         if parts.done(number):
             recent += chunks.restored(parts, number, tracks)
         else:
-            recent += chunks.done(parts, number, tracks, settings, plan, recent)
-        if on_progress is not None:
-            on_progress(min((number + 1) * settings.chunk, len(spool.vehicles)), len(spool.vehicles))
+            recent += chunks.done(
+                parts, number, tracks, settings, plan, recent,
+                lambda share, words, b=begin, e=end, n=everybody: progress(  # type: ignore[misc]
+                    settings.task, b + int(share * (e - b)), n, words
+                ),
+            )  # fmt: skip
+        progress(settings.task, end, everybody, "")
+    scored = []
+    if settings.task == "reconstruct":
+        progress("scoring", 0, 0, "points left out of the file")
+        scored = left_out.score(spool, plan, settings)
+    progress("writing", 0, 0, "the report")
     parts.join(TRAJECTORIES, out / "trajectories.parquet")
     parts.join(PARAMETERS, out / "parameters.parquet")
-    report = _report(spool, parts, settings, plan, lost, notes)
-    write_report(out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet"))
+    report = _report(spool, parts, settings, plan, lost, notes) | {"left_out_points": scored}
+    drawn = pictures.space_time(out / "trajectories.parquet", spool, bridge)
+    write_report(out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet"), drawn)
     parts.remove()
     return report
 
@@ -142,16 +164,6 @@ def _compile() -> None:
     track = Track("", "", 0, time_s, 10.0 * time_s, 4.5, nobody, np.full(len(time_s), -1))
     recipe([track], 0.1, fit_noise([(time_s, track.position_m)], 0.1, evaluations=2))
     paper.imitate(track, iterations=1)
-
-
-def _fingerprint(path: Path, settings: Settings, layout: str) -> str:
-    """Return a digest of the file's bytes, where there is a file, and of what is done to them."""
-    digest = hashlib.sha256(repr((settings, layout)).encode())
-    if path.is_file():
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
 
 
 def _plan(spool: Spool, settings: Settings, bridge: float | None) -> Plan:
@@ -223,6 +235,10 @@ def _report(
         "calibration_milliseconds_per_trajectory": 1e3 * totals["calibration_seconds"] / max(ours.tracks, 1),
         "overlapping_rows": int(totals["overlaps"]),
         "overlapping_rows_that_did_not_overlap_before": int(totals["new_overlaps"]),
+        "account": account(
+            ((r.kind, r.count) for r in spool.repairs),
+            [("tracks", len(lost))] if lost else [],
+        ),
         "versions": versions(),
     }
 

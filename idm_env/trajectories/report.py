@@ -27,9 +27,12 @@ MOST_LISTED = 100
 
 
 def write_report(
-    out: Path, report: dict[str, Any], shown: Sequence[tuple[Track, Motion]], parameters: pl.DataFrame
-) -> None:
+    out: Path, report: dict[str, Any], shown: Sequence[tuple[Track, Motion]], parameters: pl.DataFrame,
+    drawn: Sequence[page.Block] = (),
+) -> None:  # fmt: skip
     """Write ``report.json`` and ``report.html`` with the table of methods, pictures before and after, and histograms.
+
+    ``drawn`` are pictures in space and time.
 
     Numbers that are not finite become null in JSON, which knows none.
     """
@@ -38,6 +41,10 @@ def write_report(
     blocks = [page.lead(_lead(report))]
     if report["noise"]:
         blocks.append(page.text(_noise(report["noise"])))
+    if report["left_out_points"]:
+        blocks += _left_out_points(report["left_out_points"])
+    if drawn:
+        blocks += [page.heading("In space and time"), *drawn]
     blocks += [page.heading("Methods on these data"), methods(report["methods"])]
     blocks.append(
         page.note(
@@ -55,6 +62,7 @@ def write_report(
     blocks += _parameters(parameters)
     blocks.append(page.heading("Before and after"))
     blocks += [page.picture(before_and_after(track, motion), f"Track {track.key}") for track, motion in shown]
+    blocks += [page.heading("Data"), page.text(report["account"])]
     left_out = [f"{item['track']}: {item['reason']}" for item in report["left_out"]]
     repaired = [item["text"] for item in report["repairs"]]
     repaired += [f"{item['vehicle']}: {item['note']}" for item in report["divided"]]
@@ -82,6 +90,35 @@ def _noise(noise: dict[str, float]) -> str:
         f"{noise['time']:.2f} s, jerk density {noise['jerk']:.3g} m²/s⁵"
     )
     return words + (f", accelerations fade in {noise['accel_time']:.2f} s." if noise["accel_time"] else ".")
+
+
+def _left_out_points(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
+    """Return how far the methods are from points of the file that they were not given."""
+    ours, line = rows[0], next((row for row in rows if row["method"] == "linear"), None)
+    words = (
+        f"Every second point of {ours['tracks']} tracks was left out, {ours['points']} in all, "
+        f"and reconstructed from the others, {ours['spacing_s']:.3g} s apart: root mean square error "
+        f"{ours['rmse_m']:.2f} m"
+    )
+    if line is not None:
+        words += f", straight lines {line['rmse_m']:.2f} m"
+    table = [
+        {
+            "method": row["method"], "RMSE (m)": row["rmse_m"], "mean |error| (m)": row["mae_m"],
+            "95 % of errors below (m)": row["p95_m"], "mean error (m)": row["bias_m"],
+        }
+        for row in rows
+    ]  # fmt: skip
+    digits = dict.fromkeys(list(table[0])[1:], 2)
+    return [
+        page.heading("Points of the file that were left out"),
+        page.text(f"{words}."),
+        page.table(table, digits=digits, first=True),
+        page.note(
+            "With all points given, half as far apart, errors between them are usually smaller. The points carry the "
+            "noise of measurement themselves. The noise above was fitted to all points, the left-out ones included."
+        ),
+    ]
 
 
 def methods(rows: Sequence[dict[str, Any]]) -> page.Block:

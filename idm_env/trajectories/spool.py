@@ -13,10 +13,12 @@ from pathlib import Path
 
 import polars as pl
 
-from idm_env.data import DataError, Repair
+from idm_env import keep
+from idm_env.data import DataError, Repair, directions
 from idm_env.data.clean import check_columns, identifiers, natural, numbers
 from idm_env.data.load import batches
-from idm_env.trajectories.tracks import Table, check_units, prepared, with_leaders
+from idm_env.data.speeds import length_assumed
+from idm_env.trajectories.tracks import Table, check_units, has_length, prepared, with_leaders
 
 KEPT = ("run_id", "vehicle_id", "time_s", "position_m", "leader_id", "lane", "length_m", "ring_length_m")
 MOST_BUCKETS = 64
@@ -104,7 +106,7 @@ class Spool:
         for piece, repairs in batches(path, layout=layout):
             self._counted.add(repairs)
             check_columns(piece, self.source)
-            piece, repairs = numbers(identifiers(piece), self.source)
+            piece, repairs = numbers(identifiers(piece, self.source), self.source)
             self._counted.add(repairs)
             whole = piece.filter(pl.all_horizontal(pl.col(*KEY, "time_s").is_not_null()))
             self._counted.add(_lost("no time", piece.height - whole.height, "rows without a vehicle or a time"))
@@ -119,7 +121,7 @@ class Spool:
             kept = kept.select(pl.col(name) for name in KEPT if name in kept.columns)
             # derived leaders wait for _led: the vehicle ahead may be in another piece
             waits = "leader_id" not in kept.columns and "lane" in kept.columns
-            (kept if waits else with_leaders(kept)).write_parquet(files[-1])
+            keep.write(files[-1], (kept if waits else with_leaders(kept)).write_parquet)
             index = _indexed(index, kept)
         if index is None:
             raise DataError(
@@ -130,8 +132,18 @@ class Spool:
         if backward:
             text = f"{backward} rows are earlier than the row before them of their vehicle; rows were sorted by time."
             self._counted.add([Repair("time not increasing", backward, text)])
+        self._counted.add(length_assumed(int(index["known"].not_().sum())))
+        index = self._one_way(files, index)
         order = (natural("run_id"), "run_id", "begin", natural("vehicle_id"), "vehicle_id")
         return files, index.sort(*order).with_row_index("number")
+
+    def _one_way(self, files: list[Path], index: pl.DataFrame) -> pl.DataFrame:
+        """Mirror vehicles that drive against the others, in the pieces; return the index with their new runs."""
+        vehicles = directions.against(index.filter(~pl.col("ring")))
+        for path in files if vehicles.height else []:
+            keep.write(path, directions.mirrored(pl.read_parquet(path), vehicles).write_parquet)
+        self._counted.add(directions.repairs(vehicles))
+        return directions.renamed(index, vehicles)
 
     def _led(self, raw: list[Path], index: pl.DataFrame) -> list[Path]:
         """Return files whose rows have leaders: the pieces themselves, or what is derived from lanes time by time."""
@@ -149,7 +161,7 @@ class Spool:
             frame, repairs = prepared(pl.read_parquet(files, missing_columns="insert"))
             self._counted.add(repairs)
             led.append(self.folder / f"led-{number:05d}.parquet")
-            with_leaders(frame).write_parquet(led[-1])
+            keep.write(led[-1], with_leaders(frame).write_parquet)
             _remove(files)
         return led
 
@@ -167,25 +179,34 @@ class Spool:
                 frame = frame.join(index.select(*KEY, "number"), on=KEY, how="left", maintain_order="left")
             frame = frame.with_columns(bucket.cast(pl.Int64).alias("bucket"))
             for (key,), part in frame.partition_by("bucket", as_dict=True, include_key=False).items():
-                part.write_parquet(self.folder / f"{name}-{key:03d}-{n:05d}.parquet")
+                keep.write(self.folder / f"{name}-{key:03d}-{n:05d}.parquet", part.write_parquet)
             path.unlink()
         return self.folder
 
 
 def _indexed(index: pl.DataFrame | None, piece: pl.DataFrame) -> pl.DataFrame:
-    """Return per vehicle its first time, rows, last time, and how often its time runs backward, one piece further."""
+    """Return what is known per vehicle, one piece further.
+
+    Its first and last time with the positions there, lane, rows, whether a length is known, whether it is on a ring,
+    and how often its time runs backward.
+    """
     time = pl.col("time_s")
+    ring = pl.col("ring_length_m").is_not_null().any() if "ring_length_m" in piece.columns else pl.lit(False)
     new = piece.group_by(KEY, maintain_order=True).agg(
-        time.min().alias("begin"), pl.len().cast(pl.Int64).alias("rows"), time.first().alias("first"),
-        time.last().alias("last"), (time.diff() < 0).sum().cast(pl.Int64).alias("backward"),
+        *directions.END, directions.lane_of(piece), pl.len().cast(pl.Int64).alias("rows"), time.first().alias("first"),
+        time.last().alias("last"), (time.diff() < 0).sum().cast(pl.Int64).alias("backward"), has_length(piece),
+        ring.alias("ring"),
     )  # fmt: skip
     if index is None:
         return new
     both = pl.concat([index, new])
     return both.group_by(KEY, maintain_order=True).agg(
-        pl.col("begin").min(), pl.col("rows").sum(), pl.col("first").first(), pl.col("last").last(),
+        pl.col("from").sort_by("begin").first(), pl.col("to").sort_by("end").last(), pl.col("begin").min(),
+        pl.col("end").max(), pl.col("lane").first(), pl.col("rows").sum(), pl.col("first").first(),
+        pl.col("last").last(),
         pl.col("backward").sum() + (pl.col("first").shift(-1) < pl.col("last")).sum().cast(pl.Int64),
-    )  # fmt: skip
+        pl.col("known").any(), pl.col("ring").any(),
+    ).select(index.columns)  # fmt: skip
 
 
 def _lost(kind: str, count: int, what: str) -> list[Repair]:

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from idm_env.data import DataError, Repair, units
+from idm_env.data import DataError, Repair, directions, units
 from idm_env.data.clean import NO_LEADER, check_columns, identifiers, natural, numbers, without_empty
 from idm_env.data.load import read
 from idm_env.data.schema import DEFAULT_LENGTH_M, HIGHEST_SPEED_MPS, LONGEST_LENGTH_M
-from idm_env.data.speeds import unwrapped
+from idm_env.data.speeds import length_assumed, unwrapped
 
 SMALLEST_JUMP_M = 8.0
 """A change of position is a jump only above this, whatever the time step (m)."""
@@ -92,7 +92,7 @@ def from_frame(frame: pl.DataFrame, source: str = "table", repairs: list[Repair]
     """Return the table of a tidy frame (vehicle_id, time_s, position_m at least)."""
     done = list(repairs or ())
     check_columns(frame, source)
-    frame, more = numbers(identifiers(frame), source)
+    frame, more = numbers(identifiers(frame, source), source)
     done += more
     frame, more = without_empty(frame, source)
     done += more
@@ -102,6 +102,9 @@ def from_frame(frame: pl.DataFrame, source: str = "table", repairs: list[Repair]
         done.append(Repair("no position", lost, f"{lost} rows without a position were left out."))
     if frame.height == 0:
         raise DataError(f"{source}: position_m is empty in every row; it must hold positions in metres.")
+    frame, more = directions.one_way(frame)
+    known = frame.group_by("run_id", "vehicle_id").agg(has_length(frame))["known"]
+    done += [*more, *length_assumed(int((~known).sum()))]
     check_units(frame, source)
     unsorted = int(frame.select((pl.col("time_s").diff().over("run_id", "vehicle_id") < 0).sum()).item() or 0)
     if unsorted:
@@ -118,6 +121,14 @@ def check_units(frame: pl.DataFrame, source: str) -> None:
     rising = frame.filter(forwards)
     if rising.height:
         units.check(rising, source, longest_step=float("inf"))
+
+
+def has_length(frame: pl.DataFrame) -> pl.Expr:
+    """Return, per group, whether a vehicle has a length that can be used: the column ``known``."""
+    if "length_m" not in frame.columns:
+        return pl.lit(False).alias("known")
+    median = pl.col("length_m").filter(pl.col("length_m").is_finite()).median()
+    return ((median > 0) & (median <= LONGEST_LENGTH_M)).fill_null(False).alias("known")
 
 
 def prepared(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:

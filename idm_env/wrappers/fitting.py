@@ -31,10 +31,10 @@ class ParameterFitting:
     The model is the environment's: its effects, its time step and every parameter that is not ``free``. Each measured
     driver follows its measured leader from its measured state, and the residual is simulated minus measured gap (m).
 
-    ``parameters()`` are leaf tensors on the real line behind the parameters' bounds; ``loss()`` is differentiable in
-    them; ``fit()`` is the foundation's search; ``apply()`` puts the values into the environment. ``error(values)``
-    is the same loss of given values, for methods without gradients. ``DiffIDM-Fit-v0`` is this as a Gymnasium
-    environment.
+    ``parameters()`` are leaf tensors on the real line behind the parameters' bounds, the same ones for good, so that an
+    optimiser stays connected; ``mean_squared_error()`` and ``root_mean_squared_error()`` are differentiable in them, or
+    in values that are given; ``fit()`` is the foundation's search; ``apply()`` puts the values into the environment.
+    ``DiffIDM-Fit-v0`` is this as a Gymnasium environment.
 
     Args:
         env: An environment of this package (any face, wrapped or not), or a task.
@@ -82,7 +82,7 @@ class ParameterFitting:
             fixed=self.fixed,
         )
         self._declared = {name: catalogue(simulator.effects)[name] for name in self.free}
-        self._leaves: dict[str, Tensor] = {}
+        self._leaves = {name: torch.zeros(len(groups), dtype=torch.float64, requires_grad=True) for name in self.free}
         self.set_values({name: _value(params, name, self._declared[name].default) for name in self.free})
 
     # -- the differentiable view ---------------------------------------------------------------------------------
@@ -96,23 +96,33 @@ class ParameterFitting:
         return {name: constrain(self._declared[name], leaf) for name, leaf in self._leaves.items()}
 
     def set_values(self, values: Mapping[str, Any]) -> None:
-        """Set free parameters (numbers or one per group); the leaves are new tensors afterwards."""
-        for name, value in values.items():
+        """Write free parameters (numbers or one per group) into the leaves, in place; all gradients are cleared."""
+        for name in values:
             if name not in self.free:
                 raise ValueError(f"parameter '{name}' is not free here. Free: {', '.join(self.free)}.")
-            full = torch.as_tensor(value, dtype=torch.float64).detach().expand(len(self.problem.groups))
-            self._leaves[name] = unconstrain(self._declared[name], full).clone().requires_grad_()
+        with torch.no_grad():
+            for name, value in values.items():
+                wanted = torch.as_tensor(value, dtype=torch.float64)
+                self._leaves[name].copy_(unconstrain(self._declared[name], wanted))
+        for leaf in self._leaves.values():
+            # A gradient at the old values would move the new ones at an optimiser's next step.
+            leaf.grad = None
 
-    def loss(self) -> Tensor:
-        """Return the mean squared residual (m² for spacing), differentiable in ``parameters()``."""
-        return self.error(torch.stack(list(self.values().values()), dim=-1)).square()
+    def mean_squared_error(self, values: Tensor | np.ndarray | None = None) -> Tensor:
+        """Return the mean squared residual (m² for spacing), differentiable in ``parameters()`` or in ``values``.
 
-    def error(self, values: Tensor | np.ndarray) -> Tensor:
-        """Return the root mean square residual of values ``(free,)`` or ``(groups, free)``, ordered as ``free``."""
-        own = torch.as_tensor(values, dtype=torch.float64)
-        own = own.expand(len(self.problem.groups), len(self.free))
+        ``values`` have shape ``(free,)`` or ``(groups, free)``, ordered as ``free``; None takes those of
+        ``parameters()``.
+        """
+        own = torch.stack(list(self.values().values()), dim=-1) if values is None else torch.as_tensor(values)
+        own = own.to(torch.float64).expand(len(self.problem.groups), len(self.free))
         residual = self.problem.residual(self.problem.simulate(self.problem.rows(own, own.new_zeros(0))))
-        return torch.sqrt(residual.square().sum() / self.problem.samples.sum() + 1e-18)
+        return residual.square().sum() / self.problem.samples.sum()
+
+    def root_mean_squared_error(self, values: Tensor | np.ndarray | None = None) -> Tensor:
+        """Return the square root of ``mean_squared_error`` (m for spacing)."""
+        # At an error of exactly 0 the root has no gradient.
+        return torch.sqrt(self.mean_squared_error(values) + 1e-18)
 
     @property
     def vehicle_steps(self) -> int:
@@ -122,7 +132,7 @@ class ParameterFitting:
     # -- search and use ------------------------------------------------------------------------------------------
 
     def fit(self, **options: Any) -> Fit:
-        """Search by ``idm_env.fitting`` (Levenberg–Marquardt or Adam; its options), keep and return the result."""
+        """Search by ``idm_env.fitting`` (its options), write the result into the leaves, and return it."""
         from idm_env.fitting.fit import fit
 
         own = torch.stack([x.detach() for x in self.values().values()], dim=-1)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 
+from idm_env.checks import shown
 from idm_env.wrappers.fitting import ParameterFitting
 
 
@@ -17,9 +18,10 @@ class FittingEnv(gymnasium.Env):
     """``gym.make("DiffIDM-Fit-v0", trajectories="pairs.parquet", task="ring", …)``: one step, one guess.
 
     Action: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean square
-    residual. Observation: the last guess, zeros at first. Episodes have one step. ``free`` and ``objective`` are those
-    of ``ParameterFitting``, with one set of parameters for all drivers; all other keywords make the environment whose
-    drivers are fitted.
+    residual. Observation: the last guess, zeros at first. Info: its ``parameters`` by full name, after a reset also
+    their ``bounds``, what [−1, 1] spans, and after a step their ``root_mean_squared_error``. Episodes have one step.
+    ``free`` and ``objective`` are those of ``ParameterFitting``, with one set of parameters for all drivers; all other
+    keywords make the environment whose drivers are fitted.
 
     ``bounds`` narrows what [−1, 1] spans: ``{"idm.time_gap": [0.5, 3.0]}``.
     """
@@ -58,7 +60,7 @@ class FittingEnv(gymnasium.Env):
         """Return the parameters of an action, in the order of ``free``; ValueError for a wrong shape or NaN."""
         guess = np.asarray(action, dtype=np.float64)
         if guess.shape != self.action_space.shape or not np.isfinite(guess).all():
-            raise ValueError(f"action = {action!r} must be {len(self.low)} finite numbers in [-1, 1].")
+            raise ValueError(f"action = {shown(action)} must be {len(self.low)} finite numbers in [-1, 1].")
         return self.low + 0.5 * (np.clip(guess, -1.0, 1.0) + 1.0) * (self.high - self.low)
 
     def reset(
@@ -68,11 +70,18 @@ class FittingEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             self._last = np.zeros_like(self._last)
-        return self._last.copy(), {}
+        spans = zip(self.low.tolist(), self.high.tolist(), strict=True)
+        bounds = dict(zip(self.problem.free, spans, strict=True))
+        return self._last.copy(), {"parameters": self._named(self.values(self._last)), "bounds": bounds}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Judge a guess; the episode ends."""
+        values = self.values(action)
         with torch.no_grad():
-            error = float(self.problem.error(self.values(action)))
+            error = float(self.problem.root_mean_squared_error(values))
         self._last = np.clip(np.asarray(action, np.float32), -1.0, 1.0)
-        return self._last.copy(), -error, True, False, {}
+        info = {"parameters": self._named(values), "root_mean_squared_error": error}
+        return self._last.copy(), -error, True, False, info
+
+    def _named(self, values: np.ndarray) -> dict[str, float]:
+        return dict(zip(self.problem.free, values.tolist(), strict=True))

@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 import torch
+from stable_baselines3.common.logger import Logger
+
+from agents.monitor import make_logger
 
 RING: dict[str, Any] = {
     "task": "ring", "vehicles": 8, "length": [60.0, 75.0], "warmup": 20, "warmup_pool": 8, "tailgating": 5.0,
@@ -34,3 +37,17 @@ def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 PASSED: dict[str, Any] = {"speed_ratio": 1.0, "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}
+
+
+@pytest.fixture
+def loggers(monkeypatch: pytest.MonkeyPatch) -> list[Logger]:
+    """The loggers that trainings make; the files of one that is over must be closed."""
+    made: list[Logger] = []
+
+    def make(*given: Any) -> Logger:
+        made.append(make_logger(*given))
+        return made[-1]
+
+    monkeypatch.setattr("agents.monitor.make_logger", make)
+    monkeypatch.setattr("agents.imitation.make_logger", make)
+    return made

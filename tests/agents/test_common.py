@@ -115,12 +115,13 @@ def test_checkpoints_of_another_task_agent_version_or_kind_are_refused(tmp_path,
         common.load(path, "ring", "shac")
     content = torch.load(path, weights_only=True)
     for key, value, words in (
-        ("schema", 99, "layout 99; this version reads layout 1"),
+        ("schema", 99, "layout 99; this version reads layout 2"),
         (
             "features",
             ["speed", "gap"],
-            "on observations speed, gap; task 'ring' now gives speed, relative_speed, headway",
+            "on observations speed / 5, gap / 1; task 'ring' now gives speed / 5, relative_speed / 1, headway / 10",
         ),
+        ("scales", [15.0, 15.0, 270.0], "on observations speed / 15, relative_speed / 15, headway / 270; task"),
     ):
         torch.save({**content, key: value}, path)
         with pytest.raises(ValueError, match=words):
@@ -232,6 +233,22 @@ def test_the_command_line_tells_in_one_line(module, arguments, words, tmp_path):
     with pytest.raises(SystemExit) as told:
         module.main([given.get(word, word) for word in arguments])
     assert words in str(told.value) and "\n" not in str(told.value)
+
+
+def test_a_training_overwrites_neither_its_configuration_nor_what_no_agent_wrote(tmp_path):
+    config = tmp_path / "agent.yaml"
+    config.write_text("configures: agent\nagent: apg\n")
+    (tmp_path / "run").mkdir()
+    last = tmp_path / "run" / "last.pt"
+    last.symlink_to(config)
+    given = ["--config", str(config), "--out", str(tmp_path / "run")]
+    with pytest.raises(ValueError, match="is an input, and"):
+        common.parse(apg.Arguments, "apg", given)
+    last.unlink()
+    last.write_text("mine")
+    with pytest.raises(ValueError, match="is not a checkpoint of an agent, or is broken"):
+        common.parse(apg.Arguments, "apg", given)
+    assert last.read_text() == "mine" and config.read_text().startswith("configures")
 
 
 def test_an_interruption_says_how_to_go_on(capsys):

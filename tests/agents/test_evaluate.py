@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -11,9 +13,10 @@ from agents.common import Policy
 from agents.evaluate import solved_at
 from agents.rollout import Driven, ring_start, uniform_speed
 from idm_env import metrics
+from idm_env.tasks.ring import SCALES
 
 RING = {"task": "ring"}
-VEHICLE: dict[str, float] = {"dt": 0.1, "max_command": 1.0, "vehicle_length": 5.0}
+VEHICLE: dict[str, Any] = {"dt": 0.1, "max_command": 1.0, "vehicle_length": 5.0, "scales": SCALES}
 
 
 def test_uniform_speed_is_the_equilibrium_of_equal_drivers():
@@ -85,7 +88,7 @@ def test_humans_make_waves_and_pi_with_saturation_dissolves_young_ones():
 
 def test_observations_of_the_ring_are_unpacked():
     start = ring_start(RING, (240.0,))
-    view, state = seen(start.task.observe(start.world).flatten(1), 5.0), start.world.state
+    view, state = seen(start.task.observe(start.world).flatten(1), 5.0, start.task.scales), start.world.state
     assert torch.allclose(view.speed, state.speed[:, :1], atol=1e-4)
     assert torch.allclose(view.lead_speed, state.speed[:, -1:], atol=1e-4)
     assert torch.allclose(view.gap, state.gap[:, :1], atol=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import pytest
@@ -102,3 +103,16 @@ def test_measured_pairs_are_split_as_published_and_can_be_driven(measured, tmp_p
     torch.manual_seed(0)
     found = imitation.judge(imitation.cloned(a, training), test, 4.0)
     assert found["episodes"] == 20 and 1.0 < found["gap_rmse_m"] < 20.0
+
+
+@pytest.mark.parametrize("way_out", [None, KeyboardInterrupt, OSError])
+def test_the_log_is_closed_on_every_way_out(way_out, data, tmp_path, loggers, monkeypatch):
+    def fail(*given: object) -> None:
+        raise way_out
+
+    if way_out is not None:
+        monkeypatch.setattr(common, "save", fail)
+    with pytest.raises(way_out) if way_out else contextlib.nullcontext():
+        imitation.train(arguments(data, tmp_path))
+    assert len(loggers) == 1
+    assert all(part.file.closed for part in loggers[0].output_formats)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from stable_baselines3.common.save_util import load_from_pkl
 from agents import apg, common, environments, ppo, shac
 from agents.common import DivergedError, Policy
 from idm_env.tasks.ring import RingTask
+from tests.agents.conftest import PASSED
 
 SMALL = {"count": 4, "window": 20}
 AGENTS = {
@@ -38,7 +40,7 @@ def test_the_same_seed_gives_the_same_policy_and_another_seed_another(name, quic
     module, kind, small = AGENTS[name]
     for out, seed in (("a", 1), ("b", 1), ("c", 2)):
         history = module.train(kind(**{**quick, "out": tmp_path / out, "seed": seed, "updates": 2}, **small))
-        assert [row["update"] for row in history] == [0, 1]
+        assert [row["updates"] for row in history] == [0, 1, 2]  # the first is of the policy before any update
     a, b, c = (weights(tmp_path / out / "last.pt") for out in "abc")
     assert same(a, b) and not same(a, c)
 
@@ -48,13 +50,13 @@ def test_a_resumed_training_goes_on_where_it_was(name, quick):
     module, kind, small = AGENTS[name]
     whole = kind(**quick, **small)
     first = module.train(dataclasses.replace(whole, cpu_seconds=1e-9))
-    assert len(first) == 1  # the clock stops it after the first update
+    assert len(first) == 2  # the clock stops it after the first update
     history = module.train(dataclasses.replace(whole, resume=True))
-    assert [row["update"] for row in history] == [0, 1, 2, 3]
-    assert [row["steps"] for row in history] == [first[0]["steps"] * k for k in (1, 2, 3, 4)]
-    assert history[1]["cpu_seconds"] > history[0]["cpu_seconds"] == first[0]["cpu_seconds"]
+    assert [row["updates"] for row in history] == [0, 1, 2, 3, 4]
+    assert [row["steps"] for row in history] == [first[1]["steps"] * k for k in range(5)]
+    assert history[2]["cpu_seconds"] > history[1]["cpu_seconds"] == first[1]["cpu_seconds"]
     rows = [(whole.out / "log" / part / "progress.csv").read_text().splitlines() for part in ("", "from1")]
-    assert [len(part) - 1 for part in rows] == [1, 3]  # what was logged before stays
+    assert [len(part) - 1 for part in rows] == [2, 3]  # what was logged before stays
 
 
 def test_apg_resumes_exactly(quick, tmp_path):
@@ -63,6 +65,19 @@ def test_apg_resumes_exactly(quick, tmp_path):
     apg.train(dataclasses.replace(whole, cpu_seconds=1e-9))
     apg.train(dataclasses.replace(whole, resume=True))
     assert same(weights(tmp_path / "whole" / "last.pt"), weights(whole.out / "last.pt"))
+
+
+@pytest.mark.parametrize("file", ["model.zip", "returns.pkl"])
+def test_a_broken_file_of_stable_baselines3_is_one_line(file, quick):
+    module, kind, small = AGENTS["ppo"]
+    begun = kind(**quick, **{**small, "cpu_seconds": 1e-9})
+    module.train(begun)
+    path = begun.out / file
+    for broken in (b"", b"garbage", path.read_bytes()[:-30]):
+        path.write_bytes(broken)
+        with pytest.raises(ValueError, match=rf"{file} is broken .*Leave out --resume") as told:
+            module.train(dataclasses.replace(begun, resume=True))
+        assert "\n" not in str(told.value)
 
 
 def test_sac_resumes_with_its_memory(quick):
@@ -99,7 +114,7 @@ def test_a_model_one_chunk_ahead_of_its_checkpoint_is_resumed(quick):
     module.train(dataclasses.replace(whole, updates=2, resume=True))
     (whole.out / "last.pt").write_bytes(before)  # as if killed between the two files
     history = module.train(dataclasses.replace(whole, updates=3, resume=True))
-    assert [row["update"] for row in history] == [0, 2]
+    assert [row["updates"] for row in history] == [0, 1, 3]
     assert history[-1]["steps"] == 3 * small["n_steps"] * small["count"]
 
 
@@ -115,6 +130,13 @@ def test_resuming_another_agents_or_tasks_training_is_refused(quick):
     other = {**quick, "environment": {"task": "follow", "vehicles": 4}}
     with pytest.raises(ValueError, match="of task 'ring', and 'follow' is wanted"):
         apg.train(apg.Arguments(**other, **SMALL, resume=True))
+
+
+def raising(error: type[BaseException]):
+    def fail(*given: object) -> None:
+        raise error
+
+    return fail
 
 
 def break_rewards(monkeypatch, after: int) -> None:
@@ -149,6 +171,18 @@ def test_a_critic_that_diverges_before_the_actor_learns_is_not_kept(quick, monke
         module.train(kind(**quick, **{**small, "critic_first": 3}))
     kept = common.load(quick["out"] / "last.pt")[1]["training"]
     assert kept["update"] == 0 and all(bool(torch.isfinite(x).all()) for x in kept["critic"].values())
+
+
+@pytest.mark.parametrize("way_out", [None, KeyboardInterrupt, OSError])
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_log_is_closed_on_every_way_out(name, way_out, quick, loggers, monkeypatch):
+    module, kind, small = AGENTS[name]
+    if way_out is not None:
+        monkeypatch.setattr("agents.monitor.common.save", raising(way_out))
+    with pytest.raises(way_out) if way_out else contextlib.nullcontext():
+        module.train(kind(**{**quick, "updates": 1}, **small))
+    assert len(loggers) == 1
+    assert all(part.file.closed for part in loggers[0].output_formats)
 
 
 @pytest.mark.parametrize("name", ["apg", "shac"])
@@ -207,7 +241,7 @@ def test_a_baseline_begins_as_the_clone(name, quick, monkeypatch):
 
 
 def test_the_best_checkpoint_has_the_best_score(quick, monkeypatch):
-    ratios = iter([0.5, 0.9, 0.7, 0.9])
+    ratios = iter([0.99, 0.5, 0.9, 0.7, 0.9])  # the untrained policy's own does not count
 
     def evaluate(policy, environment):
         return {"speed_ratio": next(ratios), "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}
@@ -322,3 +356,25 @@ def test_a_collision_is_worth_nothing(ring):
     _, window = shac.roll(env, policy, Ends(), env.task.observe(env.batch.world).flatten(1), a)
     assert window.ended[0].tolist() == [False, True]
     assert float(window.following[0, 0]) > 1.0 and float(window.following[0, 1]) == 0.0
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_policy_before_any_update_is_judged_and_logged(name, quick, monkeypatch):
+    module, kind, small = AGENTS[name]
+    small = {**small, "critic_first": 0} if name == "shac" else small
+    judged = []
+
+    def evaluate(policy, environment):
+        judged.append({k: v.clone() for k, v in policy.state_dict().items()})
+        return PASSED
+
+    monkeypatch.setattr("agents.monitor.evaluate", evaluate)
+    module.train(kind(**{**quick, "updates": 1}, **small))
+    assert len(judged) == 2
+    assert not same(judged[0], judged[1])
+    rows = (quick["out"] / "log" / "progress.csv").read_text().splitlines()
+    names = rows[0].split(",")
+    first, second = (dict(zip(names, row.split(","), strict=True)) for row in rows[1:])
+    assert (float(first["updates"]), float(second["updates"])) == (0.0, 1.0)
+    assert float(first["steps"]) == 0.0
+    assert float(first["speed_ratio"]) == 1.0

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import polars as pl
 import pytest
 
 from idm_env.data import DataError, Trajectories, episodes, load
+from idm_env.trajectories.tracks import read_table
 from tests.data.tables import kinds, platoon, with_value
 
 make = Trajectories.from_frame
@@ -295,3 +298,56 @@ def test_files_that_cannot_be_read(tmp_path) -> None:
     assert message(tmp_path / "binary.csv")
     assert "directory" in message(tmp_path)
     assert "does not exist" in message(tmp_path / "nothing.csv")
+
+
+def with_gaps(factor: float) -> pl.DataFrame:
+    table = platoon()
+    gap = pl.when(pl.col("leader_id").is_not_null()).then(16.0 * factor + 0.1 * pl.col("time_s").sin())
+    return table.with_columns(gap.alias("gap_m"))
+
+
+def test_gaps_in_feet_beside_positions_in_metres_are_refused() -> None:
+    fails(with_gaps(3.281), "gap_m looks like feet", "0.3048")
+    make(with_gaps(1.0))
+    make(with_gaps(1.25))  # an antenna four metres from the bumper
+
+
+def test_positions_in_feet_beside_gaps_in_metres_are_refused() -> None:
+    feet = with_gaps(16.5 / 16.0).drop("speed_mps").with_columns(pl.col("position_m") * 3.281, length_m=11.5)
+    fails(feet, "position_m looks like feet")
+
+
+@pytest.mark.parametrize("layout", ["position_m,speed_mps,speed_mps", "position_m,position_m , speed_mps"])
+def test_a_column_twice_is_refused(tmp_path: Path, layout: str) -> None:
+    path = tmp_path / "twice.csv"
+    path.write_text(f"vehicle_id,time_s,{layout}\n1,0.0,1,2,3\n1,0.1,1,2,3\n")
+    for read in (load, read_table):
+        with pytest.raises(DataError, match=r"column '(speed_mps|position_m)' is there twice; remove or rename one"):
+            read(path)
+
+
+@pytest.mark.parametrize("name", ["vehicle_id", "leader_id"])
+def test_identifiers_that_are_floats_beyond_2_to_the_53_are_refused(name: str) -> None:
+    large = pl.col("vehicle_id").cast(pl.Float64) + 2.0**53
+    fails(platoon().with_columns(large.alias(name)), name, "2^53", "write identifiers as integers or text")
+    exact = platoon().with_columns(pl.col("vehicle_id", "leader_id") + 2**53)
+    assert make(exact).table["vehicle_id"].n_unique() == 3
+
+
+@pytest.mark.parametrize("name", ["Vehicle_ID", "Preceding"])
+def test_identifiers_of_ngsim_are_held_to_the_same(tmp_path: Path, name: str) -> None:
+    path, feet = tmp_path / "ngsim.csv", {"position_m": "Local_Y", "speed_mps": "v_Vel", "length_m": "v_Length"}
+    table = platoon().select(
+        (pl.col("vehicle_id") + 2**53).alias("Vehicle_ID"),
+        (pl.col("time_s") * 10).round().cast(pl.Int64).alias("Frame_ID"),
+        *((pl.col(old) / 0.3048).alias(new) for old, new in feet.items()),
+        (pl.col("leader_id").fill_null(-(2**53)) + 2**53).alias("Preceding"),
+    )
+    table.write_csv(path)
+    loaded = load(path).table
+    assert loaded["vehicle_id"].n_unique() == 3
+    assert loaded["leader_id"].drop_nulls().unique().sort().to_list() == [str(2**53 + n) for n in (1, 2)]
+    table.with_columns(pl.col(name).cast(pl.Float64)).write_csv(path)
+    for read in (load, read_table):
+        with pytest.raises(DataError, match=rf"{name.lower()} = .* 2\^53.*write identifiers as integers or text"):
+            read(path)

@@ -55,7 +55,9 @@ def test_a_model_comes_back_the_same(tmp_path):
         ({"schema": 9}, "reads schema 1"),
         ({"integration": "eulr"}, "Did you mean 'euler'"),
         ({"configures": "environment"}, "a model is wanted"),
-        ({"dt": 0}, "must be positive"),
+        ({"dt": 0}, "dt = 0 s is outside"),
+        ({"dt": 100}, "dt = 100 s is outside .0, 5. s: no step may be longer than a driver's time gap"),
+        ({"dt": 2}, "dt = 2 s is longer than the shortest time gap, idm.time_gap = 1.1 s"),
     ],
 )
 def test_mistakes_in_a_model_are_one_line(tmp_path, change, words):
@@ -63,6 +65,24 @@ def test_mistakes_in_a_model_are_one_line(tmp_path, change, words):
     with pytest.raises(ValueError, match=words) as caught:
         make_task("ring", effects=path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("effects: [idm, brakes]\ndt: 0.1\ndt: 0.2\n", "line 3: key 'dt' is there twice"),
+        (
+            "effects: [idm]\nparameters: {idm: {time_gap: 1.1, time_gap: 1.2}}\n",
+            "line 2: key 'time_gap' is there twice",
+        ),
+        ("effects: [idm]\nparameters: {idm: {time_gap: 1.1}, idm.time_gap: 1.2}\n", "'idm.time_gap' is given twice"),
+    ],
+)
+def test_nothing_is_given_twice(tmp_path, text, words):
+    (tmp_path / "model.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=words) as caught:
+        load_model(tmp_path / "model.yaml")
+    assert "model.yaml" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_files_that_are_no_yaml(tmp_path):
@@ -123,9 +143,9 @@ def test_every_face_takes_a_file_and_keywords_beside_it(face):
     env.close()
 
 
-@pytest.mark.parametrize(("said", "given", "steps"), [(4, None, 4), (4, 6, 4), (6, 4, 4)])
+@pytest.mark.parametrize(("said", "given", "steps"), [(4, None, 4), (4, 6, 6), (6, 4, 4)])
 @pytest.mark.parametrize("face", FACES)
-def test_the_smaller_limit_of_file_and_keyword_holds(face, said, given, steps, tmp_path):
+def test_a_files_limit_holds_unless_a_keyword_gives_another(face, said, given, steps, tmp_path):
     path = write(tmp_path / "short.yaml", {"configures": "environment", "task": "platoon", "max_episode_steps": said})
     name = "max_cycles" if face == "parallel" else "max_episode_steps"
     env = FACES[face](config=path, **({} if given is None else {name: given}))

@@ -58,10 +58,10 @@ def test_the_loss_is_differentiable_and_falls_under_adam(recording):
     _, fitting = problem(recording)
     assert all(leaf.is_leaf and leaf.requires_grad for leaf in fitting.parameters())
     optimiser = torch.optim.Adam(fitting.parameters(), lr=0.1)
-    first = float(fitting.loss().detach())
+    first = float(fitting.mean_squared_error().detach())
     for _ in range(60):
         optimiser.zero_grad()
-        loss = fitting.loss()
+        loss = fitting.mean_squared_error()
         loss.backward()
         optimiser.step()
     assert float(loss.detach()) < 0.05 * first
@@ -70,7 +70,41 @@ def test_the_loss_is_differentiable_and_falls_under_adam(recording):
 def test_gradcheck_of_the_loss(recording):
     _, fitting = problem(recording)
     values = torch.tensor([1.2, 0.9, 2.2], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(fitting.error, (values,), rtol=1e-2, atol=1e-5)
+    for error in (fitting.root_mean_squared_error, fitting.mean_squared_error):
+        assert torch.autograd.gradcheck(error, (values,), rtol=1e-2, atol=1e-5)
+
+
+def test_errors_are_what_their_names_say(recording):
+    _, fitting = problem(recording)
+    plain = fitting.problem
+    own = torch.stack(list(fitting.values().values()), dim=-1).detach().expand(len(plain.groups), -1)
+    residual = plain.residual(plain.simulate(plain.rows(own, own.new_zeros(0))))
+    expected = float(residual.square().sum() / plain.samples.sum())
+    assert float(fitting.mean_squared_error().detach()) == pytest.approx(expected)
+    assert float(fitting.root_mean_squared_error().detach()) == pytest.approx(expected**0.5)
+    assert float(fitting.root_mean_squared_error(own[0])) == pytest.approx(expected**0.5)
+
+
+@pytest.mark.parametrize("change", [lambda p: p.set_values({"idm.time_gap": 2.0}), lambda p: p.fit(iterations=2)])
+def test_an_optimiser_made_before_stays_connected(recording, change):
+    _, fitting = problem(recording)
+    optimiser = torch.optim.Adam(fitting.parameters(), lr=0.1)
+    fitting.mean_squared_error().backward()
+    change(fitting)
+    assert all(leaf.grad is None for leaf in fitting.parameters())
+    before = {name: float(value.detach()) for name, value in fitting.values().items()}
+    fitting.mean_squared_error().backward()
+    optimiser.step()
+    after = {name: float(value.detach()) for name, value in fitting.values().items()}
+    assert all(after[name] != before[name] for name in FREE)
+
+
+def test_values_that_cannot_be_set_change_nothing(recording):
+    _, fitting = problem(recording)
+    before = [leaf.detach().clone() for leaf in fitting.parameters()]
+    with pytest.raises(ValueError, match="not free here"):
+        fitting.set_values({"idm.time_gap": 2.0, "idm.exponent": 4.0})
+    assert all(torch.equal(a, b) for a, b in zip(before, fitting.parameters(), strict=True))
 
 
 def test_fit_finds_what_was_hidden_and_the_environment_takes_it(recording, tmp_path):
@@ -95,21 +129,25 @@ def test_effects_of_the_environment_are_part_of_the_problem(recording):
     env = gym.make("DiffIDM-v0", warmup=1, effects=["delay"], parameters={"delay.delay": 0.3})
     fitting = ParameterFitting(env, recording, free=("idm.time_gap", "delay.delay"))
     assert float(fitting.values()["delay.delay"].detach()) == pytest.approx(0.3, abs=1e-3)
-    fitting.loss().backward()
+    fitting.mean_squared_error().backward()
     assert all(float(leaf.grad.abs()) > 0 for leaf in fitting.parameters())
 
 
 def test_the_gymnasium_environment(recording):
     env = gym.make("DiffIDM-Fit-v0", trajectories=recording, free=FREE, bounds={"idm.time_gap": [0.4, 2.4]}, warmup=1)
     check_env(env.unwrapped, skip_render_check=True)
-    env.reset(seed=0)
+    _, info = env.reset(seed=0)
+    assert info["parameters"] == pytest.approx(dict(zip(FREE, env.unwrapped.values(np.zeros(3)), strict=True)))
+    assert info["bounds"]["idm.time_gap"] == (0.4, 2.4)
     inner = env.unwrapped
     best = np.array([1.4, 1.1, 2.6])
     action = (2.0 * (best - inner.low) / (inner.high - inner.low) - 1.0).astype(np.float32)
     np.testing.assert_allclose(inner.values(action), best, rtol=1e-5)
     assert inner.values(np.zeros(3))[0] == pytest.approx(1.4)
-    _, good, terminated, _, _ = env.step(action)
+    _, good, terminated, _, info = env.step(action)
     assert terminated
+    assert info["parameters"] == pytest.approx(dict(zip(FREE, best, strict=True)), rel=1e-5)
+    assert info["root_mean_squared_error"] == -good
     env.reset()
     bad = env.step(np.full(3, 0.5, np.float32))[1]
     assert bad < good < 0.0

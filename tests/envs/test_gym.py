@@ -1,5 +1,6 @@
 """The single environment: Gymnasium's own checks, keywords, actions, pickling and the JSON of its spec."""
 
+import functools
 import pickle
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env, data_equivalence
 
 import idm_env  # noqa: F401
+from idm_env.tasks import make_task
 
 QUICK = {"warmup": 5}
 
@@ -40,6 +42,23 @@ def test_check_env(keywords):
 def test_importing_the_package_imports_no_torch():
     code = "import sys, idm_env, gymnasium; gymnasium.spec('DiffIDM-v0'); assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("make", ["make", "make_vec"])
+def test_a_process_that_has_not_imported_the_package_finds_it_by_module(make):
+    code = f"import sys, gymnasium; assert 'idm_env' not in sys.modules; gymnasium.{make}('idm_env:DiffIDM-v0')"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_spawned_workers_find_it_by_module():
+    # A partial is pickled by names alone, so that a worker imports the package only through the module of the id.
+    make = functools.partial(gym.make, "idm_env:DiffIDM-v0", **QUICK)
+    near = gym.vector.SyncVectorEnv([make] * 2)
+    far = gym.vector.AsyncVectorEnv([make] * 2, context="spawn")
+    try:
+        np.testing.assert_array_equal(near.reset(seed=0)[0], far.reset(seed=0)[0])
+    finally:
+        far.close()
 
 
 def test_spec_survives_json_and_makes_the_same_environment():
@@ -119,6 +138,19 @@ def test_bad_keywords_are_errors_of_one_line(keywords, words):
     with pytest.raises(ValueError, match=words) as caught:
         quick(**keywords)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+@pytest.mark.parametrize("given", [{"vehicels": 3}, {"frameskip": 1}, {"task": make_task("ring"), "vehicles": 3}])
+def test_a_keyword_that_does_not_exist_is_a_type_error_as_gymnasiums(make, given):
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{list(given)[-1]}'"):
+        make("DiffIDM-v0", **given)
+
+
+def test_a_keyword_of_vectors_is_not_suggested_for_itself():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'num_envs'") as told:
+        gym.make("DiffIDM-v0", num_envs=3)
+    assert "mean 'num_envs'" not in str(told.value)
 
 
 def test_a_step_before_reset_is_an_error():

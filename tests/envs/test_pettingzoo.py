@@ -3,22 +3,50 @@
 import pickle
 
 import numpy as np
+import pettingzoo
 import pytest
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test, seed_test
+from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.state_test import state_test
 
+from idm_env.envs import pettingzoo as diffidm
 from idm_env.envs.pettingzoo import env, parallel_env, raw_env
 
 QUICK = {"controlled": 3, "warmup": 5}
 
 
+EVERYBODY = [
+    {"controlled": "all", "vehicles": 5, "length": 80.0, "warmup": 5},
+    {"controlled": 0.25, "warmup": 5},
+    {"task": "follow", "controlled": "all"},
+    {"task": "platoon", "controlled": 0.5},
+    {"task": "replay", "controlled": "all"},
+]
+
+
 @pytest.mark.filterwarnings("error::UserWarning")
-def test_parallel_api():
-    parallel_api_test(parallel_env(**QUICK, max_cycles=40), num_cycles=60)
+@pytest.mark.parametrize("keywords", [QUICK, *EVERYBODY], ids=str)
+def test_parallel_api(keywords):
+    parallel_api_test(parallel_env(**keywords, max_cycles=40), num_cycles=60)
 
 
-def test_api():
-    api_test(env(**QUICK, max_cycles=30), num_cycles=60)
+@pytest.mark.parametrize("keywords", [QUICK, *EVERYBODY], ids=str)
+@pytest.mark.parametrize("make", [env, raw_env])
+def test_api(make, keywords):
+    api_test(make(**keywords, max_cycles=30), num_cycles=60)
+
+
+def test_max_cycles():
+    max_cycles_test(diffidm)
+
+
+def test_pettingzoos_registry_knows_it():
+    if not hasattr(pettingzoo, "make"):
+        pytest.skip("this PettingZoo has no registry")
+    many = pettingzoo.make("parallel", "diffidm_v0", max_cycles=5, **QUICK)
+    assert isinstance(many, parallel_env)
+    assert many.max_cycles == 5
+    assert pettingzoo.make("aec", "diffidm_v0", **QUICK).possible_agents == many.possible_agents
 
 
 def test_seeds():
@@ -75,5 +103,5 @@ def test_bad_actions_are_errors(bad):
 
 
 def test_a_misspelled_keyword_has_a_suggestion():
-    with pytest.raises(ValueError, match="Did you mean 'vehicles'"):
+    with pytest.raises(TypeError, match="Did you mean 'vehicles'"):
         parallel_env(vehicels=3)

@@ -1,5 +1,8 @@
 """Pictures: what is drawn where, headless windows, videos, and space-time diagrams."""
 
+import base64
+import json
+
 import gymnasium as gym
 import numpy as np
 import polars as pl
@@ -8,6 +11,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
+from idm_env.diagrams import panels, write_html
 from idm_env.render import colour, space_time
 from idm_env.simulator import Trajectory
 
@@ -99,6 +103,40 @@ def test_space_time_on_a_ring_draws_no_line_across_the_lap():
     drawn = lines(space_time(Trajectory(position, position, position, position), ring_length=10.0))
     assert all(abs(segment[1, 1] - segment[0, 1]) < 2.0 for segment in drawn[0].get_segments())
     assert len(drawn[0].get_segments()) == 23
+
+
+def rows(run, lane, vehicles, count=20):
+    return [
+        {"run_id": run, "lane": lane, "vehicle_id": f"{run}{lane}-{i}", "time_s": 0.1 * k, "position_m": 10.0 * i + k,
+         "speed_mps": 10.0, "controlled": i == 1}
+        for i in range(vehicles) for k in range(count)
+    ]  # fmt: skip
+
+
+def test_panels_are_one_per_run_and_lane_the_largest_first(tmp_path):
+    table = pl.DataFrame(rows("a", 1, 2) + rows("a", 2, 5) + rows("b", 1, 3))
+    found = panels(table.sample(fraction=1.0, shuffle=True, seed=0))
+    assert [p.title for p in found] == ["run a, lane 2, 5 vehicles", "run b, lane 1, 3 vehicles",
+                                        "run a, lane 1, 2 vehicles"]  # fmt: skip
+    assert all((np.diff(line.time) > 0).all() for p in found for line in p.lines)
+    assert [line.marked for line in found[0].lines] == [False, True, False, False, False]
+    axes = space_time(found).axes
+    assert [a.get_title() for a in axes[:3]] == [p.title for p in found]
+    assert axes[0].get_legend().get_texts()[0].get_text() == "controlled"
+    assert len([a for a in space_time(found, most=2).axes if a.get_title()]) == 2
+
+
+def test_the_interactive_page_holds_what_was_drawn_and_needs_no_network(tmp_path):
+    found = panels(pl.DataFrame(rows("a</script>", 1, 3)))
+    write_html(tmp_path / "x.html", found, "x")
+    page = (tmp_path / "x.html").read_text()
+    assert "http" not in page and page.count("</script>") == page.count("<script")
+    data = json.loads(page.split('id="measured">')[1].split("</script>")[0])
+    (panel,) = data["panels"]
+    line = panel["vehicles"][2]
+    place = np.frombuffer(base64.b64decode(line["place"]), "<u2") / 65535 * np.ptp(panel["place"]) + panel["place"][0]
+    np.testing.assert_allclose(place, found[0].lines[2].position, atol=1e-3)
+    assert line["name"] == "a</script>1-2" and panel["vehicles"][1]["marked"]
 
 
 def test_a_table_without_speed_is_an_error():

@@ -17,12 +17,10 @@ from idm_env.envs.sb3 import SB3VecEnv
 QUICK = {"warmup": 5}
 
 
-def adapter(mode="SameStep", limit=20, count=4, **keywords):
-    return SB3VecEnv(
-        gym.make_vec(
-            "DiffIDM-v0", num_envs=count, autoreset_mode=mode, max_episode_steps=limit, **{**QUICK, **keywords}
-        )
-    )
+def adapter(mode=None, limit=20, count=4, **keywords):
+    """Return the adapter over a vector, by default in the vector's own mode."""
+    chosen = {**QUICK, **keywords} | ({} if mode is None else {"autoreset_mode": mode})
+    return SB3VecEnv(gym.make_vec("DiffIDM-v0", num_envs=count, max_episode_steps=limit, **chosen))
 
 
 @pytest.mark.parametrize("keywords", [{}, {"controlled": 2}])
@@ -32,7 +30,7 @@ def test_check_env_without_warnings(keywords):
         check_env(gym.make("DiffIDM-v0", **QUICK, **keywords))
 
 
-@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+@pytest.mark.parametrize("mode", [None, "SameStep", "Disabled"])
 def test_the_ends_are_told_as_sb3_wants_them(mode):
     env = adapter(mode, limit=6)
     loop = [gym.make("DiffIDM-v0", max_episode_steps=6, **QUICK) for _ in range(4)]

@@ -136,3 +136,5 @@ def test_torch_output_has_the_dense_layout():
     assert all(isinstance(x, torch.Tensor) for x in (observation, reward, terminated, truncated))
     assert info["final_obs"].shape == (COUNT, 3)
     assert info["_final_obs"].all()
+    assert info["_final_info"].all()
+    assert info["final_info"] == {}

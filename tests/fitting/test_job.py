@@ -10,7 +10,7 @@ import pytest
 
 from idm_env.config import load_model
 from idm_env.data import synthetic
-from idm_env.fitting.job import Options, Source, fit_file, simulate_file
+from idm_env.fitting.job import FITTED, Options, Source, fit_file, simulate_file
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_fit_writes_parameters_model_and_reports(file: Path, tmp_path: Path) -> 
     before = file.read_bytes()
     result = fit_file(Source(file, smooth=True), Options(starts=2, held_out=0.25), tmp_path)
     assert file.read_bytes() == before
-    assert {p.name for p in tmp_path.iterdir()} == {"parameters.parquet", "model.yaml", "report.json", "report.html"}
+    assert {p.name for p in tmp_path.iterdir()} == {*FITTED, "run.json"}
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["fit"]["gap_rmse_m"] == pytest.approx(result["fit"]["gap_rmse_m"])
     assert report["fit"]["gap_rmse_m"] < 0.3
@@ -38,7 +38,30 @@ def test_fit_writes_parameters_model_and_reports(file: Path, tmp_path: Path) -> 
     table = pl.read_parquet(tmp_path / "parameters.parquet")
     assert table.height == 5 * report["fit"]["groups"]
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 2 and "http" not in page
+    assert page.count("data:image/png;base64,") == 4 and "http" not in page
+
+
+def test_every_driver_has_a_row_and_bounds_are_counted(file: Path, tmp_path: Path) -> None:
+    """One row per driver in drivers.csv and on the page; the shares at bounds are those of the parameters."""
+    seen: list[str] = []
+    result = fit_file(
+        Source(file, smooth=True), Options(starts=1), tmp_path, on_progress=lambda phase, *_: seen.append(phase)
+    )
+    drivers = pl.read_csv(tmp_path / "drivers.csv", schema_overrides={"bounds": pl.String})
+    long = pl.read_parquet(tmp_path / "parameters.parquet")
+    assert drivers["group"].to_list() == long["group"].unique(maintain_order=True).to_list() and drivers.height == 8
+    for row in result["bounds"]:
+        mine = long.filter(pl.col("parameter") == row["parameter"])
+        assert drivers[row["parameter"]].to_list() == pytest.approx(mine["estimate"].to_list())
+        assert row["on_low"] + row["on_high"] == mine["at_bound"].sum()
+        on = drivers["bounds"].fill_null("").str.split(" ").list.contains(row["parameter"])
+        assert on.to_list() == mine["at_bound"].to_list()
+        if mine["at_bound"].sum():
+            assert f"{row['symbol']} on its bound for {mine['at_bound'].sum()} of 8" in result["at_bounds"]
+    assert result["at_bounds"] in (tmp_path / "report.html").read_text()
+    rms = (drivers["gap_rmse_m"] * drivers["episodes"]).sum() / drivers["episodes"].sum()
+    assert rms == pytest.approx(result["fit"]["gap_rmse_m"], rel=0.3)
+    assert seen[0] == "reading" and seen[-1] == "writing"
 
 
 def test_simulate_repeats_what_fit_reported(file: Path, tmp_path: Path) -> None:
@@ -108,3 +131,35 @@ def test_bad_input_is_one_line(file: Path, tmp_path: Path) -> None:
     model.write_text("configures: model\nschema: 1\neffects: [idm, brakes, imagined]\n")
     with pytest.raises(ValueError, match="'imagined' takes an input"):
         simulate_file(Source(file), model, tmp_path / "sim")
+
+
+def test_simulate_says_what_the_model_was_fitted_on(file: Path, tmp_path: Path) -> None:
+    """Fitted, held out, partly one and partly the other, or unknown: in the report and on its page, by content."""
+    fit_file(Source(file), Options(starts=1, held_out=0.25), tmp_path / "fit")
+    saved = tmp_path / "fit" / "model.yaml"
+    model = load_model(saved)
+    runs = sorted({key.split("/")[0] for key in model.drivers})
+    table = pl.read_csv(file)
+    held = next(r for r in table["run_id"].cast(pl.String).unique() if r not in runs)
+    pl.read_csv(file).write_parquet(tmp_path / "renamed.parquet")
+    own = tmp_path / "own.yaml"
+    own.write_text("configures: model\neffects: [idm, brakes]\n")
+    for path, where, yaml, count, words in (
+        (file, f"run_id={runs[0]}", saved, 2, "m, fitted on these data: not a held-out figure."),
+        (file, f"run_id={held}", saved, 0, "m, on data that the model was not fitted on."),
+        (
+            tmp_path / "renamed.parquet",
+            None,
+            saved,
+            6,
+            "in part fitted on these data (6 of 8 episodes): not a held-out",
+        ),
+        (file, None, own, None, "does not say whether it was fitted on them"),
+    ):
+        result = simulate_file(Source(path, where=where), yaml, tmp_path / "sim")
+        assert result["fitted_on"]["episodes_fitted_on"] == count
+        page = (tmp_path / "sim" / "report.html").read_text()
+        assert words in page and "<h2>Data</h2>" in page and f"{path.name}: " in page
+        if count == 6:
+            assert f"On the others it is {result['fitted_on']['gap_rmse_of_others_m']:.2f} m." in page
+            assert result["fitted_on"]["gap_rmse_of_others_m"] != pytest.approx(result["error"]["gap_rmse_m"])

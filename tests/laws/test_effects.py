@@ -36,6 +36,26 @@ def test_the_catalogue_of_candidates_is_all_nullable() -> None:
         assert any(p.null is not None for p in make(name).parameters), name
 
 
+@pytest.mark.parametrize("name", CANDIDATES)
+def test_what_discovery_has_to_know_of_a_candidate_stands_in_its_class(name: str) -> None:
+    """Otherwise reports fall silent, or another file has to know effects by name."""
+    effect = make(name)
+    cls = type(effect)
+    assert cls.title and cls.equation and cls.told_by and cls.looks_like
+    strength = next(p for p in effect.parameters if p.null is not None)
+    low, high = strength.searched or (strength.low, strength.high)
+    # A clause for every side of the null that a search can reach, and for no other.
+    assert [bool(text) for text in cls.wording] == [low < strength.null, high > strength.null]  # type: ignore[operator]
+    known = {*CANDIDATES, *(p.name for p in IDM.declared)}
+    assert {item.split()[0] for item in cls.looks_like} <= known - {name}
+    assert set(cls.cancels) <= set(CANDIDATES) - {name}
+    assert bool(cls.column) <= (cls.sought == "profile")
+    if cls.sought == "anywhere":
+        for p in effect.parameters:
+            least, most = p.searched or (p.low, p.high)
+            assert p.starts and all(least < start < most for start in p.starts), p.name
+
+
 @nullable
 @pytest.mark.parametrize("road", [Lane(), Ring()], ids=["lane", "ring"])
 @pytest.mark.parametrize("integration", ["ballistic", "euler", "midpoint"])
@@ -79,9 +99,9 @@ def test_an_effect_at_its_default_does_something(effect: Effect) -> None:
     inputs = inputs_for(simulator, 60, torch.zeros(N, dtype=DTYPE))
     ends = []
     for params in (simulator.defaults(dtype=DTYPE), parameters.null(simulator.effects, dtype=DTYPE)):
-        if effect.kind == "power_limit":
-            params["power_limit"]["power"] = params["power_limit"]["power"].clamp_max(2.0)
-            params["power_limit"]["power"] = params["power_limit"]["power"] if not ends else torch.tensor(1e5)
+        if effect.kind in ("power_limit", "traction"):  # what a car can is more than these drivers want
+            (p,) = effect.parameters
+            params[effect.name][p.name] = torch.tensor(p.null if ends else p.low, dtype=DTYPE)
             params["idm"]["desired_speed"] = torch.tensor(60.0, dtype=DTYPE)
         ends.append(simulator.rollout(start(simulator, params), inputs, params, 60)[0].position)
     assert (ends[0] - ends[1]).abs().max() > 1e-4

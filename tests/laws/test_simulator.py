@@ -239,6 +239,10 @@ def test_errors_name_value_rule_and_cure() -> None:
         simulator.check({**params, "idm": {**params["idm"], "headway": torch.tensor(1.0)}})
     with pytest.raises(ValueError, match=r"'idm.time_gap' is missing"):
         simulator.check({**params, "idm": {k: v for k, v in params["idm"].items() if k != "time_gap"}})
+    with pytest.raises(ValueError, match=r"dt = 100 s is outside \(0, 5\] s: no step"):
+        Simulator(Lane(), (IDM(), Brakes()), dt=100.0)
+    with pytest.raises(ValueError, match=r"dt = 2 s is longer than the shortest time gap, idm.time_gap = 1.5 s.*Take"):
+        Simulator(Lane(), (IDM(), Brakes()), dt=2.0).check({e: params[e] for e in ("idm", "brakes")})
     with pytest.raises(ValueError, match="Did you mean 'delay'"):
         make("dely")
     with pytest.raises(ValueError, match=r"no choice 'max_dely'.*'max_delay'"):

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from idm_env.prediction.metrics import (
     SHAPES,
     Case,
+    Score,
+    _weighted_map,
     at_two_hertz,
     average_precision,
     displacement,
     hits,
+    intervals,
     score,
     shape_of,
     speed_scale,
@@ -79,6 +84,20 @@ def test_average_precision_by_hand() -> None:
     assert average_precision([score(case((50.0, 0.0)))], 3) == 0.0
 
 
+def test_equal_confidences_do_not_depend_on_the_order_of_agents() -> None:
+    """As in the benchmark's own code, false positives come first among equals."""
+    hit, miss = score(case((0.0, 0.0))), score(case((50.0, 0.0)))
+    for order in ([hit, miss, miss], [miss, miss, hit]):
+        assert average_precision(order, 3) == pytest.approx(1 / 3 * 1 / 3)
+
+
+def test_right_u_turns_count_with_right_turns() -> None:
+    """As in the benchmark's own code, so that one agent is not an eighth of the mean."""
+    hit, miss = score(case((0.0, 0.0))), score(case((50.0, 0.0)))
+    scores = [replace(hit, shape="right"), replace(miss, shape="right U-turn"), replace(miss, shape="straight")]
+    assert summary(scores)["mAP_3s"] == pytest.approx((1 / 2 * 1 / 2 + 0.0) / 2)
+
+
 def path(turn: float, length: float = 40.0) -> tuple[np.ndarray, np.ndarray]:
     heading = np.linspace(0.0, turn, 81)
     step = length / 80 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
@@ -101,3 +120,39 @@ def test_the_eight_shapes(turn: float, length: float, shape: str) -> None:
     speed = np.full(81, length / 8)
     assert shape in SHAPES
     assert shape_of(position, heading, speed, np.ones(81, bool)) == shape
+
+
+def test_intervals_hold_the_figure_and_are_those_of_agents_or_scenes() -> None:
+    rng = np.random.default_rng(0)
+    scores = [
+        Score("vehicle", "straight", [0.7, 0.3], [x, 2 * x, 3 * x], [x, x, None], [[x < 1, False], [True, False], None])
+        for x in rng.exponential(1.0, 60)
+    ]
+    row = summary(scores)
+    found = intervals(scores, ["one"] * len(scores))
+    for name in ("minADE_3s", "minADE_8s", "minFDE_5s", "miss_rate_3s", "mAP_3s"):
+        low, high = found[name]
+        assert low < row[name] < high, name
+    assert np.isnan(found["minFDE_8s"]).all() and np.isnan(found["mAP_8s"]).all()
+    assert found["miss_rate_5s"] == (0.0, 0.0)
+    width = found["minADE_3s"][1] - found["minADE_3s"][0]
+    assert width == pytest.approx(4 * np.std([s.ade[0] for s in scores]) / np.sqrt(60), rel=0.3)
+    # Agents of a scene that are all alike are one: with whole scenes drawn, the interval is as of 12 agents.
+    alike = [s for s in scores[:12] for _ in range(5)]
+    by_scene = intervals(alike, [str(i) for i in range(12) for _ in range(5)])["minADE_3s"]
+    by_agent = intervals(alike, ["one"] * 60)["minADE_3s"]
+    assert by_scene[1] - by_scene[0] > 1.5 * (by_agent[1] - by_agent[0])
+    assert np.isnan(intervals(scores[:1], ["one"])["minADE_3s"]).all()
+
+
+def test_a_resampled_map_with_everybody_once_is_the_map() -> None:
+    rng = np.random.default_rng(1)
+    scores = []
+    for i in range(40):
+        confidence = rng.dirichlet(np.ones(4)).tolist()
+        hit = [bool(x) for x in rng.random(4) < 0.3]
+        scores.append(Score("vehicle", ("straight", "left")[i % 2], confidence, [1.0] * 3, [1.0] * 3, [hit] * 3))
+    once = _weighted_map(scores, 3, np.ones((1, 40)))
+    assert once[0] == pytest.approx(float(summary(scores)["mAP_3s"]), abs=1e-12)
+    twice = _weighted_map(scores, 3, np.repeat([[2.0, 0.0]], 20, axis=0).reshape(1, -1))
+    assert twice[0] == pytest.approx(float(summary(scores[::2])["mAP_3s"]), abs=1e-12)

@@ -9,10 +9,12 @@ import numpy as np
 import polars as pl
 import pytest
 
+from benchmarks import prediction as benchmark
 from idm_env.data import DataError
 from idm_env.data.womd import Control, Scenario, read_json, scenarios
+from idm_env.keep import UNFINISHED
 from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
-from idm_env.prediction.files import case_of, predict_files
+from idm_env.prediction.files import OURS, case_of, predict_files
 from idm_env.prediction.lanes import LaneGraph, Route
 from idm_env.prediction.metrics import score, summary
 from idm_env.prediction.predict import (
@@ -26,6 +28,7 @@ from idm_env.prediction.predict import (
 from idm_env.prediction.rollout import Ahead, Course, Drivers, nobody, roll
 from idm_env.prediction.scene import STEPS, Scene
 from idm_env.prediction.select import chances, select
+from idm_env.prediction.shares import SHARES, fit_shares
 from idm_env.prediction.stops import Stop, StopLines
 from tests.prediction import scenes
 from tests.prediction.test_womd import write_json
@@ -174,6 +177,14 @@ def test_one_second_of_braking_shifts_the_weight_to_those_who_stop(fork: Scenari
     assert shares[1] > shares[0] + 0.2
 
 
+def test_nobody_is_predicted_worse_than_by_constant_velocity(fork: Scenario) -> None:
+    """It is one of the six, to the last bit, for every kind, on and off the lanes."""
+    scene = Scene(fork)
+    for index in range(4):
+        straight = straight_on(scene, index).futures[0]
+        assert np.abs(predict(scene, index).futures - straight).max(axis=(1, 2)).min() == 0.0
+
+
 def test_who_stands_may_stay(fork: Scenario) -> None:
     agent = fork.agents[0]
     still = np.zeros_like(agent.velocity)
@@ -259,12 +270,12 @@ def test_files_report_and_bad_input(tmp_path: Path) -> None:
     report = predict_files(
         [good, bare, lost, tmp_path / "broken.json"],
         tmp_path / "out",
-        on_progress=lambda done, total: seen.append(done),
+        on_progress=lambda phase, done, total, words: seen.append(done) if phase == "predict" else None,
     )
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        "predictions.parquet", "parameters.parquet", "report.json", "report.html",
+        "predictions.parquet", "parameters.parquet", "report.json", "report.html", "run.json",
     }  # fmt: skip
-    assert report["scenarios"] == 3 and report["agents"] == 4 and seen == [1, 2, 3, 4]
+    assert report["scenarios"] == 3 and report["agents"] == 4 and seen == [0, 1, 1, 2, 2, 3, 4]
     reasons = " ".join(item["reason"] for item in report["left_out"])
     assert len(report["left_out"]) == 2 and "not valid at the present" in reasons and "cannot be read" in reasons
     assert any("no lanes" in item["note"] for item in report["notes"])
@@ -281,25 +292,25 @@ def test_an_interrupted_run_goes_on_after_the_last_file(tmp_path: Path) -> None:
     paths = [write_json(tmp_path / f"{i}.json", wanted=[i]) for i in range(3)]
     whole = predict_files(paths, tmp_path / "whole")
 
-    def stop(done: int, total: int) -> None:
-        if done == 2:
+    def stop(phase: str, done: int, total: int, words: float | str) -> None:
+        if (done, words) == (2, "1.json"):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         predict_files(paths, tmp_path / "out", on_progress=stop)
-    assert (tmp_path / "out" / "parts" / "000001.json").exists()
-    with pytest.raises(DataError, match="other data or settings; leave out resume"):
+    assert (tmp_path / "out" / UNFINISHED / "predict" / "000001.kept").exists()
+    with pytest.raises(ValueError, match="other data or options"):
         predict_files(paths[:2], tmp_path / "out", resume=True)
     paths[0].write_text(paths[0].read_text())  # as new: another file by its time
-    with pytest.raises(DataError, match="other data or settings"):
+    with pytest.raises(ValueError, match="other data or options"):
         predict_files(paths, tmp_path / "out", resume=True)
     with pytest.raises(KeyboardInterrupt):
         predict_files(paths, tmp_path / "out", on_progress=stop)
     seen: list[int] = []
-    report = predict_files(paths, tmp_path / "out", resume=True, on_progress=lambda done, total: seen.append(done))
-    assert report["methods"] == whole["methods"] and seen == [1, 2, 3]
+    report = predict_files(paths, tmp_path / "out", resume=True, on_progress=lambda *at: seen.append(at[1]))
+    assert report["methods"] == whole["methods"] and seen[1:-1] == [1, 2, 2, 3]
     tables = [pl.read_parquet(tmp_path / name / "predictions.parquet") for name in ("whole", "out")]
-    assert tables[0].equals(tables[1]) and not (tmp_path / "out" / "parts").exists()
+    assert tables[0].equals(tables[1]) and not (tmp_path / "out" / UNFINISHED).exists()
 
 
 def test_better_than_all_three_single_futures_on_measured_scenes(measured) -> None:  # type: ignore[no-untyped-def]
@@ -317,3 +328,25 @@ def test_better_than_all_three_single_futures_on_measured_scenes(measured) -> No
     for name, row in rows.items():
         for what in ("minADE_3s", "minADE_5s", "minADE_8s", "miss_rate_3s", "miss_rate_5s", "miss_rate_8s"):
             assert ours[what] < row[what], (name, what)
+
+
+def test_held_out_no_kind_is_predicted_worse_than_by_constant_velocity(measured) -> None:  # type: ignore[no-untyped-def]
+    """Each scene with the shares of the ways fitted to the other two; those of all three are the shipped ones."""
+    scenes = [
+        benchmark.known_agents(scenario)
+        for path in sorted(measured("womd_json").glob("*.json.gz"))
+        for scenario in scenarios(path)
+    ]
+    fitted = fit_shares(one.seen for scene in scenes for one in scene)
+    assert all(fitted[key] == pytest.approx(SHARES[key], abs=2e-3) for key in SHARES)
+    agents = benchmark.held_out(scenes)
+    groups = {(one.seen.kind, one.seen.pace) for one, _ in agents}
+    assert len(groups) == 4
+    for group in groups:
+        here = [item for item in agents if (item[0].seen.kind, item[0].seen.pace) == group]
+        rows = {name: summary(kept) for name, kept in benchmark.compared(here, [benchmark.STRAIGHT]).items()}
+        ours, straight = rows[OURS], rows[benchmark.STRAIGHT]
+        assert ours["mAP"] >= straight["mAP"] - 1e-12, group
+        for what in ("minADE", "minFDE", "miss_rate"):
+            for seconds in (3, 5, 8):
+                assert ours[f"{what}_{seconds}s"] <= straight[f"{what}_{seconds}s"], (group, what, seconds)

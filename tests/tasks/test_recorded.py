@@ -1,5 +1,7 @@
 """Tasks behind records: the leader is where the record says, episodes end with it, and rewards are what is written."""
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import polars as pl
@@ -63,11 +65,24 @@ def test_follow_rewards_what_is_written():
 
 @pytest.mark.parametrize("task", ["follow", "platoon", "replay"])
 def test_shorter_defaults_truncate_themselves(task):
-    horizon = {"follow": 1000, "platoon": None, "replay": 300}[task]
+    horizon = {"follow": 1000, "platoon": 3000, "replay": 300}[task]
     assert make_task(task).horizon == horizon
     env = gym.make("DiffIDM-v0", task=task, max_episode_steps=4)
     env.reset(seed=0)
     assert [env.step(None)[3] for _ in range(4)] == [False, False, False, True]
+
+
+def test_platoons_clock_is_as_precise_as_its_dtype():
+    # An integer times dt is float32 whatever comes after: 2.8e-5 m after 600 steps.
+    task = make_task("platoon", vehicles=3)
+    waves = torch.tensor([[[0.11, 0.13, 0.15], [0.1, 2.0, 4.0], [1.0, 1.2, 0.8]]], dtype=torch.float64)
+    position, speed, _ = task._motion(waves, torch.tensor([601]))[0].tolist()
+    t, moved, now = 60.1, 0.0, 0.0
+    for w, phi, a in waves[0].T.tolist():
+        moved += a * ((math.sin(w * t + phi) - math.sin(phi)) / w - math.cos(phi) * 10.0 * (1.0 - math.exp(-0.1 * t)))
+        now += a * (math.cos(w * t + phi) - math.cos(phi) * math.exp(-0.1 * t))
+    assert position == pytest.approx(10.0 * t + moved, abs=1e-11)
+    assert speed == pytest.approx(10.0 + now, abs=1e-12)
 
 
 def test_platoon_amplifies_towards_its_end_and_starts_at_rest_with_its_head():
@@ -121,6 +136,12 @@ def recording(tmp_path):
     path = tmp_path / "road.csv"
     pl.DataFrame(rows, infer_schema_length=None).write_csv(path)
     return str(path)
+
+
+def test_the_made_up_scene_is_simulated_once(monkeypatch):
+    first = make_task("replay").scene
+    monkeypatch.setattr("idm_env.simulator.Simulator.step", None)
+    assert make_task("replay", controlled=2).scene is first
 
 
 def test_a_file_is_replayed_with_its_gaps_and_changing_leaders(recording):

@@ -12,7 +12,7 @@ def start(task, count=1, seed=0, dtype=torch.float64):
     return task.reset(Draw.of(torch.arange(count) + seed, torch.zeros(count, dtype=torch.int64)), params), params
 
 
-def test_observation_and_reward_are_flows():
+def test_the_observation_is_what_is_written_and_the_reward_flows():
     task = make_task("ring", warmup=50)
     before, params = start(task)
     command = torch.tensor([[0.5]], dtype=torch.float64)
@@ -21,7 +21,7 @@ def test_observation_and_reward_are_flows():
     seen = task.observe(after)[0, 0]
     agent, leader = task.agents[0], (task.agents[0] - 1) % 22
     headway = float((position[leader] - position[agent]) % ring)
-    expected = [float(v[agent]) / 15, float(v[leader] - v[agent]) / 15, headway / 270]
+    expected = [float(v[agent]) / 5, float(v[leader] - v[agent]), headway / 10]
     torch.testing.assert_close(seen, torch.tensor(expected, dtype=torch.float64))
     reward = task.reward(before, command, after)
     assert float(reward) == pytest.approx(4.0 * float(v.mean()) / 20.0 - 4.0 * 0.5)

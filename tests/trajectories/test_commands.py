@@ -32,7 +32,8 @@ def test_filter_and_its_ablation(tmp_path: Path) -> None:
     done = call("filter", path, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert {p.name for p in (tmp_path / "out").iterdir()} == OUTPUT
-    assert "3/3" in done.stderr + done.stdout  # the progress bar at its end
+    assert "3/3" in done.stderr + done.stdout  # the progress at its end
+    assert "Data: nothing was repaired or left out." in done.stderr.splitlines()
     named = methods(tmp_path / "out")
     assert named[0] == "simulator, imagined leader" and {"linear", "Savitzky–Golay", "bounded spline"} <= set(named)
     assert "Driver parameters" in (tmp_path / "out" / "report.html").read_text()
@@ -62,6 +63,7 @@ def test_predict_does_the_whole_records_of_a_truncated_file(tmp_path: Path) -> N
     files = tmp_path / "cut.tfrecord", write_json(tmp_path / "old.json"), tmp_path / "missing.json"
     done = call("predict", *files, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
+    assert "Data: 2 bad files: cut.tfrecord, missing.json." in done.stderr.splitlines()
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["scenarios"] == 2 and report["agents"] == 5
     reasons = [item["reason"] for item in report["left_out"]]
@@ -74,7 +76,7 @@ def test_predict_does_the_whole_records_of_a_truncated_file(tmp_path: Path) -> N
     [
         (("filter", "missing.csv"), "missing.csv does not exist"),
         (("filter", "lane.csv", "--recipe", "papers"), "recipe = 'papers' is unknown; use 'default' or 'paper'"),
-        (("reconstruct", "lane.csv", "--dt", "9"), "dt = 9 s is outside [0.01, 2] s"),
+        (("reconstruct", "lane.csv", "--dt", "9"), "--dt = 9 s is outside [0.01, 2] s"),
         (("predict", "broken.json"), "no scenario can be used: broken.json cannot be read"),
     ],
 )
@@ -83,6 +85,6 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, arguments: tuple[str, ...], w
     (tmp_path / "broken.json").write_text("{")
     name, file, *more = arguments
     done = call(name, tmp_path / file, *more, "--out", tmp_path / "out")
-    assert done.returncode == 1 and not (tmp_path / "out" / "parts").exists()
+    assert done.returncode == 1 and not (tmp_path / "out" / "idm-env-unfinished").exists()
     (line,) = [line for line in done.stderr.strip().splitlines() if line.startswith("error:")]
     assert words in line

@@ -10,11 +10,12 @@ import polars as pl
 import pytest
 
 from idm_env.data import DataError
+from idm_env.keep import UNFINISHED
 from idm_env.trajectories import files
 from tests.trajectories.test_recipe import correlated
 from tests.trajectories.tracks import swinging
 
-OUTPUT = {"trajectories.parquet", "parameters.parquet", "report.json", "report.html"}
+OUTPUT = {"trajectories.parquet", "parameters.parquet", "report.json", "report.html", "run.json"}
 
 
 def lane(path: Path, vehicles: int = 4, seconds: float = 25.0, every: int = 1) -> Path:
@@ -34,8 +35,10 @@ def lane(path: Path, vehicles: int = 4, seconds: float = 25.0, every: int = 1) -
 
 
 def test_filter_writes_tidy_output_and_a_report(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    report = files.filter_file(lane(tmp_path / "lane.csv"), tmp_path / "out", on_progress=lambda *at: seen.append(at))
+    seen: list[tuple[str, int, int]] = []
+    report = files.filter_file(
+        lane(tmp_path / "lane.csv"), tmp_path / "out", on_progress=lambda *at: seen.append(at[:3])
+    )
     assert {path.name for path in (tmp_path / "out").iterdir()} == OUTPUT
     table = pl.read_parquet(tmp_path / "out" / "trajectories.parquet")
     assert table.height == 4 * 251
@@ -48,9 +51,12 @@ def test_filter_writes_tidy_output_and_a_report(tmp_path: Path) -> None:
     methods = {row["method"]: row for row in report["methods"]}
     assert methods["simulator, imagined leader"]["implausible_percent"] == 0.0
     assert methods["linear"]["implausible_percent"] == 100.0
-    assert seen == [(4, 4)]
+    filtering = [at for at in seen if at[0] == "filter"]
+    assert filtering[0] == ("filter", 0, 4) and filtering[-1] == ("filter", 4, 4)
+    assert filtering == sorted(filtering) and len(filtering) > 4  # it moves within a chunk too
+    assert [at[0] for at in seen if at not in filtering] == ["compiling", "reading", "writing"]
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("data:image/png") == 5 and "Savitzky–Golay" in page
+    assert page.count("data:image/png") == 6 and "Savitzky–Golay" in page
 
 
 def test_chunks_and_resume_change_nothing(tmp_path: Path) -> None:
@@ -60,31 +66,32 @@ def test_chunks_and_resume_change_nothing(tmp_path: Path) -> None:
     class StoppedError(Exception):
         pass
 
-    def stop(done: int, total: int) -> None:
-        if done >= 4:
+    def stop(phase: str, done: int, total: int, words: float | str) -> None:
+        if phase == "filter" and done >= 4:
             raise StoppedError
 
     with pytest.raises(StoppedError):
         files.filter_file(path, tmp_path / "out", baselines=False, chunk=2, on_progress=stop)
-    assert (tmp_path / "out" / "parts").exists()
+    assert (tmp_path / "out" / UNFINISHED).exists()
     files.filter_file(path, tmp_path / "out", baselines=False, chunk=2, resume=True)
     whole, out = (pl.read_parquet(tmp_path / name / "trajectories.parquet") for name in ("whole", "out"))
     for name in ("position_m", "speed_mps", "accel_mps2"):
         assert np.allclose(whole[name], out[name], atol=1e-9)
     gaps = [table["gap_m"].fill_null(-1.0).to_numpy() for table in (whole, out)]
     assert np.allclose(gaps[0], gaps[1], atol=1e-9)
-    assert not (tmp_path / "out" / "parts").exists()
+    assert not (tmp_path / "out" / UNFINISHED).exists()
 
 
 def test_resume_refuses_other_settings(tmp_path: Path) -> None:
     path = lane(tmp_path / "lane.csv", vehicles=2)
 
-    def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
+    def stop(phase: str, done: int, total: int, words: float | str) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         files.filter_file(path, tmp_path / "out", chunk=1, baselines=False, on_progress=stop)
-    with pytest.raises(DataError, match="other data or settings; leave out resume"):
+    with pytest.raises(ValueError, match="other data or options"):
         files.filter_file(path, tmp_path / "out", chunk=2, baselines=False, resume=True)
 
 
@@ -96,7 +103,7 @@ def test_bad_tracks_are_counted_and_the_others_done(tmp_path: Path) -> None:
         "two": (np.array([0.0, 0.1]), np.array([0.0, 1.0])),
         "parked": (time, np.zeros_like(time)),
         "jump": (time, 10 * time + 100.0 * (time > 6.0)),
-        "reverse": (time, -8 * time),
+        "reverse": (time, np.minimum(8 * time, 40 - 2 * time)),
         "shuffled": (time[::-1], 10 * time[::-1]),
         "double": (np.repeat(time, 2), np.repeat(10 * time, 2)),
     }
@@ -104,7 +111,9 @@ def test_bad_tracks_are_counted_and_the_others_done(tmp_path: Path) -> None:
     pl.concat(frames).write_parquet(tmp_path / "bad.parquet")
     report = files.filter_file(tmp_path / "bad.parquet", tmp_path / "out")
     assert {item["track"] for item in report["left_out"]} == {"0/point", "0/reverse/0"}
-    assert {item["kind"] for item in report["repairs"]} == {"time not increasing", "duplicated time"}
+    assert {item["kind"] for item in report["repairs"]} == {
+        "time not increasing", "duplicated time", "length assumed",
+    }  # fmt: skip
     assert report["tracks"] == 7  # the jump makes two
     table = pl.read_parquet(tmp_path / "out" / "trajectories.parquet")
     assert table["accel_mps2"].abs().max() < 10  # type: ignore[operator]

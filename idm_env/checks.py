@@ -1,0 +1,78 @@
+"""Checks of what users give, numbers first: one line that names the value, the rule and the cure."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import numbers
+import reprlib
+from collections.abc import Iterable
+from typing import Any
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 2
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
+
+
+def shown(value: Any) -> str:
+    """Return a value as an error text may show it: never longer than a line, whatever it is."""
+    try:
+        return _SHORT.repr(value)
+    except (ValueError, RecursionError):  # Python writes no whole number of more than 4300 digits
+        return f"a very large {type(value).__name__}"
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return ' Did you mean …?' for the nearest known word, or the list of all when none is near."""
+    known, word = list(known), word[:200]
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    if not close and "." in word:
+        close = difflib.get_close_matches(word.split(".")[-1], [k.split(".")[-1] for k in known], n=1, cutoff=0.4)
+        close = [k for k in known if close and k.split(".")[-1] == close[0]][:1]
+    return f" Did you mean '{close[0]}'?" if close else f" Known: {', '.join(sorted(known)) or 'none'}."
+
+
+def one_of(name: str, value: Any, known: Iterable[str]) -> str:
+    """Return a value that is one of some words."""
+    known = list(known)
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name} = {shown(value)} is unknown.{nearest(str(shown(value)).strip(chr(39)), known)}")
+    return value
+
+
+def whole(name: str, value: Any, low: int, high: int | None = None) -> int:
+    """Return a whole number of at least ``low``, and at most ``high``."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise ValueError(f"{name} = {shown(value)} must be a whole number.")
+    number = int(value)
+    if number < low:
+        raise ValueError(f"{name} = {shown(value)} must be at least {low}.")
+    if high is not None and number > high:
+        raise ValueError(f"{name} = {shown(value)} must be at most {high}.")
+    return number
+
+
+def finite(name: str, value: Any, unit: str = "") -> float:
+    """Return a finite number."""
+    try:
+        if not isinstance(value, bool) and isinstance(value, numbers.Real) and math.isfinite(value):
+            return float(value)
+    except OverflowError:  # a whole number beyond 1e308
+        pass
+    raise ValueError(f"{name} = {shown(value)} must be a finite number{' of ' + unit if unit else ''}.")
+
+
+def at_least(name: str, value: Any, low: float, unit: str = "") -> float:
+    """Return a finite number of at least ``low``."""
+    if finite(name, value, unit) < low:
+        raise ValueError(f"{name} = {value:g}{' ' + unit if unit else ''} must be at least {low:g}.")
+    return float(value)
+
+
+def within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
+    """Return a number in ``[low, high]``; only a bound that is infinite lets an infinite number through."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        unit = f" {unit}" if unit else ""
+        told = f"{value:g}" if isinstance(value, float) else shown(value)
+        raise ValueError(f"{name} = {told}{unit} is outside [{low:g}, {high:g}]{unit}.")
+    return float(value)

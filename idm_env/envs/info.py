@@ -1,0 +1,123 @@
+"""What infos tell of a step, and how: single environments, vectors as Gymnasium lays them out, and one row of these.
+
+``accel``
+    Executed accelerations of the agents (m/s²), shape ``(agents,)``: what drivers' brakes and the failsafe left.
+``command``
+    Commanded accelerations (m/s²): the clipped action times ``max_command``; NaN where nobody commands.
+``failsafe``
+    Whether the failsafe cut each command (bool).
+``crash``, ``crash_reason``
+    Whether the episode ended in a crash (bool), and, only then, who touched whom (a text).
+``vehicle_id``
+    Recorded ids of the agents' vehicles (a tuple of texts), in ``reset`` too; only in tasks that replay a recording.
+
+``info="none"``, or some of these names, leaves the rest out. With torch output accelerations are tensors, with their
+graph.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env.envs.batch import Batch, Outcome
+
+
+def ids(batch: Batch) -> tuple[str, ...] | None:
+    """Return the recorded ids of the agents' vehicles where the infos tell them."""
+    known = batch.task.vehicle_ids
+    if known is None or "vehicle_id" not in batch.settings.info:
+        return None
+    return tuple(known[i] for i in batch.task.agents)
+
+
+def begun(batch: Batch) -> dict[str, Any]:
+    """Return the info of the reset of a single environment."""
+    known = ids(batch)
+    return {} if known is None else {"vehicle_id": known}
+
+
+def single(batch: Batch, outcome: Outcome) -> dict[str, Any]:
+    """Return the info of a step of a single environment."""
+    info: dict[str, Any] = {}
+    for name, value in outcome.details.items():
+        if name == "crash":
+            info["crash"] = bool(value.any())
+        else:
+            info[name] = _out(batch, value)[0]
+    if info.get("crash"):
+        assert batch.world is not None
+        info["crash_reason"] = batch.task.crash_reason(batch.world, 0)
+    return info | begun(batch)
+
+
+def _out(batch: Batch, value: Tensor) -> Any:
+    return value.detach().cpu().numpy() if batch.settings.output == "numpy" else value
+
+
+class Rows:
+    """Infos of the rows of a vector: every array beside a mask ``_name`` that says in which rows it holds.
+
+    With torch output numbers and masks are tensors; texts are object arrays always. What holds nowhere is left out.
+    """
+
+    def __init__(self, batch: Batch) -> None:
+        self.batch = batch
+        self._torch = batch.settings.output == "torch"
+        known = ids(batch)
+        self._ids = None
+        if known is not None:
+            self._ids = np.empty(batch.count, dtype=object)
+            self._ids.fill(known)
+
+    def begun(self, rows: np.ndarray) -> dict[str, Any]:
+        """Return the info of resets of some rows (bool)."""
+        info: dict[str, Any] = {}
+        if self._ids is not None:
+            self._put(info, "vehicle_id", self._ids, rows)
+        return info
+
+    def stepped(self, outcome: Outcome, rows: np.ndarray) -> dict[str, Any]:
+        """Return the info of a step of some rows (bool); to be called before any row is reset."""
+        info: dict[str, Any] = {}
+        for name, value in outcome.details.items():
+            whole = value.any(-1) if name == "crash" else value
+            self._put(info, name, _out(self.batch, whole), rows)
+        if "crash" in outcome.details:
+            crashed = outcome.terminated.any(-1).cpu().numpy() & rows
+            if crashed.any():
+                world = self.batch.world
+                assert world is not None
+                reasons = np.full(self.batch.count, None, dtype=object)
+                for row in np.flatnonzero(crashed):
+                    reasons[row] = self.batch.task.crash_reason(world, int(row))
+                self._put(info, "crash_reason", reasons, crashed)
+        return info
+
+    def _put(self, info: dict[str, Any], name: str, value: Any, rows: np.ndarray) -> None:
+        if not rows.any():
+            return
+        mask: Any = rows.copy()
+        if isinstance(value, Tensor):
+            mask = torch.as_tensor(mask, device=value.device)
+            if not rows.all():
+                value = torch.where(mask.view(-1, *(1,) * (value.dim() - 1)), value, torch.zeros_like(value))
+        else:
+            if self._torch:
+                mask = torch.as_tensor(mask)
+            value = value.copy()
+            if not rows.all():
+                value[~rows] = None if value.dtype == object else 0
+        info[name], info[f"_{name}"] = value, mask
+
+
+def row(info: dict[str, Any], i: int) -> dict[str, Any]:
+    """Return what the infos of a vector tell of one environment; final observations and infos are left out."""
+    return {
+        name: value[i]
+        for name, value in info.items()
+        if not name.startswith(("_", "final_")) and bool(info[f"_{name}"][i])
+    }

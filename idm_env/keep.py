@@ -1,0 +1,250 @@
+"""What is kept on disk: files in one piece, results that overwrite nothing of a user's, and work that can go on.
+
+One mechanism for every command. ``write`` replaces a file only by a whole one. ``results`` guards a folder of results:
+no output is an input, and nothing is overwritten that ``run.json`` there does not name as ours. ``Store`` holds what an
+interrupted run goes on with, in a folder of our own that only its ``run.json`` makes removable. ``read`` turns whatever
+is wrong with a file into one line with a cure.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+MARK = "run.json"
+"""The file that says what in a folder is ours."""
+UNFINISHED = "idm-env-unfinished"
+"""Folder in a folder of results in which interrupted runs leave what they go on with."""
+AFRESH = "Leave out --resume to start afresh."
+
+_OWNER = "idm-env"
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+R = TypeVar("R")
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+
+def write(path: Path, writer: Callable[[Path], Any]) -> None:
+    """Let ``writer`` write a file; one of that name is replaced only by a whole one.
+
+    OSError, in one line, where the disk is full; nothing is left of the file then.
+    """
+    beside = path.with_name(f".{path.stem}.idm-env-part{path.suffix}")
+    try:
+        writer(beside)
+        os.replace(beside, path)
+    except BaseException as error:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+        reason = full(error)
+        if reason is None:
+            raise
+        raise OSError(f"{path} cannot be written: {reason}. Free space there and run again.") from None
+
+
+def full(error: BaseException) -> str | None:
+    """Return why nothing more can be written, or None; libraries in Rust tell the number of the error in words."""
+    number = error.errno if isinstance(error, OSError) else None
+    told = [n for n in _FULL if n == number or f"os error {n})" in str(error)]
+    return os.strerror(told[0]) if told else None
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a text file in one piece."""
+    write(path, lambda beside: beside.write_text(content, encoding="utf-8"))
+
+
+def read(path: Path, reader: Callable[[Path], R], cure: str) -> R:
+    """Return what ``reader`` makes of a file of ours; ValueError with the cure, in one line, for a broken file."""
+    try:
+        return reader(path)
+    except Exception as error:
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        raise ValueError(f"{path} is broken ({reason}). {cure}") from None
+
+
+def fingerprint(*parts: object) -> str:
+    """Return a digest of files (a path's bytes, where there is a file), arrays and tensors, and all else by repr."""
+    found = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path) and part.is_file():
+            with part.open("rb") as file:
+                while block := file.read(1 << 20):
+                    found.update(block)
+        elif hasattr(part, "detach"):
+            found.update(part.detach().cpu().numpy().tobytes())
+        elif hasattr(part, "tobytes"):
+            found.update(part.tobytes())
+        else:
+            found.update(repr(part).encode(errors="surrogateescape"))
+        found.update(b"\0")
+    return found.hexdigest()
+
+
+# -- results ---------------------------------------------------------------------------------------------------------
+
+
+def not_an_input(output: Path, inputs: Iterable[Path | str | None]) -> None:
+    """Raise ValueError where an output is the same file as an input, through links too."""
+    for given in inputs:
+        if given is not None and output.exists() and Path(given).exists() and os.path.samefile(output, given):
+            raise ValueError(f"{given} is an input, and {output} would overwrite it. Give --out another place.")
+
+
+@contextmanager
+def results(out: str | Path, names: Sequence[str], inputs: Iterable[Path | str | None] = ()) -> Iterator[Path]:
+    """Give ``out`` as a folder that exists, into which the files ``names`` may be written while this lasts.
+
+    ValueError, before anything is written, if ``out`` is a file, an output is an input, an input is part of what an
+    interrupted run left, or a file of such a name was not written by us or was changed since.
+    """
+    folder, inputs = Path(out), list(inputs)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file. Give --out a folder.")
+    left = (folder / UNFINISHED).resolve()
+    for given in inputs:
+        if given is not None and Path(given).resolve().is_relative_to(left):
+            raise ValueError(f"{given} belongs to an interrupted run, which removes it at its end. Copy it elsewhere.")
+    for name in names:
+        not_an_input(folder / name, inputs)
+    mark = _mark(folder)
+    if mark is None and os.path.lexists(folder / MARK):
+        raise ValueError(f"{folder / MARK} is not one of {_OWNER}'s. Move it, or give --out another folder.")
+    ours: dict[str, str | None] = dict((mark or {}).get("files", {}))
+    for name in names:
+        path = folder / name
+        if os.path.lexists(path) and not (name in ours and path.is_file() and ours[name] in (None, fingerprint(path))):
+            told = f"was changed since {_OWNER} wrote it" if name in ours else f"was not written by {_OWNER}"
+            raise ValueError(f"{path} {told}. Move it, or give --out another folder.")
+    folder.mkdir(parents=True, exist_ok=True)
+    # No digest: being written. Whoever is killed leaves files that the next run may replace.
+    _sign(folder, files={**ours, **dict.fromkeys(names)})
+    try:
+        yield folder
+    finally:
+        now = {name: fingerprint(folder / name) for name in names if (folder / name).is_file()}
+        kept = {name: value for name, value in ours.items() if name not in names} | now
+        if kept:
+            _sign(folder, files=kept)
+        else:
+            (folder / MARK).unlink(missing_ok=True)
+
+
+def _mark(folder: Path) -> dict[str, Any] | None:
+    """Return what the ``run.json`` of a folder says, or None where it is none of ours."""
+    try:
+        found = json.loads((folder / MARK).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    ours = isinstance(found, dict) and found.get("written_by") == _OWNER and isinstance(found.get("files", {}), dict)
+    return found if ours else None
+
+
+def _sign(folder: Path, **content: Any) -> None:
+    write_text(folder / MARK, json.dumps({"written_by": _OWNER, **content}, indent=1) + "\n")
+
+
+# -- unfinished work -------------------------------------------------------------------------------------------------
+
+
+class Store:
+    """What an interrupted run goes on with: contents by key, and files of the run's own under ``folder``.
+
+    The folder belongs to one run, told by the fingerprint of its data and options in its ``run.json``. Without
+    ``resume`` it is emptied, but only if that ``run.json`` is ours. ``folder`` None keeps everything in memory only.
+
+    Raises:
+        ValueError: In one line, for a folder of another run, one that is not ours, and broken files.
+    """
+
+    def __init__(self, folder: Path | None, run: str, resume: bool) -> None:
+        self.folder = folder
+        self._memory: dict[str, bytes] = {}
+        if folder is None:
+            return
+        if folder.is_dir() and any(folder.iterdir()):
+            mark = _mark(folder)
+            if mark is None:
+                raise ValueError(
+                    f"{folder / MARK} is broken or missing, so that nothing there is known to be {_OWNER}'s. Delete "
+                    f"{folder} to start afresh, or give --out another folder."
+                )
+            if resume:
+                if mark.get("fingerprint") != run:
+                    raise ValueError(f"{folder} was left by a run on other data or options. {AFRESH}")
+                return
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        _sign(folder, fingerprint=run)
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file of this run."""
+        assert self.folder is not None, "a store in memory has no files"
+        return self.folder / name
+
+    def put(self, key: str, content: Any) -> None:
+        """Keep tensors and plain values, nested in mappings and lists."""
+        import torch
+
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        self._put(key, buffer.getvalue())
+
+    def get(self, key: str) -> Any:
+        """Return what was kept by ``put``, or None."""
+        import torch
+
+        return self._get(key, lambda kept: torch.load(io.BytesIO(kept), weights_only=True))
+
+    def put_json(self, key: str, content: Any) -> None:
+        """Keep plain values."""
+        self._put(key, json.dumps(content).encode())
+
+    def get_json(self, key: str) -> Any:
+        """Return what was kept by ``put_json``, or None."""
+        return self._get(key, json.loads)
+
+    def kept(self) -> list[str]:
+        """Return the names under which contents are kept, sorted."""
+        found = self._memory if self.folder is None else [p.stem for p in self.folder.glob("*.kept")]
+        return sorted(found)
+
+    def remove(self) -> None:
+        """Remove everything: the run has ended."""
+        if self.folder is not None and _mark(self.folder) is not None:
+            shutil.rmtree(self.folder)
+            if self.folder.parent.name == UNFINISHED:
+                with suppress(OSError):  # another command has left something there
+                    self.folder.parent.rmdir()
+
+    def _put(self, key: str, content: bytes) -> None:
+        key = quote(key, safe="")
+        if self.folder is None:
+            self._memory[key] = content
+        else:
+            sealed = hashlib.sha256(content).digest() + content
+            write(self.folder / f"{key}.kept", lambda beside: beside.write_bytes(sealed))
+
+    def _get(self, key: str, reader: Callable[[bytes], Any]) -> Any:
+        key = quote(key, safe="")
+        if self.folder is None:
+            return reader(self._memory[key]) if key in self._memory else None
+        path = self.folder / f"{key}.kept"
+        return read(path, lambda p: reader(_unsealed(p)), AFRESH) if path.exists() else None
+
+
+def _unsealed(path: Path) -> bytes:
+    """Return the content of a file that begins with the content's digest."""
+    sealed = path.read_bytes()
+    if hashlib.sha256(sealed[32:]).digest() != sealed[:32]:
+        raise ValueError(f"its {len(sealed)} bytes are not what was written")
+    return sealed[32:]

@@ -1,0 +1,72 @@
+"""How good a reconstruction is on points of the user's own file that it was not given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from idm_env.trajectories import baselines, paper
+from idm_env.trajectories.chunks import OURS, Plan, Settings
+from idm_env.trajectories.recipe import clock_of, recipe
+from idm_env.trajectories.scores import Motion
+from idm_env.trajectories.spool import Spool
+from idm_env.trajectories.tracks import Pieces, Track
+
+VEHICLES = 120
+"""Vehicles that are scored, at most, in blocks that follow one another so that leaders are among them."""
+BLOCKS = 4
+
+
+def thinned(track: Track) -> tuple[Track, np.ndarray]:
+    """Return a track without every second point, and the indices of the points left out; both ends stay."""
+    out = np.arange(1, len(track) - 1, 2)
+    return track.part(np.setdiff1d(np.arange(len(track)), out)), out
+
+
+def score(spool: Spool, plan: Plan, settings: Settings) -> list[dict[str, Any]]:
+    """Return one row per method, ours first: errors (m) at every second point of some tracks, left out.
+
+    Tracks of fewer than five points are not scored; no row if there is no other.
+    """
+    tracks = [t for table in spool.picked(_chosen(len(spool.vehicles))) for t in Pieces(table, None) if len(t) >= 5]
+    if not tracks:
+        return []
+    given, out = zip(*(thinned(track) for track in tracks), strict=True)
+    if plan.noise is None:
+        fixed = settings.fixed_parameters
+        ours = [paper.imitate(track, plan.dt, fixed_parameters=fixed).motion for track in given]
+    else:
+        ours = [f.motion for f in recipe(list(given), plan.dt, plan.noise, plan.choices)]
+    motions = {OURS[settings.recipe]: ours}
+    for name in baselines.available() if settings.baselines else ():
+        motions[name] = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in given]
+    spacing = float(np.median(np.concatenate([np.diff(t.time_s) for t in given])))
+    return [_row(name, found, tracks, out, spacing) for name, found in motions.items()]
+
+
+def _chosen(count: int) -> list[int]:
+    if count <= VEHICLES:
+        return list(range(count))
+    size = VEHICLES // BLOCKS
+    begins = np.linspace(0, count - size, BLOCKS).round().astype(int)
+    return sorted({int(b) + i for b in begins for i in range(size)})
+
+
+def _row(
+    name: str, motions: list[Motion], tracks: list[Track], out: tuple[np.ndarray, ...], spacing: float
+) -> dict[str, Any]:
+    apart = np.concatenate([
+        motion.at(track.time_s[at]) - track.position_m[at]
+        for motion, track, at in zip(motions, tracks, out, strict=True)
+    ])  # fmt: skip
+    return {
+        "method": name,
+        "tracks": len(tracks),
+        "points": len(apart),
+        "spacing_s": spacing,
+        "rmse_m": float(np.sqrt(np.mean(apart**2))),
+        "mae_m": float(np.abs(apart).mean()),
+        "p95_m": float(np.percentile(np.abs(apart), 95)),
+        "bias_m": float(apart.mean()),
+    }

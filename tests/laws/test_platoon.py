@@ -1,0 +1,143 @@
+"""What keeps a quiet platoon quiet: bounds of gains, and the maximum that physics sets to whatever effects add."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+from idm_env.effects import ALL, IDM, Brakes, Effect, Traction, make
+from idm_env.parameters import Parameter
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator, Trajectory
+from idm_env.types import Adjacent, Command, Driver, Imagined, Params, Record, Scene
+from tests.laws.members import DTYPE, MEMBERS, around, label
+
+VEHICLES, STEPS, SPEED = 50, 600, 15.0
+MAX_ACCEL = Traction().parameters[0].default
+EQUILIBRIUM_GAP = (2.0 + 1.5 * SPEED) / (1.0 - (SPEED / 33.0) ** 4) ** 0.5
+BOUNDS = [(e, p, end) for e in MEMBERS for p in e.parameters for end in ("low", "high")]
+
+
+def quiet(simulator: Simulator, params: Params, steps: int = STEPS) -> Trajectory:
+    """Fifty vehicles at the equilibrium of default drivers behind a leader whose speed sways by 0.5 m/s."""
+    place = 320.0 - (EQUILIBRIUM_GAP + 5.0) * torch.arange(VEHICLES, dtype=DTYPE)
+    begin = simulator.state(place, torch.full((VEHICLES,), SPEED, dtype=DTYPE), params)
+    time = simulator.dt * torch.arange(1, steps + 1, dtype=DTYPE)[:, None]
+    all_rows = torch.zeros(steps, VEHICLES, dtype=DTYPE)
+    first = (torch.arange(VEHICLES) == 0).expand(steps, VEHICLES)
+    sway, often = 0.5, 0.5
+    every = {
+        "replay": Record(
+            all_rows + place[0] + SPEED * time + sway / often * (1.0 - torch.cos(often * time)),
+            all_rows + SPEED + sway * torch.sin(often * time),
+            all_rows + sway * often * torch.cos(often * time),
+            first,
+        ),
+        "noise": torch.randn(all_rows.shape, generator=torch.Generator().manual_seed(1), dtype=DTYPE),
+        "control": Command(all_rows, first),
+        "imagined": Imagined(all_rows + EQUILIBRIUM_GAP, all_rows),
+        "lateral": Adjacent(all_rows + 5.0, all_rows + SPEED - 0.5, all_rows + 1.0),
+    }
+    inputs = {name: value for name, value in every.items() if name in simulator.by_name}
+    kept: Trajectory = simulator.rollout(begin, inputs, params, steps)[1]
+    return kept
+
+
+def behind_a_record(effect: Effect) -> Simulator:
+    """Return IDM, Brakes and the effect behind a replayed leader."""
+    simulator = around(effect)
+    return simulator if "replay" in simulator.by_name else simulator.adding(make("replay"))
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "end"), BOUNDS, ids=[f"{label(e)}-{p.name}-{end}" for e, p, end in BOUNDS]
+)
+def test_no_bound_of_any_effect_makes_a_quiet_platoon_collide(effect: Effect, parameter: Parameter, end: str) -> None:
+    """Nobody overlaps and nobody accelerates as no car can, with every parameter at either of its bounds."""
+    simulator = behind_a_record(effect)
+    params = simulator.defaults(dtype=DTYPE)
+    params[effect.name][parameter.name] = torch.tensor(getattr(parameter, end), dtype=DTYPE)
+    kept = quiet(simulator, params)
+    assert kept.gap[:, 1:].min() > 0.0
+    assert kept.accel.max() <= MAX_ACCEL
+    assert kept.accel.min() >= -9.0 - 1e-9
+
+
+def test_feeding_the_leader_s_acceleration_forward_does_not_amplify() -> None:
+    """String stability at the upper bound of the gain: the last vehicle brakes and accelerates less than the second."""
+    simulator = behind_a_record(make("leader_acceleration"))
+    params = simulator.defaults(dtype=DTYPE)
+    params["leader_acceleration"]["gain"] = torch.tensor(simulator.by_name["leader_acceleration"].parameters[0].high)
+    late = quiet(simulator, params, 1500).accel[-500:].abs().amax(0)
+    assert late[-1] <= late[1]
+
+
+@dataclass(frozen=True)
+class Push(Effect):
+    """A user's own effect, of which the package knows nothing: a constant push."""
+
+    kind: ClassVar[str] = "push"
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("push", "", "m/s²", 500.0, 0.0, 1e4, null=0.0),)
+
+    def accelerate(self, scene: Scene, driver: Driver, p: dict[str, Tensor]) -> Tensor:
+        """Return the push."""
+        return p["push"] + 0.0 * scene.speed
+
+
+@dataclass(frozen=True)
+class LatePush(Effect):
+    """The same, after all that physics limits."""
+
+    kind: ClassVar[str] = "late_push"
+    rank: ClassVar[int] = 80
+    declared = Push.declared
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: dict[str, Tensor]) -> Tensor:
+        """Return the acceleration and the push."""
+        return accel + p["push"]
+
+
+@dataclass(frozen=True)
+class EagerIDM(IDM):
+    """A user's own law, a subclass of one that keeps its bounds."""
+
+    def accelerate(self, scene: Scene, driver: Driver, p: dict[str, Tensor]) -> Tensor:
+        """Return a thousand times IDM."""
+        return 1000.0 * super().accelerate(scene, driver, p)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [(IDM(), Push(), Brakes()), (IDM(), Brakes(), LatePush()), (EagerIDM(), Brakes()), (IDM(), Push())],
+    ids=["accelerate", "after_the_brakes", "own_law", "without_brakes"],
+)
+def test_what_a_user_s_effect_adds_is_held_too(effects: tuple[Effect, ...]) -> None:
+    """Whatever way it gets into the simulator, and with the parameters of that simulator alone."""
+    for simulator in (Simulator(Lane(), effects), Simulator(Lane(), (effects[0],)).adding(*effects[1:])):
+        params = simulator.defaults(dtype=DTYPE)
+        state = simulator.state(torch.zeros(1, dtype=DTYPE), torch.zeros(1, dtype=DTYPE), params)
+        assert simulator.acceleration(state, {}, params).item() == MAX_ACCEL
+
+
+def test_the_maximum_has_its_own_value_and_its_null() -> None:
+    """Named in the list of effects it takes any value; at its null nothing is held."""
+    simulator = Simulator(Lane(), (IDM(), Push(), Traction(), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    state = simulator.state(torch.zeros(1, dtype=DTYPE), torch.zeros(1, dtype=DTYPE), params)
+    for value, expected in ((3.0, 3.0), (1e5, 501.4)):
+        params["traction"]["max_accel"] = torch.tensor(value, dtype=DTYPE)
+        simulator.check(params)
+        assert simulator.acceleration(state, {}, params).item() == pytest.approx(expected)
+
+
+def test_effects_that_cannot_add_need_no_tyres() -> None:
+    """IDM, its brakes, commands and records: the step that kernels know is what it was."""
+    for name, cls in ALL.items():
+        if not cls.adds:
+            assert not any(isinstance(e, Traction) for e in around(make(name))._hooks["limit"]) or name == "traction"
+    assert {name for name, cls in ALL.items() if cls.adds} >= {"leader_acceleration", "noise", "asymmetry", "curve"}
+    assert not any(ALL[name].adds for name in ("idm", "brakes", "control", "replay", "delay"))

@@ -1,0 +1,106 @@
+"""A crash is worse than any survival, in every task: by bounds of what a step pays, and in wild rollouts."""
+
+import pytest
+import torch
+
+from idm_env.tasks import TASKS, Draw, make_task
+from idm_env.tasks.crash import floored
+
+CASES = {
+    "ring": {"task": "ring", "warmup": 60},
+    "ring, wave": {"task": "ring", "warmup": 60, "start": "wave", "controlled": 3},
+    "ring, weights": {"task": "ring", "warmup": 60, "tailgating": 2.0, "fuel": 3.0, "max_command": 4.0},
+    "follow": {"task": "follow"},
+    "follow, hard": {"task": "follow", "max_command": 30.0, "controlled": 2},
+    "platoon": {"task": "platoon", "controlled": 2},
+    "replay": {"task": "replay"},
+    "replay, follow": {"task": "replay", "controlled": 3, "reward_terms": "follow"},
+}
+STEPS, COUNT = 150, 24
+
+
+def wild(task, kind, step):
+    """Actions that try to end early, to waste, or neither."""
+    generator = torch.Generator().manual_seed(step)
+    noise = 2.0 * torch.rand(COUNT, len(task.agents), generator=generator, dtype=torch.float64) - 1.0
+    if kind == "random":
+        return noise
+    if kind == "alternate":
+        return torch.full_like(noise, 1.0 if step % 2 else -1.0)
+    return torch.full_like(noise, {"throttle": 1.0, "brake": -1.0}[kind])
+
+
+def returns(task, kind):
+    """Roll COUNT environments out, as a single environment pays; return their returns and whether they crashed."""
+    params = task.params(torch.float64, "cpu")
+    draw = Draw.of(torch.arange(COUNT), torch.zeros(COUNT, dtype=torch.int64))
+    world = task.reset(draw, params)
+    normals = draw.normals(world.state.step, STEPS, task.vehicles, torch.float64) if task.noisy else None
+    total, live = torch.zeros(COUNT, dtype=torch.float64), torch.ones(COUNT, dtype=torch.bool)
+    for t in range(STEPS):
+        command = task.command(wild(task, kind, t))
+        after = task.step(world, command, None if normals is None else normals[t], params)
+        total += torch.where(live, task.reward(world, command, after).mean(-1), 0.0)
+        live &= ~task.ended(after).terminated.any(-1)
+        world = after
+    return total, ~live
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_crash_returns_less_than_every_survival(name):
+    crashed, survived = [], []
+    with torch.no_grad():
+        for failsafe in (0.0, 3.0):
+            task = make_task(**CASES[name], failsafe=failsafe, max_episode_steps=STEPS)
+            for kind in ("random", "alternate", "throttle", "brake"):
+                total, over = returns(task, kind)
+                crashed += total[over].tolist()
+                survived += total[~over].tolist()
+    assert len(crashed) > 5
+    assert len(survived) > 50
+    assert max(crashed) < min(survived)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_state_pays_beyond_the_bounds_that_the_cost_is_made_of(name):
+    task = make_task(**CASES[name])
+    assert task.pay.low <= 0.0 <= task.pay.high
+    shared = task.cost_of_crash / task.shares
+    assert (task.horizon - 1) * task.pay.high - shared < task.horizon * task.pay.low
+    params = task.params(torch.float64, "cpu")
+    draw = Draw.of(torch.arange(500), torch.zeros(500, dtype=torch.int64))
+    world = task.begin(draw, params)
+    u = draw.uniforms(3, 3 * task.vehicles, torch.float64).view(500, 3, task.vehicles)
+    state = world.state._replace(
+        speed=200.0 * u[:, 0] ** 3, accel=20.0 * u[:, 1] - 10.0, gap=1e4 * u[:, 2] ** 4 + 1e-9,
+        position=world.state.position + 1e5 * u[:, 0], step=world.state.step + 9,
+    )  # fmt: skip
+    command = task.max_command * (2.0 * u[:, 1, : len(task.agents)] - 1.0)
+    earned = task.earned(world, command, world._replace(state=state))
+    assert bool(torch.isfinite(earned).all())
+    assert task.pay.low <= float(earned.min()) < float(earned.max()) <= task.pay.high
+
+
+def test_every_task_is_tried():
+    assert {case["task"] for case in CASES.values()} == set(TASKS)
+
+
+def test_the_floor_changes_nothing_above_its_knee_and_has_a_gradient_everywhere():
+    reward = torch.tensor([1.0, -3.9, -4.0, -4.0001, -5.0, -1e3, -1e9], dtype=torch.float64, requires_grad=True)
+    kept = floored(reward, -4.0, -8.0)
+    kept.sum().backward()
+    torch.testing.assert_close(kept[:3], reward[:3])
+    torch.testing.assert_close(reward.grad[[0, 1, 3]], torch.ones(3, dtype=torch.float64), rtol=0, atol=1e-4)
+    assert bool((kept > -8.0).all())
+    assert bool((reward.grad > 0.0).all())
+    assert float(kept[4].detach()) == pytest.approx(-4.8)
+
+
+def test_a_cost_of_ones_own_replaces_the_lawful_one():
+    task = make_task("follow", crash_cost=50.0)
+    params = task.params(torch.float64, "cpu")
+    world = task.begin(Draw.of(torch.tensor([0]), torch.tensor([0])), params)
+    gap = world.state.gap.clone()
+    gap[0, 3] = -0.1
+    touched = world._replace(state=world.state._replace(gap=gap))
+    assert float(task.reward(world, torch.zeros(1, 1, dtype=torch.float64), touched)) == -50.0

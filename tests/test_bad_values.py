@@ -1,0 +1,380 @@
+"""Whatever a user gives, bad numbers, hostile files, a full disk or Ctrl-C: one line, and at once."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import idm_env  # noqa: F401
+from agents import apg, common
+from idm_env import checks, cli
+from idm_env.config import load_environment, load_model
+from idm_env.data import synthetic
+from idm_env.envs.pettingzoo import parallel_env
+
+QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    """Run the command line in this process; return its exit code and what it said, a traceback being a failure."""
+    before, words = sys.argv, io.StringIO()
+    sys.argv = ["idm-env", *map(str, arguments)]
+    try:
+        with contextlib.redirect_stderr(words), contextlib.redirect_stdout(io.StringIO()):
+            cli.run()
+    except SystemExit as end:
+        return int(end.code or 0), words.getvalue()
+    finally:
+        sys.argv = before
+    raise AssertionError("the command line has no end")
+
+
+def refused(*arguments: object) -> str:
+    """Return the one line with which a command refuses what it was given."""
+    code, words = run(*arguments)
+    lines = [line for line in words.splitlines() if line.startswith("error: ")]
+    assert code == 1 and len(lines) == 1 and "Traceback" not in words, words
+    assert len(lines[0]) < 1100
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs of a leader and a follower."""
+    path = tmp_path_factory.mktemp("data") / "data.csv"
+    synthetic.generate(2, runs=2, followers=1, seconds=30.0)[0].table.drop("gap_m").write_csv(path)
+    return path
+
+
+# -- numbers ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "flag", "value"),
+    [
+        ("fit", "--max-gap", "nan"),
+        ("fit", "--max-gap", "-1"),
+        ("fit", "--window", "0"),
+        ("fit", "--window", "-1"),
+        ("fit", "--window", "nan"),
+        ("fit", "--dt", "nan"),
+        ("fit", "--dt", "inf"),
+        ("fit", "--min-seconds", "nan"),
+        ("fit", "--ring-length", "nan"),
+        ("fit", "--starts", "0"),
+        ("fit", "--substeps", "1000000000000"),
+        ("fit", "--seed", "-1"),
+        ("fit", "--held-out", "nan"),
+        ("fit", "--held-out", "2"),
+        ("explain", "--seed", "99999999999999999999"),
+        ("explain", "--ring-length", "0"),
+        ("explain", "--effects", ","),
+        ("explain", "--effects", ""),
+        ("explain", "--known", " , "),
+        ("simulate", "--window", "nan"),
+        ("reconstruct", "--dt", "nan"),
+        ("plot", "--seconds", "nan"),
+        ("demo", "--seed", "-3"),
+        ("bench", "--sizes", "nan"),
+        ("bench", "--sizes", "1e400"),
+        ("bench", "--rounds", "0"),
+    ],
+)
+def test_a_bad_number_is_refused_by_the_name_of_its_flag(
+    data: Path, tmp_path: Path, command: str, flag: str, value: str
+) -> None:
+    given = () if command in ("demo", "bench") else (data,)
+    more = ("--model", data) if command == "simulate" else ()
+    line = refused(command, *given, *more, f"{flag}={value}", "--out", tmp_path / "out")
+    assert line.startswith(f"error: {flag} = ") and not (tmp_path / "out").exists()
+
+
+def test_every_number_of_the_command_line_is_checked_in_the_one_place() -> None:
+    found = 0
+    for command in cli.app.registered_commands:
+        assert command.callback is not None
+        for name, hint in get_type_hints(command.callback, include_extras=True).items():
+            kind, *extras = get_args(hint) or (hint,)
+            if {float, int} & {kind, *get_args(kind)}:
+                found += 1
+                assert extras and extras[0].callback is not None, f"{command.callback.__name__} {name}"
+    assert found > 20
+
+
+def test_a_picture_has_a_file_that_is_no_input(data: Path, tmp_path: Path) -> None:
+    assert "is a folder" in refused("plot", data, "--out", tmp_path)
+    assert "names no kind of picture" in refused("plot", data, "--out", tmp_path / "a.csv")
+    link = tmp_path / "a.png"
+    link.symlink_to(data)
+    before = data.read_bytes()
+    assert "is an input" in refused("plot", data, "--out", link)
+    assert data.read_bytes() == before and link.is_symlink()
+
+
+@given(st.recursive(st.integers() | st.floats() | st.text() | st.binary() | st.none(), st.lists, max_leaves=200))
+def test_a_value_in_an_error_text_is_short(value: Any) -> None:
+    assert len(checks.shown(value)) < 700 and "\n" not in checks.shown(value)
+
+
+def test_a_value_in_an_error_text_is_short_however_it_grows() -> None:
+    laughs: Any = "ha"
+    for _ in range(30):
+        laughs = [laughs] * 9
+    for value in (laughs, 10**5000, "x" * 10**7, {"a": laughs}):
+        assert len(checks.shown(value)) < 700
+
+
+# -- environments ----------------------------------------------------------------------------------------------------
+
+
+def test_too_many_environments_are_refused_with_the_memory_that_they_would_take() -> None:
+    for count in (10**9, 10**15):
+        with pytest.raises(ValueError, match=rf"num_envs = {count} would take about [\d,]+ GB, and cpu has"):
+            gym.make_vec("DiffIDM-v0", num_envs=count)
+
+
+def test_unknown_reset_options_are_refused() -> None:
+    for env, known in (
+        (gym.make("DiffIDM-v0").unwrapped, "state"),
+        (gym.make_vec("DiffIDM-v0", num_envs=2), "reset_mask"),
+    ):
+        with pytest.raises(ValueError, match=rf"unknown reset option 'reset_maks'\..*{known}"):
+            env.reset(options={"reset_maks": 1})
+        with pytest.raises(ValueError, match="must be a mapping"):
+            env.reset(options=[1])  # type: ignore[arg-type]
+        env.reset(options={})
+
+
+@pytest.mark.parametrize("kind", [torch.complex64, torch.bool])
+def test_an_action_that_is_no_real_number_is_refused(kind: torch.dtype) -> None:
+    for env, shape in ((gym.make("DiffIDM-v0"), (1,)), (gym.make_vec("DiffIDM-v0", num_envs=2), (2, 1))):
+        env.reset(seed=0)
+        for action in (torch.ones(shape, dtype=kind), torch.ones(shape, dtype=kind).numpy()):
+            with pytest.raises(ValueError, match=rf"an action of type (torch\.)?{str(kind).split('.')[1]}"):
+                env.step(action)
+    turns = parallel_env()
+    turns.reset(seed=0)
+    with pytest.raises(ValueError, match="must be one finite number"):
+        turns.step({agent: torch.ones(1, dtype=kind).numpy() for agent in turns.agents})
+
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+LAUGHS = "a: &a [ha, ha, ha, ha, ha, ha, ha, ha, ha]\n" + "".join(
+    f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
+)
+HOSTILE = {
+    "laughs": f"{LAUGHS}effects: *i\n",
+    "brackets": "effects: " + "[" * 100_000,
+    "mappings": "a: " + "{a: " * 100_000,
+    "indented": "\n".join(" " * i + "a:" for i in range(3000)),
+    "400 digits": f"effects: [idm]\ndt: 1{'0' * 400}\n",
+    "5000 digits": f"effects: [idm]\ndt: 1{'0' * 5000}\n",
+    "base 60": "effects: [idm]\ndt: 1" + ":59" * 100_000,
+    "integration": "effects: [idm]\nintegration: [euler]\n",
+    "by": "effects: [idm]\nby: [a, b]\n",
+    "no day": "effects: [idm]\ndt: 2001-99-99\n",
+    "no number": "effects: [idm]\ndt: !!int ''\n",
+    "complex key": "? [a]\n: 1\n",
+    "number as key": "effects: [{effect: delay, 1: 2}]\n",
+    "list as choice": "effects: [{effect: delay, max_delay: [1]}]\n",
+    "text as choice": "effects: [{effect: delay, max_delay: ha}]\n",
+    "effect is a list": "effects: [{effect: [delay]}]\n",
+    "substeps": "effects: [idm]\nsubsteps: 1.0e+300\n",
+    "substeps true": "effects: [idm]\nsubsteps: true\n",
+    "schema": "effects: [idm]\nschema: [1]\n",
+    "tag": "effects: !!python/object/apply:os.system [ls]\n",
+    "zeros": "\0" * 1000,
+    "long key": "x" * 1_000_000 + ": 1",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize("reader", ["model", "environment", "agent"])
+def test_a_hostile_yaml_file_is_one_line(tmp_path: Path, name: str, reader: str) -> None:
+    path = tmp_path / "model.yaml"
+    head = {"model": "", "environment": "configures: environment\n", "agent": "configures: agent\nagent: apg\n"}[reader]
+    text = HOSTILE[name]
+    path.write_text(head + (text if reader == "model" else text.replace("effects: [idm]\n", "")))
+    read = {
+        "model": lambda: load_model(path),
+        "environment": lambda: gym.make("DiffIDM-v0", **load_environment(path)),
+        "agent": lambda: common.load_agent(path, apg.Arguments, "apg"),
+    }[reader]
+    with pytest.raises((ValueError, TypeError) if reader == "environment" else ValueError) as told:
+        read()
+    assert "\n" not in str(told.value) and len(str(told.value)) < 1000
+
+
+def test_a_small_file_cannot_take_time_and_memory(data: Path, tmp_path: Path) -> None:
+    """In a process of its own, which is ended if it does not end by itself."""
+    path = tmp_path / "model.yaml"
+    path.write_text(HOSTILE["laughs"])
+    code = (
+        "import resource, sys; from idm_env import cli; from idm_env.fitting import job; sys.argv[0] = 'idm-env'\n"
+        "def used(): usage = resource.getrusage(resource.RUSAGE_SELF); return usage.ru_utime, usage.ru_maxrss / 1e3\n"
+        "before = used(); resource.setrlimit(resource.RLIMIT_CPU, (int(before[0]) + 30, int(before[0]) + 30))\n"
+        "try: cli.run()\nfinally: print(used()[1] - before[1])"
+    )
+    given = ("simulate", data, "--model", path, "--out", tmp_path / "out")
+    done = subprocess.run([sys.executable, "-c", code, *map(str, given)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1 and "aliases" in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr[-2000:]
+    assert float(done.stdout) < 50.0  # MB
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.dates(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5) | st.integers(), inner, max_size=3),
+    max_leaves=8,
+)
+KEYS = st.sampled_from(
+    ["configures", "schema", "dt", "integration", "effects", "parameters", "by", "drivers", "substeps"]
+)
+
+
+@given(st.dictionaries(KEYS, VALUES, max_size=4))
+@QUICK
+def test_any_model_is_read_or_refused_in_one_line(data: Path, tmp_path: Path, content: dict[str, Any]) -> None:
+    import yaml
+
+    path = tmp_path / "model.yaml"
+    path.write_text(yaml.safe_dump({"effects": ["idm", "brakes"], **content}), encoding="utf-8")
+    try:
+        load_model(path)
+    except ValueError as error:
+        assert "\n" not in str(error)
+
+
+TASK_KEYS = st.sampled_from(
+    ["task", "length", "vehicles", "controlled", "parameters", "effects", "dt", "noise", "warmup", "output", "device",
+     "dtype", "max_episode_steps", "render_mode", "autoreset_mode", "warmup_pool", "failsafe", 7]
+)  # fmt: skip
+
+
+@given(st.dictionaries(TASK_KEYS, VALUES, max_size=2))
+@QUICK
+def test_any_environment_is_made_or_refused_in_one_line(tmp_path: Path, content: dict[Any, Any]) -> None:
+    import yaml
+
+    path = tmp_path / "env.yaml"
+    path.write_text(yaml.safe_dump({"configures": "environment", "warmup": 1, **content}), encoding="utf-8")
+    code, words = run("plot", path, "--seconds", 0.2, "--out", tmp_path / "a.png")
+    assert code in (0, 1) and (code == 0 or words.count("error: ") == 1), words
+
+
+@given(st.binary(max_size=300) | st.text(alphabet="[]{}:,-&*!|>'\"#%@ \n\tab01.", max_size=200).map(str.encode))
+@QUICK
+def test_any_bytes_as_yaml_are_refused_in_one_line(data: Path, tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_bytes(content)
+    refused("plot", path, "--out", tmp_path / "a.png")
+
+
+@given(
+    st.sampled_from(["a.csv", "a.csv.gz", "a.parquet", "a.txt"]),
+    st.binary(max_size=300) | st.binary(max_size=99).map(lambda b: b"PAR1" + b + b"PAR1")
+    | st.text(alphabet="vehicle_id,time_sposition_m\n0123456789.-e\"", max_size=200).map(
+        lambda text: b"vehicle_id,time_s,position_m\n" + text.encode()),
+)  # fmt: skip
+@QUICK
+def test_any_bytes_as_data_are_refused_in_one_line(tmp_path: Path, name: str, content: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    code, words = run("plot", path, "--out", tmp_path / "a.png")
+    assert code in (0, 1) and (code == 0 or words.count("error: ") == 1), words
+
+
+@given(
+    st.binary(max_size=300) | st.just(b"[" * 100_000) | st.just(b'{"objects": ' * 50_000)
+    | st.just(b'{"objects": [1' + b"0" * 5000 + b"]}")
+    | st.recursive(st.none() | st.integers() | st.floats() | st.text(max_size=4), lambda x: st.lists(x, max_size=3)
+                   | st.dictionaries(st.sampled_from(["position", "x", "y", "type", "valid", "geometry"]), x)).map(
+        lambda x: __import__("json").dumps({"objects": [x], "roads": [x], "name": "a", "tl_states": x}).encode()),
+)  # fmt: skip
+@QUICK
+def test_any_bytes_as_a_scenario_are_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    for name in ("a.json", "a.tfrecord"):
+        path = tmp_path / name
+        path.write_bytes(content)
+        refused("predict", path, "--out", tmp_path / "out")
+        assert not (tmp_path / "out" / "run.json").exists()
+
+
+@pytest.mark.parametrize("command", ["filter", "fit", "simulate", "reconstruct"])
+def test_a_full_disk_is_one_line(data: Path, tmp_path: Path, command: str) -> None:
+    """Files cannot grow beyond a limit, which to a program is a full disk."""
+    code = (
+        "import resource, sys; from idm_env import cli\n"
+        "cli.app([*sys.argv[1:-1], sys.argv[-1] + '-before'], standalone_mode=False)  # compiled loops are files too\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1200, 1200)); sys.argv[0] = 'idm-env'; cli.run()"
+    )
+    model = tmp_path / "model.yaml"
+    model.write_text("effects: [idm, brakes]\n")
+    more = ("--model", model) if command == "simulate" else ()
+    given = map(str, (command, data, *more, "--out", tmp_path / "out"))
+    done = subprocess.run([sys.executable, "-c", code, *given], capture_output=True, text=True, timeout=300)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr[-3000:]
+    assert len(lines) == 1 and "cannot be written" in lines[0] and "Free space" in lines[0], done.stderr[-3000:]
+    assert not list((tmp_path / "out").rglob("*idm-env-part*"))
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.4, 0.8, 1.4, 2.2])
+def test_ctrl_c_while_modules_are_imported_is_one_line(data: Path, tmp_path: Path, seconds: float) -> None:
+    given = ("-X", "importtime", "-m", "idm_env", "fit", data, "--out", tmp_path / "out")
+    running = subprocess.Popen([sys.executable, *map(str, given)], stderr=subprocess.PIPE, text=True)
+    assert running.stderr is not None
+    for line in running.stderr:
+        if line.split()[-1] == "signal":  # the first thing that the package imports: nothing of ours has begun yet
+            break
+    time.sleep(seconds)
+    os.kill(running.pid, signal.SIGINT)
+    _, words = running.communicate(timeout=120)
+    said = [line for line in words.splitlines() if not line.startswith("import time:")]
+    assert "Traceback" not in words and said and said[-1].startswith("interrupted"), words[-1500:]
+    # Python ends by the signal itself where it met the interruption in code made from text; a shell says 130 to both.
+    assert running.returncode in (130, -signal.SIGINT)
+
+
+# -- checkpoints of agents -------------------------------------------------------------------------------------------
+
+
+def test_a_hollow_checkpoint_of_an_agent_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "last.pt"
+    policy = common.Policy(3)
+    common.save(path, policy, "apg", {"task": "ring"}, {"update": 3})
+    whole, content = path.read_bytes(), torch.load(path, weights_only=True)
+    hollow: list[Any] = [{key: value for key, value in content.items() if key != name} for name in content]
+    hollow += [{"schema": 1}, {**content, "policy": {"made": {}, "state": {}}}, {**content, "policy": {"made": 1}}, [1]]
+    for broken in hollow:
+        torch.save(broken, path)
+        with pytest.raises(ValueError, match=r"broken.*without --resume") as told:
+            common.load(path)
+        assert "\n" not in str(told.value)
+    for raw in (b"", whole[:-20], np.zeros(99).tobytes()):
+        path.write_bytes(raw)
+        with pytest.raises(ValueError, match=r"broken.*without --resume"):
+            common.load(path)
+
+
+@pytest.mark.parametrize(("name", "value"), [("learning_rate", "nan"), ("learning_rate", 0), ("clip", -1.0),
+                                             ("cpu_seconds", ".inf")])  # fmt: skip
+def test_a_number_of_an_agent_is_finite(tmp_path: Path, name: str, value: object) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(f"configures: agent\nagent: apg\n{name}: {value}\n")
+    with pytest.raises(ValueError, match=rf"{name} = "):
+        common.load_agent(path, apg.Arguments, "apg")

@@ -1,0 +1,314 @@
+"""A user's files are never lost or overwritten, and broken ones of ours are one line with a cure."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+import torch
+
+from idm_env import keep
+from idm_env.cli import EXPLAINED
+from idm_env.data import synthetic
+from idm_env.discovery import write
+from idm_env.fitting import job
+from idm_env.fitting.job import Options, Source, fit_file, simulate_file
+from idm_env.parts import Parts
+from idm_env.prediction.files import predict_files
+from idm_env.trajectories import files
+
+NAMES = ("report.json", "table.parquet")
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Return every file under a folder with its bytes."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """Two runs of a leader and a follower."""
+    path = tmp_path / "data.csv"
+    synthetic.generate(2, runs=2, followers=1, seconds=30.0)[0].table.drop("gap_m").write_csv(path)
+    return path
+
+
+def test_a_file_is_replaced_only_by_a_whole_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("old")
+
+    def half(beside: Path) -> None:
+        beside.write_text("ha")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        keep.write(path, half)
+    assert content(tmp_path) == {"a.json": b"old"}
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("… (os error 28)")])
+def test_a_full_disk_is_told_as_such_and_leaves_nothing_half(tmp_path: Path, error: Exception) -> None:
+    def full(beside: Path) -> None:
+        beside.write_text("half")
+        raise error
+
+    with pytest.raises(OSError, match=r"a\.json cannot be written: No space left on device\. Free space"):
+        keep.write(tmp_path / "a.json", full)
+    assert not any(tmp_path.iterdir())
+
+
+def run(out: Path, text: str = "1", inputs: tuple[Path, ...] = ()) -> None:
+    """Write both results."""
+    with keep.results(out, NAMES, inputs) as folder:
+        for name in NAMES:
+            keep.write_text(folder / name, text)
+
+
+def test_results_of_ours_are_replaced_and_those_of_others_kept(tmp_path: Path) -> None:
+    run(tmp_path)
+    run(tmp_path, "2")
+    assert (tmp_path / "report.json").read_text() == "2"
+    (tmp_path / "report.json").write_text("my remarks")
+    before = content(tmp_path)
+    with pytest.raises(ValueError, match=r"report\.json was changed since idm-env wrote it\. Move it"):
+        run(tmp_path, "3")
+    assert content(tmp_path) == before
+    os.replace(tmp_path / "report.json", tmp_path / "mine.json")
+    run(tmp_path, "3")
+    assert (tmp_path / "mine.json").read_text() == "my remarks" and (tmp_path / "report.json").read_text() == "3"
+
+
+@pytest.mark.parametrize("name", [*NAMES, keep.MARK])
+def test_a_file_that_is_not_ours_is_never_replaced(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(ValueError, match=rf"{name}.* (was not written by|is not one of) idm-env"):
+        run(tmp_path)
+    assert content(tmp_path) == {name: b"mine"}
+
+
+def test_a_killed_run_may_be_done_again_and_a_failed_one_leaves_no_mark(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), keep.results(tmp_path, NAMES):
+        raise ZeroDivisionError
+    assert not any(tmp_path.iterdir())
+    killed = keep.results(tmp_path, NAMES)
+    folder = killed.__enter__()
+    (folder / NAMES[0]).write_text("of a run that was killed")
+    left = content(folder)
+    killed.__exit__(None, None, None)
+    shutil.rmtree(tmp_path)
+    for name, kept in left.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(kept)
+    run(tmp_path)
+    assert (tmp_path / NAMES[0]).read_text() == "1"
+
+
+@pytest.mark.parametrize("how", ["itself", "symbolic link", "hard link", "link as output"])
+def test_an_output_that_is_an_input_is_refused_through_links_too(tmp_path: Path, how: str) -> None:
+    out = tmp_path / "out"
+    run(out)
+    output, given = out / "report.json", tmp_path / "given.json"
+    if how == "itself":
+        given = output
+    elif how == "symbolic link":
+        given.symlink_to(output)
+    elif how == "hard link":
+        given.hardlink_to(output)
+    else:
+        os.replace(output, given)
+        output.symlink_to(given)
+    before = content(tmp_path)
+    with pytest.raises(ValueError, match=r"is an input, and .* would overwrite it"):
+        run(out, "2", (given,))
+    assert content(tmp_path) == before
+
+
+def test_the_names_that_the_command_line_guards_are_those_that_are_written() -> None:
+    assert set(EXPLAINED) == set(write.OUTPUT)
+
+
+def test_fit_and_simulate_refuse_to_overwrite_what_they_read(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    fit_file(Source(data), Options(by="all", starts=1, substeps=1), out)
+    simulate_file(Source(data), out / "model.yaml", out)
+    before = content(out)
+    assert set(before) == {*job.FITTED, *job.SIMULATED, keep.MARK}
+    for refused in (
+        lambda: fit_file(Source(data), Options(by="all", model=str(out / "model.yaml")), out),
+        lambda: fit_file(Source(out / "parameters.parquet"), Options(), out),
+        lambda: simulate_file(Source(out / "simulated.parquet"), out / "model.yaml", out),
+    ):
+        with pytest.raises(ValueError, match="is an input"):
+            refused()
+    assert content(out) == before
+
+
+# -- unfinished work -------------------------------------------------------------------------------------------------
+
+
+def test_a_store_keeps_and_is_removed(tmp_path: Path) -> None:
+    folder = tmp_path / keep.UNFINISHED / "fit"
+    store = keep.Store(folder, "a", False)
+    kept = {"x": torch.arange(3.0), "n": [1, {"deep": True}]}
+    store.put("round 1/delay", kept)
+    again = keep.Store(folder, "a", True)
+    found = again.get("round 1/delay")
+    assert torch.equal(found["x"], kept["x"]) and found["n"] == kept["n"] and again.get("other") is None
+    with pytest.raises(ValueError, match="other data or options"):
+        keep.Store(folder, "b", True)
+    assert keep.Store(folder, "b", False).get("round 1/delay") is None
+    again.remove()
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_not_ours_is_never_emptied(tmp_path: Path) -> None:
+    folder = tmp_path / keep.UNFINISHED / "filter"
+    folder.mkdir(parents=True)
+    (folder / "thesis.txt").write_text("years of work")
+    for mark in (None, "", "{", "{}", '{"written_by": "somebody"}', "[" * 100_000):
+        if mark is not None:
+            (folder / keep.MARK).write_text(mark)
+        for resume in (False, True):
+            with pytest.raises(ValueError, match=r"run\.json is broken or missing.* Delete .* to start afresh") as told:
+                keep.Store(folder, "a", resume)
+            assert "\n" not in str(told.value)
+    assert (folder / "thesis.txt").read_text() == "years of work"
+
+
+def damaged(path: Path) -> dict[str, bytes]:
+    """Return a file empty, cut, garbled by one bit, replaced by something else, and hollow."""
+    whole = path.read_bytes()
+    torch.save({}, path)
+    hollow = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    path.write_bytes(whole)
+    return {"empty": b"", "cut": whole[:-9], "bit": bytes(flipped), "garbage": b"hello" * 99, "hollow": hollow}
+
+
+def test_every_broken_file_of_a_store_is_one_line(tmp_path: Path) -> None:
+    store = keep.Store(tmp_path / "fit", "a", False)
+    store.put("tensors", {"x": torch.zeros(5)})
+    store.put_json("plain", {"x": [1, 2, 3]})
+    for key, get in (("tensors", store.get), ("plain", store.get_json)):
+        path = store.path(f"{key}.kept")
+        for name, broken in damaged(path).items():
+            path.write_bytes(broken)
+            with pytest.raises(ValueError, match=rf"{key}\.kept is broken .* Leave out --resume") as told:
+                get(key)
+            assert "\n" not in str(told.value) and "weights_only" not in str(told.value), name
+
+
+def test_a_broken_table_of_a_finished_part_is_one_line(tmp_path: Path) -> None:
+    parts = Parts(tmp_path / "filter", "a", False)
+    parts.write(0, "trajectories", pl.DataFrame({"x": range(1000)}))
+    parts.finish(0, {"tracks": 3})
+    path = parts.path(0, "trajectories")
+    again = Parts(tmp_path / "filter", "a", True)
+    assert again.done(0) and not again.done(1) and again.summaries() == [{"tracks": 3}]
+    for broken in (b"", path.read_bytes()[:-3], b"hello"):
+        path.write_bytes(broken)
+        with pytest.raises(ValueError, match=r"trajectories\.parquet is broken .* Leave out --resume"):
+            again.done(0)
+    path.unlink()
+    with pytest.raises(ValueError, match="is broken"):
+        again.done(0)
+
+
+def test_what_determines_a_run_is_in_its_fingerprint(tmp_path: Path) -> None:
+    file = tmp_path / "model.yaml"
+    file.write_text("a")
+    first = keep.fingerprint(file, torch.zeros(2), "x")
+    assert keep.fingerprint(file, torch.zeros(2), "x") == first
+    assert keep.fingerprint(file, torch.ones(2), "x") != first and keep.fingerprint(file, torch.zeros(2), "y") != first
+    file.write_text("b")
+    assert keep.fingerprint(file, torch.zeros(2), "x") != first
+
+
+# -- commands --------------------------------------------------------------------------------------------------------
+
+
+def refused(*arguments: object) -> str:
+    """Return the one line with which a command refuses what it was given."""
+    done = subprocess.run([sys.executable, "-m", "idm_env", *map(str, arguments)], capture_output=True, text=True)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert done.returncode == 1 and len(lines) == 1 and "Traceback" not in done.stderr, done.stderr
+    return lines[0]
+
+
+def test_filter_keeps_a_user_s_parts_and_refuses_its_own_output_as_input(data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("numba", reason="numba is not installed")
+    out = tmp_path / "out"
+    (out / "parts").mkdir(parents=True)
+    (out / "parts" / "thesis.txt").write_text("years of work")
+    files.filter_file(data, out, baselines=False)
+    assert (out / "parts" / "thesis.txt").read_text() == "years of work" and not (out / keep.UNFINISHED).exists()
+    before = content(out)
+    with pytest.raises(ValueError, match=r"trajectories\.parquet is an input, and"):
+        files.filter_file(out / "trajectories.parquet", out, baselines=False)
+    with pytest.raises(ValueError, match=r"report\.json is an input, and"):
+        predict_files([out / "report.json"], out)
+    assert content(out) == before
+    (out / keep.UNFINISHED).mkdir()
+    shutil.copy(data, out / keep.UNFINISHED / "mine.csv")
+    with pytest.raises(ValueError, match=r"mine\.csv belongs to an interrupted run"):
+        files.filter_file(out / keep.UNFINISHED / "mine.csv", out)
+
+
+def test_predict_that_refuses_deletes_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "parts").mkdir(parents=True)
+    (out / "parts" / "thesis.txt").write_text("years of work")
+    (out / "predictions.parquet").write_text("mine")
+    (tmp_path / "broken.json").write_text("{")
+    before = content(tmp_path)
+    with pytest.raises(ValueError, match="was not written by idm-env"):
+        predict_files([tmp_path / "broken.json"], out)
+    (out / "predictions.parquet").rename(out / "mine.parquet")
+    with pytest.raises(ValueError, match="no scenario can be used"):
+        predict_files([tmp_path / "broken.json"], out)
+    (out / "mine.parquet").rename(out / "predictions.parquet")
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize(("command", "name"), [("demo", "platoon.csv"), ("bench", "performance.json")])
+def test_commands_without_input_keep_what_is_not_theirs(tmp_path: Path, command: str, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    more = ("--sizes", 100) if command == "bench" else ()
+    assert f"{name} was not written by idm-env" in refused(command, "--out", tmp_path, *more)
+    assert content(tmp_path) == {name: b"mine"}
+
+
+def test_a_broken_checkpoint_is_one_line_and_without_resume_a_fit_starts_afresh(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def stop(phase: str, done: int, total: int, value: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_file(Source(data), Options(by="all", starts=1, substeps=1), out, on_progress=stop)
+    folder = out / keep.UNFINISHED / "fit"
+    (kept,) = folder.glob("*.kept")
+    options = ("--by", "all", "--starts", 1, "--substeps", 1, "--out", out)
+    for broken in (b"", b"garbage", kept.read_bytes()[:-5]):
+        kept.write_bytes(broken)
+        line = refused("fit", data, *options, "--resume")
+        assert f"{kept.name} is broken" in line and "Leave out --resume to start afresh" in line
+    (folder / keep.MARK).write_text("")
+    assert "Delete" in refused("fit", data, *options, "--resume")
+    keep._sign(folder, fingerprint="")
+    fit_file(Source(data), Options(by="all", starts=1, substeps=1), out)
+    assert not (out / keep.UNFINISHED).exists()
+
+
+def test_explain_and_fit_refuse_inputs_among_their_outputs(data: Path, tmp_path: Path) -> None:
+    link = tmp_path / "report.json"
+    link.symlink_to(data)
+    for command in ("explain", "fit"):
+        assert "is an input" in refused(command, data, "--out", tmp_path)
+    assert link.is_symlink() and sorted(p.name for p in tmp_path.iterdir()) == ["data.csv", "report.json"]

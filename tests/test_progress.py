@@ -1,0 +1,72 @@
+"""Progress from the first moment, with the time that remains, by one protocol."""
+
+from __future__ import annotations
+
+import inspect
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from idm_env import progress
+
+
+def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
+    written = io.StringIO()
+    return Console(file=written, force_terminal=terminal, width=120), written
+
+
+def test_a_terminal_shows_something_before_anything_is_imported() -> None:
+    shown, written = console(terminal=True)
+    with progress.shown(shown):
+        assert "starting" in written.getvalue()
+
+
+def test_a_bar_tells_what_is_done_and_what_is_left() -> None:
+    shown, written = console(terminal=True)
+    with progress.shown(shown) as report:
+        report("reading", 0, 0, "a.csv")
+        report("fit", 1, 4, 0.5)
+        report("fit", 2, 4, 0.25)
+        report("[red]", 1, 1, "a[1].csv")
+    text = written.getvalue()
+    assert "2/2" in text and "residual 0.250" in text and "left" in text
+    assert "[red]" in text and "a[1].csv" in text  # a user's names are no markup
+    assert "reading" not in text.splitlines()[-1]
+
+
+def test_a_log_gets_a_line_now_and_then_and_one_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    shown, written = console(terminal=False)
+    with progress.shown(shown) as report:
+        for done in range(1, 101):
+            now[0] += 0.5
+            report("predict", done, 100, "x.json")
+    lines = written.getvalue().splitlines()
+    assert lines[0] == "predict 21/100, 0:00:38 left x.json"
+    assert lines[-1] == "predict 100/100 in 0:00:50" and len(lines) == 5
+
+
+def test_a_log_that_ends_in_an_error_holds_the_error_alone() -> None:
+    shown, written = console(terminal=False)
+    with pytest.raises(ValueError, match="bad"), progress.shown(shown) as report:
+        report("reading", 0, 0, "a.csv")
+        raise ValueError("bad")
+    assert written.getvalue() == ""
+
+
+def test_there_is_one_protocol() -> None:
+    """Whatever takes long takes ``on_progress: OnProgress | None``, and no module declares another."""
+    from idm_env import bench
+    from idm_env.discovery.discover import discover
+    from idm_env.fitting.fit import fit
+    from idm_env.fitting.job import fit_file, simulate_file
+    from idm_env.prediction.files import predict_files
+    from idm_env.trajectories.files import filter_file, reconstruct_file
+
+    for long in (fit, fit_file, simulate_file, discover, filter_file, reconstruct_file, predict_files, bench.run):
+        assert inspect.signature(long).parameters["on_progress"].annotation == "OnProgress | None", long
+    package = Path(progress.__file__).parent
+    assert [p.name for p in package.rglob("*.py") if "\nOnProgress =" in p.read_text()] == ["progress.py"]

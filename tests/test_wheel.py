@@ -1,0 +1,79 @@
+"""The wheel, built and listed: it carries the package, nothing else, and declares exactly what the package imports."""
+
+from __future__ import annotations
+
+import ast
+import email
+import importlib.metadata
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+NO_PART = ("__pycache__", "*.egg-info")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """Build from a copy, so that nothing is written into the checkout."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for folder in ("idm_env", "agents", "configs"):
+        shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns(*NO_PART))
+    for file in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / file, source)
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", out, source]
+    subprocess.run(build, check=True)
+    return zipfile.ZipFile(next(out.glob("*.whl")))
+
+
+def requirements(wheel: zipfile.ZipFile) -> dict[str, set[str]]:
+    """Return the names of the distributions that every extra asks for; '' is no extra."""
+    name = next(n for n in wheel.namelist() if n.endswith(".dist-info/METADATA"))
+    head = email.message_from_bytes(wheel.read(name))
+    found: dict[str, set[str]] = {extra: set() for extra in ("", *(head.get_all("Provides-Extra") or []))}
+    for line in head.get_all("Requires-Dist") or []:
+        one = Requirement(line)
+        for extra, names in found.items():
+            with_extra = one.marker is not None and one.marker.evaluate({"extra": extra})
+            if with_extra if extra else one.marker is None:
+                names.add(canonicalize_name(one.name))
+    return found
+
+
+def imported(wheel: zipfile.ZipFile) -> list[set[str]]:
+    """Return, for each module from outside that the package imports anywhere, the distributions that give it."""
+    modules = set()
+    for name in wheel.namelist():
+        if name.endswith(".py"):
+            for node in ast.walk(ast.parse(wheel.read(name))):
+                if isinstance(node, ast.Import):
+                    modules |= {alias.name.split(".")[0] for alias in node.names}
+                elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                    modules.add(node.module.split(".")[0])
+    outside = modules - set(sys.stdlib_module_names) - {"idm_env"}
+    known = importlib.metadata.packages_distributions()
+    return [{canonicalize_name(name) for name in known.get(module, [module])} for module in sorted(outside)]
+
+
+def test_it_carries_every_file_of_the_package_and_nothing_beside_it(wheel: zipfile.ZipFile) -> None:
+    """Agents and configurations are run from the checkout: a wheel must not claim names such as ``agents``."""
+    files = {p.relative_to(ROOT).as_posix() for p in (ROOT / "idm_env").rglob("*") if p.is_file()}
+    wanted = {name for name in files if "__pycache__" not in name}
+    carried = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert carried == wanted
+
+
+def test_it_declares_what_it_imports_and_no_extra_for_what_it_does_not_carry(wheel: zipfile.ZipFile) -> None:
+    """Every import is a requirement, and every requirement of an extra for users is imported."""
+    declared = {extra: names for extra, names in requirements(wheel).items() if extra not in ("dev", "all")}
+    everything = set().union(*declared.values())
+    undeclared = [names for names in imported(wheel) if not names & everything]
+    assert not undeclared
+    used = set().union(*imported(wheel))
+    assert everything == used & everything
