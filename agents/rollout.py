@@ -54,7 +54,7 @@ def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> D
     """Roll a policy out from given worlds; ``act`` None leaves everybody to the human drivers."""
     task, world, draw, params = start
     like = world.state.speed
-    advance = advance_of(task.simulator, "numpy", like.device, like.dtype)
+    advance = advance_of(task.simulator, "numpy", like.device)
     none = like.new_zeros(len(like), len(task.agents))
     kept: list[tuple[Tensor, ...]] = []
     with torch.inference_mode():
@@ -79,12 +79,11 @@ def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws
     chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": warmup}
     task = task_of({**chosen, "length": [min(lengths), max(lengths)]})
     params = task.params(torch.float32, "cpu")
-    advance = advance_of(task.simulator, "numpy", torch.device("cpu"), torch.float32)
     keys, states = [], []
     for i, length in enumerate(lengths):
         draw = Draw.of(torch.tensor([SEED + 1000 * k + i for k in draws]), torch.zeros(len(draws), dtype=torch.int64))
         one = task_of({**chosen, "length": length})
-        states.append(one.reset(draw, params, getattr(advance, "run", None)).state)
+        states.append(one.reset(draw, params).state)
         keys.append(draw.key)
     memory = {name: torch.cat([s.memory[name] for s in states]) for name in states[0].memory}
     columns = {

@@ -23,7 +23,7 @@ from idm_env.roads.base import Road
 from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
 
 if TYPE_CHECKING:
-    from typing_extensions import Self  # noqa: UP035
+    from typing_extensions import Self
 
 Integration = Literal["ballistic", "euler", "midpoint"]
 

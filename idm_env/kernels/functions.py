@@ -19,8 +19,6 @@ _LN2_HIGH, _LN2_LOW = 0.693147180369123816490, 1.90821492927058770002e-10
 """ln 2 in two parts, the first with trailing zeros, so that n ln 2 is exact (Cody and Waite 1980)."""
 
 
-
-
 def _exponent(number: ir.Type, bits: ir.IntType, bias: int, mantissa: int, kind: types.Float) -> Any:
     @intrinsic
     def power_of_two(typing_context: Any, x: Any) -> Any:

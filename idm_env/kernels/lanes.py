@@ -158,7 +158,7 @@ def starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
 
 
 def past_rows(past: Tensor, shape: tuple[int, ...]) -> Array:
-    """Return the past as (slots · signals, vehicles), newest slot first; as (signals, vehicles) if all slots are one."""
+    """Return the past as (slots · signals, vehicles), newest slot first, or (signals, vehicles) if all slots are one."""
     full = past.detach().expand(*shape, *past.shape[-2:]).movedim((-2, -1), (0, 1))
     if full.stride(0) == 0:
         full = full[:1]
@@ -313,9 +313,7 @@ def _timed(gradient: Array, plan: _Plan, like: Tensor) -> Tensor:
     return torch.cat((part, like.new_zeros(len(like) - plan.steps, *like.shape[1:])))
 
 
-def _differentiable(
-    plan: _Plan, saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...]
-) -> list[Tensor | None]:
+def _differentiable(plan: _Plan, saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...]) -> list[Tensor | None]:
     """Return the gradients with a graph of their own, for second derivatives, from the torch path."""
     from idm_env.kernels.dispatch import off
 
@@ -328,10 +326,13 @@ def _differentiable(
     plain = {n: x for n, x in given.items() if n not in program.memories}
     with off("second derivatives"):
         last, kept = plan.simulator.rollout(  # type: ignore[attr-defined]
-           
             plan.state._replace(**plain, memory=memory), plan.inputs, plan.params, plan.steps
         )
-    outputs = [*starts(last, program.states), *([last.memory[PAST]] if plan.slots else []), *(kept if plan.keep else ())]
+    outputs = [
+        *starts(last, program.states),
+        *([last.memory[PAST]] if plan.slots else []),
+        *(kept if plan.keep else ()),
+    ]
     pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if s is not None]
     wanted = [x for x in saved if x.requires_grad]
     found = iter(

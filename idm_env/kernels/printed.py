@@ -71,7 +71,12 @@ class TileKernel:
         self.looks = _flat(text.looks(), ("static", *PHASES))
         self.recalls = np.array(
             [
-                (text.at(f"AGO_{r.ago}") * ROW, r.signal, text.at(row(r.slot)) * ROW, text.at(f"ON_{row(r.slot)}") * ROW)
+                (
+                    text.at(f"AGO_{r.ago}") * ROW,
+                    r.signal,
+                    text.at(row(r.slot)) * ROW,
+                    text.at(f"ON_{row(r.slot)}") * ROW,
+                )
                 for r in program.recalls
             ],
             np.int64,

@@ -15,6 +15,7 @@ Share = tuple[int, Node]
 
 
 def _masked(graph: Graph, op: str, a: Node, b: Node, g: Node) -> Node:
+    """All of g where a and b compare so, else nothing."""
     return graph.select(graph.compare(op, a, b), g, graph.constant(0.0))
 
 
@@ -22,6 +23,16 @@ def _larger(graph: Graph, a: Node, b: Node, g: Node) -> Node:
     """All of g where a > b, half of it where they are equal."""
     half = graph.mul(g, graph.constant(0.5))
     return graph.select(graph.compare("gt", a, b), g, _masked(graph, "eq", a, b, half))
+
+
+def _chosen(graph: Graph, a: Node, b: Node, g: Node) -> list[Share]:
+    """To the first argument all of g where a > b, to the second where b > a."""
+    return [(0, _larger(graph, a, b, g)), (1, _larger(graph, b, a, g))]
+
+
+def _clamped(graph: Graph, node: Node, g: Node, inside: str, beyond: str) -> list[Share]:
+    x, bound = node.args
+    return [(0, _masked(graph, inside, x, bound, g)), (1, _masked(graph, beyond, x, bound, g))]
 
 
 def _div(graph: Graph, node: Node, g: Node) -> list[Share]:
@@ -75,23 +86,16 @@ RULES: dict[str, Callable[[Graph, Node, Node], list[Share]]] = {
     "sin": lambda graph, node, g: [(0, graph.mul(g, graph.node("cos", node.args[0])))],
     "cos": lambda graph, node, g: [(0, graph.neg(graph.mul(g, graph.node("sin", node.args[0]))))],
     "relu": lambda graph, node, g: [(0, _masked(graph, "gt", node.args[0], graph.constant(0.0), g))],
-    "clamp_min": lambda graph, node, g: [
-        (0, _masked(graph, "ge", *node.args, g)), (1, _masked(graph, "lt", *node.args, g))
-    ],
-    "clamp_max": lambda graph, node, g: [
-        (0, _masked(graph, "le", *node.args, g)), (1, _masked(graph, "gt", *node.args, g))
-    ],
-    "maximum": lambda graph, node, g: [
-        (0, _larger(graph, *node.args, g)), (1, _larger(graph, node.args[1], node.args[0], g))
-    ],
-    "minimum": lambda graph, node, g: [
-        (0, _larger(graph, node.args[1], node.args[0], g)), (1, _larger(graph, *node.args, g))
-    ],
+    "clamp_min": lambda graph, node, g: _clamped(graph, node, g, "ge", "lt"),
+    "clamp_max": lambda graph, node, g: _clamped(graph, node, g, "le", "gt"),
+    "maximum": lambda graph, node, g: _chosen(graph, node.args[0], node.args[1], g),
+    "minimum": lambda graph, node, g: _chosen(graph, node.args[1], node.args[0], g),
     "floor": lambda graph, node, g: [],
     "sign": lambda graph, node, g: [],
     "detach": lambda graph, node, g: [],
 }  # fmt: skip
 """Operation → the adjoints of its arguments from that of its result."""
+
 
 def adjoint(graph: Graph, outputs: Sequence[Node], seeds: Sequence[Node]) -> dict[Node, Node]:
     """Return the adjoint of every leaf that the outputs depend on: Σ seed · ∂output/∂leaf."""

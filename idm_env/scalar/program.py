@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from idm_env.scalar.derive import adjoint
-from idm_env.scalar.graph import STATIC, Graph, Node, Slot, hoisted, inputs_of, replaced, ordered
+from idm_env.scalar.graph import STATIC, Graph, Node, Slot, hoisted, inputs_of, ordered, replaced
 from idm_env.scalar.record import Recording
 
 STATICS = ("led", "leads", "length", "present")

@@ -44,7 +44,6 @@ class Form:
         memories = tuple(sorted(name for name in state.memory if name != history.PAST))
         return cls(tuple(found), memories, state.present is not None)
 
-
     @property
     def flags(self) -> tuple[str, ...]:
         """Names of the inputs that are truth values."""
@@ -163,13 +162,11 @@ class _Recorder(Stepping):
         graph.note = ""
 
         now["displacement"] = value_of(graph, motion.displacement)
-        known = motion._replace(
-            displacement=Scalar(graph, graph.input("displacement")),
-            position=Scalar(graph, graph.input("position after")),
-        )
+        known: Any = Scalar(graph, graph.input("displacement")), Scalar(graph, graph.input("position after"))
+        known = motion._replace(displacement=known[0], position=known[1])
         if motion.present is not state.present:
             self.recording.close["present"] = value_of(graph, motion.present)
-        return super()._gaps(state, known)  # type: ignore[arg-type]
+        return super()._gaps(state, known)
 
 
 def record(simulator: Stepping, form: Form) -> Recording:
@@ -199,7 +196,9 @@ def record(simulator: Stepping, form: Form) -> Recording:
     try:
         after = recorder.step(state, _inputs(form, graph), _Parameters(recorder, graph))  # type: ignore[arg-type]
     except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise Untraceable(f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}") from error
+        raise Untraceable(
+            f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}"
+        ) from error
     for name in ("position", "speed", "accel"):
         recording.respond[name] = value_of(graph, getattr(after, name))
     for name in form.memories:

@@ -42,7 +42,9 @@ def word(slot: Slot) -> str:
     """Return a slot as a Python name: ``speed``, ``speed_ahead``, ``speed_behind``, ``idm_time_gap``."""
     name = re.sub(r"\W+", "_", slot.name)
     where = {0: "", 1: "_ahead", -1: "_behind"}.get(slot.shift)
-    return name + (where if where is not None else f"_ahead_{slot.shift}" if slot.shift > 0 else f"_behind_{-slot.shift}")
+    return name + (
+        where if where is not None else f"_ahead_{slot.shift}" if slot.shift > 0 else f"_behind_{-slot.shift}"
+    )
 
 
 def row(slot: Slot) -> str:
@@ -66,6 +68,7 @@ _FORMS: dict[str, str] = {
 
 Read = Callable[[Slot], str]
 """How a slot is read inside the loop."""
+
 
 class Body(NamedTuple):
     """Lines of one loop's body, the constants that it needs (name → index), and the places that it writes."""

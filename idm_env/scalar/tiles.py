@@ -57,7 +57,10 @@ class TileText:
     def _chain(slots: set[Slot]) -> set[Slot]:
         """Add the nearer vehicles over which a number is handed on to those further away."""
         return {
-            Slot(s.name, sign * k) for s in slots for sign in [1 if s.shift > 0 else -1] for k in range(1, abs(s.shift) + 1)
+            Slot(s.name, sign * k)
+            for s in slots
+            for sign in [1 if s.shift > 0 else -1]
+            for k in range(1, abs(s.shift) + 1)
         }
 
     # -- where things are ----------------------------------------------------------------------------------------

@@ -263,7 +263,9 @@ class Task(abc.ABC):
         if len(self.machinery) == 1:
             still = torch.zeros(steps, self.vehicles, dtype=torch.bool, device=state.speed.device)
             return {"control": Command(state.speed.new_zeros(steps, 1), still)}
-        every = [self.inputs(world._replace(state=state._replace(step=state.step + t)), None, None) for t in range(steps)]
+        every = [
+            self.inputs(world._replace(state=state._replace(step=state.step + t)), None, None) for t in range(steps)
+        ]
         return {name: stacked([inputs[name] for inputs in every]) for name in every[0]}
 
     def command(self, action: Tensor) -> Tensor:
