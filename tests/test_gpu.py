@@ -1,0 +1,69 @@
+"""On a GPU everything is as on the CPU: steps, gradients, rollouts, environments. Skipped where there is none."""
+
+import pytest
+import torch
+
+from tests.laws.members import DTYPE, MEMBERS, N, around, inputs_for, label, start
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here: its tests have not run")
+
+STEPS = 20
+
+
+def moved(value, device):
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if isinstance(value, dict):
+        return {k: moved(v, device) for k, v in value.items()}
+    if isinstance(value, tuple):
+        return type(value)(*(moved(v, device) for v in value))
+    return value
+
+
+def outcome(effect, device):
+    """Return the trajectory's tensors and the gradients by every parameter of the effect, on the CPU."""
+    simulator = around(effect)
+    params = moved(simulator.defaults(dtype=DTYPE), device)
+    leaves = {name: x.clone().requires_grad_() for name, x in params[effect.name].items()}
+    params = {**params, effect.name: leaves}
+    state = moved(start(simulator, moved(params, "cpu")), device)
+    inputs = moved(inputs_for(simulator, STEPS, torch.zeros(N, dtype=DTYPE)), device)
+    _, kept = simulator.rollout(state, inputs, params, STEPS)
+    loss = sum((0.01 * x).sin().sum() for x in kept)
+    found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True) if leaves else ()
+    return [x.detach().cpu() for x in kept], [None if g is None else g.cpu() for g in found]
+
+
+@pytest.mark.parametrize("effect", MEMBERS, ids=label)
+def test_every_effect_is_the_same_on_a_gpu(effect):
+    here, there = outcome(effect, "cpu"), outcome(effect, "cuda")
+    for mine, other in zip(here[0], there[0], strict=True):
+        torch.testing.assert_close(other, mine, rtol=1e-10, atol=1e-9)
+    for mine, other in zip(here[1], there[1], strict=True):
+        assert (mine is None) == (other is None)
+        if mine is not None:
+            torch.testing.assert_close(other, mine, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("task", ["ring", "follow", "platoon"])
+def test_environments_give_on_a_gpu_what_they_give_on_the_cpu(task):
+    gymnasium = pytest.importorskip("gymnasium")
+    import idm_env  # noqa: F401
+
+    seen = {}
+    for device in ("cpu", "cuda"):
+        short = {"warmup": 50} if task == "ring" else {}
+        env = gymnasium.make_vec(
+            "DiffIDM-v0", num_envs=8, task=task, output="torch", device=device, dtype="float64", **short
+        )
+        env.reset(seed=3)
+        action = torch.full((8, 1), 0.3, dtype=torch.float64, device=device, requires_grad=True)
+        total = 0.0
+        for _ in range(10):
+            observation, reward, *_ = env.step(action)
+            total = total + reward.sum()
+        total.backward()
+        assert observation.device.type == device
+        seen[device] = (observation.detach().cpu(), reward.detach().cpu(), action.grad.cpu())
+    for mine, other in zip(seen["cpu"], seen["cuda"], strict=True):
+        torch.testing.assert_close(other, mine, rtol=1e-9, atol=1e-9)
