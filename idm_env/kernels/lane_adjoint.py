@@ -47,7 +47,6 @@ from idm_env.kernels.tiles import (
     add,
     clear,
     exact,
-    gather,
     load,
     padded,
     place,
@@ -60,20 +59,22 @@ from idm_env.kernels.tiles import (
 
 @exact
 def send(w, n, size, measures, sends, phase):
-    """Send what fell on neighbours' numbers to them; further than one vehicle is handed on."""
-    scratch, ring = measures[SCRATCH], measures[IS_RING]
+    """Add what fell on neighbours' numbers to their adjoints; further than one vehicle it is handed on."""
+    ring = measures[IS_RING]
     for i in range(sends.shape[0]):
         if sends[i, 0] != phase:
             continue
-        source = sends[i, 2]
-        for _ in range(abs(sends[i, 1])):
-            if sends[i, 1] > 0:
-                send_ahead(w, scratch, source, n, size, ring)
+        shift, source = sends[i, 1], sends[i, 2]
+        for hop in range(abs(shift)):
+            last = hop == abs(shift) - 1
+            target = sends[i, 3] if last else measures[SCRATCH] + (hop % 2) * ROW
+            if not last:
+                clear(w, target, padded(n))
+            if shift > 0:
+                send_ahead(w, target, source, n, size, ring)
             else:
-                send_back(w, scratch, source, n, size, ring)
-            source, scratch = scratch, source
-        gather(w, sends[i, 3], source, n)
-        scratch = measures[SCRATCH]
+                send_back(w, target, source, n, size, ring)
+            source = target
 
 
 @exact

@@ -91,31 +91,31 @@ def look_back(w, to, source, n, size, is_ring):
 
 
 @exact
+def _add(target, source, n):
+    for j in range(n):
+        target[j] += source[j]
+
+
+@exact
 def send_ahead(w, to, source, n, size, is_ring):
-    """Fill row ``to`` with what each follower sends to his leader, 0 for whoever has none: adjoint of looking ahead."""
-    _copy(w[to:], w[source + 1 :], padded(n))
-    w[to + n - 1] = 0
-    if is_ring and n >= size:
-        for j in range(0, n, size):
-            w[to + j + size - 1] = w[source + j]
+    """Add to row ``to`` what each follower sends to his leader: adjoint of looking ahead."""
+    if not (is_ring and n >= size):
+        _add(w[to:], w[source + 1 :], n - 1)
+        return
+    for j in range(0, n, size):
+        _add(w[to + j :], w[source + j + 1 :], size - 1)
+        w[to + j + size - 1] += w[source + j]
 
 
 @exact
 def send_back(w, to, source, n, size, is_ring):
-    """Fill row ``to`` with what each leader sends to his follower, 0 for whoever has none: adjoint of looking back."""
-    w[to] = 0
-    _copy(w[to + 1 :], w[source:], padded(n) - 1)
-    if is_ring and n >= size:
-        for j in range(0, n, size):
-            w[to + j] = w[source + j + size - 1]
-
-
-@exact
-def gather(w, to, source, n):
-    """Add one row to another."""
-    left, right = w[to:], w[source:]
-    for j in range(padded(n)):
-        left[j] += right[j]
+    """Add to row ``to`` what each leader sends to his follower: adjoint of looking back."""
+    if not (is_ring and n >= size):
+        _add(w[to + 1 :], w[source:], n - 1)
+        return
+    for j in range(0, n, size):
+        _add(w[to + j + 1 :], w[source + j :], size - 1)
+        w[to + j] += w[source + j + size - 1]
 
 
 # -- memory ------------------------------------------------------------------------------------------------------
@@ -197,9 +197,7 @@ def store(target, base, w, row, n):
 @exact
 def add(target, base, w, row, n):
     """Add ``n`` values from index ``row`` of the workspace."""
-    left, right = target[base:], w[row:]
-    for j in range(n):
-        left[j] += right[j]
+    _add(target[base:], w[row:], n)
 
 
 @exact

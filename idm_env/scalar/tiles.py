@@ -41,7 +41,7 @@ class TileText:
         self._begin("RECALLED", [row(r.slot) for r in p.recalls])
         self._begin("ON_RECALLED", [f"ON_{row(r.slot)}" for r in p.recalls])
         self._begin("AGO", [row(Slot(f"ago {i}")) for i in range(len(p.recall))])
-        self._begin("OTHER", ["DISPLACEMENT", "ON_DISPLACEMENT", "SCRATCH", *(row(s) for s in self._neighbours)])
+        self._begin("OTHER", ["DISPLACEMENT", "ON_DISPLACEMENT", "SCRATCH", "SCRATCH_TOO", *(row(s) for s in self._neighbours)])
         self._rows += [f"SENT_{row(s)}" for phase in PHASES for s in self._back[phase].sent]
         self._rows = list(dict.fromkeys([*self._rows, "SEEDED"]))
 
@@ -158,7 +158,9 @@ class TileText:
         made = {"hoist_back": ("Adjoint of what depends on parameters alone.", hoist)}
         for phase in PHASES:
             back = self._back[phase]
-            writes = [Write(f"w[ON_{self._row(s)} + j]", x) for s, x in back.assigned.items()]
+            # An adjoint that only passes through stays where it is.
+            passing = {s for s, x in back.assigned.items() if x is self.program.graph.input(f"on {s.name}")}
+            writes = [Write(f"w[ON_{self._row(s)} + j]", x) for s, x in back.assigned.items() if s not in passing]
             writes += [Write(f"w[ON_{self._row(s)} + j]", x, adds=True) for s, x in back.added.items()]
             writes += [Write(f"w[SENT_{row(s)} + j]", x) for s, x in back.sent.items()]
             made[f"{phase}_back"] = (f"Adjoint of {phase}.", writes)
