@@ -187,8 +187,13 @@ def test_plot_and_effects(frame: pl.DataFrame, tmp_path: Path) -> None:
         picture = tmp_path / f"{source.stem}.png"
         done = call("plot", source, "--out", picture, "--html", *options)
         assert done.returncode == 0, done.stderr
-        page = picture.with_suffix(".html").read_text()
-        assert "http" not in page and '"marked": true' in page if source is ring else '"marked": false' in page
+        page = picture.with_suffix(".html")
+        text = page.read_text()
+        assert "http" not in text and ('"marked": true' if source is ring else '"marked": false') in text
         assert picture.read_bytes().startswith(b"\x89PNG")
+        assert call("plot", source, "--out", picture, "--html", *options).returncode == 0  # its own page is replaced
+    page.write_text("mine")
+    done = call("plot", path, "--out", tmp_path / f"{ring.stem}.png", "--html")
+    assert done.returncode == 1 and "was not written by idm-env plot" in done.stderr and page.read_text() == "mine"
     listed = call("effects", env={**os.environ, "COLUMNS": "200"})
     assert "second_leader.weight" in listed.stdout

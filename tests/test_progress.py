@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from idm_env import progress
+import idm_env
+from idm_env import cli, progress
 
 
 def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
@@ -70,3 +71,27 @@ def test_there_is_one_protocol() -> None:
         assert inspect.signature(long).parameters["on_progress"].annotation == "OnProgress | None", long
     package = Path(progress.__file__).parent
     assert [p.name for p in package.rglob("*.py") if "\nOnProgress =" in p.read_text()] == ["progress.py"]
+
+
+def test_whoever_shows_progress_takes_ctrl_c_over_once_its_modules_are_imported() -> None:
+    """Until then Ctrl-C ends the process at once; forgotten, it would lose what is done."""
+    shows = [f for f in vars(cli).values() if inspect.isfunction(f) and "shown(console)" in inspect.getsource(f)]
+    assert len(shows) >= 8
+    for command in shows:
+        source = inspect.getsource(command)
+        assert "_work_begins()" in source or " _explain(" in source, command
+    assert "_work_begins()" in inspect.getsource(cli._explain)
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_ctrl_c_while_modules_are_imported_shows_the_cursor_again(
+    watched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bars hide it, and nothing but this runs after them."""
+    said: list[bytes] = []
+    codes: list[int] = []
+    monkeypatch.setattr(idm_env.os, "isatty", lambda to: watched)
+    monkeypatch.setattr(idm_env.os, "write", lambda to, words: said.append(words))
+    monkeypatch.setattr(idm_env.os, "_exit", codes.append)
+    idm_env._end(2, None)
+    assert codes == [130] and said == [(b"\x1b[?25h" if watched else b"") + b"interrupted.\n"]

@@ -86,11 +86,10 @@ def test_the_cost_of_a_crash_knows_the_episodes_length():
 
 def test_a_picture_is_as_long_as_it_was_asked_for(tmp_path, monkeypatch):
     # The usual 3000 steps are no limit of it: plot's ring is drawn over 400 s.
-    from idm_env import cli, diagrams
+    from idm_env import cli, progress
 
-    seen = []
-    monkeypatch.setattr(diagrams, "space_time", lambda states, **_: seen.append(len(states.position)))
+    monkeypatch.setattr(cli, "_work_begins", lambda: None)
     path = tmp_path / "ring.yaml"
     path.write_text("configures: environment\ntask: ring\nvehicles: 3\nlength: 60.0\nwarmup: 1\n")
-    cli._rollout_figure(path, 310.0, 0)
-    assert seen == [3100]
+    panel = cli._rollout_panel(path, 310.0, 0, progress.silent)
+    assert [len(line.time) for line in panel.lines] == [3100] * 3

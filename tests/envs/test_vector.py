@@ -137,4 +137,7 @@ def test_torch_output_has_the_dense_layout():
     assert info["final_obs"].shape == (COUNT, 3)
     assert info["_final_obs"].all()
     assert info["_final_info"].all()
-    assert info["final_info"] == {}
+    final = info["final_info"]
+    assert final["command"].shape == (COUNT, 1) and all(
+        final[f"_{name}"].all() for name in ("command", "accel", "crash")
+    )

@@ -33,7 +33,7 @@ def test_filter_and_its_ablation(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert {p.name for p in (tmp_path / "out").iterdir()} == OUTPUT
     assert "3/3" in done.stderr + done.stdout  # the progress at its end
-    assert "Data: nothing was repaired or left out." in done.stderr.splitlines()
+    assert "Data: repaired: length assumed 3." in done.stderr.splitlines()
     named = methods(tmp_path / "out")
     assert named[0] == "simulator, imagined leader" and {"linear", "Savitzky–Golay", "bounded spline"} <= set(named)
     assert "Driver parameters" in (tmp_path / "out" / "report.html").read_text()
