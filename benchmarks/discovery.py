@@ -144,13 +144,13 @@ def oracle(found: Any, truth: Any) -> float | None:
             place = found.records.signals[:, 18]
             first, count = float(place.min()), 60
             distance = float(np.ptp(place)) / (count - 1)
-            term = terms.grade(first, distance, count, 0.0)
+            term = terms.unknown_profile("grade", first, distance, count, 0.0)
             values += hidden.slope(first + distance * np.arange(count), strength).tolist()
         elif name == "speed_zone":
-            term = terms.speed_zone(*hidden.ZONE_M, strength)
+            term = terms.placed("speed_zone", strength, *hidden.ZONE_M)
             values += [strength, *hidden.ZONE_M]
         elif name == "regime_shift":
-            term = terms.regime_shift(hidden.SHIFT_TIME_S, strength)
+            term = terms.placed("regime_shift", strength, hidden.SHIFT_TIME_S)
             values += [strength, hidden.SHIFT_TIME_S]
         else:
             term = terms.simple(name)
@@ -181,7 +181,7 @@ def measure(job: Job) -> dict[str, Any]:
         "after": report["error"]["after"]["gap_rmse_m"],
         "floor": report["error"]["floor"]["gap_rmse_m"],
         "oracle": oracle(found, truth) if truth.effects else None,
-        "why": [r.why_not for r in found.rounds][-1],
+        "why": report["reason"],
         "best": next((c["effect"] for c in report["candidates"]), ""),
         "best_gain": next((c["held_out_gain"] for c in report["candidates"]), 0.0),
         "where": [f["where"] for f in report["found"]],

@@ -80,7 +80,7 @@ def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
             for f in report["found"]
         ],
         "known": report["known"],
-        "why": found.rounds[-1].why_not,
+        "why": report["reason"],
         "partial": report["partial"],
         "before": report["error"]["before"],
         "after": report["error"]["after"],

@@ -145,7 +145,7 @@ def main() -> None:
                     for f in found.report["found"]
                 ],
                 "gap_rmse_m": [round(error[x]["gap_rmse_m"], 3) for x in ("before", "after", "floor")],
-                "why": found.rounds[-1].why_not,
+                "why": found.report["reason"],
             }), flush=True)  # fmt: skip
 
 

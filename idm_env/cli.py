@@ -53,7 +53,9 @@ Place = Annotated[str | None, typer.Option(help="Column that names places, such 
 Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim or openacc.")]
 MaxGap = Annotated[float, typer.Option(help="Gaps above this (m) mean a lost leader and are left out.")]
 MinSeconds = Annotated[float, typer.Option(help="Shorter stretches behind one leader are left out (s).")]
-Where = Annotated[str | None, typer.Option(help='Only runs or drivers with "column=value".')]
+Where = Annotated[
+    list[str] | None, typer.Option(help='Only runs or drivers with "column=value"; given twice, both must hold.')
+]
 Window = Annotated[float | None, typer.Option(help="Cut longer stretches into windows of so many seconds.")]
 Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
 Step = Annotated[float | None, typer.Option("--dt", help="Use every n-th sample, to this step (s).")]
@@ -176,6 +178,7 @@ def _explain(
     import json
 
     from idm_env.discovery import discover, write_report
+    from idm_env.discovery.words import ERRORS
     from idm_env.report import output_folder
 
     output_folder(out)
@@ -192,12 +195,39 @@ def _explain(
         )
         write_report(found, out)
     result = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    names = [entry["effect"] or f"{entry['what']} over {entry['where']['coordinate']}" for entry in result["found"]]
-    console.print(f"Verdict: [bold]{result['verdict']}[/bold]{': ' + ', '.join(names) if names else ''}")
-    keys = ("gap_rmse_m", "gap_rmse_median_driver_m", "horizon_rmse_m", "speed_rmse_mps")
-    rows = [{"": when, **{k: result["error"][when].get(k) for k in keys}} for when in ("before", "after", "floor")]
-    _show("Errors on runs that neither fitted nor chose anything", rows)
+    console.print(f"Verdict: [bold]{result['verdict'].replace('_', ' ')}[/bold]. ", end="")
+    console.print(result["sentence"], markup=False, highlight=False)
+    before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
+    if before is not None:
+        _show("Errors on runs that neither fitted nor chose anything", [
+            _error_row(name, unit, before[key], after[key], found.judgement.titles, result["helps"].get(key))
+            for key, (name, unit) in ERRORS.items()
+        ])  # fmt: skip
+    if result["interval"]:
+        console.print(result["interval"], style="dim", highlight=False)
+    files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
+    best = ", which predicts best" if len(files) > 1 else ""
+    console.print(
+        "; ".join(f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files)), highlight=False
+    )
     _done(out)
+
+
+def _error_row(
+    name: str, unit: str, before: float, after: float, models: tuple[str, ...], compared: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Return one error of explain: that of every model, and whether the second's is better, the same or worse."""
+    from idm_env.discovery.words import percent
+
+    row: dict[str, Any] = {"error": f"{name} ({unit})"} | dict(zip(models, (before, after), strict=False))
+    if len(models) > 1:
+        known = compared is not None and compared["high"] is not None
+        row["change"] = percent(after / before) if before else ""
+        row["95 % interval"] = (
+            f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and known else ""
+        )
+        row["verdict"] = compared["verdict"] if compared else ""
+    return row
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:

@@ -28,7 +28,8 @@ class Parameter:
 
     ``null`` is the value at which the effect is absent (None where the effect is never absent). ``role`` says how it
     is found: a *strength* has a gradient at its null; a *shape* matters only once the strength does; a *threshold* or
-    a *place* has to be searched, from ``starts`` where given.
+    a *place* has to be searched, from ``starts`` where given. ``searched`` are bounds of the search for a missing
+    effect, where these are other than (low, high): wider than plausible, narrower than where IDM would collide.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Parameter:
     null: float | None = None
     role: Role = "strength"
     starts: tuple[float, ...] = ()
+    searched: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.low < self.high or not self.low <= self.default <= self.high:

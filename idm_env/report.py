@@ -29,6 +29,12 @@ table { border-collapse: collapse; margin: .8rem 0; font-size: .92rem; display: 
 th, td { padding: .25rem .8rem .25rem 0; text-align: left; border-bottom: 1px solid #dde; vertical-align: top; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
 table.first tbody tr:first-child { font-weight: 600; background: #eef5fb; }
+.lights { display: grid; grid-template-columns: repeat(auto-fit, minmax(15rem, 1fr)); gap: .6rem; margin: 1rem 0; }
+.light { border-left: .4rem solid #8a94a0; background: #f5f7f9; padding: .4rem .7rem; font-size: .92rem; }
+.light b { display: block; } .light.better { border-color: #1a7f37; } .light.worse { border-color: #b42318; }
+dl.terms { font-size: .88rem; color: #445; margin: .2rem 0 1.2rem; } dl.terms dt { font-weight: 600; float: left;
+clear: left; margin-right: .4rem; } dl.terms dd { margin: 0 0 .2rem; }
+@media (max-width: 600px) { figure { overflow-x: auto; } figure img.wide { max-width: none; width: 40rem; } }
 .gallery { display: flex; flex-wrap: wrap; gap: 1rem; } .gallery figure { flex: 1 1 26rem; margin: 0; }
 </style></head><body>
 <h1>{{ title }}</h1>
@@ -38,8 +44,14 @@ table.first tbody tr:first-child { font-weight: 600; background: #eef5fb; }
 {% elif block.kind == "note" %}<p class="note">{{ block.text }}</p>
 {% elif block.kind == "text" %}<p>{{ block.text }}</p>
 {% elif block.kind == "list" %}<ul>{% for item in block.rows %}<li>{{ item }}</li>{% endfor %}</ul>
-{% elif block.kind == "figure" %}<figure><img alt="{{ block.text }}" src="{{ block.image }}">
+{% elif block.kind == "figure" %}<figure><picture>{% if block.narrow %}<source media="(max-width: 600px)"
+ srcset="{{ block.narrow }}">{% endif %}<img{% if not block.narrow %} class="wide"{% endif %}
+ alt="{{ block.text }}" src="{{ block.image }}"></picture>
 <figcaption>{{ block.text }}</figcaption></figure>
+{% elif block.kind == "lights" %}<div class="lights">{% for name, state, words in block.rows %}
+<div class="light {{ state }}"><b>{{ name }}: {{ state }}</b>{{ words }}</div>{% endfor %}</div>
+{% elif block.kind == "terms" %}<dl class="terms">{% for name, meaning in block.rows %}
+<dt>{{ name }}:</dt><dd>{{ meaning }}</dd>{% endfor %}</dl>
 {% elif block.kind == "gallery" %}<div class="gallery">{% for item in block.rows %}<figure>
 <img alt="{{ item.text }}" src="{{ item.image }}"><figcaption>{{ item.text }}</figcaption></figure>{% endfor %}</div>
 {% elif block.kind == "table" %}<table{% if block.text %} class="{{ block.text }}"{% endif %}>
@@ -54,11 +66,15 @@ cell.text }} </td>{% endfor %}</tr>{% endfor %}</tbody></table>
 
 @dataclass(frozen=True)
 class Block:
-    """One piece of a page: a heading, a paragraph, a list, a figure, a gallery of figures or a table."""
+    """One piece of a page: a heading, a paragraph, a list, lights, terms, a figure, a gallery of figures or a table.
+
+    ``narrow`` is the figure's picture for small screens, where it has one.
+    """
 
     kind: str
     text: str = ""
     image: str = ""
+    narrow: str = ""
     columns: tuple[str, ...] = ()
     rows: tuple[Any, ...] = ()
 
@@ -120,20 +136,36 @@ def shortened(items: Sequence[str], most: int = 100) -> list[str]:
     return [*items[:most], *([f"… and {more} more, in report.json."] if more > 0 else [])]
 
 
+def lights(rows: Iterable[tuple[str, str, str]]) -> Block:
+    """Return one light per (name, ``better``, ``same`` or ``worse``, words); the state is a word and a colour."""
+    return Block("lights", rows=tuple(rows))
+
+
+def terms(meanings: Mapping[str, str]) -> Block:
+    """Return what the terms of a table mean, to stand under it."""
+    return Block("terms", rows=tuple(meanings.items()))
+
+
 def gallery(figures: Iterable[Block]) -> Block:
     """Return figures side by side, as many in a row as there is room for."""
     return Block("gallery", rows=tuple(figures))
 
 
-def picture(figure: Figure, caption: str) -> Block:
-    """Return a matplotlib figure as a block; the picture travels inside the page. The figure is closed."""
+def picture(figure: Figure, caption: str, narrow: Figure | None = None) -> Block:
+    """Return a matplotlib figure as a block; the picture travels inside the page. Figures are closed.
+
+    ``narrow`` is shown instead where the screen is less than 600 pixels wide.
+    """
+    return Block("figure", caption, _encoded(figure), narrow="" if narrow is None else _encoded(narrow))
+
+
+def _encoded(figure: Figure) -> str:
     import matplotlib.pyplot as plt
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
     plt.close(figure)
-    image = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
-    return Block("figure", caption, image)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (9.0, 3.4)) -> tuple[Figure, Any]:

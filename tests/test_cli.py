@@ -116,6 +116,20 @@ def test_bad_rows_are_repaired_and_counted(frame: pl.DataFrame, tmp_path: Path) 
     assert "10 rows repeat" in page, page[-800:]
 
 
+def test_two_conditions_both_hold(tmp_path: Path) -> None:
+    """Each condition narrows what the others left."""
+    made, _ = synthetic.generate(3, runs=3, followers=2, seconds=30.0)
+    site, weather = ({"1": a, "2": b, "3": c} for a, b, c in (("a", "a", "b"), ("dry", "wet", "wet")))
+    run = pl.col("run_id")
+    table = made.table.with_columns(run.replace_strict(site).alias("site"), run.replace_strict(weather).alias("sky"))
+    path = tmp_path / "two.parquet"
+    table.write_parquet(path)
+    out = tmp_path / "out"
+    done = call("fit", path, "--where", "site=a", "--where", "sky=wet", "--starts", "1", "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((out / "report.json").read_text())["fit"]["episodes"] == 2
+
+
 def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
     """SIGINT ends with code 130 and a hint; SIGKILL leaves a checkpoint; --resume ends as an undisturbed run does."""
     path = tmp_path / "good.csv"

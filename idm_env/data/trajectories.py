@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import polars as pl
@@ -69,8 +70,8 @@ class Trajectories:
         """Return the identifiers of the runs, in order."""
         return self.table["run_id"].unique(maintain_order=True).to_list()
 
-    def where(self, condition: str) -> Trajectories:
-        """Return the part for which ``"column=value"`` holds.
+    def where(self, condition: str | Sequence[str]) -> Trajectories:
+        """Return the part for which ``"column=value"`` holds, or for which several such conditions all hold.
 
         A column that is constant in a run selects runs; one that is constant for a vehicle selects drivers, whose
         neighbours stay in the table.
@@ -78,6 +79,8 @@ class Trajectories:
         Raises:
             DataError: If the condition has another form, the column is missing or varies along a track, or none fits.
         """
+        if not isinstance(condition, str):
+            return reduce(Trajectories.where, condition, self)
         column, equals, value = (part.strip() for part in condition.partition("="))
         if not equals or not column:
             raise DataError(f"{condition!r} is no condition; write it as column=value, such as split=test.")

@@ -10,9 +10,11 @@ from scipy.stats import ttest_1samp
 from idm_env.discovery import judge, places
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import whole
-from idm_env.discovery.score import Verdict, held_out, westfall_young
+from idm_env.discovery.score import Tested, held_out, westfall_young
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.solve import Solution, solve
+from idm_env.discovery.verdict import Reason, Refusal
+from idm_env.effects import ALL
 
 ALPHA = 0.05
 LEAST_GAIN = 0.005
@@ -22,14 +24,11 @@ FEWEST_RUNS = 5
 MOST_ROUNDS = 3
 SAME = 0.15
 """Candidates whose gain is within this share of the best one's are told apart by nothing but their names."""
-CLASSES = ({"delay", "lag"},)
 AT_FLOOR = 1.15
 """A corrected model whose free simulation errs by no more times the noise of measurement lacks nothing worth a name.
 
 With the right effect in the model, generated sets without drivers' noise come to 1.00 to 1.08.
 """
-PAIRS = (("delay", "leader_acceleration"), ("delay", "second_leader"))
-"""Effects whose responses cancel, so that each may gain little alone where both act."""
 
 
 @dataclass(eq=False)
@@ -37,14 +36,14 @@ class Round:
     """What one round of the search saw, for the report."""
 
     scored: list[Scored]
-    verdict: Verdict
+    tested: Tested
     before: np.ndarray
     left: np.ndarray
     winner: int | None
     partner: int | None = None
     equivalent: list[int] = field(default_factory=list)
     share: float = float("nan")
-    why_not: str = ""
+    refusal: Refusal | None = None
     partial: int | None = None
 
 
@@ -75,14 +74,20 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
             break
         scored, before = searching.round(now, number)
         scored = [s for s in scored if not _same_class(s.term, now.model)]
-        verdict = westfall_young(np.array([s.gains for s in scored]), seed)
-        order = np.argsort(-verdict.gain)
-        fitted = [i for i in order if scored[i].solution is not None and verdict.p_value[i] < 2 * ALPHA]
-        if fitted and verdict.gain[fitted[0]] > 0.3 * LEAST_GAIN:
+        if not scored and rounds:
+            break
+        if not scored:
+            raise ValueError(
+                f"{', '.join(searching.names)}: no place or time in these data is long enough to be tried."
+            )
+        tested = westfall_young(np.array([s.gains for s in scored]), seed)
+        order = np.argsort(-tested.gain)
+        fitted = [i for i in order if scored[i].solution is not None and tested.p_value[i] < 2 * ALPHA]
+        if fitted and tested.gain[fitted[0]] > 0.3 * LEAST_GAIN:
             now, scored = searching.again(now, scored[fitted[0]], scored)
-            verdict = westfall_young(np.array([s.gains for s in scored]), seed)
+            tested = westfall_young(np.array([s.gains for s in scored]), seed)
         left = judge.ceiling(places.respond(searching.task, now))
-        this = Round(scored, verdict, before, left, None)
+        this = Round(scored, tested, before, left, None)
         rounds.append(this)
         _choose(searching, now, this)
         if this.winner is None:
@@ -100,8 +105,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
 
 def _is_a_step(now: Solution, dt: float) -> bool:
     """Tell whether the last term is a latency below one step."""
-    last = now.model.terms[-1]
-    return last.effect in {"delay", "lag"} and abs(float(now.values[-1])) < dt
+    return _late(now.model.terms[-1].effect) and abs(float(now.values[-1])) < dt
 
 
 def _at_floor(searching: Search, now: Solution) -> bool:
@@ -117,17 +121,19 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     Tested with the whole list of the round that had no winner, as candidates more.
     """
     have = {t.label for t in now.model.terms}
+    free = [n for n in searching.names if n not in have]
+    late = any(_late(t.effect) for t in now.model.terms)
     wanted = [
-        p for p in PAIRS
-        if set(p) <= set(searching.names) - have and not any({n, h} in CLASSES for n in p for h in have)
+        (name, other) for name in free for other in ALL[name].cancels
+        if other in free and not (late and (_late(name) or _late(other)))
     ]  # fmt: skip
-    if not wanted or last.why_not.startswith("only"):
+    if not wanted or (last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS):
         return None
     number = len(have) + 1
     before = held_out(searching.task, now)
     scored = [searching.pair(now, pair, before, number) for pair in wanted]
-    verdict = westfall_young(np.array([s.gains for s in (*last.scored, *scored)]), seed)
-    mine = Verdict(*(x[len(last.scored) :] for x in (verdict.p_value, verdict.gain, verdict.interval)))
+    tested = westfall_young(np.array([s.gains for s in (*last.scored, *scored)]), seed)
+    mine = Tested(*(x[len(last.scored) :] for x in (tested.p_value, tested.gain, tested.interval)))
     this = Round(scored, mine, before, last.left, None)
     _choose(searching, now, this)
     if this.winner is None:
@@ -135,51 +141,56 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     solution = scored[this.winner].solution
     assert solution is not None
     both = [Scored(term, solution, scored[this.winner].gains) for term in solution.model.terms[-2:]]
-    twice = Verdict(*(np.repeat(x[[this.winner]], 2, axis=0) for x in (mine.p_value, mine.gain, mine.interval)))
+    twice = Tested(*(np.repeat(x[[this.winner]], 2, axis=0) for x in (mine.p_value, mine.gain, mine.interval)))
     return Round(both, twice, this.before, this.left, 0, 1, share=this.share)
 
 
 def _same_class(term: Term, model: Model) -> bool:
     """Tell whether the model has an effect already that only sharp inputs tell from this one."""
-    return any({term.effect, other.effect} in CLASSES for other in model.terms)
+    return _late(term.effect) and any(_late(t.effect) and t.effect != term.effect for t in model.terms)
+
+
+def _late(name: str | None) -> bool:
+    """Tell whether an effect is a latency."""
+    return name is not None and ALL[name].latency
 
 
 def _choose(searching: Search, now: Solution, this: Round) -> None:
     """Set the winner of a round, or say why there is none."""
     runs = len(this.before)
     if runs < FEWEST_RUNS:
-        this.why_not = f"only {runs} runs are left to choose on: the smallest p-value is {2.0**-runs:.2g}"
+        this.refusal = Refusal(Reason.FEW_RUNS, figure=runs)
         return
-    verdict, scored = this.verdict, this.scored
+    tested, scored = this.tested, this.scored
     able = [
         i for i, s in enumerate(scored)
-        if s.solution is not None and verdict.p_value[i] < ALPHA and verdict.gain[i] >= LEAST_GAIN
+        if s.solution is not None and tested.p_value[i] < ALPHA and tested.gain[i] >= LEAST_GAIN
     ]  # fmt: skip
     if not able:
-        this.why_not = "no candidate gains enough on held-out runs"
+        this.refusal = Refusal(Reason.NO_GAIN)
         return
-    best = max(able, key=lambda i: verdict.gain[i])
-    same = [i for i in able if verdict.gain[i] >= (1.0 - SAME) * verdict.gain[best]]
+    best = max(able, key=lambda i: tested.gain[i])
+    same = [i for i in able if tested.gain[i] >= (1.0 - SAME) * tested.gain[best]]
     same += [
         i for i in able
-        if i not in same and {scored[i].term.label, scored[best].term.label} in CLASSES
-        and verdict.gain[i] >= 0.7 * verdict.gain[best]
+        if i not in same and _late(scored[i].term.effect) and _late(scored[best].term.effect)
+        and tested.gain[i] >= 0.7 * tested.gain[best]
     ]  # fmt: skip
     named = [i for i in same if scored[i].term.effect is not None]
     # What has a name goes before what is only located, where both explain the same.
-    winner = max(named, key=lambda i: verdict.gain[i]) if named else best
+    winner = max(named, key=lambda i: tested.gain[i]) if named else best
     chosen = scored[winner].solution
     assert chosen is not None
     after = judge.ceiling(places.respond(searching.task, chosen))
-    gained, rest = float(verdict.gain[winner]), max(float(after.mean()), 0.0)
+    gained, rest = float(tested.gain[winner]), max(float(after.mean()), 0.0)
     explained = 1.0 - np.exp(-2 * gained)
     this.share = float(explained / max(explained + np.exp(-2 * gained) * (1.0 - np.exp(-2 * rest)), 1e-12))
     this.partial = winner
     if this.share < LEAST_SHARE:
-        this.why_not = f"{scored[winner].term.label} explains only {this.share:.0%} of what can be explained"
+        this.refusal = Refusal(Reason.SMALL_SHARE, figure=this.share)
         return
     if not _free_run_holds(searching, now, chosen):
-        this.why_not = f"{scored[winner].term.label} makes free simulation worse"
+        this.refusal = Refusal(Reason.FREE_SIMULATION)
         return
     this.winner = winner
     this.equivalent = [i for i in same if i != winner]

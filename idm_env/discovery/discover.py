@@ -13,7 +13,7 @@ import numpy as np
 
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
-from idm_env.discovery import checkpoint, judge, places, records, search, summary
+from idm_env.discovery import checkpoint, judge, places, records, search, summary, words
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.decide import Round, decide
@@ -21,31 +21,37 @@ from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import OnProgress, Search
 from idm_env.discovery.solve import NAMES, Solution, Task
-from idm_env.effects import CANDIDATES, IDM, Brakes
+from idm_env.discovery.verdict import Reason, Refusal, Verdict, improves
+from idm_env.effects import ALL, CANDIDATES, IDM, Brakes
 from idm_env.parameters import nearest
 
 
 @dataclass(eq=False)
 class Discovery:
-    """Result: the report's content, the corrected model, and what the pictures are drawn from."""
+    """Result: the report's content, models by the name of their file, and what the pictures are drawn from.
+
+    ``final`` has what was added or, where nothing was, what came nearest; ``judgement`` compares it with ``null``.
+    """
 
     report: dict[str, Any]
-    model: SavedModel
+    models: dict[str, SavedModel]
     records: Records
-    chosen: Model
-    values: np.ndarray
     null: Solution
     final: Solution
     task: Task
     rounds: list[Round]
-    before: judge.Judged | None
-    after: judge.Judged | None
+    judgement: summary.Judgement
     responses: places.Responses
 
     @property
-    def verdict(self) -> str:
-        """``none``, ``named``, ``located``, ``unexplained`` or ``cannot_tell``."""
-        return str(self.report["verdict"])
+    def verdict(self) -> Verdict:
+        """What is concluded."""
+        return Verdict(self.report["verdict"])
+
+    @property
+    def model(self) -> SavedModel:
+        """The model that predicts best of those compared on runs kept back."""
+        return self.models["model.yaml"]
 
 
 def discover(
@@ -86,6 +92,9 @@ def discover(
     prepared = prepare(trajectories, by, place)
     names, refused = terms.testable(prepared, names)
     names = [n for n in names if n not in known]
+    if not names:
+        why = "; ".join(f"{name}: {reason}" for name, reason in refused.items()) or "all of them are known"
+        raise ValueError(f"no candidate can be tried on these data ({why}). Name others, or leave out --effects.")
     fit_runs, kept_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
     if out is not None:
@@ -97,7 +106,7 @@ def discover(
     progress("calibration", "idm", 0, 1)
     theta, calibrated = calibrate(prepared.of_runs(fit_runs), by, task.prior.centre)
     progress("null", "idm", 0, 1)
-    base = Model(tuple(_known_terms(prepared, known, trajectories)))
+    base = Model(tuple(_known_term(prepared, name) for name in known))
     null = searching.null(base, theta)
     null, steps, rounds = decide(searching, null, seed)
     saved.done()
@@ -113,9 +122,10 @@ def discover(
         refused,
         by,
         seed,
-        names,
     )
-    discovery.report["calibration"] = calibrated
+    report = discovery.report
+    report["calibration"] = calibrated
+    report["details"] += words.cautions(report["data"]["at_bounds"], calibrated["groups"], calibrated["converged"])
     return discovery
 
 
@@ -127,8 +137,9 @@ def _names(effects: Sequence[str] | None, known: Sequence[str]) -> list[str]:
         if name not in CANDIDATES:
             raise ValueError(f"effect '{name}' is no candidate.{nearest(name, CANDIDATES)}")
     for name in known:
-        if name != "grade":
-            raise ValueError(f"known effect '{name}' cannot be read from data; only 'grade' can (column grade).")
+        if not ALL[name].column:
+            able = ", ".join(f"'{n}' (column {ALL[n].column})" for n in CANDIDATES if ALL[n].column)
+            raise ValueError(f"known effect '{name}' cannot be read from data; only these can: {able}.")
     return list(effects or CANDIDATES)
 
 
@@ -162,17 +173,18 @@ def _split(prepared: Records, share: float, seed: int) -> tuple[list[str], list[
     return [r for r in runs if r not in kept], [r for r in runs if r in kept]
 
 
-def _known_terms(prepared: Records, known: Sequence[str], trajectories: Trajectories) -> list[Term]:
-    if "grade" not in known:
-        return []
-    if "grade" not in trajectories.table.columns:
-        raise ValueError("known effect 'grade' needs a column grade (rise over run), and the data have none.")
+def _known_term(prepared: Records, name: str) -> Term:
+    """Return the effect with its profile over places as the file gives it."""
+    column = ALL[name].column
     # Where a record does not tell, the profile of the others is taken for the same place.
-    told = [e for e in prepared.episodes if "grade" in e.columns]
+    told = [e for e in prepared.episodes if column in e.columns]
     if not told:
-        raise ValueError("known effect 'grade' needs a column grade without holes, and no record has it. Fill it in.")
+        raise ValueError(
+            f"known effect '{name}' needs a column {column} (rise over run) without holes, and no record has it. "
+            "Fill it in."
+        )
     place = np.concatenate([e.place_m for e in told])
-    slope = np.concatenate([e.columns["grade"] for e in told])
+    slope = np.concatenate([e.columns[column] for e in told])
     period = prepared.period
     place = np.mod(place, period) if period else place
     low, high = (0.0, period) if period else (float(place.min()), float(place.max()))
@@ -182,7 +194,7 @@ def _known_terms(prepared: Records, known: Sequence[str], trajectories: Trajecto
     total = np.bincount(index, slope, minlength=count)
     number = np.bincount(index, minlength=count)
     profile = np.interp(np.arange(count), np.flatnonzero(number), total[number > 0] / number[number > 0])
-    return [terms.known_grade(low, distance, profile.tolist(), period)]
+    return terms.known_profile(name, low, distance, profile.tolist(), period)
 
 
 # -- after the search ------------------------------------------------------------------------------------------------
@@ -190,19 +202,17 @@ def _known_terms(prepared: Records, known: Sequence[str], trajectories: Trajecto
 
 def _finish(
     trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], searching: Search,
-    null: Solution, steps: list[Solution], rounds: list[Round], refused: dict[str, str], by: str,
-    seed: int, names: list[str],
+    null: Solution, steps: list[Solution], rounds: list[Round], refused: dict[str, str], by: str, seed: int,
 ) -> Discovery:  # fmt: skip
     adapt = by == "driver"
-    base = len(null.model.terms)
     fit_records = prepared.of_runs(fit_runs)
     kept = prepared.of_runs(kept_runs) if kept_runs else None
-    final = null
+    final, refusal = null, rounds[0].refusal
     if kept is not None:
         # The lockbox is looked into once for every addition, and only to end there.
         for s in steps:
             if judge.confirmed(kept, searching.task, final, s) <= 0:
-                rounds[-1].why_not = "the lockbox does not confirm the finding"
+                refusal = Refusal(Reason.LOCKBOX)
                 break
             final = s
 
@@ -212,33 +222,31 @@ def _finish(
             return theta, None
         return theta, judge.judge(kept, s.model, s.values, s.prior, None if adapt else theta.theta, adapt)
 
+    # Where nothing was added, what came nearest is compared with the null and says what it would have done.
+    added = final is not null
+    nearest_one = None if kept is None or rounds[0].partial is None else rounds[0].scored[rounds[0].partial].solution
+    compared = final if added else nearest_one
     first, before = judged(null)
-    last, after = (first, before) if final is null else judged(final)
-    thetas = [first, last]
-    partial = None
-    if kept_runs and len(final.model.terms) == base and rounds[0].partial is not None:
-        best = rounds[0].scored[rounds[0].partial].solution
-        assert best is not None
-        _, partial = judged(best)
-    responses = places.respond(searching.task, final)
+    last, after = (first, before) if compared is None else judged(compared)
+    judgement = summary.Judgement(null, compared, added, refusal, before, after, seed)
+    if added and judgement.errors and not improves(judgement.errors):
+        judgement = replace(judgement, added=False, refusal=Refusal(Reason.HELD_OUT))
     report = summary.report(
-        trajectories, prepared, fit_runs, kept_runs, searching.task, null, final, rounds, refused, before, after,
-        partial, thetas, by, seed, names,
-    )  # fmt: skip
+        trajectories, prepared, fit_runs, kept_runs, searching.task, judgement, rounds, refused, [first, last], by
+    )
+    shown = null if compared is None else compared
+    pair = [corrected(prepared, s, theta.theta, by) for s, theta in ((null, first), (shown, last))]
+    models = dict(zip(judgement.names(), pair, strict=False))
     return Discovery(
-        report, corrected(prepared, final, thetas[1].theta, by), prepared, final.model, final.values, null, final,
-        searching.task, rounds, before, after, responses,
-    )  # fmt: skip
-
-
-ORDER = ("memory", "speed_zone", "regime_shift", "driver_curve", "speed_dependent_gap")
+        report, models, prepared, null, shown, searching.task, rounds, judgement, places.respond(searching.task, shown)
+    )
 
 
 def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:
     """Return the corrected model as it is saved: effects, shared parameters, the median driver and every driver."""
     added, numbers = terms.effects_of(final.model, final.values)
     # Effects that adapt a driver are chained in the order of the compiled twin.
-    added.sort(key=lambda e: ORDER.index(e.kind) if e.kind in ORDER else 0)
+    added.sort(key=lambda e: e.rank if e.hook == "adapt" else 0)
     seen = np.unique(prepared.group)
     middle = np.exp(np.median(theta[seen], axis=0))
 

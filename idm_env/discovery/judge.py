@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,28 +21,69 @@ CORRELATION_S = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Errors of every record's free simulation and what was simulated: gap [R, samples] beside the measured one."""
+    """Errors of every row's free simulation [R, samples], what was simulated, and errors 5 s ahead of windows [W].
+
+    ``gap`` and ``speed`` are the simulated ones, ``scored`` the samples that count; a driver's record may be cut into
+    several rows, and a driver may have several records: figures per driver are those of ``followers``.
+    """
 
     rows: Rows
     theta: np.ndarray
     gap: np.ndarray
+    speed: np.ndarray
     scored: np.ndarray
-    gap_rmse: np.ndarray
-    speed_rmse: np.ndarray
-    horizon_rmse: float
+    ahead: np.ndarray
+    ahead_record: np.ndarray
+
+    @cached_property
+    def gap_error(self) -> np.ndarray:
+        """Simulated less measured gap (m) [R, samples], 0 where it does not count."""
+        records = self.rows.records
+        return np.where(self.scored, np.clip(self.gap - records.gap[self.rows.samples], -200, 200), 0.0)
+
+    @cached_property
+    def followers(self) -> tuple[tuple[str, str], ...]:
+        """Run and vehicle of every driver, once each."""
+        return tuple(dict.fromkeys((e.run_id, e.vehicle_id) for e in self.rows.records.episodes))
+
+    @cached_property
+    def follower(self) -> np.ndarray:
+        """Number in ``followers`` of every record."""
+        number = {key: i for i, key in enumerate(self.followers)}
+        return np.array([number[e.run_id, e.vehicle_id] for e in self.rows.records.episodes])
+
+    @cached_property
+    def squares(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Sums of squares and numbers of samples [followers] of every error."""
+        speed_error = np.where(self.scored, self.speed - self.rows.records.speed[self.rows.samples], 0.0)
+        of_row = self.follower[self.rows.record]
+        samples = self._summed(of_row, self.scored.sum(1))
+        of_window = self.follower[self.ahead_record]
+        return {
+            "gap_rmse_m": (self._summed(of_row, (self.gap_error**2).sum(1)), samples),
+            "horizon_rmse_m": (
+                self._summed(of_window, self.ahead**2), self._summed(of_window, np.ones(len(of_window))),
+            ),
+            "speed_rmse_mps": (self._summed(of_row, (speed_error**2).sum(1)), samples),
+        }  # fmt: skip
+
+    def _summed(self, of: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return np.bincount(of, values, minlength=len(self.followers)).astype(float)
+
+    @property
+    def gap_rmse(self) -> np.ndarray:
+        """Gap RMSE of every follower (m), NaN where nothing was scored."""
+        square, count = self.squares["gap_rmse_m"]
+        return np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.nan)
 
     def summary(self) -> dict[str, float]:
         """Return the four errors of the report; the pooled ones weigh every scored sample alike."""
-        samples = self.scored.sum(1)
-        ok = samples > 0
-        pooled = float(np.sqrt((self.gap_rmse[ok] ** 2 * samples[ok]).sum() / samples[ok].sum()))
-        speed = float(np.sqrt((self.speed_rmse[ok] ** 2 * samples[ok]).sum() / samples[ok].sum()))
-        return {
-            "gap_rmse_m": pooled,
-            "gap_rmse_median_driver_m": float(np.median(self.gap_rmse[ok])),
-            "horizon_rmse_m": self.horizon_rmse,
-            "speed_rmse_mps": speed,
+        pooled = {
+            key: float(np.sqrt(square.sum() / count.sum())) if count.sum() else float("nan")
+            for key, (square, count) in self.squares.items()
         }
+        median = float(np.nanmedian(self.gap_rmse)) if np.isfinite(self.gap_rmse).any() else float("nan")
+        return pooled | {"gap_rmse_median_driver_m": median}
 
 
 def calibrate(
@@ -132,18 +174,11 @@ def judge(
     empty = np.zeros((1, 0))
     task = Task(rows, None, prior, np.ones(len(rows)))
     gap, speed = (x[0] for x in task.predict(theta[None], frozen, empty))
-    at = rows.samples
-    count = np.maximum(scored.sum(1), 1)
-    gap_error = np.where(scored, np.clip(gap - records.gap[at], -200, 200), 0.0)
-    speed_error = np.where(scored, speed - records.speed[at], 0.0)
     short = windows(records)
     near = Task(short, None, prior, np.ones(len(short)))
     ahead = near.errors(theta[None], frozen, empty)[0][:, -1]
     odd = short.block % 2 == 1 if adapt else np.ones(len(short), bool)
-    return Judged(
-        rows, theta, gap, scored, np.sqrt((gap_error**2).sum(1) / count), np.sqrt((speed_error**2).sum(1) / count),
-        float(np.sqrt(np.mean(ahead[odd] ** 2))) if odd.any() else float("nan"),
-    )  # fmt: skip
+    return Judged(rows, theta, gap, speed, scored, ahead[odd], short.record[odd])
 
 
 def floor(records: Records) -> dict[str, float]:

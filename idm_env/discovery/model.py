@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -116,7 +117,8 @@ class Model:
     @property
     def lead(self) -> float:
         """Seconds before a window in which memories are wound up on the measured record."""
-        return 2.0 if {"lag", "action_point"} & {t.effect for t in self.terms} else 0.1
+        named = [catalogue.ALL[t.effect] for t in self.terms if t.effect is not None]
+        return max((effect.wind_up_s for effect in named), default=Effect.wind_up_s)
 
 
 class Frozen(Model):
@@ -141,71 +143,46 @@ class Frozen(Model):
 EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed": 0.2, "lead_accel": 0.1}
 """Half-width over which an interval of a located effect sets in."""
 
-_BOUNDS = {
-    # Wider than plausible where the declaration is narrow, narrower where IDM would collide.
-    "delay.delay": (0.0, 1.2), "lag.lag": (0.0, 2.0), "power_limit.power": (2.0, 60.0),
-}  # fmt: skip
-STARTS: dict[str, tuple[tuple[float, ...], ...]] = {
-    "delay": ((0.3,), (0.8,)), "lag": ((0.3,), (0.8,)), "second_leader": ((0.1,),), "leader_acceleration": ((0.1,),),
-    "brake_light": ((0.1,),), "asymmetry": ((0.05,),), "power_limit": ((10.0,), (18.0,)), "drag": ((1e-4,),),
-    "speed_dependent_gap": ((0.5,),), "memory": ((0.5, 30.0), (0.5, 150.0)), "follower": ((0.03,),),
-    "dead_zone": ((0.001,), (0.004,)), "action_point": ((0.15,), (0.4,)), "lateral": ((0.03,),), "gap_bias": ((0.2,),),
-}  # fmt: skip
-"""Effects that need no place, and from which values of their parameters a search starts."""
-
 
 def simple(name: str) -> Term:
-    """Return the term of an effect of the catalogue that needs no place."""
-    declared = catalogue.ALL[name]().parameters
-    parameters = tuple(_narrowed(f"{name}.{p.name}", p) for p in declared)
-    return Term(name, name, parameters, STARTS[name], what=_WHAT.get(name, "acceleration"), coordinate="state")
+    """Return the term of an effect of the catalogue that needs no place; one start for every mix of its parameters'."""
+    cls = catalogue.ALL[name]
+    parameters = tuple(_searched(p) for p in cls().parameters)
+    starts = tuple(product(*(p.starts for p in parameters)))
+    return Term(name, name, parameters, starts, what=cls.changes, coordinate="state")
 
 
-_WHAT = {
-    "delay": "response", "lag": "response", "memory": "time_gap", "dead_zone": "closing_speed", "gap_bias": "gap",
-    "action_point": "response", "speed_dependent_gap": "desired_gap",
-}  # fmt: skip
-
-
-def _narrowed(full: str, p: Parameter) -> Parameter:
-    if full not in _BOUNDS:
+def _searched(p: Parameter) -> Parameter:
+    """Return the declaration with the bounds of the search."""
+    if p.searched is None:
         return p
-    low, high = _BOUNDS[full]
+    low, high = p.searched
     return replace(p, low=low, high=high, default=min(max(p.default, low), high))
 
 
-def speed_zone(begin: float, end: float, factor: float, period: float = 0.0) -> Term:
-    """Return one factor on v0 over one interval of positions."""
-    effect = catalogue.SpeedZone()
-    p = effect.parameters
+def placed(name: str, *values: float, period: float = 0.0) -> Term:
+    """Return the term of an effect that acts in one interval of places or from one moment on: strength, then places."""
+    cls = catalogue.ALL[name]
+    coordinate = {"interval": "position", "step": "time"}[cls.sought]
+    return Term(name, name, cls().parameters, (values,), what=cls.changes, coordinate=coordinate, period=period)
+
+
+def unknown_profile(name: str, first: float, distance: float, count: int, period: float) -> Term:
+    """Return an effect whose profile over position is not known: one parameter at every knot."""
+    declared = catalogue.make(name, knots=tuple(first + distance * i for i in range(count))).parameters
+    parameters = tuple(replace(p, default=0.0) for p in declared)
     return Term(
-        "speed_zone", "speed_zone", p, ((factor, begin, end),), what="desired_speed", coordinate="position",
-        period=period,
-    )  # fmt: skip
-
-
-def regime_shift(time: float, strength: float) -> Term:
-    """Return one step of T in time."""
-    return Term(
-        "regime_shift", "regime_shift", catalogue.RegimeShift().parameters, ((strength, time),),
-        what="time_gap", coordinate="time",
-    )  # fmt: skip
-
-
-def grade(first: float, distance: float, count: int, period: float) -> Term:
-    """Return an unknown profile of slopes over position."""
-    parameters = tuple(Parameter(f"slope_{i}", f"θ{i}", "1", 0.0, -0.2, 0.2, null=0.0) for i in range(count))
-    return Term(
-        "grade", "grade", parameters, ((0.0,) * count,), what="slope", coordinate="position", form=twin.CURVE,
+        name, name, parameters, ((0.0,) * count,), what="slope", coordinate="position", form=twin.CURVE,
         knots=(first, distance, count), period=period, smoothness=0.03,
     )  # fmt: skip
 
 
-def known_grade(first: float, distance: float, profile: Sequence[float], period: float) -> Term:
-    """Return a known profile of slopes of which some share acts."""
-    share = (Parameter("share", "", "1", 0.5, -2.0, 3.0, null=0.0),)
+def known_profile(name: str, first: float, distance: float, profile: Sequence[float], period: float) -> Term:
+    """Return an effect whose profile over position is known, and of which some share acts."""
+    places = tuple(first + distance * i for i in range(len(profile)))
+    share = tuple(replace(p, default=0.5) for p in catalogue.make(name, knots=places, profile=profile).parameters)
     return Term(
-        "grade", "grade", share, ((0.2,),), what="share", coordinate="position", form=twin.CURVE,
+        name, name, share, ((0.2,),), what="share", coordinate="position", form=twin.CURVE,
         knots=(first, distance, len(profile)), period=period, profile=tuple(profile),
     )  # fmt: skip
 
@@ -240,19 +217,19 @@ def curve(
     )  # fmt: skip
 
 
+NEIGHBOURS = {"second leader": "second", "vehicle behind": "behind", "vehicle in an adjacent lane": "beside"}
+"""Column of the records that says when a neighbour is there."""
+
+
 def testable(records: Records, names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     """Return which effects the data can show at all, and why others cannot be tested."""
-    share = {
-        name: float(records.signals[:, twin.COLUMNS.index(column)].mean())
-        for name, column in (("second_leader", "second_present"), ("follower", "behind_present"),
-                             ("lateral", "beside_present"))
-    }  # fmt: skip
-    reasons = {
-        "second_leader": "no second leader is measured",
-        "follower": "no vehicle behind is measured",
-        "lateral": "no vehicle in an adjacent lane is measured",
-    }
-    refused = {name: reasons[name] for name in names if share.get(name, 1.0) < 0.02}
+    refused = {}
+    for name in names:
+        beyond = catalogue.ALL[name].beyond
+        if beyond in NEIGHBOURS:
+            column = twin.COLUMNS.index(f"{NEIGHBOURS[beyond]}_present")
+            if records.signals[:, column].mean() < 0.02:
+                refused[name] = f"no {beyond} is measured"
     return [name for name in names if name not in refused], refused
 
 
@@ -274,8 +251,7 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
     names = [p.name for p in term.parameters]
     if term.form == twin.NONE:
         assert term.effect is not None
-        lap = {"period": term.period} if term.effect == "speed_zone" and term.period else {}
-        return [(catalogue.make(term.effect, **lap), dict(zip(names, map(float, values), strict=True)))]
+        return [(_made(term), dict(zip(names, map(float, values), strict=True)))]
     period = term.period or None
     if term.form == twin.INTERVAL:
         amount, begin, end = values
@@ -288,12 +264,9 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
         first, distance, count = term.knots
         knots = tuple(float(first + distance * i) for i in range(count))
         heights = list(values)
-    if term.what in ("slope", "share"):
-        if term.profile is not None:
-            effect = catalogue.Grade(knots=knots, profile=term.profile, period=period)
-            return [(effect, {"share": float(values[0])})]
-        effect = catalogue.Grade(knots=knots, period=period)
-        return [(effect, {f"slope_{i}": float(h) for i, h in enumerate(heights)})]
+    if term.effect is not None:
+        numbers = values if term.profile is not None else heights
+        return [(_made(term, knots), dict(zip(names, map(float, numbers), strict=True)))]
     given = {f"knot_{i}": float(h) for i, h in enumerate(heights)}
     if term.what == "acceleration":
         return [(catalogue.Curve(feature=term.coordinate, knots=knots, period=period), given)]
@@ -302,3 +275,14 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
         (catalogue.DriverCurve(target=t, feature=term.coordinate, knots=knots, period=period), given)  # type: ignore[arg-type]
         for t in targets
     ]
+
+
+def _made(term: Term, knots: tuple[float, ...] | None = None) -> Effect:
+    """Return the effect of a named term: on its lap, and with the knots and the profile of its curve."""
+    assert term.effect is not None
+    choices: dict[str, object] = {}
+    if knots is not None:
+        choices |= {"knots": knots, "profile": term.profile}
+    if term.period:
+        choices["period"] = term.period
+    return catalogue.make(term.effect, **choices)

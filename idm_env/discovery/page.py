@@ -1,4 +1,4 @@
-"""The page for people: what is missing, how sure that is, and everything that was tried."""
+"""The page for people: what is missing, what it does for predictions, how sure that is, and everything tried."""
 
 from __future__ import annotations
 
@@ -6,45 +6,60 @@ from collections.abc import Iterator
 from typing import Any
 
 from idm_env import report as pages
-from idm_env.discovery import pictures
+from idm_env.discovery import pictures, words
 from idm_env.discovery.decide import ALPHA, LEAST_GAIN, LEAST_SHARE
 from idm_env.discovery.discover import Discovery
+from idm_env.discovery.verdict import Verdict
+from idm_env.discovery.words import percent as change
+from idm_env.effects import IDM
 from idm_env.report import Block
 
-ERRORS = {
-    "gap_rmse_m": "gap RMSE, free simulation, pooled (m)",
-    "gap_rmse_median_driver_m": "gap RMSE, median driver (m)",
-    "horizon_rmse_m": "gap RMSE 5 s ahead (m)",
-    "speed_rmse_mps": "speed RMSE (m/s)",
+TITLES = {
+    Verdict.NAMED: "What IDM lacks here has a name",
+    Verdict.LOCATED: "What IDM lacks here has a place, but no name",
+    Verdict.UNEXPLAINED: "IDM lacks something here that nothing tried explains",
+    Verdict.NONE: "Nothing was found that IDM lacks here",
+    Verdict.CANNOT_TELL: "These data cannot tell what IDM lacks",
+}
+MEANING_OF_ERRORS = {
+    "gap in free simulation": "every follower is simulated alone from its first measured sample on, behind its "
+    "measured leader; root mean square of simulated less measured gap over all scored samples of all followers",
+    "the same, median follower": "half of the followers err by less",
+    "gap 5 s ahead": "the simulation starts anew on the measured state every 5 s; root mean square of the gap's error "
+    "at the end of the 5 s",
+    "speed in free simulation": "as the first, of the speed",
+    "scored": "every other stretch of time (up to 30 s); the stretches between fit the driver's own parameters",
+    "noise of measurement": "what the noise in the file alone would leave of a perfect model",
 }
 DATA = {
-    "rows": "rows",
-    "runs": "runs",
-    "drivers": "drivers (groups of parameters)",
-    "vehicle_seconds": "vehicle seconds",
-    "windows": "5 s windows that were fitted",
-    "runs_to_choose_on": "runs to choose on",
-    "smallest_p_value": "smallest possible p-value",
-    "gap_noise_m": "white noise of the gap (m)",
-    "residual_autocorrelation": "autocorrelation of the whitened residual",
-    "share_following": "share of time following",
-    "share_approaching": "share of time approaching",
-    "share_free": "share of time free",
-    "share_standing": "share of time standing",
-    "lap_m": "lap (m)",
+    "rows": ("rows", "lines of the file that were used"),
+    "runs": ("runs", "recordings that share nothing but the road"),
+    "drivers": ("groups of parameters", "drivers, or what --by names, with IDM parameters of their own"),
+    "vehicle_seconds": ("vehicle seconds", "time behind a leader, all followers added"),
+    "windows": ("5 s windows", "predictions that candidates were fitted to"),
+    "runs_to_choose_on": ("runs to choose on", "all but those kept back"),
+    "smallest_p_value": ("smallest possible p-value", "0.5 to the power of the runs to choose on"),
+    "gap_noise_m": ("white noise of the gap (m)", "from third differences: slow drift does not show in it"),
+    "residual_autocorrelation": ("autocorrelation of the whitened residual", "0: the model of noise is right"),
+    "share_following": ("share of time following", "behind a leader, closing by at most 1 m/s"),
+    "share_approaching": ("share of time approaching", "closing by more than 1 m/s"),
+    "share_free": ("share of time free", "gap above three seconds"),
+    "share_standing": ("share of time standing", "below 0.3 m/s"),
+    "lap_m": ("lap (m)", "length after which places repeat"),
 }
+"""Name and meaning of every figure of the data's card."""
 
 
 def number(x: object, digits: int = 3) -> str:
     """Return a number with so many significant digits, a dash for what is not there."""
     if x is None:
         return "–"
-    return f"{x:.{digits}g}" if isinstance(x, float) else str(x)
+    return words.number(x, digits) if isinstance(x, float) else str(x)
 
 
 def percent(x: float | None, digits: int = 0) -> str:
     """Return a share in percent."""
-    return "–" if x is None else f"{100 * x:.{digits}f} %"
+    return "–" if x is None else f"{100 * x:.{digits}f} %".replace("-", "−")
 
 
 def _between(low: float | None, high: float | None) -> str:
@@ -52,16 +67,20 @@ def _between(low: float | None, high: float | None) -> str:
 
 
 def blocks(d: Discovery) -> Iterator[Block]:
-    """Return the pieces of the page."""
+    """Return the pieces of the page: what fits on a first screen, then everything else."""
     r = d.report
-    yield pages.note(
-        f"{r['data']['source']} · {r['data']['drivers']} drivers in {r['data']['runs']} runs · "
-        f"{len(r['error']['held_out_runs'])} runs kept for the final check · seed {r['seed']}"
-    )
     yield pages.lead(r["sentence"])
-    yield from _errors(r)
+    yield from _lights(r)
+    yield from _first_picture(d)
+    yield pages.heading("How sure is that")
+    yield pages.bullets(r["details"])
+    yield pages.note(
+        f"{r['data']['source']} · {r['data']['drivers']} groups of parameters in {r['data']['runs']} runs · "
+        f"{len(r['error']['held_out_runs'])} runs kept back for the final check · seed {r['seed']}"
+    )
+    yield from _errors(d)
     yield from _added(r)
-    yield from _moved(r)
+    yield from _moved(d)
     for title, figure in pictures.all_of(d):
         yield pages.heading(title)
         yield figure
@@ -70,40 +89,73 @@ def blocks(d: Discovery) -> Iterator[Block]:
     yield pages.note(" · ".join(f"{k} {v}" for k, v in r["versions"].items()))
 
 
-def _errors(r: dict[str, Any]) -> Iterator[Block]:
-    yield pages.heading("Error on runs that neither fitted nor chose anything")
-    before, after, floor = (r["error"][k] for k in ("before", "after", "floor"))
-    if before is None:
-        yield pages.text("No run could be kept for a final check.")
+def _lights(r: dict[str, Any]) -> Iterator[Block]:
+    if not r["helps"]:
+        yield pages.note("No second model came near enough to be compared with IDM on runs kept back.")
         return
-    yield pages.table(
-        [
-            {
-                "": text,
-                "before": number(before[key]),
-                "after": number(after[key]),
-                "after / before": number(after[key] / before[key]) if before[key] and after[key] else "–",
-                "noise of measurement": number(floor[key]),
-            }
-            for key, text in ERRORS.items()
-        ]
+    yield pages.lights(
+        (
+            words.ERRORS[key][0].capitalize(),
+            h["verdict"],
+            f"{number(h['before'])} → {number(h['after'])} {h['unit']}, {change(h['ratio'])}"
+            + ("" if h["high"] is None else f" ({change(h['low'])} to {change(h['high'])})"),
+        )
+        for key, h in r["helps"].items()
     )
+
+
+def _first_picture(d: Discovery) -> Iterator[Block]:
+    figure = pictures.first_screen(d)
+    if figure is None:
+        yield pages.note("No run could be kept back for a final check.")
+        return
+    follower = pictures.typical(d)
+    assert follower is not None and d.judgement.before is not None
+    run, vehicle = d.judgement.before.followers[follower]
+    yield pages.picture(
+        figure,
+        f"The follower kept back whose error with IDM is the median one: run {run}, vehicle {vehicle}. Below: "
+        "simulated less measured gap where it is scored (shaded, as in the table).",
+        pictures.first_screen(d, (4.2, 4.6)),
+    )
+
+
+def _errors(d: Discovery) -> Iterator[Block]:
+    r, judgement = d.report, d.judgement
+    yield pages.heading("Errors on runs that neither fitted nor chose anything")
+    if judgement.before is None:
+        yield pages.text("No run could be kept back for a final check.")
+        return
+    results = {name: judged.summary() for name, judged, *_ in pictures.named(d)}
+    rows = []
+    for key, (name, unit) in words.ERRORS.items():
+        row = {"error": f"{name} ({unit})"} | {model: number(values[key]) for model, values in results.items()}
+        help_of = r["helps"].get(key)
+        if r["helps"]:
+            row["change"] = change(help_of["ratio"]) if help_of else _change([v[key] for v in results.values()])
+            known = help_of is not None and help_of["high"] is not None
+            row["95 % interval"] = f"{change(help_of['low'])} … {change(help_of['high'])}" if known else "–"
+            row["verdict"] = help_of["verdict"] if help_of else "–"
+        rows.append(row | {"noise of measurement": number(r["error"]["floor"].get(key))})
+    yield pages.table(rows)
+    yield pages.terms(MEANING_OF_ERRORS | ({"interval": r["interval"]} if r["interval"] else {}))
+    files = "; ".join(f"{file} is {name}" for file, name in r["models"].items())
+    best = " model.yaml predicts best: the smaller geometric mean of the three errors." if r["helps"] else ""
     yield pages.note(
-        "Every driver is simulated alone behind its measured leader. Before: the Intelligent Driver Model; after: with "
-        "what was added below; both calibrated the same way. Held-out runs: "
+        f"Models: {files}.{best} Both are calibrated the same way. Runs kept back: "
         + ", ".join(pages.shortened(r["error"]["held_out_runs"], 20))
     )
     partial = r["partial"]
     if partial:
-        values = ", ".join(f"{k} {number(v)}" for k, v in partial["parameters"].items())
-        moves = ", ".join(
-            f"{ERRORS[k]}: {number(before[k])} → {number(partial['after'][k])}"
-            for k in ("gap_rmse_m", "gap_rmse_median_driver_m", "horizon_rmse_m")
-        )
         yield pages.note(
-            f"Best partial explanation, not added: {partial['effect']} ({values}). {moves}. "
-            f"{percent(partial['share_of_drivers_improved'])} of held-out drivers improve."
+            f"Not added: {partial['effect']}: "
+            + ", and ".join(t["clause"] for t in partial["terms"])
+            + f". {percent(partial['share_of_drivers_improved'])} of the followers kept back improve with it."
         )
+
+
+def _change(values: list[float]) -> str:
+    return change(values[1] / values[0]) if len(values) == 2 and values[0] else "–"
 
 
 def _added(r: dict[str, Any]) -> Iterator[Block]:
@@ -112,31 +164,45 @@ def _added(r: dict[str, Any]) -> Iterator[Block]:
         rows = []
         for f in r["found"]:
             shown = list(f["parameters"].items())
-            for i, (name, p) in enumerate(shown if len(shown) <= 6 else shown[:3]):
+            for i, (name, p) in enumerate(shown if len(shown) <= words.MANY else shown[:3]):
                 unit = "" if p["unit"] == "1" else f" {p['unit']}"
                 rows.append({
-                    "effect": (f["effect"] or f["label"]) if i == 0 else "",
-                    "parameter": name,
+                    "effect": f["title"] if i == 0 else "",
+                    "equation": f["equation"] if i == 0 else "",
+                    "parameter": f"{name.replace('_', ' ')} {p['symbol']}",
                     "estimate": number(p["estimate"]) + unit,
-                    "95 % interval": _between(p["low"], p["high"]),
+                    "95 % interval": _between(p["low"], p["high"]) + unit,
                     "p": number(f["p_value"], 2) if i == 0 else "",
                     "held-out gain": percent(f["held_out_gain"], 1) if i == 0 else "",
                     "explained share": percent(f["explained_share"]) if i == 0 else "",
                 })  # fmt: skip
         yield pages.table(rows)
-        yield pages.note("Of a curve only the first knots are listed; all are in report.json and in the picture below.")
+        yield pages.terms(TERMS_OF_TESTS | {
+            "explained share": "of what any smooth function of the state explains, how much this effect explains",
+            "estimate": "shared by all drivers; of a curve only the first knots are listed, all are in report.json and "
+            "in the picture below",
+        })  # fmt: skip
     if r["known"]:
         yield pages.note(
-            "Part of the null (given, or a latency below one step of the data): "
+            "Part of both models (given, or a latency below one step of the data): "
             + "; ".join(
-                f"{k['effect']}.{k['parameter']} = {number(k['estimate'])} ({_between(k['low'], k['high'])})"
+                f"{words.plain(k['effect'])}, {k['parameter']} = {number(k['estimate'])} "
+                f"({_between(k['low'], k['high'])})"
                 for k in r["known"]
             )
         )
 
 
-def _moved(r: dict[str, Any]) -> Iterator[Block]:
-    yield pages.heading("How calibrated parameters moved")
+TERMS_OF_TESTS = {
+    "held-out gain": "fall of the 5 s prediction error (in units of its noise) on runs that the candidate's parameters "
+    "have not seen",
+    "p": "chance of such a gain of any candidate of the whole list, were there none (sign flips of runs)",
+}
+
+
+def _moved(d: Discovery) -> Iterator[Block]:
+    r = d.report
+    yield pages.heading("How the drivers' own parameters moved")
     start = r.get("calibration")
     if start:
         yield pages.note(
@@ -144,24 +210,35 @@ def _moved(r: dict[str, Any]) -> Iterator[Block]:
             f"through the simulator: {start['episodes']} windows of the fitting runs, mean gap RMSE "
             f"{number(start['gap_rmse_m'])} m, {start['converged']} of {start['groups']} groups converged."
         )
+    declared = {p.name: p for p in IDM.declared}
     rows = []
     for p in r["parameters"]:
-        row = {"parameter": p["parameter"]}
-        for when in ("before", "after"):
+        own = declared[p["parameter"]]
+        row = {"parameter": f"{own.name.replace('_', ' ')} {own.symbol} ({own.unit})"}
+        for when, model in zip(("before", "after"), d.judgement.titles, strict=False):
             row |= {
-                f"{when}: median": number(p[when]["median"]),
-                f"{when}: 10 … 90 % of drivers": _between(p[when]["low"], p[when]["high"]),
-                f"{when}: standard error": number(p[when]["standard_error"], 2),
+                f"{model}: median": number(p[when]["median"]),
+                "10 … 90 % of drivers" if when == "before" else "10 … 90 % ": _between(p[when]["low"], p[when]["high"]),
+                "standard error" if when == "before" else "standard error ": number(p[when]["standard_error"], 2),
             }
         rows.append(row)
     yield pages.table(rows)
+    yield pages.terms({
+        "median": "of the drivers' own values",
+        "10 … 90 % of drivers": "how much drivers differ",
+        "standard error": "how well one driver's value is known, median over drivers",
+    })  # fmt: skip
 
 
 def _data(r: dict[str, Any]) -> Iterator[Block]:
     yield pages.heading("The data")
-    rows = [{"": text, " ": number(r["data"][key])} for key, text in DATA.items()]
-    bounds = ", ".join(f"{k} {n}" for k, n in r["data"]["at_bounds"].items())
-    yield pages.table([*rows, {"": "groups with a parameter at its bound", " ": bounds}])
+    rows = [{"figure": name, "value": number(r["data"][key]), "meaning": text} for key, (name, text) in DATA.items()]
+    bounds = ", ".join(f"{k.replace('_', ' ')} {n}" for k, n in r["data"]["at_bounds"].items())
+    at_bounds = {
+        "figure": "groups with a parameter at its bound", "value": bounds,
+        "meaning": f"of {r['data']['drivers']}: many mean that the data do not tell it, or that IDM lacks something",
+    }  # fmt: skip
+    yield pages.table([*rows, at_bounds])
     if r["data"]["repairs"]:
         yield pages.note("Repaired or left out on loading: " + " ".join(x["text"] for x in r["data"]["repairs"]))
 
@@ -170,17 +247,24 @@ def _tried(r: dict[str, Any]) -> Iterator[Block]:
     yield pages.heading("Everything that was tried")
     yield pages.table([
         {
-            "candidate": c["effect"],
+            "candidate": words.plain(c["effect"]),
             "round": str(c["round"]),
             "held-out gain": percent(c["held_out_gain"], 2),
             "95 % interval": "–" if None in c["interval"] else " … ".join(percent(x, 2) for x in c["interval"]),
-            "p (whole list)": number(c["p_value"], 2),
+            "p": number(c["p_value"], 2),
             "absorbed": percent(c["absorbed_share"]),
-            "parameters": ", ".join(f"{k} {number(v)}" for k, v in c["parameters"].items()),
-            " ": c["note"],
+            "parameters": ", ".join(
+                f"{k.replace('_', ' ')} {words.amount(v, c['units'][k])}" for k, v in c["parameters"].items()
+            ),
+            "note": c["note"],
         }
         for c in r["candidates"]
     ])  # fmt: skip
+    yield pages.terms(TERMS_OF_TESTS | {
+        "round": "0: could not be tested; every effect that was added begins a new round",
+        "95 % interval": "of the gain, over runs",
+        "absorbed": "share of the candidate's response that calibrated drivers' own parameters take up",
+    })  # fmt: skip
     yield pages.heading("How this was decided")
     yield pages.text(
         f"The drivers' own parameters and every candidate are fitted to predictions {number(r['data']['horizon_s'])} s "
@@ -189,5 +273,6 @@ def _tried(r: dict[str, Any]) -> Iterator[Block]:
         "that its parameters have not seen, and tested by sign flips of whole runs with the maximum over the whole "
         f"list (Westfall and Young). It must be significant at {percent(ALPHA)}, gain at least "
         f"{percent(LEAST_GAIN, 1)}, explain at least {percent(LEAST_SHARE)} of what any smooth function of the state "
-        "explains, not make free simulation worse, and hold on the runs kept for the end."
+        "explains, not make free simulation worse, and hold on the runs kept back, where it is called an improvement "
+        "only if an error falls, and none is worse unless another is better."
     )

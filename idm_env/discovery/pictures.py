@@ -12,11 +12,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from idm_env.discovery import march as twin
+from idm_env.discovery import words
 from idm_env.report import Block, picture
 
 if TYPE_CHECKING:
     from idm_env.discovery.decide import Round
     from idm_env.discovery.discover import Discovery
+    from idm_env.discovery.judge import Judged
 
 BEFORE, AFTER, TRUTH, GREY = "#c0392b", "#1f6fb2", "#222222", "#9aa5b1"
 plt.rcParams.update(
@@ -57,32 +59,36 @@ def all_of(d: Discovery) -> list[tuple[str, Block]]:
     )
     put("Curves that were found", "Estimate and 95 % interval at every knot.", curves(d))
     put(
-        "Residual against features, before and after",
+        "Residual against features",
         "By how much the measured driver accelerated more than the predicted one (m/s²), second by second in windows "
         "of 5 s, averaged in bins, with two standard errors.",
         features(d),
     )
-    put("Residual over position and time, before and after", "The same acceleration as a map.", maps(d))
+    put("Residual over position and time", "The same acceleration as a map.", maps(d))
     put(
         "Measured and simulated gap",
-        "Best, median and worst held-out driver in free simulation behind the measured leader. Shaded blocks are "
-        "scored; the drivers' own parameters come from the others.",
+        "Best, median and worst follower kept back, in free simulation behind the measured leader. Shaded spans are "
+        "scored, as in the table; the drivers' own parameters come from the others.",
         gaps(d),
     )
-    put("Error of every held-out driver", "Free simulation, before and after; below the line is better.", scatter(d))
+    put(
+        "Error of every follower kept back",
+        "Free simulation; below the line the model on the axis is better.",
+        scatter(d),
+    )
     return made
 
 
 def ranking(this: Round) -> Figure:
     """Bars of all candidates of a round, best on top."""
-    order = np.argsort(this.verdict.gain)[-22:]
-    gain = 100 * (1 - np.exp(-this.verdict.gain[order]))
-    low, high = (100 * (1 - np.exp(-this.verdict.interval[order, k])) for k in range(2))
+    order = np.argsort(this.tested.gain)[-22:]
+    gain = 100 * (1 - np.exp(-this.tested.gain[order]))
+    low, high = (100 * (1 - np.exp(-this.tested.interval[order, k])) for k in range(2))
     figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.24 * len(order) + 1.0))
-    colours = [AFTER if p < 0.05 else GREY for p in this.verdict.p_value[order]]
+    colours = [AFTER if p < 0.05 else GREY for p in this.tested.p_value[order]]
     axes.barh(range(len(order)), gain, color=colours)
     axes.errorbar(gain, range(len(order)), xerr=[gain - low, high - gain], fmt="none", ecolor=TRUTH, lw=0.8)
-    axes.set_yticks(range(len(order)), [this.scored[i].term.label.replace("_", " ") for i in order])
+    axes.set_yticks(range(len(order)), [words.plain(this.scored[i].term.label) for i in order])
     axes.set_xlabel("held-out gain (%)")
     axes.axvline(0, color=TRUTH, lw=0.6)
     edge = max(float(gain.max()), 1.0)
@@ -98,7 +104,7 @@ def absorption(d: Discovery) -> Figure | None:
     rows.sort(key=lambda c: c["absorbed_share"])
     figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.22 * len(rows) + 0.9))
     axes.barh(range(len(rows)), [100 * c["absorbed_share"] for c in rows], color=GREY)
-    axes.set_yticks(range(len(rows)), [c["effect"].replace("_", " ") for c in rows])
+    axes.set_yticks(range(len(rows)), [words.plain(c["effect"]) for c in rows])
     axes.set_xlim(0, 100)
     axes.set_xlabel("absorbed by re-calibration (%)")
     return figure
@@ -133,7 +139,7 @@ def look_alikes(d: Discovery) -> Figure | None:
     for s in d.rounds[0].scored:
         column = _projected(d, s) if s.term.effect is not None else None
         if column is not None and np.sum(column**2) > 1e-9:
-            names.append(s.term.label.replace("_", " "))
+            names.append(words.plain(s.term.label))
             columns.append(column.ravel() / np.sqrt(np.sum(column**2)))
     if len(names) < 2:
         return None
@@ -169,7 +175,7 @@ def added_variable(d: Discovery) -> Figure | None:
     slope = float((x * y).sum() / max((x * x).sum(), 1e-12))
     reach = np.array([x.min(), x.max()])
     axes.plot(reach, slope * reach, color=BEFORE, lw=1.2)
-    axes.set_xlabel(f"response to {scored.term.label.replace('_', ' ')} (in units of noise)")
+    axes.set_xlabel(f"response to {words.plain(scored.term.label)} (in units of noise)")
     axes.set_ylabel("residual along it")
     return figure
 
@@ -178,8 +184,8 @@ def curves(d: Discovery) -> Figure | None:
     """Estimate and interval of every added curve over its coordinate."""
     shown = []
     for f in d.report["found"]:
-        term = next(t for t in d.chosen.terms if t.label == f["label"])
-        if len(f["parameters"]) > 6:
+        term = next(t for t in d.judgement.terms if t.label == f["label"])
+        if len(f["parameters"]) > words.MANY:
             shown.append((term, list(f["parameters"].values())))
     if not shown:
         return None
@@ -199,7 +205,7 @@ def _residual(d: Discovery) -> list[np.ndarray]:
     """Return the residual acceleration before and after [R, J]: how much more the driver gains in speed each second."""
     task = d.task
     shown = []
-    for s in (d.null, d.final):
+    for s in (d.null, d.final)[: len(d.judgement.titles)]:
         errors = task.errors(s.theta[None], s.model, s.values[None])[0]
         seconds = errors[:, 1:-2:2]
         shown.append(-np.diff(seconds, axis=1, prepend=0.0))
@@ -210,7 +216,7 @@ def features(d: Discovery) -> Figure:
     """Binned means over speed, gap, closing speed, leader's acceleration, position and time."""
     figure, axes = plt.subplots(2, 3, layout="constrained", figsize=(9.0, 4.8), sharey=True)
     column = {name: i for i, name in enumerate(twin.COLUMNS)}
-    for mend, colour, label in zip(_residual(d), (BEFORE, AFTER), ("before", "after"), strict=True):
+    for mend, colour, label in zip(_residual(d), (BEFORE, AFTER), d.judgement.titles, strict=False):
         responses = d.responses
         rows = responses.rows
         signals = rows.records.signals
@@ -236,7 +242,7 @@ def features(d: Discovery) -> Figure:
             axis.errorbar(centre, mean, error, color=colour, lw=1.1, marker=".", ms=4, label=label, capsize=0)
             axis.axhline(0, color=TRUTH, lw=0.5)
             axis.set_xlabel(name)
-    axes[0, 0].legend()
+    figure.legend(handles=axes[0, 0].get_legend_handles_labels()[0], loc="outside upper left", ncols=2)
     axes[0, 0].set_ylabel("residual (m/s²)")
     axes[1, 0].set_ylabel("residual (m/s²)")
     return figure
@@ -244,7 +250,11 @@ def features(d: Discovery) -> Figure:
 
 def maps(d: Discovery) -> Figure:
     """Residual over position and time."""
-    figure, axes = plt.subplots(1, 2, layout="constrained", figsize=(9.0, 3.2), sharey=True, sharex=True)
+    titles = d.judgement.titles
+    figure, grid_of = plt.subplots(
+        1, len(titles), layout="constrained", figsize=(9.0, 3.2), sharey=True, sharex=True, squeeze=False
+    )
+    axes = grid_of[0]
     grids, extent = [], (0.0, 1.0, 0.0, 1.0)
     for residual in _residual(d):
         responses = d.responses
@@ -255,7 +265,7 @@ def maps(d: Discovery) -> Figure:
         grids.append(np.where(count > 0, total / np.maximum(count, 1), np.nan).T)
         extent = (bins[0][0], bins[0][-1], bins[1][0], bins[1][-1])
     limit = float(np.nanquantile(np.abs(grids[0]), 0.95)) or 1.0
-    for axis, grid, title in zip(axes, grids, ("before", "after"), strict=True):
+    for axis, grid, title in zip(axes, grids, titles, strict=True):
         image = axis.imshow(grid, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-limit, vmax=limit)
         axis.set_title(title)
         axis.set_xlabel("position (m)")
@@ -264,44 +274,112 @@ def maps(d: Discovery) -> Figure:
     return figure
 
 
-def gaps(d: Discovery) -> Figure | None:
-    """Best, median and worst held-out driver."""
-    if d.before is None or d.after is None:
-        return None
-    rows = d.before.rows
-    able = np.flatnonzero(d.before.scored.any(1))
-    order = able[np.argsort(d.after.gap_rmse[able])]
-    picks = [order[0], order[len(order) // 2], order[-1]]
-    figure, axes = plt.subplots(3, 1, layout="constrained", figsize=(9.0, 6.6))
-    for axis, i, title in zip(axes, picks, ("best", "median", "worst"), strict=True):
+def _trace(judged: Judged, follower: int) -> tuple[np.ndarray, ...]:
+    """Return time, measured gap, simulated gap and where it is scored, of all pieces of a follower's record.
+
+    Pieces are divided by NaN. The samples are those of every table.
+    """
+    rows = judged.rows
+    pieces: list[np.ndarray] = []
+    for i in np.flatnonzero(judged.follower[rows.record] == follower):
         valid = rows.valid[i]
         at = rows.samples[i][valid]
-        time = (at - rows.records.first[rows.record[i]]) * rows.records.dt
-        axis.plot(time, rows.records.gap[at], color=TRUTH, lw=1.4, label="measured")
-        axis.plot(time, d.before.gap[i][valid], color=BEFORE, lw=1, label=f"before: {d.before.gap_rmse[i]:.2f} m")
-        axis.plot(time, d.after.gap[i][valid], color=AFTER, lw=1, ls="--", label=f"after: {d.after.gap_rmse[i]:.2f} m")
-        scored = d.before.scored[i][valid]
-        axis.fill_between(time, 0, 1, where=scored, transform=axis.get_xaxis_transform(), color="#eef2f6", zorder=-5)
-        episode = rows.records.episodes[rows.record[i]]
-        axis.set_title(f"{title}: run {episode.run_id}, vehicle {episode.vehicle_id}", loc="left")
+        time = rows.records.signals[at, twin.COLUMNS.index("time")]
+        piece = np.stack([time, rows.records.gap[at], judged.gap[i][valid], judged.scored[i][valid]])
+        pieces += [piece, np.array([[time[-1]], [np.nan], [np.nan], [0.0]])]
+    time, measured, simulated, scored = np.concatenate(pieces, axis=1)
+    return time - time[0], measured, simulated, scored > 0
+
+
+def typical(d: Discovery) -> int | None:
+    """Return the follower kept back whose error with IDM is the median one, or None where no run was kept."""
+    if d.judgement.before is None:
+        return None
+    error = d.judgement.before.gap_rmse
+    seen = np.flatnonzero(np.isfinite(error))
+    return int(seen[np.argsort(error[seen])][len(seen) // 2]) if len(seen) else None
+
+
+def named(d: Discovery) -> list[tuple[str, Judged, str, str]]:
+    """Return name, result, colour and line style of the models compared, IDM first."""
+    judgement = d.judgement
+    assert judgement.before is not None
+    plain, corrected = judgement.titles
+    models = [(plain, judgement.before, BEFORE, "-")]
+    if judgement.compared is not None and judgement.after is not None:
+        models.append((corrected, judgement.after, AFTER, "--"))
+    return models
+
+
+def first_screen(d: Discovery, size: tuple[float, float] = (9.0, 4.0)) -> Figure | None:
+    """Measured and simulated gap of the typical follower over time, and the residual of both models below."""
+    follower = typical(d)
+    if follower is None:
+        return None
+    figure, (above, below) = plt.subplots(
+        2, 1, figsize=size, sharex=True, height_ratios=(3, 2), layout="constrained"
+    )  # fmt: skip
+    handles = []
+    for i, (name, judged, colour, style) in enumerate(named(d)):
+        time, measured, simulated, scored = _trace(judged, follower)
+        if not i:
+            handles += above.plot(time, measured, color=TRUTH, lw=1.5, label="measured")
+            shade = {"where": scored, "color": "#e6edf4", "zorder": -5, "lw": 0}
+            for axis in (above, below):
+                axis.fill_between(time, 0, 1, transform=axis.get_xaxis_transform(), **shade)
+        label = f"{name}: {judged.gap_rmse[follower]:.2f} m"
+        handles += above.plot(time, simulated, color=colour, ls=style, lw=1.1, label=label)
+        below.plot(time, np.where(scored, simulated - measured, np.nan), color=colour, ls=style, lw=1.1)
+    below.axhline(0, color=TRUTH, lw=0.6)
+    above.set_ylabel("gap (m)")
+    below.set_ylabel("residual (m)")
+    below.set_xlabel("time (s)")
+    columns = len(handles) if size[0] > 6 else 1
+    figure.legend(handles=handles, loc="outside upper left", ncols=columns)
+    return figure
+
+
+def gaps(d: Discovery) -> Figure | None:
+    """Best, median and worst follower kept back."""
+    if d.judgement.before is None:
+        return None
+    models = named(d)
+    error = models[-1][1].gap_rmse
+    order = np.argsort(np.where(np.isfinite(error), error, np.inf))[: int(np.isfinite(error).sum())]
+    picks = [order[0], order[len(order) // 2], order[-1]]
+    figure, axes = plt.subplots(3, 1, layout="constrained", figsize=(9.0, 7.0))
+    for axis, follower, title in zip(axes, picks, ("best", "median", "worst"), strict=True):
+        texts = []
+        for i, (name, judged, colour, style) in enumerate(models):
+            time, measured, simulated, scored = _trace(judged, int(follower))
+            if not i:
+                axis.plot(time, measured, color=TRUTH, lw=1.4, label="measured")
+                axis.fill_between(
+                    time, 0, 1, where=scored, transform=axis.get_xaxis_transform(), color="#e6edf4", zorder=-5, lw=0
+                )
+            axis.plot(time, simulated, color=colour, ls=style, lw=1, label=name)
+            texts.append(f"{name} {judged.gap_rmse[follower]:.2f} m")
+        run, vehicle = models[0][1].followers[follower]
+        axis.set_title(f"{title}: run {run}, vehicle {vehicle}: {', '.join(texts)}", loc="left", fontsize=9)
         axis.set_ylabel("gap (m)")
-        axis.legend(ncols=3, loc="upper right")
+    figure.legend(handles=axes[0].get_legend_handles_labels()[0], loc="outside upper left", ncols=3)
     axes[-1].set_xlabel("time (s)")
     return figure
 
 
 def scatter(d: Discovery) -> Figure | None:
-    """Errors after against errors before, one point per held-out driver."""
-    if d.before is None or d.after is None:
+    """Errors of both models, one point per follower kept back."""
+    if d.judgement.before is None or d.judgement.compared is None:
         return None
-    ok = d.before.scored.any(1)
-    x, y = d.before.gap_rmse[ok], d.after.gap_rmse[ok]
+    (plain, before, _, _), (corrected, after, _, _) = named(d)
+    ok = np.isfinite(before.gap_rmse)
+    x, y = before.gap_rmse[ok], after.gap_rmse[ok]
     figure, axes = plt.subplots(layout="constrained", figsize=(4.4, 4.0))
     axes.plot(x, y, "o", ms=4, color=AFTER, alpha=0.7)
     reach = [0.9 * min(x.min(), y.min()), 1.1 * max(x.max(), y.max())]
     axes.plot(reach, reach, color=TRUTH, lw=0.7)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_xlabel("gap RMSE before (m)")
-    axes.set_ylabel("gap RMSE after (m)")
+    axes.set_xlabel(f"gap RMSE, {plain} (m)")
+    axes.set_ylabel(f"gap RMSE, {corrected} (m)")
     return figure

@@ -88,7 +88,7 @@ def _without_own_run(task: Task, solution: Solution) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Tested:
     """Of every candidate: p-value corrected for the whole list, mean gain in log RMSE, and its 95 % interval."""
 
     p_value: np.ndarray
@@ -96,7 +96,7 @@ class Verdict:
     interval: np.ndarray
 
 
-def westfall_young(gains: np.ndarray, seed: int = 0) -> Verdict:
+def westfall_young(gains: np.ndarray, seed: int = 0) -> Tested:
     """Test candidates [K, runs] by sign flips of runs, with the maximum over all candidates (Westfall, Young 1993).
 
     The statistic is the mean of signed square roots of the gains over their root mean square, to which ``FAINT`` is
@@ -117,7 +117,7 @@ def westfall_young(gains: np.ndarray, seed: int = 0) -> Verdict:
     mean = gains.mean(1)
     error = gains.std(1, ddof=1) / np.sqrt(runs) if runs > 1 else np.full(candidates, np.inf)
     width = student.ppf(0.975, max(runs - 1, 1)) * error
-    return Verdict(p_value, mean, np.stack([mean - width, mean + width], axis=1))
+    return Tested(p_value, mean, np.stack([mean - width, mean + width], axis=1))
 
 
 def interval_of(solution: Solution, task: Task) -> np.ndarray:

@@ -15,7 +15,8 @@ from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out
 from idm_env.discovery.solve import NAMES, Prior, Solution, Task, centred, finish, linearise, solve, with_noise
-from idm_env.effects import IDM
+from idm_env.effects import ALL, IDM
+from idm_env.effects.base import Sought
 
 OnProgress = Callable[[str, str, int, int], None]
 """Called with the stage, the current candidate, candidates done and candidates in all."""
@@ -66,7 +67,7 @@ class Search:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [runs]."""
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
-        wanted = [terms.simple(n) for n in self.names if n in terms.STARTS and n not in have]
+        wanted = [terms.simple(n) for n in self._sought("anywhere") if n not in have]
         found = []
         responses = places.respond(self.task, solution)
         for i, term in enumerate(wanted):
@@ -128,6 +129,9 @@ class Search:
         gains = 0.5 * np.log(before / held_out(self.task, best))
         return Scored(term, best, gains)
 
+    def _sought(self, what: Sought) -> list[str]:
+        return [n for n in self.names if ALL[n].sought == what]
+
     # -- where and when ----------------------------------------------------------------------------------------------
 
     def _places(self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int) -> list[Scored]:
@@ -177,12 +181,12 @@ class Search:
             )
 
         position = _knots(responses.coordinates["position"], 80.0, 48, period)
-        if "grade" in self.names:
-            curve_of(terms.grade(*position, period), "position")
-        if "speed_zone" in self.names:
-            interval_of("desired_speed", "position", named="speed_zone")
-        if "regime_shift" in self.names:
-            interval_of("time_gap", "time", open_end=True, named="regime_shift")
+        for name in self._sought("profile"):
+            curve_of(terms.unknown_profile(name, *position, period), "position")
+        for name in self._sought("interval"):
+            interval_of(ALL[name].changes, "position", named=name)
+        for name in self._sought("step"):
+            interval_of(ALL[name].changes, "time", open_end=True, named=name)
         if not self.located:
             return result
         for what in ("time_gap", "accel_and_decel", "acceleration"):
@@ -213,12 +217,11 @@ class Search:
 
 
 def _interval_term(what: str, coordinate: str, found: places.Found, open_end: bool, named: str, period: float) -> Term:
-    if named == "speed_zone":
-        # The response is that of (v/v0)⁴, whose factor f^−4 is known to all orders.
-        factor = float(np.clip(1.0 - 4.0 * found.amount, 0.3, 100.0)) ** -0.25
-        return terms.speed_zone(found.begin, found.end, min(max(factor, 0.25), 1.9), period)
-    if named == "regime_shift":
-        return terms.regime_shift(found.begin, float(np.clip(found.amount, -0.6, 1.5)))
+    if named:
+        strength = ALL[named].strength_of(found.amount)
+        if open_end:
+            return terms.placed(named, strength, found.begin)
+        return terms.placed(named, strength, found.begin, found.end, period=period)
     limit = 3.0 if what == "acceleration" else 0.6
     amount = float(np.clip(found.amount, -limit, limit))
     term = terms.interval(what, coordinate, found.begin, 1e6 if open_end else found.end, amount,

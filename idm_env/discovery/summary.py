@@ -1,220 +1,221 @@
-"""The content of ``report.json``: schema 1, and the sentences that say in plain words what was found."""
+"""The content of ``report.json``: what was found, what it does for errors on runs kept back, and all that was tried."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
-from idm_env.discovery import judge
+from idm_env.discovery import judge, words
+from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
 from idm_env.discovery.decide import ALPHA, LEAST_GAIN
 from idm_env.discovery.model import Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.score import interval_of
 from idm_env.discovery.solve import BOUNDS, NAMES, Solution, Task
+from idm_env.discovery.verdict import Refusal, conclude
+from idm_env.effects import ALL
 from idm_env.report import versions
 
-LEFT = 0.04
-"""Gain in log RMSE of a smooth function of the state above which something is left to explain.
+SCHEMA = 2
 
-Drivers' own noise of 0.2 m/s² alone comes to 0.01 to 0.03: it has changed the state that the function sees.
-"""
-LOOK_ALIKES = {
-    "delay": ["lag", "leader_acceleration (negative)"], "lag": ["delay", "leader_acceleration (negative)"],
-    "leader_acceleration": ["delay", "lag", "brake_light", "second_leader"],
-    "brake_light": ["leader_acceleration", "asymmetry", "second_leader"],
-    "second_leader": ["brake_light", "leader_acceleration", "delay"], "asymmetry": ["brake_light"],
-    "drag": ["speed_dependent_gap", "power_limit", "v0"], "speed_dependent_gap": ["drag", "time_gap"],
-    "memory": ["regime_shift", "time_gap"], "regime_shift": ["memory"], "grade": ["speed_zone", "T over position"],
-    "speed_zone": ["grade", "T over position"], "power_limit": ["drag"], "gap_bias": ["min_gap"],
-}  # fmt: skip
-WOULD_TELL = {
-    "delay": "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells delay from lag",
-    "lag": "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells lag from delay",
-    "drag": "free starts from standstill to above 25 m/s tell drag from v0 and power",
-    "power_limit": "free starts from standstill to above 25 m/s tell power from drag and v0",
-    "speed_dependent_gap": "following at 5 to 30 m/s by one driver tells the gap from drag",
-    "memory": "runs that begin at different times of the day tell memory from a shift of regime",
-    "regime_shift": "runs with different clock offsets tell a shift of regime from memory",
-    "grade": "the same place at low and high speed, with and without leader, tells a grade from a speed zone",
-    "speed_zone": "the same place at low and high speed, with and without leader, tells a zone from a grade",
-}
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Two models on the runs kept back: IDM, and IDM with what was added, or with what came nearest to that.
+
+    ``refusal`` says why nothing (more) was added; ``compared`` is None where nothing came near.
+    """
+
+    null: Solution
+    compared: Solution | None
+    added: bool
+    refusal: Refusal | None
+    before: judge.Judged | None
+    after: judge.Judged | None
+    seed: int
+
+    @cached_property
+    def errors(self) -> dict[str, Comparison]:
+        """How the errors on runs kept back changed; empty where nothing can be compared."""
+        if self.compared is None or self.before is None or self.after is None:
+            return {}
+        return compare(self.before, self.after, self.seed)
+
+    @property
+    def corrected_is_best(self) -> bool:
+        """Whether the compared model predicts best: a smaller geometric mean of the errors on runs kept back."""
+        if self.compared is None or not self.errors:
+            return False
+        return bool(np.prod([c.ratio for c in self.errors.values() if np.isfinite(c.ratio)]) < 1.0)
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """What the compared model has more than the null."""
+        return () if self.compared is None else self.compared.model.terms[len(self.null.model.terms) :]
+
+    @property
+    def tried(self) -> str:
+        """Plain names of ``terms``."""
+        return " and ".join(words.plain(t.effect or t.label) for t in self.terms)
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """Plain names of the models: the null and, where there is one, the model beside it."""
+        known = [words.plain(t.effect or t.label) for t in self.null.model.terms]
+        lists = [known] if self.compared is None else [known, [*known, self.tried]]
+        return tuple(" with ".join(["IDM", *([" and ".join(names)] if names else [])]) for names in lists)
+
+    def names(self) -> dict[str, str]:
+        """Return which model every file holds: IDM first, then the model beside it."""
+        if self.compared is None:
+            return {"model.yaml": self.titles[0]}
+        files = ("model_idm.yaml", "model.yaml") if self.corrected_is_best else ("model.yaml", "model_corrected.yaml")
+        return dict(zip(files, self.titles, strict=True))
 
 
 def report(
     trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], task: Task,
-    null: Solution, final: Solution, rounds: list[Any], refused: dict[str, str], before: judge.Judged | None,
-    after: judge.Judged | None,
-    partial: judge.Judged | None, thetas: list[Solution], by: str, seed: int, names: list[str],
+    judged: Judgement, rounds: list[Any], refused: dict[str, str], thetas: list[Solution], by: str,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the report as plain numbers and texts."""
+    null, compared, before, after = judged.null, judged.compared, judged.before, judged.after
     base = len(null.model.terms)
-    found = _found(null, final, rounds, interval_of(final, task), base)
-    verdict = _verdict(found, rounds)
+    final = compared if compared is not None and judged.added else null
+    entries = [] if compared is None else _found(compared, rounds, interval_of(compared, task), base)
+    found = entries if judged.added else []
+    first = rounds[0]
+    structured = bool(((first.tested.p_value < ALPHA) & (first.tested.gain >= LEAST_GAIN)).any())
+    verdict = conclude(bool(found), any(f["effect"] for f in found), judged.refusal, structured, first.left)
     lockbox = prepared.of_runs(kept_runs) if kept_runs else prepared
+    errors = judged.errors
+    left = 1.0 - np.exp(-max(float(first.left.mean()), 0.0))
     content = {
-        "schema": 1,
-        "verdict": verdict,
-        "sentence": " ".join([sentence(verdict, found, rounds), *_soberly(found, before, after)]),
+        "schema": SCHEMA,
+        "verdict": verdict.value,
+        "reason": None if judged.refusal is None else judged.refusal.reason.value,
+        "sentence": words.headline(verdict, [f["clause"] for f in found], judged.refusal, judged.tried, errors),
+        "details": words.details(verdict, found, left),
         "found": found,
         "known": _known(final, interval_of(final, task), base),
+        "helps": {
+            key: {"verdict": c.light.value, "ratio": c.ratio, "low": c.low, "high": c.high, "before": c.before,
+                  "after": c.after, "unit": words.ERRORS[key][1]}
+            for key, c in errors.items()
+        },
+        "interval": _how(before) if errors and before is not None else None,
+        "models": judged.names(),
         "error": {
             "held_out_runs": kept_runs,
-            "held_out_drivers": [
-                {"driver": e.key, "before_m": float(b), "after_m": float(a)} for e, b, a in _drivers(before, after)
-            ],
+            "held_out_drivers": _drivers(before, after if judged.added else before),
             "before": None if before is None else before.summary(),
-            "after": None if after is None else after.summary(),
+            "after": None if after is None or before is None else (after if judged.added else before).summary(),
             "floor": judge.floor(lockbox),
         },
-        "partial": _partial(rounds[0], partial, before),
+        "partial": None if judged.added or compared is None else _partial(judged, entries, first),
         "candidates": _candidates(rounds, refused),
         "parameters": _parameters(thetas, prepared),
         "data": _data(trajectories, prepared, fit_runs, task, null, by, rounds),
-        "seed": seed,
+        "seed": judged.seed,
         "versions": versions(),
-    }
+    }  # fmt: skip
     return _plain(content)
 
 
-def _partial(first: Any, after: judge.Judged | None, before: judge.Judged | None) -> dict[str, Any] | None:
-    """Return the best partial explanation where nothing was added: its name, share and error on the lockbox."""
-    if after is None or before is None or first.partial is None:
+def _how(before: judge.Judged) -> str:
+    """Say how the intervals of ``helps`` were made."""
+    count = before.squares["gap_rmse_m"][1]
+    runs = np.array([run for (run, _), n in zip(before.followers, count, strict=True) if n])
+    return (
+        f"95 % by bootstrap of {unit_of(runs)}, {DRAWS} draws: standard error of the logarithm of after / before, "
+        "times Student's t. Better or worse: the whole interval lies on one side of no change."
+    )
+
+
+def _partial(judged: Judgement, entries: list[dict[str, Any]], first: Any) -> dict[str, Any] | None:
+    """Return what came nearest where nothing was added: its terms, share and errors on the runs kept back."""
+    before, after = judged.before, judged.after
+    if before is None or after is None:
         return None
-    s = first.scored[first.partial]
-    values = s.solution.values[s.solution.model.where(s.term.label)]
-    ok = before.scored.any(1)
+    ok = np.isfinite(before.gap_rmse)
     return {
-        "effect": s.term.effect or s.term.label,
-        "parameters": dict(zip([p.name for p in s.term.parameters][:4], values[:4].tolist(), strict=False)),
+        "effect": judged.tried,
+        "terms": entries,
         "explained_share": first.share,
         "after": after.summary(),
         "share_of_drivers_improved": float((after.gap_rmse[ok] < before.gap_rmse[ok]).mean()),
     }
 
 
-def _drivers(before: judge.Judged | None, after: judge.Judged | None) -> list[tuple[Any, float, float]]:
+def _drivers(before: judge.Judged | None, after: judge.Judged | None) -> list[dict[str, Any]]:
+    """Return every held-out driver once, however many pieces the record has."""
     if before is None or after is None:
         return []
-    episodes = before.rows.records.episodes
     return [
-        (episodes[r], b, a)
-        for r, b, a, n in zip(before.rows.record, before.gap_rmse, after.gap_rmse, before.scored.sum(1), strict=True)
-        if n
-    ]
-
-
-def _verdict(found: list[dict[str, Any]], rounds: list[Any]) -> str:
-    if found:
-        return "named" if any(f["effect"] for f in found) else "located"
-    first = rounds[0]
-    if first.why_not.startswith("only"):
-        return "cannot_tell"
-    structured = bool(((first.verdict.p_value < ALPHA) & (first.verdict.gain >= LEAST_GAIN)).any())
-    left = first.left
-    error = left.std(ddof=1) / np.sqrt(len(left)) if len(left) > 1 else np.inf
-    return "unexplained" if structured or left.mean() > max(LEFT, 3.0 * error) else "none"
-
-
-def sentence(verdict: str, found: list[dict[str, Any]], rounds: list[Any]) -> str:
-    """Say in plain words what was found, how sure it is, what it is confused with, and what data would tell."""
-    if verdict == "none":
-        return (
-            "Nothing is missing that these data could show: no candidate lowers the error on runs that it was not "
-            "fitted to. What remains looks like the drivers' own noise and the noise of measurement."
-        )
-    if verdict == "cannot_tell":
-        return (
-            f"These data cannot tell: {rounds[0].why_not}. Seven runs are needed (a quarter is kept for the final "
-            "check), ten or more are better. The ranking below is a hint, not a finding."
-        )
-    if verdict == "unexplained":
-        return (
-            f"Something is missing that no candidate explains: {rounds[0].why_not}. The best partial explanation is at "
-            "the top of the ranking; the maps of the residual say where to look."
-        )
-    parts = []
-    for f in found:
-        name = f["effect"] or f["label"]
-        numbers = ", ".join(
-            f"{k} = {v['estimate']:.3g} ({v['low']:.3g} to {v['high']:.3g})"
-            + ("" if v["unit"] == "1" else f" {v['unit']}")
-            for k, v in list(f["parameters"].items())[:3]
-        )
-        if len(f["parameters"]) > 6:
-            estimates = [v["estimate"] for v in f["parameters"].values()]
-            numbers = f"a curve of {len(estimates)} knots from {min(estimates):.3g} to {max(estimates):.3g}"
-        what = f"{name} is missing" if f["effect"] else f"an effect without a name was located: {name}"
-        parts.append(f"{what[0].upper()}{what[1:]} ({numbers}; p = {f['p_value']:.2g}).")
-        if f["equivalent"]:
-            parts.append(f"These data cannot tell it from {', '.join(f['equivalent'])}.")
-        elif f["looks_like"]:
-            parts.append(f"It is most easily confused with {', '.join(f['looks_like'][:3])}.")
-        if f["effect"] in WOULD_TELL:
-            parts.append(f"What would tell: {WOULD_TELL[f['effect']]}.")
-    return " ".join(parts)
-
-
-def _soberly(found: list[dict[str, Any]], before: judge.Judged | None, after: judge.Judged | None) -> list[str]:
-    """Say what the finding does not do for long simulation, if so."""
-    if not found or before is None or after is None:
-        return []
-    was, now = (x.summary()["gap_rmse_m"] for x in (before, after))
-    if now < was:
-        return []
-    return [
-        f"It shows in predictions over some seconds; free simulation of the runs kept back does not get better by it "
-        f"(gap RMSE {was:.2f} to {now:.2f} m)."
+        {"driver": "/".join(name), "before_m": float(b), "after_m": float(a)}
+        for name, b, a in zip(before.followers, before.gap_rmse, after.gap_rmse, strict=True)
+        if np.isfinite(b)
     ]
 
 
 def _where(term: Term, values: dict[str, float]) -> dict[str, Any]:
-    if term.effect == "speed_zone" or (term.effect is None and "begin" in values):
+    if "begin" in values:
         return {"coordinate": term.coordinate, "interval": [values["begin"], values["end"]]}
-    if term.effect == "regime_shift":
+    if term.effect is not None and ALL[term.effect].sought == "step":
         return {"coordinate": "time", "interval": [values["time"], None]}
-    if term.knots[2] > 2 or term.effect == "grade":
+    if term.knots[2] > 2:
         first, distance, count = term.knots
         coordinate = "period" if "phase" in term.label else term.coordinate
         return {"coordinate": coordinate, "interval": [first, first + distance * (count - 1)]}
     return {"coordinate": "state" if term.coordinate in ("", "state") else term.coordinate, "interval": [None, None]}
 
 
-def _found(
-    null: Solution, final: Solution, rounds: list[Any], intervals: np.ndarray, base: int
-) -> list[dict[str, Any]]:
+def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: int) -> list[dict[str, Any]]:
     result = []
-    at = sum(t.size for t in final.model.terms[:base])
-    for term in final.model.terms[base:]:
+    at = sum(t.size for t in compared.model.terms[:base])
+    for term in compared.model.terms[base:]:
         this, winner = next(
             (r, i)
-            for r in rounds for i in (r.winner, r.partner)
+            for r in rounds for i in (r.winner, r.partner, r.partial)
             if i is not None and r.scored[i].term.label == term.label
         )  # fmt: skip
         mine = intervals[at : at + term.size]
         values = {p.name: float(x[0]) for p, x in zip(term.parameters, mine, strict=True)}
         parameters = {
-            p.name: {"estimate": float(x[0]), "low": float(x[1]), "high": float(x[2]), "unit": p.unit}
+            p.name: {
+                "symbol": p.symbol,
+                "estimate": float(x[0]),
+                "low": float(x[1]),
+                "high": float(x[2]),
+                "unit": p.unit,
+            }
             for p, x in zip(term.parameters, mine, strict=True)
         }
         where = _where(term, values)
         if where["coordinate"] == "time" and (where["interval"][1] or 0) > 9e5:
             where["interval"][1] = None
-        if term.effect == "grade" and term.profile is None:
+        effect = None if term.effect is None else ALL[term.effect]
+        if effect is not None and effect.sought == "profile" and term.profile is None:
             first, distance, _ = term.knots
             where["profile"] = {"position_m": [first + distance * i for i in range(term.size)]}
         result.append(
             {
                 "effect": term.effect,
                 "label": term.label,
+                "title": words.plain(term.effect or term.label),
+                "equation": words.CHANGES[term.what][3] if effect is None else effect.equation,
+                "clause": words.clause(term, mine.tolist()),
                 "equivalent": [this.scored[i].term.effect or this.scored[i].term.label for i in this.equivalent],
-                "looks_like": LOOK_ALIKES.get(term.effect or "", []),
+                "looks_like": [] if effect is None else list(effect.looks_like),
+                "told_by": "" if effect is None else effect.told_by,
                 "parameters": parameters,
                 "what": term.what if term.what != "slope" else "acceleration",
                 "where": where,
-                "p_value": float(this.verdict.p_value[winner]),
-                "held_out_gain": float(1.0 - np.exp(-this.verdict.gain[winner])),
+                "p_value": float(this.tested.p_value[winner]),
+                "held_out_gain": float(1.0 - np.exp(-this.tested.gain[winner])),
                 "explained_share": this.share,
             }
         )
@@ -234,27 +235,30 @@ def _known(final: Solution, intervals: np.ndarray, base: int) -> list[dict[str, 
 def _candidates(rounds: list[Any], refused: dict[str, str]) -> list[dict[str, Any]]:
     rows = []
     for number, this in enumerate(rounds, 1):
-        for i in np.argsort(-this.verdict.gain):
+        for i in np.argsort(-this.tested.gain):
             s = this.scored[i]
             solution = s.solution
             found = np.zeros(0) if solution is None else solution.values[solution.model.where(s.term.label)]
             values = dict(zip((p.name for p in s.term.parameters), found.tolist(), strict=False))
+            units = {p.name: p.unit for p in s.term.parameters}
             rows.append(
                 {
                     "round": number,
                     "effect": s.term.effect or s.term.label,
                     "named": s.term.effect is not None,
-                    "p_value": this.verdict.p_value[i],
-                    "held_out_gain": 1.0 - np.exp(-this.verdict.gain[i]),
-                    "interval": (1.0 - np.exp(-this.verdict.interval[i])).tolist(),
+                    "p_value": this.tested.p_value[i],
+                    "held_out_gain": 1.0 - np.exp(-this.tested.gain[i]),
+                    "interval": (1.0 - np.exp(-this.tested.interval[i])).tolist(),
                     "absorbed_share": absorbed(solution, s.term),
-                    "parameters": values if len(values) <= 4 else {},
+                    "parameters": values if len(values) <= words.MANY else {},
+                    "units": units if len(values) <= words.MANY else {},
                     "note": "" if solution is not None else "scored by its linear response only",
                 }
             )
     for name, reason in refused.items():
         rows.append({"round": 0, "effect": name, "named": True, "p_value": None, "held_out_gain": None,
-                     "interval": [None, None], "absorbed_share": None, "parameters": {}, "note": reason})  # fmt: skip
+                     "interval": [None, None], "absorbed_share": None, "parameters": {}, "units": {},
+                     "note": reason})  # fmt: skip
     return rows
 
 

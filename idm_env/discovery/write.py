@@ -1,4 +1,4 @@
-"""Writes a discovery: report.json for programs, report.html for people, model.yaml for simulations."""
+"""Writes a discovery: report.json for programs, report.html for people, models for simulations."""
 
 from __future__ import annotations
 
@@ -8,15 +8,22 @@ from idm_env.config import save_model
 from idm_env.discovery.discover import Discovery
 from idm_env.report import output_folder, write_json, write_page
 
+OUTPUT = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
+"""Every file that a discovery may write."""
+
 
 def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
-    """Write ``report.json``, ``report.html`` (self-contained) and ``model.yaml`` into a folder; return their paths."""
+    """Write report.json, report.html (self-contained) and models into a folder; return their paths by file name.
+
+    ``model.yaml`` predicts best of the models compared; where two were, the other lies beside it as
+    ``model_idm.yaml`` or ``model_corrected.yaml``.
+    """
     from idm_env.discovery import page
 
     folder = output_folder(Path(out))
-    paths = {name: folder / name for name in ("report.json", "report.html", "model.yaml")}
+    paths = {name: folder / name for name in ("report.json", "report.html", *discovery.models)}
     write_json(paths["report.json"], discovery.report)
-    save_model(paths["model.yaml"], discovery.model)
-    title = f"What is missing? {discovery.verdict.replace('_', ' ')}"
-    write_page(paths["report.html"], title, page.blocks(discovery))
+    for name, model in discovery.models.items():
+        save_model(paths[name], model)
+    write_page(paths["report.html"], page.TITLES[discovery.verdict], page.blocks(discovery))
     return paths

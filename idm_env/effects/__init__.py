@@ -4,6 +4,8 @@ and a candidate in discovery.
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 from idm_env.effects.actions import Control, Replay
 from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
 from idm_env.effects.base import CarFollowing, Effect
@@ -76,7 +78,7 @@ def make(kind: str, **choices: object) -> Effect:
     if kind not in ALL:
         raise ValueError(f"unknown effect '{kind}'.{nearest(kind, ALL)}")
     cls = ALL[kind]
-    known = list(cls.__dataclass_fields__)
+    known = [field.name for field in fields(cls)]
     for choice in choices:
         if choice not in known:
             raise ValueError(f"effect '{kind}' has no choice '{choice}'.{nearest(choice, known)}")

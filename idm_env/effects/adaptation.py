@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects.base import Effect, P
+from idm_env.effects.base import Effect, P, Sought
 from idm_env.effects.places import along, smooth_step, window
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -19,7 +19,19 @@ class SpeedDependentGap(Effect):
     """``s* += s1 √(v/v0)`` (Treiber, Hennecke, Helbing 2000), with √ continued linearly below v/v0 = 10⁻³."""
 
     kind: ClassVar[str] = "speed_dependent_gap"
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("extra_gap", "s1", "m", 3.0, -10.0, 15.0, null=0.0),)
+    rank: ClassVar[int] = 4
+    title: ClassVar[str] = "speed-dependent gap"
+    equation: ClassVar[str] = "s* += s1 √(v/v0)"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers keep shorter gaps at speed than IDM's constant time gap",
+        "drivers keep longer gaps at speed than IDM's constant time gap",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("drag", "time_gap")
+    told_by: ClassVar[str] = "following at 5 to 30 m/s by one driver tells the gap from drag"
+    changes: ClassVar[str] = "desired_gap"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("extra_gap", "s1", "m", 3.0, -10.0, 15.0, null=0.0, starts=(0.5,)),
+    )
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the longer desired gap."""
@@ -37,9 +49,18 @@ class LongMemory(Effect):
     """
 
     kind: ClassVar[str] = "memory"
+    title: ClassVar[str] = "memory of congestion"
+    equation: ClassVar[str] = "T (1 + β (1 − λ)), τ dλ/dt = v/v0 − λ"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers keep shorter time gaps the longer they have driven slowly, where IDM keeps one",
+        "drivers keep longer time gaps the longer they have driven slowly, where IDM keeps one",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("regime_shift", "time_gap")
+    told_by: ClassVar[str] = "runs that begin at different times of the day tell memory from a shift of regime"
+    changes: ClassVar[str] = "time_gap"
     declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("strength", "β", "1", 0.5, -0.9, 3.0, null=0.0),
-        Parameter("memory_time", "τ", "s", 60.0, 5.0, 900.0, role="shape", starts=(20.0, 120.0)),
+        Parameter("strength", "β", "1", 0.5, -0.9, 3.0, null=0.0, starts=(0.5,)),
+        Parameter("memory_time", "τ", "s", 60.0, 5.0, 900.0, role="shape", starts=(30.0, 150.0)),
     )
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -64,6 +85,17 @@ class SpeedZone(Effect):
     """
 
     kind: ClassVar[str] = "speed_zone"
+    title: ClassVar[str] = "speed zone"
+    equation: ClassVar[str] = "v0 → f v0 between x1 and x2"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers want to go slower in one stretch of the road, where IDM has one desired speed",
+        "drivers want to go faster in one stretch of the road, where IDM has one desired speed",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("grade", "time_gap over position")
+    told_by: ClassVar[str] = "the same place at low and high speed, with and without leader, tells a zone from a grade"
+    sought: ClassVar[Sought] = "interval"
+    changes: ClassVar[str] = "desired_speed"
+    rank: ClassVar[int] = 1
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("factor", "f", "1", 0.7, 0.2, 2.0, null=1.0),
         Parameter("begin", "x1", "m", 200.0, -1e6, 1e6, role="place"),
@@ -71,6 +103,12 @@ class SpeedZone(Effect):
     )
     width: float = 5.0
     period: float | None = None
+
+    @classmethod
+    def strength_of(cls, change: float) -> float:
+        """Return f: the response is that of (v/v0)⁴, whose factor f⁻⁴ is known to all orders."""
+        factor = min(max(1.0 - 4.0 * change, 0.3), 100.0) ** -0.25
+        return min(max(factor, 0.25), 1.9)
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the desired speed in force."""
@@ -83,11 +121,27 @@ class RegimeShift(Effect):
     """``T → T (1 + k)`` after time t* (rain, darkness); the step is smooth over ``width`` (s)."""
 
     kind: ClassVar[str] = "regime_shift"
+    title: ClassVar[str] = "shift of regime"
+    equation: ClassVar[str] = "T → T (1 + k) after t*"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers keep shorter time gaps from one moment on, where IDM keeps one",
+        "drivers keep longer time gaps from one moment on, where IDM keeps one",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("memory", "time_gap over time")
+    told_by: ClassVar[str] = "runs with different clock offsets tell a shift of regime from memory"
+    sought: ClassVar[Sought] = "step"
+    changes: ClassVar[str] = "time_gap"
+    rank: ClassVar[int] = 2
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("strength", "k", "1", 0.3, -0.8, 3.0, null=0.0),
         Parameter("time", "t*", "s", 60.0, -1e7, 1e7, role="place"),
     )
     width: float = 0.5
+
+    @classmethod
+    def strength_of(cls, change: float) -> float:
+        """Return k, between what drivers do."""
+        return min(max(change, -0.6), 1.5)
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the time gap in force."""

@@ -13,6 +13,11 @@ from idm_env.types import Driver, Motion, Scene
 Hook = Literal["perceive", "adapt", "accelerate", "limit", "place"]
 HOOKS: tuple[Hook, ...] = ("perceive", "adapt", "accelerate", "limit", "place")
 
+Sought = Literal["anywhere", "profile", "interval", "step"]
+"""What a search has to find beside a strength: nothing, a curve over places, an interval of places, a moment."""
+Neighbour = Literal["leader", "second leader", "vehicle behind", "vehicle in an adjacent lane"]
+"""Whom a record must show for the effect to be seen in it."""
+
 P = dict[str, Tensor]
 """The parameters of one effect: name → tensor."""
 
@@ -33,7 +38,28 @@ class Effect:
 
     Class attributes: ``kind`` is the name in ``effects.ALL`` and in YAML; ``needs`` names the optional neighbours
     of the scene that it reads; ``sees_truth`` marks effects of physics, which get the true scene instead of the
-    perceived one; ``rank`` orders perceptions and limits, low first. Dataclass fields are the static choices.
+    perceived one; ``rank`` orders perceptions and limits, low first, and what discovery adds to a driver. Dataclass
+    fields are the static choices.
+
+    What a search and a report have to know of an effect stands beside its equation, too:
+
+    ==============  ====================================================================================================
+    ``title``       its plain name
+    ``equation``    what it adds to IDM, in one line
+    ``wording``     what drivers do then, in a clause: with the strength below its null, and above
+    ``looks_like``  what it is most easily confused with: candidates, or parameters and curves in plain words
+    ``told_by``     data that would tell it from these
+    ``cancels``     candidates whose response is nearly its own with the other sign: the pairs are tried jointly
+    ``latency``     the response comes late by the first parameter (s). Latencies are one class, told apart by sharp
+                    inputs only, and one below a step of the data belongs to how these were made
+    ``sought``      what has to be found beside the strength
+    ``changes``     what it changes: an acceleration, a parameter of the driver, a perceived signal, the response
+    ``beyond``      whom the record must show
+    ``wind_up_s``   seconds of the record that its memory needs before a prediction begins
+    ``column``      column of a file that gives its ``profile``, if measured
+    ==============  ====================================================================================================
+
+    Where a search starts and how far it goes stands in the parameters (``starts``, ``searched``).
     """
 
     kind: ClassVar[str] = ""
@@ -43,6 +69,19 @@ class Effect:
     remembers: ClassVar[bool] = False
     rank: ClassVar[int] = 0
     hook: ClassVar[Hook]
+
+    title: ClassVar[str] = ""
+    equation: ClassVar[str] = ""
+    wording: ClassVar[tuple[str, str]] = ("", "")
+    looks_like: ClassVar[tuple[str, ...]] = ()
+    told_by: ClassVar[str] = ""
+    cancels: ClassVar[tuple[str, ...]] = ()
+    latency: ClassVar[bool] = False
+    sought: ClassVar[Sought] = "anywhere"
+    changes: ClassVar[str] = "acceleration"
+    beyond: ClassVar[Neighbour] = "leader"
+    wind_up_s: ClassVar[float] = 0.1
+    column: ClassVar[str] = ""
 
     def __init_subclass__(cls) -> None:
         mine = [hook for hook in HOOKS if getattr(cls, hook) is not getattr(Effect, hook)]
@@ -67,6 +106,14 @@ class Effect:
     def looks_back(self) -> float:
         """Seconds of the past that this effect may ask the scene for (``scene.past``); 0 for none."""
         return 0.0
+
+    @classmethod
+    def strength_of(cls, change: float) -> float:
+        """Return the strength that changes what it ``changes`` by ``change``, to first order, from its null on.
+
+        A scan over places or times finds ``change``; a search starts from what this makes of it.
+        """
+        return change
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene as the driver sees it."""

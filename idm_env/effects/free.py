@@ -82,6 +82,7 @@ class DriverCurve(Effect):
     """One driver parameter times ``1 + Σ c_k hat_k(x)`` over one feature x: T(x), v0(t) and their kin."""
 
     kind: ClassVar[str] = "driver_curve"
+    rank: ClassVar[int] = 3
     target: Target = "time_gap"
     feature: str = "position"
     knots: tuple[float, ...] = (0.0, 500.0, 1000.0)

@@ -19,8 +19,20 @@ class Asymmetry(Effect):
     """Weaker acceleration than braking: ``a > 0: (1 − k) a``, ``a < 0: (1 + k) a`` (Newell; Laval and Leclercq)."""
 
     kind: ClassVar[str] = "asymmetry"
+    title: ClassVar[str] = "asymmetry"
+    equation: ClassVar[str] = "a > 0: (1 − k) a, a < 0: (1 + k) a"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers accelerate harder and brake softer than IDM",
+        "drivers accelerate softer and brake harder than IDM",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("brake_light", "max_accel and comfort_decel together")
+    told_by: ClassVar[str] = (
+        "accelerating and braking on a free road, where no leader sets the pace, tells asymmetry from brake lights"
+    )
     rank: ClassVar[int] = 10
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("strength", "k", "1", 0.3, -0.9, 0.9, null=0.0),)
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("strength", "k", "1", 0.3, -0.9, 0.9, null=0.0, starts=(0.05,)),
+    )
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return a − k |a|."""
@@ -35,6 +47,18 @@ class ActionPoint(Effect):
     """
 
     kind: ClassVar[str] = "action_point"
+    title: ClassVar[str] = "action points"
+    equation: ClassVar[str] = "a is held until the wanted one differs by Δa"
+    wording: ClassVar[tuple[str, str]] = (
+        "",
+        "drivers hold an acceleration until a clearly different one is wanted, where IDM adjusts all the time",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("lag", "leader_acceleration")
+    told_by: ClassVar[str] = (
+        "accelerations measured at 10 Hz or more (steps, and stretches without change) tell action points from lag"
+    )
+    changes: ClassVar[str] = "response"
+    wind_up_s: ClassVar[float] = 2.0
     rank: ClassVar[int] = 30
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "Δa", "m/s²", 0.3, 0.0, 2.0, null=0.0, role="threshold", starts=(0.15, 0.4)),
@@ -50,10 +74,29 @@ class PowerLimit(Effect):
     """``a ≤ (P/m) / v`` with specific power P/m (W/kg); absent at its null, a power that no car has."""
 
     kind: ClassVar[str] = "power_limit"
+    title: ClassVar[str] = "power limit"
+    equation: ClassVar[str] = "a ≤ (P/m) / v"
+    wording: ClassVar[tuple[str, str]] = (
+        "vehicles accelerate less at high speed than IDM, as an engine's power allows",
+        "",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("drag", "desired_speed")
+    told_by: ClassVar[str] = "free starts from standstill to above 25 m/s tell power from drag and v0"
     rank: ClassVar[int] = 40
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("power", "P/m", "W/kg", 15.0, 2.0, 100.0, null=1e5, role="threshold", starts=(8.0, 16.0)),
+        Parameter(
+            "power",
+            "P/m",
+            "W/kg",
+            15.0,
+            2.0,
+            100.0,
+            null=1e5,
+            role="threshold",
+            starts=(10.0, 18.0),
+            searched=(2.0, 60.0),
+        ),
     )
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -69,10 +112,21 @@ class Lag(Effect):
     """
 
     kind: ClassVar[str] = "lag"
+    title: ClassVar[str] = "response lag"
+    equation: ClassVar[str] = "τ dA/dt = a − A"
+    wording: ClassVar[tuple[str, str]] = (
+        "",
+        "vehicles take longer than IDM to reach the acceleration that is wanted",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("delay", "leader_acceleration with the other sign")
+    told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells lag from delay"
+    latency: ClassVar[bool] = True
+    changes: ClassVar[str] = "response"
+    wind_up_s: ClassVar[float] = 2.0
     rank: ClassVar[int] = 50
     sees_truth: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("lag", "τ", "s", 0.5, 0.0, 3.0, null=0.0, starts=(0.3, 0.8)),
+        Parameter("lag", "τ", "s", 0.5, 0.0, 3.0, null=0.0, starts=(0.3, 0.8), searched=(0.0, 2.0)),
     )
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:

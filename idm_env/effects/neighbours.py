@@ -11,7 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects.base import Effect, P
+from idm_env.effects.base import Effect, Neighbour, P
 from idm_env.effects.idm import interaction
 from idm_env.parameters import Parameter
 from idm_env.types import Adjacent, Driver, Scene
@@ -25,7 +25,20 @@ class SecondLeader(Effect):
     """
 
     kind: ClassVar[str] = "second_leader"
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("weight", "w", "1", 0.3, -0.5, 1.0, null=0.0),)
+    title: ClassVar[str] = "second leader"
+    equation: ClassVar[str] = "(1 − w) (s*₁/s₁)² + w (s*₂/(s₂/2))² in place of (s*₁/s₁)²"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers go by their own leader even more than IDM, against what the vehicle ahead of it does",
+        "drivers look past their leader to the vehicle ahead of it, which IDM does not see",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("brake_light", "leader_acceleration", "delay")
+    told_by: ClassVar[str] = (
+        "leaders that brake without their own leaders braking, and the reverse, tell a second leader from brake lights"
+    )
+    beyond: ClassVar[Neighbour] = "second leader"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("weight", "w", "1", 0.3, -0.5, 1.0, null=0.0, starts=(0.1,)),
+    )
     needs: ClassVar[frozenset[str]] = frozenset({"second_leader"})
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -45,8 +58,18 @@ class LeaderAcceleration(Effect):
     """
 
     kind: ClassVar[str] = "leader_acceleration"
+    title: ClassVar[str] = "leader's acceleration"
+    equation: ClassVar[str] = "+ c a_lead"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers answer their leader's acceleration with the opposite sign, as late ones do",
+        "drivers follow their leader's acceleration at once, which IDM does not see",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("delay", "lag", "brake_light", "second_leader")
+    told_by: ClassVar[str] = (
+        "leaders that accelerate as sharply as they brake tell it from brake lights, sharp steps of speed from a delay"
+    )
     sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.4, -1.0, 1.5, null=0.0),)
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.4, -1.0, 1.5, null=0.0, starts=(0.1,)),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return c a_lead (m/s²)."""
@@ -58,7 +81,17 @@ class BrakeLight(Effect):
     """Reaction to the leader's braking only, ``+ c min(a_lead, 0)``."""
 
     kind: ClassVar[str] = "brake_light"
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.5, -1.0, 2.0, null=0.0),)
+    title: ClassVar[str] = "brake lights"
+    equation: ClassVar[str] = "+ c min(a_lead, 0)"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers brake less than IDM while their leader brakes",
+        "drivers brake as soon as their leader does, which IDM does not see",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("leader_acceleration", "asymmetry", "second_leader")
+    told_by: ClassVar[str] = (
+        "leaders that accelerate as sharply as they brake tell brake lights from the leader's acceleration"
+    )
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.5, -1.0, 2.0, null=0.0, starts=(0.1,)),)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return c min(a_lead, 0) (m/s²)."""
@@ -70,7 +103,18 @@ class Follower(Effect):
     """Pressure from behind: ``+ c a min(((s0 + v T)/s_behind)², cap)``; s_behind is the follower's gap (m)."""
 
     kind: ClassVar[str] = "follower"
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1", 0.15, -0.5, 1.0, null=0.0),)
+    title: ClassVar[str] = "pressure from behind"
+    equation: ClassVar[str] = "+ c a min(((s0 + v T)/s_behind)², 4)"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers slow down when a vehicle is close behind, which IDM does not see",
+        "drivers speed up when a vehicle is close behind, which IDM does not see",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("time_gap", "max_accel")
+    told_by: ClassVar[str] = "followers that come and go behind one driver tell their pressure from a shorter time gap"
+    beyond: ClassVar[Neighbour] = "vehicle behind"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("gain", "c", "1", 0.15, -0.5, 1.0, null=0.0, starts=(0.03,)),
+    )
     needs: ClassVar[frozenset[str]] = frozenset({"behind"})
     cap: float = 4.0
 
@@ -91,7 +135,18 @@ class Lateral(Effect):
     """
 
     kind: ClassVar[str] = "lateral"
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("gain", "c", "1/s", 0.1, -0.5, 1.0, null=0.0),)
+    title: ClassVar[str] = "friction with the adjacent lane"
+    equation: ClassVar[str] = "− c max(v − v_adjacent, 0) exp(−|dx| / 25 m)"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers speed up beside a slower lane, which IDM does not see",
+        "drivers slow down beside a slower lane, which IDM does not see",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("desired_speed", "drag")
+    told_by: ClassVar[str] = "free driving beside empty and beside slow lanes tells friction from a lower desired speed"
+    beyond: ClassVar[Neighbour] = "vehicle in an adjacent lane"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("gain", "c", "1/s", 0.1, -0.5, 1.0, null=0.0, starts=(0.03,)),
+    )
     reach: float = 25.0
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:

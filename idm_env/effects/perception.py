@@ -22,8 +22,19 @@ class Delay(Effect):
 
     kind: ClassVar[str] = "delay"
     rank: ClassVar[int] = -10
+    title: ClassVar[str] = "reaction delay"
+    equation: ClassVar[str] = "all that IDM sees is taken at t − τ"
+    wording: ClassVar[tuple[str, str]] = (
+        "",
+        "drivers react later than IDM",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("lag", "leader_acceleration with the other sign")
+    told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells delay from lag"
+    cancels: ClassVar[tuple[str, ...]] = ("leader_acceleration", "second_leader")
+    latency: ClassVar[bool] = True
+    changes: ClassVar[str] = "response"
     declared: ClassVar[tuple[Parameter, ...]] = (
-        Parameter("delay", "τ", "s", 0.5, 0.0, 1.5, null=0.0, starts=(0.3, 0.8)),
+        Parameter("delay", "τ", "s", 0.5, 0.0, 1.5, null=0.0, starts=(0.3, 0.8), searched=(0.0, 1.2)),
     )
     max_delay: float = 1.5
 
@@ -46,6 +57,15 @@ class DeadZone(Effect):
     """
 
     kind: ClassVar[str] = "dead_zone"
+    title: ClassVar[str] = "threshold of looming"
+    equation: ClassVar[str] = "Δv is seen as 0 while 1.8 |Δv| / s² < θ"
+    wording: ClassVar[tuple[str, str]] = (
+        "",
+        "drivers do not notice the small closing speeds that IDM reacts to",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel", "action_point")
+    told_by: ClassVar[str] = "slow approaches at long gaps tell a threshold from softer braking"
+    changes: ClassVar[str] = "closing_speed"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "θ", "rad/s", 0.002, 0.0, 0.02, null=0.0, role="threshold", starts=(0.001, 0.004)),
     )
@@ -65,7 +85,18 @@ class GapBias(Effect):
     """A gap seen (or measured) as gap + d metres, wherever there is a leader."""
 
     kind: ClassVar[str] = "gap_bias"
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("bias", "d", "m", 1.0, -5.0, 5.0, null=0.0),)
+    title: ClassVar[str] = "bias of the gap"
+    equation: ClassVar[str] = "gap seen = gap + d"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers act as if the gap were shorter than it is measured",
+        "drivers act as if the gap were longer than it is measured",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("min_gap",)
+    told_by: ClassVar[str] = (
+        "gaps measured a second way, or standstill behind a leader with known bumpers, tell a bias from the minimum gap"
+    )
+    changes: ClassVar[str] = "gap"
+    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("bias", "d", "m", 1.0, -5.0, 5.0, null=0.0, starts=(0.2,)),)
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene with the biased gap."""

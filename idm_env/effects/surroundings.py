@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects.base import Effect, P
+from idm_env.effects.base import Effect, P, Sought
 from idm_env.effects.places import along, interpolate
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -28,6 +28,18 @@ class Grade(Effect):
     """
 
     kind: ClassVar[str] = "grade"
+    title: ClassVar[str] = "slope of the road"
+    equation: ClassVar[str] = "− g sin(arctan(slope(x)))"
+    wording: ClassVar[tuple[str, str]] = (
+        "vehicles go faster uphill and slower downhill, which IDM does not know",
+        "vehicles are held back uphill and pushed on downhill, which IDM does not know",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("speed_zone", "time_gap over position")
+    told_by: ClassVar[str] = (
+        "the same place at low and high speed, with and without leader, tells a grade from a speed zone"
+    )
+    sought: ClassVar[Sought] = "profile"
+    column: ClassVar[str] = "grade"
     sees_truth: ClassVar[bool] = True
     knots: tuple[float, ...] = (0.0, 250.0, 500.0, 750.0, 1000.0)
     profile: tuple[float, ...] | None = None
@@ -66,8 +78,18 @@ class Drag(Effect):
     """Air drag ``− c v²`` beyond what the driver compensates; c = ρ c_w A / (2 m), 2e-4 to 8e-4 1/m for cars."""
 
     kind: ClassVar[str] = "drag"
+    title: ClassVar[str] = "drag"
+    equation: ClassVar[str] = "− c v²"
+    wording: ClassVar[tuple[str, str]] = (
+        "vehicles are pushed on by the square of their speed, beyond IDM",
+        "vehicles are held back by the square of their speed, beyond IDM",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("speed_dependent_gap", "power_limit", "desired_speed")
+    told_by: ClassVar[str] = "free starts from standstill to above 25 m/s tell drag from v0 and power"
     sees_truth: ClassVar[bool] = True
-    declared: ClassVar[tuple[Parameter, ...]] = (Parameter("coefficient", "c", "1/m", 4e-4, -2e-3, 5e-3, null=0.0),)
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("coefficient", "c", "1/m", 4e-4, -2e-3, 5e-3, null=0.0, starts=(1e-4,)),
+    )
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the drag (m/s²)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,8 @@ from idm_env.simulator import Integration, Simulator
 class Source:
     """How a file is read: see ``idm_env.data.load`` and ``episodes``.
 
-    ``where`` (``column=value``) selects runs or drivers; ``window`` (s) cuts long episodes.
+    ``where`` (``column=value``, or several that must all hold) selects runs or drivers; ``window`` (s) cuts long
+    episodes.
     """
 
     path: Path
@@ -39,7 +41,7 @@ class Source:
     dt: float | None = None
     smooth: bool = False
     window: float | None = None
-    where: str | None = None
+    where: str | Sequence[str] | None = None
 
     def trajectories(self) -> Trajectories:
         """Read and check the file."""

@@ -199,7 +199,9 @@ def record(simulator: Stepping, form: Form) -> Recording:
     try:
         after = recorder.step(state, _inputs(form, graph), _Parameters(recorder, graph))  # type: ignore[arg-type]
     except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise Untraceable(f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}") from error
+        raise Untraceable(
+            f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}"
+        ) from error
     for name in ("position", "speed", "accel"):
         recording.respond[name] = value_of(graph, getattr(after, name))
     for name in form.memories:

@@ -80,6 +80,17 @@ def test_few_runs_cannot_tell() -> None:
     assert found.report["found"] == []
 
 
+def test_one_candidate_alone_may_be_asked_for() -> None:
+    """The round after its addition has nothing left to try."""
+    found = discover(data("leader_acceleration"), effects=["leader_acceleration"])
+    assert [f["effect"] for f in found.report["found"]] == ["leader_acceleration"]
+
+
+def test_candidates_that_cannot_be_tried_are_named() -> None:
+    with pytest.raises(ValueError, match="lateral: no vehicle in an adjacent lane is measured"):
+        discover(data(None, runs=2), effects=["lateral"])
+
+
 def test_unknown_effect_is_refused() -> None:
     with pytest.raises(ValueError, match="Did you mean 'grade'"):
         discover(data(None, runs=2), effects=["grad"])
@@ -101,7 +112,7 @@ def test_an_interrupted_search_goes_on(tmp_path: Path) -> None:
     fresh = discover(trajectories, effects=FEW)
     assert not (tmp_path / "discovery.npz").exists()
     assert resumed.report["verdict"] == fresh.report["verdict"]
-    assert resumed.values == pytest.approx(fresh.values, rel=1e-6)
+    assert resumed.final.values == pytest.approx(fresh.final.values, rel=1e-6)
     with pytest.raises(KeyboardInterrupt):
         discover(trajectories, effects=FEW, out=tmp_path, on_progress=stop)
     with pytest.raises(ValueError, match="other data or options"):

@@ -32,10 +32,10 @@ def places(records: Records) -> dict[str, tuple[Term, tuple[float, ...]]]:
     slopes = (0.02, -0.03, 0.04, 0.0, -0.01, 0.03, -0.02)
     middle = (low + 2 * step, low + 4 * step)
     return {
-        "grade": (terms.grade(low, step, 7, 0.0), slopes),
-        "known grade": (terms.known_grade(low, step, slopes, 0.0), (0.6,)),
-        "speed_zone": (terms.speed_zone(*middle, 0.6), (0.6, *middle)),
-        "regime_shift": (terms.regime_shift(40.0, 0.3), (0.3, 40.0)),
+        "grade": (terms.unknown_profile("grade", low, step, 7, 0.0), slopes),
+        "known grade": (terms.known_profile("grade", low, step, slopes, 0.0), (0.6,)),
+        "speed_zone": (terms.placed("speed_zone", 0.6, *middle), (0.6, *middle)),
+        "regime_shift": (terms.placed("regime_shift", 0.3, 40.0), (0.3, 40.0)),
         "T over places": (terms.interval("time_gap", "position", *middle, 0.4), (0.4, *middle)),
         "a and b over time": (terms.interval("accel_and_decel", "time", 30.0, 50.0, -0.3), (-0.3, 30.0, 50.0)),
         "push over speed": (terms.curve("acceleration", "speed", 0.0, 5.0, 5), (0.3, -0.2, 0.1, 0.2, -0.1)),

@@ -36,6 +36,26 @@ def test_the_catalogue_of_candidates_is_all_nullable() -> None:
         assert any(p.null is not None for p in make(name).parameters), name
 
 
+@pytest.mark.parametrize("name", CANDIDATES)
+def test_what_discovery_has_to_know_of_a_candidate_stands_in_its_class(name: str) -> None:
+    """Otherwise reports fall silent, or another file has to know effects by name."""
+    effect = make(name)
+    cls = type(effect)
+    assert cls.title and cls.equation and cls.told_by and cls.looks_like
+    strength = next(p for p in effect.parameters if p.null is not None)
+    low, high = strength.searched or (strength.low, strength.high)
+    # A clause for every side of the null that a search can reach, and for no other.
+    assert [bool(text) for text in cls.wording] == [low < strength.null, high > strength.null]  # type: ignore[operator]
+    known = {*CANDIDATES, *(p.name for p in IDM.declared)}
+    assert {item.split()[0] for item in cls.looks_like} <= known - {name}
+    assert set(cls.cancels) <= set(CANDIDATES) - {name}
+    assert bool(cls.column) <= (cls.sought == "profile")
+    if cls.sought == "anywhere":
+        for p in effect.parameters:
+            least, most = p.searched or (p.low, p.high)
+            assert p.starts and all(least < start < most for start in p.starts), p.name
+
+
 @nullable
 @pytest.mark.parametrize("road", [Lane(), Ring()], ids=["lane", "ring"])
 @pytest.mark.parametrize("integration", ["ballistic", "euler", "midpoint"])

@@ -1,0 +1,110 @@
+"""Is an error on runs kept back better, the same or worse, and how sure is that: bootstrap over followers or runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from scipy.stats import t as student
+
+from idm_env.discovery.judge import Judged
+
+DRAWS = 2000
+RUNS = 6
+"""Held-out runs from which whole runs are drawn; of fewer, the followers within them."""
+ERRORS = ("gap_rmse_m", "horizon_rmse_m", "speed_rmse_mps")
+"""Errors that are compared: the gap in free simulation, the gap 5 s ahead, and the speed in free simulation."""
+
+
+class Light(str, Enum):
+    """What the interval of an error's ratio says."""
+
+    BETTER = "better"
+    SAME = "same"
+    WORSE = "worse"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One error before and after; ``ratio`` is after / before, with its 95 % interval from ``low`` to ``high``."""
+
+    before: float
+    after: float
+    ratio: float
+    low: float
+    high: float
+
+    @property
+    def light(self) -> Light:
+        """``better`` or ``worse`` where the whole interval lies on one side of 1."""
+        if self.high < 1.0:
+            return Light.BETTER
+        return Light.WORSE if self.low > 1.0 else Light.SAME
+
+
+def compare(before: Judged, after: Judged, seed: int = 0) -> dict[str, Comparison]:
+    """Return how every error of ``ERRORS`` changed, on the same followers and samples."""
+    runs = np.array([run for run, _ in before.followers])
+    result = {}
+    for key in ERRORS:
+        (was, count), (now, _) = before.squares[key], after.squares[key]
+        seen = count > 0
+        result[key] = _compared(was[seen], now[seen], float(count[seen].sum()), runs[seen], seed)
+    return result
+
+
+def _compared(was: np.ndarray, now: np.ndarray, samples: float, runs: np.ndarray, seed: int) -> Comparison:
+    """Compare sums of squares of followers [F] in runs [F]."""
+    errors = [float(np.sqrt(x.sum() / samples)) if samples else float("nan") for x in (was, now)]
+    change = 0.5 * np.log(now.sum() / was.sum()) if samples and was.sum() > 0 else float("nan")
+    width = _width(was, now, runs, seed) if np.isfinite(change) else float("inf")
+    return Comparison(*errors, *(float(np.exp(x)) for x in (change, change - width, change + width)))
+
+
+def _width(was: np.ndarray, now: np.ndarray, runs: np.ndarray, seed: int) -> float:
+    """Return half the 95 % interval of the logarithm of the ratio of two RMSEs.
+
+    The standard error is that of ``DRAWS`` bootstrap samples, widened for the few units that they are drawn from, with
+    Student's t: percentiles of so few draws are too narrow.
+    """
+    strata, freedom = sampling(runs)
+    if freedom < 1:
+        return float("inf")
+    random = np.random.default_rng(seed)
+    totals = np.zeros((2, DRAWS))
+    units = sum(len(s) for s in strata)
+    for stratum in strata:
+        weights = random.multinomial(len(stratum), np.full(len(stratum), 1.0 / len(stratum)), size=DRAWS)
+        for total, squares in zip(totals, (was, now), strict=True):
+            total += weights @ np.array([squares[unit].sum() for unit in stratum])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        drawn = 0.5 * np.log(totals[1] / totals[0])
+    drawn = drawn[np.isfinite(drawn)]
+    if len(drawn) < DRAWS // 2:
+        return float("inf")
+    return float(student.ppf(0.975, freedom) * drawn.std(ddof=1) * np.sqrt(units / freedom))
+
+
+def sampling(runs: np.ndarray) -> tuple[list[list[np.ndarray]], int]:
+    """Return what is drawn, strata of units of followers' numbers, and the degrees of freedom.
+
+    Whole runs, because followers of one run share leader, road and weather, where there are at least ``RUNS``; else
+    followers within their runs, or followers alone where runs have hardly more than one.
+    """
+    of_run = [np.flatnonzero(runs == run) for run in np.unique(runs)]
+    if len(of_run) >= RUNS:
+        return [of_run], len(of_run) - 1
+    if len(runs) - len(of_run) >= 2:
+        return [[np.array([i]) for i in run] for run in of_run], len(runs) - len(of_run)
+    return [[np.array([i]) for i in range(len(runs))]], len(runs) - 1
+
+
+def unit_of(runs: np.ndarray) -> str:
+    """Return in words what is drawn, for a report."""
+    strata, _ = sampling(runs)
+    if len(np.unique(runs)) >= RUNS:
+        return f"{len(strata[0])} whole runs"
+    if len(strata) > 1:
+        return f"{len(runs)} followers within their {len(strata)} runs, which are too few to be drawn themselves"
+    return f"{len(runs)} followers"

@@ -1,0 +1,207 @@
+"""Sentences, made from a verdict and the figures behind it; an effect's own words stand in its class."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from idm_env.discovery.compare import Comparison, Light
+from idm_env.discovery.model import Term
+from idm_env.discovery.verdict import Reason, Refusal, Verdict
+from idm_env.effects import ALL
+from idm_env.parameters import Parameter
+
+ERRORS = {
+    "gap_rmse_m": ("gap in free simulation", "m"),
+    "gap_rmse_median_driver_m": ("the same, median follower", "m"),
+    "horizon_rmse_m": ("gap 5 s ahead", "m"),
+    "speed_rmse_mps": ("speed in free simulation", "m/s"),
+}
+"""Plain name and unit of every error."""
+CHANGES = {
+    "acceleration": ("vehicles accelerate less", "vehicles accelerate more", "acceleration", "+ c"),
+    "time_gap": ("drivers keep shorter time gaps", "drivers keep longer time gaps", "time gap", "T → T (1 + k)"),
+    "desired_speed": (
+        "drivers want to go slower", "drivers want to go faster", "desired speed", "v0 → v0 (1 + k)"
+    ),
+    "accel_and_decel": (
+        "drivers accelerate and brake softer", "drivers accelerate and brake harder", "acceleration and braking",
+        "a → a (1 + k), b → b (1 + k)",
+    ),
+}  # fmt: skip
+"""Of what can be located without a name: what drivers do with less and more of it, its noun, and its equation."""
+ALONG = {
+    "position": "place", "time": "time", "speed": "speed", "gap": "gap", "closing_speed": "closing speed",
+    "lead_accel": "leader's acceleration",
+}  # fmt: skip
+MANY = 4
+"""A term with more parameters than this is a curve: its range is told instead."""
+
+
+def number(x: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits and a true minus."""
+    return f"{x:.{digits}g}".replace("-", "−")
+
+
+def amount(x: float, unit: str) -> str:
+    """Return a number with its unit."""
+    return number(x) if unit == "1" else f"{number(x)} {unit}"
+
+
+def percent(ratio: float) -> str:
+    """Return the change that a ratio means, with its sign, in percent."""
+    return f"{100.0 * (ratio - 1.0):+.1f}\N{NO-BREAK SPACE}%".replace("-", "−")
+
+
+def plain(name: str) -> str:
+    """Return a candidate's plain name, or the label of what is only located, without underscores."""
+    return (name in ALL and ALL[name].title) or name.replace("_", " ")
+
+
+def told(p: Parameter, estimate: float, low: float, high: float) -> str:
+    """Return a parameter with its unit and interval: ``k = −0.31 [−0.38, −0.25]``."""
+    unit = "" if p.unit == "1" else f" {p.unit}"
+    if p.role == "place":
+        return f"{p.symbol or p.name} = {estimate:,.0f}{unit}".replace(",", " ")
+    return f"{p.symbol or p.name} = {number(estimate)}{unit} [{number(low)}, {number(high)}]"
+
+
+def clause(term: Term, values: Sequence[Sequence[float]]) -> str:
+    """Return what drivers do with a term in the model, its equation and its parameters [(estimate, low, high)]."""
+    estimates = [v[0] for v in values]
+    if len(values) <= MANY:
+        shown = [p.role != "place" or term.effect is not None for p in term.parameters]
+        numbers = ", ".join(told(p, *v) for p, v, show in zip(term.parameters, values, shown, strict=True) if show)
+    else:
+        numbers = f"a curve of {len(values)} knots from {number(min(estimates))} to {number(max(estimates))}"
+        numbers += "" if term.parameters[0].unit == "1" else f" {term.parameters[0].unit}"
+    if term.effect is not None:
+        effect = ALL[term.effect]
+        null = term.parameters[0].null or 0.0
+        below, above = effect.wording
+        text = below if len(values) <= MANY and estimates[0] < null else above
+        name = plain(term.effect)
+        told_as = f"{name}: {effect.equation}" if effect.equation else name
+        return f"{text or below or f'an effect is missing that {name} describes'} ({told_as}, with {numbers})"
+    below, above, noun, equation = CHANGES[term.what]
+    if len(values) > MANY or term.knots[2] > 2:
+        return f"the {noun} depends on {_over(term)} ({equation}, with {numbers})"
+    if len(values) == 2:
+        return f"the {noun} drifts over {ALONG[term.coordinate]} ({equation}, with {numbers})"
+    text = below if estimates[0] < 0 else above
+    return f"{text} {_interval(term, estimates)} than elsewhere ({equation}, with {numbers})"
+
+
+def _over(term: Term) -> str:
+    if "phase" in term.label:
+        return f"the phase of a cycle of {term.period:.0f} s"
+    return f"the {ALONG[term.coordinate]}"
+
+
+def _interval(term: Term, estimates: Sequence[float]) -> str:
+    unit = term.parameters[1].unit
+    if len(estimates) < 3 or estimates[2] > 9e5:
+        return f"from {estimates[1]:.0f} {unit} on"
+    return f"between {estimates[1]:.0f} and {estimates[2]:.0f} {unit}"
+
+
+def reason(refusal: Refusal | None, tried: str = "") -> str:
+    """Say why nothing (more) was added; ``tried`` is the plain name of what came nearest."""
+    if refusal is None:
+        return ""
+    figure = refusal.figure
+    return {
+        Reason.FEW_RUNS: f"only {figure:.0f} runs are left to choose on: the smallest p-value is {2.0**-figure:.2g}"
+        if figure == figure else "",
+        Reason.NO_GAIN: "no candidate gains enough on held-out runs",
+        Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",
+        Reason.FREE_SIMULATION: f"{tried} makes free simulation worse",
+        Reason.LOCKBOX: f"the runs kept back do not confirm {tried}",
+        Reason.HELD_OUT: f"predictions of the runs kept back get no better with {tried}",
+    }[refusal.reason]  # fmt: skip
+
+
+def headline(
+    verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison]
+) -> str:
+    """Say in one sentence what is missing, or why nothing can be said.
+
+    Args:
+        verdict: What is concluded.
+        clauses: Of every term that was added.
+        refusal: Why nothing was added.
+        tried: Plain names of what came nearest, "" for nothing.
+        errors: How errors on runs kept back changed with what was added or came nearest.
+    """
+    if verdict in (Verdict.NAMED, Verdict.LOCATED):
+        text = ", and ".join(clauses)
+        unnamed = "" if verdict is Verdict.NAMED else "; the catalogue has no name for it"
+        return f"{text[0].upper()}{text[1:]}{unnamed}{_but(errors)}."
+    if verdict is Verdict.NONE:
+        return (
+            "Nothing is missing that these data could show: no candidate lowers the error on runs that it was not "
+            "fitted to."
+        )
+    if verdict is Verdict.CANNOT_TELL:
+        return (
+            f"These data cannot tell: {reason(refusal, tried)}; seven runs are needed (a quarter is kept for the "
+            "final check), ten or more are better."
+        )
+    if refusal is not None and refusal.reason is Reason.HELD_OUT:
+        what = "no error falls" if all(not c.ratio < 1.0 for c in errors.values()) else "one gets worse and none better"
+        return (
+            f"Something is missing, but no model tried predicts better: {tried} shows in the runs that chose, and on "
+            f"the runs kept back {what} with it."
+        )
+    return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
+
+
+def _but(errors: Mapping[str, Comparison]) -> str:
+    """Say what the errors on runs kept back take from a finding."""
+    worse = [ERRORS[k][0] for k, c in errors.items() if c.light is Light.WORSE]
+    if worse:
+        return f"; on the runs kept back the error of the {' and the '.join(worse)} gets worse by it"
+    if errors and not any(c.light is Light.BETTER for c in errors.values()):
+        return "; no error on the runs kept back is measurably lower for it"
+    return ""
+
+
+def details(verdict: Verdict, found: Sequence[Mapping[str, Any]], left: float) -> list[str]:
+    """Say how sure it is, what it is confused with and what data would tell; ``left`` is what could still be gained."""
+    parts = []
+    for f in found:
+        name = plain(f["effect"] or f["label"])
+        parts.append(f"{name[0].upper()}{name[1:]}: p = {number(f['p_value'], 2)} over the whole list of candidates.")
+        if f["equivalent"]:
+            parts.append(f"These data cannot tell it from {', '.join(plain(x) for x in f['equivalent'])}.")
+        elif f["looks_like"]:
+            parts.append(f"It is most easily confused with {', '.join(spoken(x) for x in f['looks_like'][:3])}.")
+        if f["told_by"]:
+            parts.append(f"What would tell: {f['told_by']}.")
+    if verdict is Verdict.NONE:
+        parts.append(
+            f"A smooth function of the state without a name would lower the 5 s error by {100 * max(left, 0.0):.1f} % "
+            "on these runs. That no candidate helps does not say what the rest is."
+        )
+    if verdict is Verdict.CANNOT_TELL:
+        parts.append("The ranking below is a hint, not a finding.")
+    if verdict is Verdict.UNEXPLAINED:
+        parts.append("The ranking and the maps of the residual below say where to look.")
+    return parts
+
+
+def cautions(at_bounds: Mapping[str, int], groups: int, converged: int) -> list[str]:
+    """Say what else speaks against the figures: parameters at their bounds, and calibrations without an end."""
+    parts = [
+        f"The fitted {name.replace('_', ' ')} is at its bound for {n} of {groups} groups of drivers."
+        for name, n in at_bounds.items() if n > 0.2 * groups
+    ]  # fmt: skip
+    if converged < 0.9 * groups:
+        parts.append(f"Only {converged} of {groups} groups of drivers were calibrated to an end before the search.")
+    return parts
+
+
+def spoken(item: str) -> str:
+    """Return an entry of ``looks_like`` in plain words: its first word may be a candidate or a parameter."""
+    first, _, rest = item.partition(" ")
+    return f"{plain(first)} {rest.replace('_', ' ')}".strip()
