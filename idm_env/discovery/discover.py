@@ -14,6 +14,7 @@ import numpy as np
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
 from idm_env.discovery import checkpoint, judge, places, records, search, summary, words
+from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.decide import Round, decide
@@ -106,7 +107,8 @@ def discover(
     progress("calibration", "idm", 0, 1)
     theta, calibrated = calibrate(prepared.of_runs(fit_runs), by, task.prior.centre)
     progress("null", "idm", 0, 1)
-    base = Model(tuple(_known_term(prepared, name) for name in known))
+    told = tuple(_known_term(prepared, name) for name in known)
+    base = Model(told, twin.Catalogue.of([terms.known_effect(term) for term in told], prepared.period))
     null = searching.null(base, theta)
     null, steps, rounds = decide(searching, null, seed)
     saved.done()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import accumulate, product
 
 import numpy as np
 
 from idm_env import effects as catalogue
 from idm_env.discovery import march as twin
+from idm_env.discovery.march import Catalogue
 from idm_env.discovery.records import Records
 from idm_env.effects import Effect
 from idm_env.parameters import Parameter
@@ -41,46 +42,50 @@ class Term:
         """Number of parameters."""
         return len(self.parameters)
 
-    def entries(self, slot: int) -> list[int]:
-        """Return the places in φ of the parameters, for a term whose curve lies in ``slot``."""
-        if self.form == twin.NONE:
-            return [twin.INDEX[f"{self.effect}.{p.name}"] for p in self.parameters]
-        at = twin.FIRST + twin.ROOM * slot
+    @property
+    def located(self) -> bool:
+        """Whether this is a curve or an interval without a name, which takes a slot of the loop."""
+        return self.effect is None
+
+    def entries(self, catalogue: Catalogue, slot: int) -> list[int]:
+        """Return the places in φ of the parameters, for a term without a name in ``slot``."""
+        if self.form == twin.NONE or self.profile is not None:
+            return [catalogue.index[f"{self.effect}.{p.name}"] for p in self.parameters]
+        at = catalogue.table_at(self.effect or str(slot))
         if self.form == twin.INTERVAL:
             return [at + 4, at, at + 1][: self.size]
-        if self.profile is not None:
-            return [at + twin.ROOM - 1]
         return [at + 4 + i for i in range(self.size)]
 
 
 @dataclass(frozen=True)
 class Model:
-    """Terms that are in the model, in the order of adding."""
+    """Terms that are in the model, in the order of adding, and the catalogue whose loop rolls it out."""
 
     terms: tuple[Term, ...] = ()
-    slots: np.ndarray = field(init=False)
+    catalogue: Catalogue = field(default_factory=twin.default_catalogue)
     entries: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        slots = np.zeros((twin.SLOTS, 4), np.int64)
         entries: list[int] = []
-        used = 0
-        for term in self.terms:
-            if term.form != twin.NONE:
-                what, where = twin.WHATS.index(term.what), twin.COORDINATES.index(term.coordinate)
-                slots[used] = (term.form, what, where, term.knots[2])
-            entries += term.entries(used)
-            used += term.form != twin.NONE
-        object.__setattr__(self, "slots", slots)
+        for term, slot in self._slots:
+            entries += term.entries(self.catalogue, slot)
         object.__setattr__(self, "entries", np.array(entries, dtype=np.int64))
+
+    @property
+    def _slots(self) -> list[tuple[Term, int]]:
+        """Terms with the slots of those that have no name."""
+        slots = np.cumsum([t.located for t in self.terms]) - 1
+        if len(slots) and slots[-1] >= twin.SLOTS:
+            raise ValueError(f"a model can have {twin.SLOTS} effects without a name, and {slots[-1] + 1} were given.")
+        return [(t, int(s)) for t, s in zip(self.terms, slots, strict=True)]
 
     def adding(self, term: Term) -> Model:
         """Return the model with one term more."""
-        return Model((*self.terms, term))
+        return Model((*self.terms, term), self.catalogue)
 
     def without(self, index: int) -> Model:
         """Return the model without a term."""
-        return Model(self.terms[:index] + self.terms[index + 1 :])
+        return Model(self.terms[:index] + self.terms[index + 1 :], self.catalogue)
 
     def where(self, label: str) -> slice:
         """Return which entries are those of the term ``label``."""
@@ -93,17 +98,37 @@ class Model:
         """Declarations of all entries."""
         return tuple(p for term in self.terms for p in term.parameters)
 
+    @property
+    def named(self) -> list[Effect]:
+        """Effects of the terms that have a name."""
+        return [self.catalogue.by_name[t.effect] for t in self.terms if t.effect is not None]
+
+    @property
+    def on(self) -> np.ndarray:
+        """Flags of the effects that are at work."""
+        on = np.zeros(len(self.catalogue.flags), np.int8)
+        for term, slot in self._slots:
+            name = term.effect or self.catalogue.shape(term.what, term.coordinate, str(slot))[0]
+            on[self.catalogue.flags[name]] = 1
+        return on
+
+    @property
+    def tables(self) -> np.ndarray:
+        """Form, number of knots and place in φ of every table."""
+        tables = np.array([(twin.NONE, 2, self.catalogue.table_at(n)) for n in self.catalogue.tables], np.int64)
+        for term, slot in self._slots:
+            if term.form != twin.NONE:
+                tables[self.catalogue.tables[term.effect or str(slot)], :2] = term.form, term.knots[2]
+        return tables
+
     def phi(self, values: np.ndarray) -> np.ndarray:
-        """Return φ [..., SIZE] from the values of all parameters [..., Q]."""
+        """Return φ from the values of all parameters [..., Q]."""
         values = np.asarray(values, float)
-        phi = np.zeros((*values.shape[:-1], twin.SIZE))
-        phi[..., : twin.FIRST] = twin.NULL
-        used = 0
-        for term in self.terms:
+        phi = np.tile(self.catalogue.null, (*values.shape[:-1], 1))
+        for term, slot in self._slots:
             if term.form == twin.NONE:
                 continue
-            at = twin.FIRST + twin.ROOM * used
-            used += 1
+            at = self.catalogue.table_at(term.effect or str(slot))
             phi[..., at + 3] = term.period
             if term.form == twin.CURVE:
                 phi[..., at], phi[..., at + 1] = term.knots[:2]
@@ -111,21 +136,18 @@ class Model:
                     phi[..., at + 4 : at + 4 + len(term.profile)] = term.profile
             else:
                 phi[..., at + 2] = EDGES[term.coordinate]
+            if term.located:
+                for name, weight in self.catalogue.shape(term.what, term.coordinate, str(slot))[1].items():
+                    phi[..., self.catalogue.index[name]] = weight
         phi[..., self.entries] = values
         return phi
-
-    @property
-    def lead(self) -> float:
-        """Seconds before a window in which memories are wound up on the measured record."""
-        named = [catalogue.ALL[t.effect] for t in self.terms if t.effect is not None]
-        return max((effect.wind_up_s for effect in named), default=Effect.wind_up_s)
 
 
 class Frozen(Model):
     """A model whose φ stands: only the drivers' own parameters are left to fit."""
 
     def __init__(self, model: Model, values: np.ndarray) -> None:
-        super().__init__(model.terms)
+        super().__init__(model.terms, model.catalogue)
         object.__setattr__(self, "_phi", model.phi(values))
         object.__setattr__(self, "entries", np.zeros(0, np.int64))
 
@@ -136,7 +158,7 @@ class Frozen(Model):
 
     def phi(self, values: np.ndarray) -> np.ndarray:
         """Return the same φ for every copy and group."""
-        phi: np.ndarray = np.broadcast_to(self._phi, (*values.shape[:-1], twin.SIZE))  # type: ignore[attr-defined]
+        phi: np.ndarray = np.broadcast_to(self._phi, (*values.shape[:-1], len(self._phi)))  # type: ignore[attr-defined]
         return phi
 
 
@@ -185,6 +207,12 @@ def known_profile(name: str, first: float, distance: float, profile: Sequence[fl
         name, name, share, ((0.2,),), what="share", coordinate="position", form=twin.CURVE,
         knots=(first, distance, len(profile)), period=period, profile=tuple(profile),
     )  # fmt: skip
+
+
+def known_effect(term: Term) -> Effect:
+    """Return the effect of a term whose profile is known."""
+    first, distance, count = term.knots
+    return _made(term, tuple(float(first + distance * i) for i in range(count)))
 
 
 def interval(what: str, coordinate: str, begin: float, end: float, amount: float, period: float = 0.0) -> Term:
@@ -258,7 +286,7 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
         edge = EDGES[term.coordinate]
         middle = max(begin + edge, end - edge)
         knots = tuple(float(k) for k in (begin - edge, begin + edge, middle, max(end, begin) + edge))
-        knots = tuple(k + 1e-6 * i for i, k in enumerate(knots))
+        knots = tuple(accumulate(knots, lambda before, k: max(k, before + 1e-6)))
         heights = [0.0, amount, amount, 0.0]
     else:
         first, distance, count = term.knots

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -55,7 +56,8 @@ class Effect:
     ``sought``      what has to be found beside the strength
     ``changes``     what it changes: an acceleration, a parameter of the driver, a perceived signal, the response
     ``beyond``      whom the record must show
-    ``wind_up_s``   seconds of the record that its memory needs before a prediction begins
+    ``wind_up_s``   seconds of the record that it needs before a prediction begins; all of it, for one that remembers,
+                    where nothing is said
     ``column``      column of a file that gives its ``profile``, if measured
     ==============  ====================================================================================================
 
@@ -91,6 +93,8 @@ class Effect:
             )
         cls.hook = mine[0]
         cls.remembers = cls.remember is not Effect.remember
+        if cls.remembers and "wind_up_s" not in vars(cls):
+            cls.wind_up_s = math.inf
 
     @property
     def name(self) -> str:
