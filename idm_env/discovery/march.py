@@ -5,7 +5,7 @@ simulator, ``Simulator(Lane(), (IDM(), every candidate, Brakes()), dt, "midpoint
 loop of ``march_loops``, each effect behind a flag; absent effects cost one comparison. No equation stands here.
 
 Parameters of a row are a flat vector φ, laid out by a ``Catalogue``; behind them come tables of ``ROOM`` numbers, each
-``[first knot or begin, distance of knots or end, edge, period, values …]``: ``SLOTS`` for what has no name, then one for
+``[first knot or begin, knots per unit or end, edge, period, values …]``: ``SLOTS`` for what has no name, then one for
 every effect with a profile.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 from idm_env import effects as known
 from idm_env import history
 from idm_env.discovery import march_loops
-from idm_env.discovery.slots import CHANGED, TARGETS, Push
+from idm_env.discovery.slots import SETS, TARGETS, Push
 from idm_env.discovery.slots import Slot as Changed
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.effects.free import FEATURES
@@ -52,7 +52,7 @@ COLUMNS = (
 
 _SEEN: dict[Slot, str] = {
     Slot("position"): "place", Slot("speed"): "speed", Slot("accel"): "accel", Slot("gap"): "gap",
-    Slot("length"): "own_length", Slot("step"): "(time / dt)",
+    Slot("length"): "own_length", Slot("step"): "(time * per_dt)",
     Slot("led"): "1.0", Slot("speed", 1): "lead_speed", Slot("accel", 1): "lead_accel",
     # A gap to the second leader is counted from the leader's rear, whose length is then not needed.
     Slot("led", 1): "signals[i, 6]", Slot("length", 1): "0.0", Slot("gap", 1): "(signals[i, 3] - signals[i, 0])",
@@ -84,9 +84,9 @@ class Catalogue:
     @cached_property
     def flagged(self) -> tuple[Effect, ...]:
         """Everything behind a flag, adaptations in the order in which they act."""
-        unnamed = [kind(label=label) for label in map(str, range(SLOTS)) for kind in (Changed, Push)]
-        pulses = [Changed(label=PULSE, given=True), Push(label=PULSE, given=True)]
-        return tuple(sorted((*self.effects, *unnamed, *pulses), key=lambda e: e.rank if e.hook == "adapt" else 0))
+        labels = [(label, False) for label in map(str, range(SLOTS))] + [(PULSE, True)]
+        slots = [kind for label, given in labels for kind in _slots(label, given)]
+        return tuple(sorted((*self.effects, *slots), key=lambda e: e.rank if e.hook == "adapt" else 0))
 
     @cached_property
     def flags(self) -> dict[str, int]:
@@ -117,12 +117,16 @@ class Catalogue:
         return len(self.index) + ROOM * self.tables[name]
 
     def shape(self, what: str, coordinate: str, label: str) -> tuple[str, dict[str, float]]:
-        """Return which effect stands for a change of ``what`` over a coordinate in a slot, and its weights in φ."""
-        name = (Push if what == "acceleration" else Changed)(label=label).name
+        """Return which effect stands for a change of ``what`` over a coordinate in a slot, and what φ says of it."""
         changed = TARGETS.get(what, ())
-        weights = {f"over_{f}": float(f == coordinate) for f in FEATURES}
-        weights |= {} if what == "acceleration" else {n: float(n in changed) for n in CHANGED}
-        return name, {f"{name}.{w}": value for w, value in weights.items()}
+        effect = next(e for e in _slots(label) if (set(changed) & set(e.targets) if isinstance(e, Changed) else not changed))
+        told = {"over": float(list(FEATURES).index(coordinate))} if coordinate else {}
+        told |= {n: float(n in changed) for n in (effect.targets if isinstance(effect, Changed) else ())}
+        return effect.name, {f"{effect.name}.{name}": value for name, value in told.items()}
+
+
+def _slots(label: str, given: bool = False) -> tuple[Effect, ...]:
+    return (*(Changed(label=label, given=given, targets=t) for t in SETS), Push(label=label, given=given))
 
 
 def _on_lap(effect: Effect, period: float) -> Effect:
@@ -191,8 +195,8 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     graph = Regions()
     made = _recorded(catalogue, dt, graph)
     memories = list(made.begin)
-    driver = {f"idm.{p.name}": f"th[{i}]" for i, p in enumerate(IDM.declared)}
-    inputs = {slot_name(f"{kind}_{PULSE}", ""): "pulse_now" for kind in (Changed.kind, Push.kind)}
+    driver = {f"idm.{p.name}": f"th{i}" for i, p in enumerate(IDM.declared)}
+    inputs = {slot_name(e.name, ""): "pulse_now" for e in _slots(PULSE)}
     for effect in catalogue.effects:
         inputs |= {slot_name(effect.name, part): text for part, text in _BESIDE.items()}
 
@@ -215,14 +219,16 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     straight = Straight(graph, read)
     after = made.respond
     moved = [("displacement", after["displacement"]), ("speed_after", after["speed"]), ("accel_after", after["accel"])]
+    remembered = [(f"moved[{j}]", after[f"memory of {m}"]) for j, m in enumerate(memories)]
     blocks = {
         "sense": straight.lines([(f"h[now, {j}]", node) for j, node in enumerate(made.sense)]),
         "begin": straight.lines([(f"memory[{j}]", made.begin[m]) for j, m in enumerate(memories)]),
-        "respond": straight.lines(
-            [*moved, *((f"moved[{j}]", after[f"memory of {m}"]) for j, m in enumerate(memories))]
-        ),
+        "wind": straight.lines(remembered),
+        "respond": straight.lines([*moved, *remembered]),
     }
-    blocks["constants"] = straight.constants()
+    constants = straight.constants()
+    loads = [f"th{i} = th[{i}]" for i in range(len(driver))] + straight.loads()
+    blocks["constants"] = [*loads, *constants]
     text = Path(march_loops.__file__).read_text(encoding="utf-8")
     counts = f"SIGNALS, MEMORIES = {max(len(made.sense), 1)}, {len(memories)}\n"
     text = text.replace("compiled = ", f"{counts}compiled = ", 1)
@@ -246,13 +252,13 @@ def _recorded(catalogue: Catalogue, dt: float, graph: Regions) -> Recording:
         wrapped.append(Behind(effect, graph, f"on {effect.name}", table))
     beside = [e.name for e in catalogue.effects if e.beyond == "vehicle in an adjacent lane"]
     inputs = [(name, tuple(_BESIDE), (False,) * len(_BESIDE)) for name in beside]
-    inputs += [(f"{kind}_{PULSE}", ("",), (False,)) for kind in (Changed.kind, Push.kind)]
+    inputs += [(e.name, ("",), (False,)) for e in _slots(PULSE)]
     memories = tuple(e.name for e in catalogue.effects if e.remembers)
     stepping = Stepping(Lane(), (IDM(), *wrapped, Brakes()), dt, "midpoint")  # type: ignore[arg-type]
     return record(stepping, Form(tuple(inputs), memories, present=False), graph)
 
 
-def lead_steps(effects: Sequence[Effect], dt: float) -> int:
-    """Return how many steps before a window memories are wound up; −1: from the record's beginning."""
-    seconds = max((e.wind_up_s for e in effects), default=Effect.wind_up_s)
-    return -1 if math.isinf(seconds) else round(seconds / dt)
+def lead_steps(effects: Sequence[Effect], dt: float) -> tuple[bool, int]:
+    """Return whether memories are wound up from a record's beginning, and for how many steps a driver settles on it."""
+    seconds = [e.wind_up_s for e in effects]
+    return math.inf in seconds, round(max([Effect.wind_up_s, *(s for s in seconds if s < math.inf)]) / dt)

@@ -28,7 +28,7 @@ def curve(p, number, tables, x):
         up = min(max((x - begin + edge) / (2.0 * edge), 0.0), 1.0)
         down = min(max((end + edge - x) / (2.0 * edge), 0.0), 1.0)
         return amount * min(up, down)
-    position = (x - p[at]) / p[at + 1]
+    position = (x - p[at]) * p[at + 1]
     if period > 0.0:
         position = position - count * np.floor(position / count)
         low = int(position)
@@ -42,20 +42,20 @@ def curve(p, number, tables, x):
 
 @compiled
 def march(
-    signals, bounds, record, start, steps, group, length, theta, phi, on, tables, back, lead, every, dt, k, pulse,
+    signals, bounds, record, start, steps, group, length, theta, phi, on, tables, back, whole, lead, every, dt, k, pulse,
     gap_out, speed_out,
 ):  # fmt: skip
     """Roll every row out in every copy and fill ``gap_out`` and ``speed_out`` [copies, rows, samples].
 
     ``signals`` [samples, columns] holds all records, record r in rows ``bounds[r] : bounds[r + 1]``. Row i starts on
-    its measured state at sample ``start[i]`` of ``record[i]`` and runs ``steps`` steps; ``lead`` steps before that
-    (negative: from the record's beginning), in which it is placed on the record, wind up what has a memory. ``theta``
+    its measured state at sample ``start[i]`` of ``record[i]`` and runs ``steps`` steps. In ``lead`` steps before that it
+    is placed on the record and responds; ``whole`` winds memories up from the record's beginning. ``theta``
     [copies, groups, 5]; ``phi`` [copies, groups, …] and ``on`` [copies, flags] as a catalogue lays them out;
     ``tables`` [tables, 3] is (form, number of knots, place in φ); ``back`` is how many steps of the past are kept;
     ``pulse`` [copies, 3] is (first step, end step, amount); ``k`` are constants that depend on dt. Every ``every`` steps
     a sample is kept; rows in which a record ends keep their last state.
     """
-    rows = len(record)
+    rows, per_dt = len(record), 1.0 / dt
     longest = 0
     for r in range(len(bounds) - 1):
         longest = max(longest, bounds[r + 1] - bounds[r])
@@ -63,7 +63,7 @@ def march(
     memory, kept_memory, moved = np.zeros(MEMORIES), np.zeros(MEMORIES), np.zeros(MEMORIES)
     for c in range(theta.shape[0]):
         flags = on[c]
-        last, kept_at, kept_accel = -1, 0, 0.0
+        last, kept_at = -1, 0
         for row in range(rows):
             r = record[row]
             th, p = theta[c, group[row]], phi[c, group[row]]
@@ -71,16 +71,15 @@ def march(
             offset = signals[origin, 18] - signals[origin, 14]
             # <constants>
             # </constants>
-            going_on = lead < 0 and r == last and kept_at <= origin
-            first = begin if lead < 0 else max(begin, origin - lead)
-            if going_on:
-                first = kept_at
-            accel = kept_accel if going_on else signals[first, 16]
-            speed, position = signals[first, 15], signals[first, 14]
-            if going_on:
-                memory[:] = kept_memory
+            # Up to ``settle`` only memories are wound up, and from there to the origin the whole step, on the record.
+            settle = max(begin, origin - lead)
+            going_on = whole and r == last and kept_at <= settle
+            first = kept_at if going_on else begin if whole else settle
+            for j in range(MEMORIES):
+                memory[j] = kept_memory[j]
             last = r
-            # Before ``first`` only the past is filled; up to the origin the driver is placed on the record.
+            speed, position, accel = signals[first, 15], signals[first, 14], signals[first, 16]
+            # Before ``first`` only the past is filled.
             i = first if going_on or back == 0 else max(begin, first - back)
             while i < origin + steps:
                 if i + 1 >= end:
@@ -89,9 +88,8 @@ def march(
                     break
                 if i <= origin:
                     position, speed = signals[i, 14], signals[i, 15]
-                if i == origin:
-                    kept_at, kept_accel = origin, accel
-                    kept_memory[:] = memory
+                    if i <= settle:
+                        accel = signals[i, 16]
                 now = i - begin
                 lead_speed, lead_accel = signals[i, 1], signals[i, 2]
                 gap = signals[i, 0] - position
@@ -111,11 +109,22 @@ def march(
                 if i == first and not going_on:
                     # <begin>
                     # </begin>
-                    if i == origin:
-                        kept_memory[:] = memory
+                    pass
+                if i < settle:
+                    # <wind>
+                    # </wind>
+                    for j in range(MEMORIES):
+                        memory[j] = moved[j]
+                    i += 1
+                    continue
+                if i == settle:
+                    kept_at = i
+                    for j in range(MEMORIES):
+                        kept_memory[j] = memory[j]
                 # <respond>
                 # </respond>
-                memory[:] = moved
+                for j in range(MEMORIES):
+                    memory[j] = moved[j]
                 accel = accel_after
                 i += 1
                 if i <= origin:

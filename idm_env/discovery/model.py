@@ -131,7 +131,7 @@ class Model:
             at = self.catalogue.table_at(term.effect or str(slot))
             phi[..., at + 3] = term.period
             if term.form == twin.CURVE:
-                phi[..., at], phi[..., at + 1] = term.knots[:2]
+                phi[..., at], phi[..., at + 1] = term.knots[0], 1.0 / term.knots[1]
                 if term.profile is not None:
                     phi[..., at + 4 : at + 4 + len(term.profile)] = term.profile
             else:

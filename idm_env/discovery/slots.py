@@ -1,7 +1,7 @@
 """Places in discovery's loop for what has no name: a curve over any feature that changes any number of the driver.
 
-One pair of effects stands for all curves and intervals. Which feature and which numbers is said by weights of 0 and 1,
-which are parameters, so that one compiled loop serves every choice.
+One pair of effects stands for all curves and intervals. Which feature and which numbers is said by parameters, so that
+one compiled loop serves every choice.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
@@ -25,32 +26,38 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "accel_and_decel": ("max_accel", "comfort_decel"),
 }
 """What a curve may change, and the driver's parameters that this means; ``acceleration`` is added instead."""
-CHANGED = ("time_gap", "desired_speed", "max_accel", "comfort_decel")
+SETS = (("time_gap", "desired_speed"), ("max_accel", "comfort_decel"))
+"""Parameters that one slot may change: what a curve leaves alone must not wait for it."""
 
 
-def _weights(names: tuple[str, ...]) -> tuple[Parameter, ...]:
-    return tuple(Parameter(name, "", "1", 0.0, 0.0, 1.0, null=0.0) for name in names)
+OVER = Parameter("over", "", "1", 0.0, 0.0, len(FEATURES) - 1.0, role="shape")
+"""Which feature a curve runs over: its place in ``FEATURES``."""
 
 
 @dataclass(frozen=True)
 class Slot(Effect):
-    """A driver whose parameters are multiplied by ``1 + w c``: c a curve at Σ w x over the features x, or the input.
+    """A driver of whom some parameters are multiplied by ``1 + c``: c a curve over one feature, or the input (``given``).
 
-    ``given`` takes c from the input. The weights w are parameters.
+    Which feature and which parameters is said by parameters: ``over``, and 1 for what changes.
     """
 
     kind: ClassVar[str] = "slot"
     rank: ClassVar[int] = DriverCurve.rank
-    declared: ClassVar[tuple[Parameter, ...]] = _weights((*(f"over_{f}" for f in FEATURES), *CHANGED))
     label: str = ""
+    targets: tuple[str, ...] = SETS[0]
     given: bool = False
     knots: tuple[float, ...] = (0.0, 1.0)
     values: tuple[float, ...] = (0.0, 0.0)
 
     @property
     def name(self) -> str:
-        """``slot_`` and the label."""
-        return f"{self.kind}_{self.label}"
+        """``slot_``, the first parameter that may change, and the label."""
+        return f"{self.kind}_{self.targets[0]}_{self.label}"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Which feature, and 1 for each parameter that changes."""
+        return (OVER, *(Parameter(name, "", "1", 0.0, 0.0, 1.0, null=0.0) for name in self.targets))
 
     def value(self, scene: Scene, p: P) -> Tensor:
         """Return c."""
@@ -58,14 +65,16 @@ class Slot(Effect):
             given: Tensor = scene.input(self.name)
             return given
         x: Any = 0.0
-        for feature in FEATURES:
-            x = x + p[f"over_{feature}"] * feature_of(scene, feature, None)
+        for number, feature in enumerate(FEATURES):
+            # Chosen, not summed: the loop need not wait for what does not count.
+            x = torch.where(p["over"] == number, feature_of(scene, feature, None), x)
         return curve(x, p, "knot", self.knots, None, self.values)
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the parameters changed."""
         c = self.value(scene, p)
-        return driver._replace(**{n: getattr(driver, n) * (1.0 + p[n] * c) for n in CHANGED})
+        now = {n: getattr(driver, n) for n in self.targets}
+        return driver._replace(**{n: torch.where(p[n] > 0.0, x * (1.0 + c), x) for n, x in now.items()})
 
 
 @dataclass(frozen=True)
@@ -73,13 +82,17 @@ class Push(Effect):
     """An added acceleration c, as in ``Slot``."""
 
     kind: ClassVar[str] = "push"
-    declared: ClassVar[tuple[Parameter, ...]] = _weights(tuple(f"over_{f}" for f in FEATURES))
+    declared: ClassVar[tuple[Parameter, ...]] = (OVER,)
     label: str = ""
     given: bool = False
     knots: tuple[float, ...] = (0.0, 1.0)
     values: tuple[float, ...] = (0.0, 0.0)
 
-    name = Slot.name
+    @property
+    def name(self) -> str:
+        """``push_`` and the label."""
+        return f"{self.kind}_{self.label}"
+
     value = Slot.value
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:

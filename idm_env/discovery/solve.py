@@ -74,7 +74,7 @@ class Task:
         loop.march(
             records.signals, records.bounds, rows.record, rows.start, rows.steps, rows.group, records.length,
             np.exp(theta), phi, on, model.tables, twin.back_steps(model.named, dt),
-            twin.lead_steps(model.named, dt), rows.every, dt, loop.varying, pulse, gap, speed,
+            *twin.lead_steps(model.named, dt), rows.every, dt, loop.varying, pulse, gap, speed,
         )  # fmt: skip
         return gap, speed
 

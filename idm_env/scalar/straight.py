@@ -40,6 +40,10 @@ class Straight:
         zeros = [f"{self._kept[n]} = 0.0" for n in wanted if n in self._graph.region]
         return [*zeros, *self._print(self._live(wanted, stop=False), names, self._kept)]
 
+    def loads(self) -> list[str]:
+        """Return lines that name what depends on the time step, from an array ``k``; call it last."""
+        return [f"k{i} = k[{i}]" for i in range(len(self.varying.values))]
+
     @staticmethod
     def _is_kept(node: Node) -> bool:
         return node.level < DYNAMIC and node.op not in ("constant", "input") and not node.boolean
@@ -101,7 +105,7 @@ class Straight:
         if node.op == "constant":
             assert isinstance(node.label, float)
             if isinstance(node.label, TimeStep):
-                return f"k[{self.varying.index(node.label)}]"
+                return f"k{self.varying.index(node.label)}"
             return repr(float(node.label)) if node.label >= 0 else f"({float(node.label)!r})"
         if node.op == "input":
             assert isinstance(node.label, Slot)
