@@ -221,10 +221,10 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     moved = [("displacement", after["displacement"]), ("speed_after", after["speed"]), ("accel_after", after["accel"])]
     remembered = [(f"moved[{j}]", after[f"memory of {m}"]) for j, m in enumerate(memories)]
     blocks = {
-        "sense": straight.lines([(f"h[now, {j}]", node) for j, node in enumerate(made.sense)]),
-        "begin": straight.lines([(f"memory[{j}]", made.begin[m]) for j, m in enumerate(memories)]),
-        "wind": straight.lines(remembered),
-        "respond": straight.lines([*moved, *remembered]),
+        "sense": straight.lines([(f"h[now, {j}]", node) for j, node in enumerate(made.sense)], "s"),
+        "begin": straight.lines([(f"memory[{j}]", made.begin[m]) for j, m in enumerate(memories)], "b"),
+        "wind": straight.lines(remembered, "w"),
+        "respond": straight.lines([*moved, *remembered], calls=False),
     }
     constants = straight.constants()
     loads = [f"th{i} = th[{i}]" for i in range(len(driver))] + straight.loads()

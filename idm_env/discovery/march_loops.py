@@ -16,6 +16,12 @@ compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @compiled
+def choose(condition, a, b):
+    """Return a where the condition holds, else b."""
+    return a if condition else b
+
+
+@compiled
 def curve(p, number, tables, x):
     """Piecewise linear through evenly spaced knots (periodic where a period is given), or a trapezoid."""
     form, count = tables[number, 0], tables[number, 1]

@@ -11,6 +11,14 @@ from idm_env.scalar.graph import DYNAMIC, Node, Slot, TimeStep
 from idm_env.scalar.regions import Regions
 from idm_env.scalar.source import _FORMS, Constants
 
+_CHOICES = {
+    "relu": "choose({0} < 0.0, 0.0, {0})", "clamp_min": "choose({0} < {1}, {1}, {0})",
+    "clamp_max": "choose({0} > {1}, {1}, {0})", "maximum": "choose({0} > {1}, {0}, {1})",
+    "minimum": "choose({0} < {1}, {0}, {1})", "select": "choose({0}, {1}, {2})",
+    "sign": "choose({0} > 0.0, 1.0, choose({0} < 0.0, -1.0, 0.0))",
+}  # fmt: skip
+"""Choices as calls of ``choose(condition, a, b)``: branches would cost numba seconds to compile."""
+
 Read = Callable[[Slot], str]
 """How an input is read: an expression."""
 
@@ -21,10 +29,16 @@ class Straight:
     def __init__(self, graph: Regions, read: Read) -> None:
         self._graph, self._read = graph, read
         self.varying = Constants()
+        self._prefix, self._calls = "t", True
         self._kept: dict[Node, str] = {}
 
-    def lines(self, writes: Sequence[tuple[str, Node]]) -> list[str]:
-        """Return lines that compute and write what changes with every step."""
+    def lines(self, writes: Sequence[tuple[str, Node]], prefix: str = "t", *, calls: bool = True) -> list[str]:
+        """Return lines that compute and write what changes with every step.
+
+        Names begin with ``prefix``: a name that is set once in a function costs its compiler much less. ``calls`` writes
+        choices as calls, which compile quicker and run slower than branches.
+        """
+        self._prefix, self._calls = prefix, calls
         live = self._live([node for _, node in writes], stop=True)
         for node in live:
             if self._is_kept(node) and node not in self._kept:
@@ -37,8 +51,8 @@ class Straight:
         """Return lines that compute what the printed lines need of parameters alone; call it last."""
         wanted = list(self._kept)
         names: dict[Node, str] = {}
-        zeros = [f"{self._kept[n]} = 0.0" for n in wanted if n in self._graph.region]
-        return [*zeros, *self._print(self._live(wanted, stop=False), names, self._kept)]
+        self._prefix, self._calls = "u", True
+        return self._print(self._live(wanted, stop=False), names, self._kept)
 
     def loads(self) -> list[str]:
         """Return lines that name what depends on the time step, from an array ``k``; call it last."""
@@ -78,7 +92,7 @@ class Straight:
                 done.add(region)
                 same = merges[region]
                 for m in same:
-                    names[m] = (fixed or {}).get(m, f"t{graph.serial[m]}")
+                    names[m] = (fixed or {}).get(m, f"{self._prefix}{graph.serial[m]}")
                 lines += [f"{names[m]} = {self._name(m.args[2], names)}" for m in same]
                 block = inside.get(region, [])
                 block = [*block, *(f"{names[m]} = {self._name(m.args[1], names)}" for m in same)]
@@ -91,7 +105,7 @@ class Straight:
                 note = node.note
                 lines.append(f"# {note or 'motion'}")
             text = self._text(node, names)
-            names[node] = (fixed or {}).get(node, f"t{graph.serial[node]}")
+            names[node] = (fixed or {}).get(node, f"{self._prefix}{graph.serial[node]}")
             target.append(f"{names[node]} = {text}")
         # Of a region that only fixes constants nothing is merged.
         for region, block in inside.items():
@@ -119,7 +133,8 @@ class Straight:
             return f"h[max(now - int({arguments[0]}), 0), {node.label}]"
         if node.op == "table":
             return f"curve(p, {node.label}, tables, {arguments[0]})"
-        return _FORMS[node.op].format(*arguments, zero="0.0", one="1.0")
+        form = (_CHOICES.get(node.op) if self._calls else None) or _FORMS[node.op]
+        return form.format(*arguments, zero="0.0", one="1.0")
 
 
 def block_note(node: Node) -> str:
