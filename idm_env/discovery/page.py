@@ -148,9 +148,8 @@ def _errors(d: Discovery) -> Iterator[Block]:
     partial = r["partial"]
     if partial:
         yield pages.note(
-            f"Not added: {partial['effect']}: "
-            + ", and ".join(t["clause"] for t in partial["terms"])
-            + f". {percent(partial['share_of_drivers_improved'])} of the followers kept back improve with it."
+            f"{percent(partial['share_of_drivers_improved'])} of the followers kept back improve with "
+            f"{partial['effect']}, which was not added."
         )
 
 

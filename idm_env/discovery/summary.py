@@ -98,7 +98,7 @@ def report(
         "verdict": verdict.value,
         "reason": None if judged.refusal is None else judged.refusal.reason.value,
         "sentence": words.headline(verdict, [f["clause"] for f in found], judged.refusal, judged.tried, errors),
-        "details": words.details(verdict, found, left),
+        "details": words.details(verdict, found, [] if judged.added else entries, left),
         "found": found,
         "known": _known(final, interval_of(final, task), base),
         "helps": {

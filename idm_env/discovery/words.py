@@ -148,10 +148,10 @@ def headline(
             "final check), ten or more are better."
         )
     if refusal is not None and refusal.reason is Reason.HELD_OUT:
-        what = "no error falls" if all(not c.ratio < 1.0 for c in errors.values()) else "one gets worse and none better"
+        falls = any(c.ratio < 1.0 for c in errors.values())
         return (
-            f"Something is missing, but no model tried predicts better: {tried} shows in the runs that chose, and on "
-            f"the runs kept back {what} with it."
+            f"Something is missing, but no model tried predicts better: with {tried}, found on the runs that chose, "
+            f"{'an error gets worse and none better' if falls else 'no error falls'} on the runs kept back."
         )
     return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
 
@@ -166,8 +166,13 @@ def _but(errors: Mapping[str, Comparison]) -> str:
     return ""
 
 
-def details(verdict: Verdict, found: Sequence[Mapping[str, Any]], left: float) -> list[str]:
-    """Say how sure it is, what it is confused with and what data would tell; ``left`` is what could still be gained."""
+def details(
+    verdict: Verdict, found: Sequence[Mapping[str, Any]], nearest: Sequence[Mapping[str, Any]], left: float
+) -> list[str]:
+    """Say how sure it is, what it is confused with and what data would tell.
+
+    ``nearest`` are the terms that came nearest where nothing was added; ``left`` is what could still be gained.
+    """
     parts = []
     for f in found:
         name = plain(f["effect"] or f["label"])
@@ -185,6 +190,8 @@ def details(verdict: Verdict, found: Sequence[Mapping[str, Any]], left: float) -
         )
     if verdict is Verdict.CANNOT_TELL:
         parts.append("The ranking below is a hint, not a finding.")
+    if nearest:
+        parts.append(f"Nearest came, without being added: {', and '.join(f['clause'] for f in nearest)}.")
     if verdict is Verdict.UNEXPLAINED:
         parts.append("The ranking and the maps of the residual below say where to look.")
     return parts

@@ -207,9 +207,7 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
                 held = effect.initial_memory(scene, driver, given[effect.name])  # type: ignore[arg-type]
                 recording.begin[effect.name] = value_of(graph, held)
     except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise Untraceable(
-            f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}"
-        ) from error
+        raise Untraceable(f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}") from error
     for name in ("position", "speed", "accel"):
         recording.respond[name] = value_of(graph, getattr(after, name))
     for name in form.memories:

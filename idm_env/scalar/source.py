@@ -49,9 +49,7 @@ def word(slot: Slot) -> str:
     """Return a slot as a Python name: ``speed``, ``speed_ahead``, ``speed_behind``, ``idm_time_gap``."""
     name = re.sub(r"\W+", "_", slot.name)
     where = {0: "", 1: "_ahead", -1: "_behind"}.get(slot.shift)
-    return name + (
-        where if where is not None else f"_ahead_{slot.shift}" if slot.shift > 0 else f"_behind_{-slot.shift}"
-    )
+    return name + (where if where is not None else f"_ahead_{slot.shift}" if slot.shift > 0 else f"_behind_{-slot.shift}")
 
 
 def row(slot: Slot) -> str:

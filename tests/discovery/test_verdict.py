@@ -164,7 +164,8 @@ def test_what_makes_every_error_worse_is_not_named(monkeypatch: pytest.MonkeyPat
     found = discover(few(effect="lag"), effects=["lag", "drag"])
     report = found.report
     assert report["verdict"] == "unexplained" and report["reason"] == "held_out" and report["found"] == []
-    assert "no error falls with it" in report["sentence"] and "response lag" in report["sentence"]
+    assert "no error falls on the runs kept back" in report["sentence"] and "response lag" in report["sentence"]
+    assert "τ dA/dt = a − A" in " ".join(report["details"])
     assert all(told["ratio"] > 1.0 for told in report["helps"].values())
     assert report["error"]["after"] == report["error"]["before"]
     assert report["partial"]["effect"] == "response lag" and report["partial"]["share_of_drivers_improved"] == 0.0
@@ -183,5 +184,5 @@ def test_bounds_and_unfinished_calibrations_are_told() -> None:
 
 def test_words_of_none_claim_no_cause() -> None:
     text = words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {})
-    assert "drivers' own noise" not in text + " ".join(words.details(Verdict.NONE, [], 0.01))
+    assert "drivers' own noise" not in text + " ".join(words.details(Verdict.NONE, [], [], 0.01))
     assert verdict.Verdict("none") is Verdict.NONE
