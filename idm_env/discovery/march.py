@@ -72,7 +72,7 @@ class Catalogue:
 
     @classmethod
     def of(cls, effects: Sequence[Effect] = (), period: float = 0.0) -> Catalogue:
-        """Return the package's candidates and ``effects``, which replace those of the same name, on a lap of ``period``."""
+        """Return the package's candidates and ``effects``, which replace those of the same name, on a lap (m) if any."""
         given = {e.name: e for e in (*(known.make(name) for name in known.CANDIDATES), *effects)}
         return cls(tuple(_on_lap(e, period) for e in given.values()))
 
@@ -136,10 +136,14 @@ def _on_lap(effect: Effect, period: float) -> Effect:
     return effect
 
 
-@lru_cache(maxsize=8)
 def default_catalogue() -> Catalogue:
-    """Return the package's candidates."""
-    return Catalogue.of()
+    """Return the package's candidates and those that are registered."""
+    return _default(known.candidates())
+
+
+@lru_cache(maxsize=8)
+def _default(names: tuple[str, ...]) -> Catalogue:
+    return Catalogue.of([known.make(name) for name in names])
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import accumulate, product
 
 import numpy as np
@@ -22,7 +22,7 @@ class Term:
 
     ``effect`` is the catalogue's name or None for what is only located; ``what`` and ``coordinate`` say what changes
     and over which coordinate; ``form`` is NONE, CURVE or INTERVAL; ``knots`` (first, distance, count) of a curve.
-    ``starts`` are values of all parameters to start a search from; ``fixed`` are entries that are not searched.
+    ``starts`` are values of all parameters to start a search from; ``made`` is the effect with its static choices.
     """
 
     label: str
@@ -36,6 +36,7 @@ class Term:
     period: float = 0.0
     profile: tuple[float, ...] | None = None
     smoothness: float = 0.0
+    made: Effect | None = None
 
     @property
     def size(self) -> int:
@@ -166,12 +167,20 @@ EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed"
 """Half-width over which an interval of a located effect sets in."""
 
 
-def simple(name: str) -> Term:
-    """Return the term of an effect of the catalogue that needs no place; one start for every mix of its parameters'."""
-    cls = catalogue.ALL[name]
-    parameters = tuple(_searched(p) for p in cls().parameters)
-    starts = tuple(product(*(p.starts for p in parameters)))
-    return Term(name, name, parameters, starts, what=cls.changes, coordinate="state")
+def simple(effect: str | Effect) -> Term:
+    """Return the term of an effect that needs no place; one start for every mix of its parameters'."""
+    one = catalogue.make(effect) if isinstance(effect, str) else effect
+    parameters = tuple(_searched(p) for p in one.parameters)
+    starts = tuple(product(*(_starts(p) for p in parameters)))
+    period = float(getattr(one, "period", None) or 0.0)
+    return Term(one.name, one.name, parameters, starts, what=one.changes, coordinate="state", period=period, made=one)
+
+
+def _starts(p: Parameter) -> tuple[float, ...]:
+    """Return where the search of a parameter starts: as declared; a strength else from a quarter of its default."""
+    if p.starts or p.role == "threshold":
+        return p.starts or (0.5 * p.default, p.default)
+    return (p.default if p.null is None else p.null + 0.25 * (p.default - p.null),)
 
 
 def _searched(p: Parameter) -> Parameter:
@@ -182,30 +191,35 @@ def _searched(p: Parameter) -> Parameter:
     return replace(p, low=low, high=high, default=min(max(p.default, low), high))
 
 
-def placed(name: str, *values: float, period: float = 0.0) -> Term:
+def placed(effect: str | Effect, *values: float, period: float = 0.0) -> Term:
     """Return the term of an effect that acts in one interval of places or from one moment on: strength, then places."""
-    cls = catalogue.ALL[name]
-    coordinate = {"interval": "position", "step": "time"}[cls.sought]
-    return Term(name, name, cls().parameters, (values,), what=cls.changes, coordinate=coordinate, period=period)
+    one = catalogue.make(effect) if isinstance(effect, str) else effect
+    coordinate = {"interval": "position", "step": "time"}[one.sought]
+    return Term(
+        one.name, one.name, one.parameters, (values,), what=one.changes, coordinate=coordinate, period=period, made=one,
+    )  # fmt: skip
 
 
-def unknown_profile(name: str, first: float, distance: float, count: int, period: float) -> Term:
+def unknown_profile(effect: str | Effect, first: float, distance: float, count: int, period: float) -> Term:
     """Return an effect whose profile over position is not known: one parameter at every knot."""
-    declared = catalogue.make(name, knots=tuple(first + distance * i for i in range(count))).parameters
+    one = catalogue.make(effect) if isinstance(effect, str) else effect
+    knots = tuple(first + distance * i for i in range(count))
+    declared = replace(one, knots=knots).parameters  # type: ignore[call-arg]
     parameters = tuple(replace(p, default=0.0) for p in declared)
     return Term(
-        name, name, parameters, ((0.0,) * count,), what="slope", coordinate="position", form=twin.CURVE,
-        knots=(first, distance, count), period=period, smoothness=0.03,
+        one.name, one.name, parameters, ((0.0,) * count,), what="slope", coordinate="position", form=twin.CURVE,
+        knots=(first, distance, count), period=period, smoothness=0.03, made=one,
     )  # fmt: skip
 
 
 def known_profile(name: str, first: float, distance: float, profile: Sequence[float], period: float) -> Term:
     """Return an effect whose profile over position is known, and of which some share acts."""
     places = tuple(first + distance * i for i in range(len(profile)))
-    share = tuple(replace(p, default=0.5) for p in catalogue.make(name, knots=places, profile=profile).parameters)
+    one = catalogue.make(name, knots=places, profile=tuple(profile))
+    share = tuple(replace(p, default=0.5) for p in one.parameters)
     return Term(
         name, name, share, ((0.2,),), what="share", coordinate="position", form=twin.CURVE,
-        knots=(first, distance, len(profile)), period=period, profile=tuple(profile),
+        knots=(first, distance, len(profile)), period=period, profile=tuple(profile), made=one,
     )  # fmt: skip
 
 
@@ -249,16 +263,22 @@ NEIGHBOURS = {"second leader": "second", "vehicle behind": "behind", "vehicle in
 """Column of the records that says when a neighbour is there."""
 
 
-def testable(records: Records, names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """Return which effects the data can show at all, and why others cannot be tested."""
+def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
+    """Return by name which effects cannot be tested, and why: the data do not show them, or no loop can have them."""
     refused = {}
-    for name in names:
-        beyond = catalogue.ALL[name].beyond
-        if beyond in NEIGHBOURS:
-            column = twin.COLUMNS.index(f"{NEIGHBOURS[beyond]}_present")
+    for effect in effects:
+        if effect.beyond in NEIGHBOURS:
+            column = twin.COLUMNS.index(f"{NEIGHBOURS[effect.beyond]}_present")
             if records.signals[:, column].mean() < 0.02:
-                refused[name] = f"no {beyond} is measured"
-    return [name for name in names if name not in refused], refused
+                refused[effect.name] = f"no {effect.beyond} is measured"
+        if effect.sought in ("interval", "step") and effect.changes not in twin.PULSED:
+            refused[effect.name] = (
+                f"an effect that is sought in an interval must say which of {', '.join(twin.PULSED)} it changes, "
+                f"and changes = '{effect.changes}'"
+            )
+        if effect.kind not in catalogue.PACKAGED and (why := twin.why_not_recorded(effect, records.dt)):
+            refused[effect.name] = why
+    return refused
 
 
 def effects_of(model: Model, values: np.ndarray) -> tuple[list[Effect], dict[str, dict[str, float]]]:
@@ -307,10 +327,10 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
 
 def _made(term: Term, knots: tuple[float, ...] | None = None) -> Effect:
     """Return the effect of a named term: on its lap, and with the knots and the profile of its curve."""
-    assert term.effect is not None
+    assert term.made is not None
     choices: dict[str, object] = {}
     if knots is not None:
         choices |= {"knots": knots, "profile": term.profile}
-    if term.period:
-        choices["period"] = term.period
-    return catalogue.make(term.effect, **choices)
+    if any(f.name == "period" for f in fields(term.made)):
+        choices["period"] = term.period or None
+    return replace(term.made, **choices)  # type: ignore[arg-type]
