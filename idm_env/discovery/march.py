@@ -72,7 +72,7 @@ class Catalogue:
 
     @classmethod
     def of(cls, effects: Sequence[Effect] = (), period: float = 0.0) -> Catalogue:
-        """Return the package's candidates and ``effects``, which replace those of the same name, on a lap (m) if any."""
+        """Return the package's candidates and ``effects``, which replace those of the same name, on a lap (m)."""
         given = {e.name: e for e in (*(known.make(name) for name in known.CANDIDATES), *effects)}
         return cls(tuple(_on_lap(e, period) for e in given.values()))
 
@@ -119,7 +119,8 @@ class Catalogue:
     def shape(self, what: str, coordinate: str, label: str) -> tuple[str, dict[str, float]]:
         """Return which effect stands for a change of ``what`` over a coordinate in a slot, and what φ says of it."""
         changed = TARGETS.get(what, ())
-        effect = next(e for e in _slots(label) if (set(changed) & set(e.targets) if isinstance(e, Changed) else not changed))
+        slots = {e.targets if isinstance(e, Changed) else (): e for e in _slots(label)}
+        effect = slots[next((t for t in slots if set(t) & set(changed)), ())]
         told = {"over": float(list(FEATURES).index(coordinate))} if coordinate else {}
         told |= {n: float(n in changed) for n in (effect.targets if isinstance(effect, Changed) else ())}
         return effect.name, {f"{effect.name}.{name}": value for name, value in told.items()}

@@ -1,4 +1,4 @@
-"""Loop over rows and time of discovery's rollout, without an equation: lines between marks are printed from a recording.
+"""Loop over rows and time of discovery's rollout, without an equation: lines between marks are printed.
 
 This file is a template (``march``): what is printed works on the local names of ``march`` below, so the compiler sees
 one loop.
@@ -48,18 +48,18 @@ def curve(p, number, tables, x):
 
 @compiled
 def march(
-    signals, bounds, record, start, steps, group, length, theta, phi, on, tables, back, whole, lead, every, dt, k, pulse,
-    gap_out, speed_out,
+    signals, bounds, record, start, steps, group, length, theta, phi, on, tables, back, whole, lead, every, dt, k,
+    pulse, gap_out, speed_out,
 ):  # fmt: skip
     """Roll every row out in every copy and fill ``gap_out`` and ``speed_out`` [copies, rows, samples].
 
     ``signals`` [samples, columns] holds all records, record r in rows ``bounds[r] : bounds[r + 1]``. Row i starts on
-    its measured state at sample ``start[i]`` of ``record[i]`` and runs ``steps`` steps. In ``lead`` steps before that it
-    is placed on the record and responds; ``whole`` winds memories up from the record's beginning. ``theta``
+    its measured state at sample ``start[i]`` of ``record[i]`` and runs ``steps`` steps. In ``lead`` steps before that
+    it is placed on the record and responds; ``whole`` winds memories up from the record's beginning. ``theta``
     [copies, groups, 5]; ``phi`` [copies, groups, …] and ``on`` [copies, flags] as a catalogue lays them out;
     ``tables`` [tables, 3] is (form, number of knots, place in φ); ``back`` is how many steps of the past are kept;
-    ``pulse`` [copies, 3] is (first step, end step, amount); ``k`` are constants that depend on dt. Every ``every`` steps
-    a sample is kept; rows in which a record ends keep their last state.
+    ``pulse`` [copies, 3] is (first step, end step, amount); ``k`` are constants that depend on dt. Every ``every``
+    steps a sample is kept; rows in which a record ends keep their last state.
     """
     rows, per_dt = len(record), 1.0 / dt
     longest = 0
@@ -115,7 +115,7 @@ def march(
                 if i == first and not going_on:
                     # <begin>
                     # </begin>
-                    pass
+                    pass  # where nothing is remembered
                 if i < settle:
                     # <wind>
                     # </wind>

@@ -34,9 +34,21 @@ OVER = Parameter("over", "", "1", 0.0, 0.0, len(FEATURES) - 1.0, role="shape")
 """Which feature a curve runs over: its place in ``FEATURES``."""
 
 
+def _value(effect: Slot | Push, scene: Scene, p: P) -> Tensor:
+    """Return c."""
+    if effect.given:
+        given: Tensor = scene.input(effect.name)
+        return given
+    x: Any = 0.0
+    for number, feature in enumerate(FEATURES):
+        # Chosen, not summed: the loop need not wait for what does not count.
+        x = torch.where(p["over"] == number, feature_of(scene, feature, None), x)
+    return curve(x, p, "knot", effect.knots, None, effect.values)
+
+
 @dataclass(frozen=True)
 class Slot(Effect):
-    """A driver of whom some parameters are multiplied by ``1 + c``: c a curve over one feature, or the input (``given``).
+    """Some parameters of the driver times ``1 + c``: c a curve over one feature, or the input (``given``).
 
     Which feature and which parameters is said by parameters: ``over``, and 1 for what changes.
     """
@@ -59,20 +71,9 @@ class Slot(Effect):
         """Which feature, and 1 for each parameter that changes."""
         return (OVER, *(Parameter(name, "", "1", 0.0, 0.0, 1.0, null=0.0) for name in self.targets))
 
-    def value(self, scene: Scene, p: P) -> Tensor:
-        """Return c."""
-        if self.given:
-            given: Tensor = scene.input(self.name)
-            return given
-        x: Any = 0.0
-        for number, feature in enumerate(FEATURES):
-            # Chosen, not summed: the loop need not wait for what does not count.
-            x = torch.where(p["over"] == number, feature_of(scene, feature, None), x)
-        return curve(x, p, "knot", self.knots, None, self.values)
-
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the parameters changed."""
-        c = self.value(scene, p)
+        c = _value(self, scene, p)
         now = {n: getattr(driver, n) for n in self.targets}
         return driver._replace(**{n: torch.where(p[n] > 0.0, x * (1.0 + c), x) for n, x in now.items()})
 
@@ -93,8 +94,6 @@ class Push(Effect):
         """``push_`` and the label."""
         return f"{self.kind}_{self.label}"
 
-    value = Slot.value
-
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return c (m/s²)."""
-        return self.value(scene, p)
+        return _value(self, scene, p)

@@ -22,7 +22,7 @@ def entered(effect: type[Effect], known: dict[str, type[Effect]]) -> type[Effect
     if not (isinstance(effect, type) and issubclass(effect, Effect)):
         raise ValueError(f"{effect!r} is no class of effects. Register the class, such as register(MyEffect).")
     if not effect.kind:
-        raise ValueError(f"effect {effect.__name__} has no name. Give it one: kind = \"my_effect\".")
+        raise ValueError(f'effect {effect.__name__} has no name. Give it one: kind = "my_effect".')
     taken = known.get(effect.kind)
     if taken is not None and not same_class(taken, effect):
         raise ValueError(f"the name '{effect.kind}' of {effect.__name__} is that of {taken.__name__}. Give it another.")
@@ -49,9 +49,9 @@ def read(where: str) -> type[Effect]:
         raise ValueError(f"effect {where}: {place} cannot be read ({type(error).__name__}: {error}).") from None
     found = getattr(module, name, None)
     if not (isinstance(found, type) and issubclass(found, Effect)):
-        able = [k for k, v in vars(module).items()
-                if isinstance(v, type) and issubclass(v, Effect) and v.__module__ == module.__name__]  # fmt: skip
-        raise ValueError(f"effect {where}: {place} has no class {name} of effects. It has: {', '.join(able) or 'none'}.")
+        mine = {k: v for k, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__}
+        able = ", ".join(k for k, v in mine.items() if issubclass(v, Effect)) or "none"
+        raise ValueError(f"effect {where}: {place} has no class {name} of effects. It has: {able}.")
     return found
 
 

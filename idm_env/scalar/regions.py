@@ -1,7 +1,7 @@
 """Graphs with parts that are computed only where an effect is at work: what discovery's loop over a catalogue needs.
 
-An effect behind a flag is wrapped: its hook runs, for real, while the graph notes that all nodes made meanwhile belong to
-a region; what the hook changed is merged with what was there before. Nodes of a region are not shared with what lies
+An effect behind a flag is wrapped: its hook runs, for real, while the graph notes that all nodes made meanwhile belong
+to a region; what the hook changed is merged with what was there before. Nodes of a region are not shared with what lies
 outside it, because outside nobody may have computed them.
 """
 
@@ -70,7 +70,8 @@ class _Tabled(dict[str, Any]):
 
     def table(self, x: Any) -> Scalar:
         """Return the curve at x."""
-        return Scalar(self._graph, self._graph.node("table", value_of(self._graph, x), label=self._number, level=DYNAMIC))
+        at = value_of(self._graph, x)
+        return Scalar(self._graph, self._graph.node("table", at, label=self._number, level=DYNAMIC))
 
 
 class Behind:

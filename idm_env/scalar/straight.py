@@ -35,8 +35,8 @@ class Straight:
     def lines(self, writes: Sequence[tuple[str, Node]], prefix: str = "t", *, calls: bool = True) -> list[str]:
         """Return lines that compute and write what changes with every step.
 
-        Names begin with ``prefix``: a name that is set once in a function costs its compiler much less. ``calls`` writes
-        choices as calls, which compile quicker and run slower than branches.
+        Names begin with ``prefix``: a name that is set once in a function costs its compiler much less. ``calls``
+        writes choices as calls, which compile quicker and run slower than branches.
         """
         self._prefix, self._calls = prefix, calls
         live = self._live([node for _, node in writes], stop=True)

@@ -1,4 +1,4 @@
-"""The catalogue is open: an effect that the package has never seen is tried, found, saved and loaded by its class alone."""
+"""The catalogue is open: an effect that the package has never seen is tried, found, saved and loaded."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_what_cannot_be_tried_is_listed_with_its_reason() -> None:
     found = discover(data, effects=[Fussy, "asymmetry"])
     row = next(c for c in found.report["candidates"] if c["effect"] == "fussy")
     assert row["note"].startswith("effect 'fussy' uses a Python `if`")
-    with pytest.raises(ValueError, match="no candidate can be tried.*fussy.*Python `if`"):
+    with pytest.raises(ValueError, match=r"no candidate can be tried.*fussy.*Python `if`"):
         discover(data, effects=[Fussy])
 
 
@@ -135,5 +135,5 @@ def test_a_registered_effect_is_a_candidate_and_names_are_not_taken_twice() -> N
 
     with pytest.raises(ValueError, match="the name 'delay' of Other is that of Delay"):
         catalogue.register(Other)
-    with pytest.raises(ValueError, match="has no class Nobody of effects. It has: Fatigue"):
+    with pytest.raises(ValueError, match=r"has no class Nobody of effects\. It has: Fatigue"):
         catalogue.named(f"{EXAMPLE}:Nobody")
