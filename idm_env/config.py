@@ -8,6 +8,9 @@
      parameters: {idm: {max_accel: 1.2, time_gap: 1.4}, delay: {delay: 0.6}},
      by: driver, drivers: {run1/7: {idm: {time_gap: 1.1}}}, substeps: 4}
 
+An effect that the package has never seen is written as the place of its class, ``my_file.py:MyEffect`` or
+``my_package.my_module:MyEffect``; reading such a model runs that file.
+
 ``by`` says what the keys of ``drivers`` are, as in ``fit``: ``driver`` (run/vehicle), ``run_id``, ``vehicle_id`` or a
 column. ``substeps`` is there where a fit chose another number of simulated steps per sample than the default.
 ``fitted_on`` holds the name of the file and a digest of every track that the model was fitted on, so that ``simulate``
@@ -193,7 +196,8 @@ def describe(effect: Effect) -> str | dict[str, Any]:
         value = getattr(effect, f.name)
         if value != f.default:
             choices[f.name] = list(value) if isinstance(value, tuple) else value
-    return {"effect": effect.kind, **choices} if choices else effect.kind
+    name = catalogue.describe(effect)
+    return {"effect": name, **choices} if choices else name
 
 
 def make_effects(descriptions: Iterable[str | Mapping[str, Any] | Effect]) -> tuple[Effect, ...]:

@@ -17,6 +17,7 @@ from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
 from idm_env.discovery import judge, places, records, search, summary, words
+from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.decide import Round, decide
@@ -25,7 +26,7 @@ from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
 from idm_env.discovery.solve import NAMES, Solution, Task
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, improves
-from idm_env.effects import ALL, CANDIDATES, IDM, Brakes
+from idm_env.effects import ALL, CANDIDATES, IDM, PACKAGED, Brakes, Effect, candidates, make, named, register
 from idm_env.progress import OnProgress, silent
 
 
@@ -61,7 +62,7 @@ def discover(
     trajectories: Trajectories,
     *,
     by: str = "driver",
-    effects: Sequence[str] | None = None,
+    effects: Sequence[str | Effect | type[Effect]] | None = None,
     known: Sequence[str] = (),
     place: str | None = None,
     out: Path | None = None,
@@ -76,7 +77,8 @@ def discover(
     Args:
         trajectories: Checked trajectories; at least 7 runs for a decision.
         by: Who shares IDM parameters: ``driver``, ``all``, or a column that is constant for a driver.
-        effects: Names of candidates; None is the whole catalogue and everything that can only be located.
+        effects: Candidates: names, ``my_file.py:MyEffect``, classes, or effects with their static choices, which need
+            not be registered. None is the whole catalogue and everything that can only be located.
         known: Effects that are given in the data and belong to the null: ``grade`` (column ``grade``, rise over run).
         place: Column with the coordinate of places, if not that of ``trajectories``; a lap's wraps are noticed.
         out: Folder in which an interrupted search keeps what is done, or None.
@@ -91,26 +93,29 @@ def discover(
         DataError: For data that cannot be used.
     """
     progress = on_progress or silent
-    names = _names(effects, known)
+    chosen = _chosen(effects, known)
     prepared = prepare(trajectories, by, place)
-    names, refused = terms.testable(prepared, names)
-    names = [n for n in names if n not in known]
+    refused = terms.testable(prepared, chosen)
+    tried = [e for e in chosen if e.name not in refused and e.name not in known]
+    names = [e.name for e in tried]
     if not names:
         why = "; ".join(f"{name}: {reason}" for name, reason in refused.items()) or "all of them are known"
         raise ValueError(f"no candidate can be tried on these data ({why}). Name others, or leave out --effects.")
     fit_runs, kept_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
-    options = (names, tuple(known), seed, located, lockbox)
+    options = (list(map(repr, tried)), tuple(known), seed, located, lockbox)
     mark = keep.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
     saved = keep.Store(None if out is None else out / keep.UNFINISHED / "explain", mark, resume)
     task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
-    searching = Search(task, names, located and effects is None, saved, progress)
+    told = tuple(_known_term(prepared, name) for name in known)
+    own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
+    base = Model(told, twin.Catalogue.of([*own, *(terms.known_effect(term) for term in told)], prepared.period))
+    searching = Search(task, names, located and effects is None, saved, progress, base)
     progress("calibration", 0, 0, "idm")
     theta, calibrated = calibrate(
         prepared.of_runs(fit_runs), by, task.prior.centre, lambda _, *state: progress("calibration", *state)
     )
     progress("null", 0, 0, "idm")
-    base = Model(tuple(_known_term(prepared, name) for name in known))
     null = searching.null(base, theta)
     null, steps, rounds = decide(searching, null, seed)
     saved.remove()
@@ -137,15 +142,31 @@ def discover(
 # -- before the search -----------------------------------------------------------------------------------------------
 
 
-def _names(effects: Sequence[str] | None, known: Sequence[str]) -> list[str]:
-    for name in (*(effects or ()), *known):
+def _chosen(effects: Sequence[str | Effect | type[Effect]] | None, known: Sequence[str]) -> list[Effect]:
+    """Return the candidates as effects, those of the user's own registered."""
+    chosen: list[Effect] = []
+    for given in candidates() if effects is None else effects:
+        if isinstance(given, str):
+            name = named(given)
+        else:
+            name = register(given if isinstance(given, type) else type(given)).kind
+        if name not in candidates():
+            raise ValueError(f"effect '{name}' is no candidate.{nearest(name, candidates())}")
+        chosen.append(given if isinstance(given, Effect) else make(name))
+        if chosen[-1].name != name:
+            raise ValueError(f"effect '{name}' calls itself '{chosen[-1].name}': a candidate needs its class's name.")
+    for name in known:
         if name not in CANDIDATES:
             raise ValueError(f"effect '{name}' is no candidate.{nearest(name, CANDIDATES)}")
-    for name in known:
         if not ALL[name].column:
             able = ", ".join(f"'{n}' (column {ALL[n].column})" for n in CANDIDATES if ALL[n].column)
             raise ValueError(f"known effect '{name}' cannot be read from data; only these can: {able}.")
-    return list(effects or CANDIDATES)
+    return list({e.name: e for e in chosen}.values())
+
+
+def _plain(effect: Effect) -> bool:
+    """Tell whether an effect is as its name makes it."""
+    return effect == make(effect.kind)
 
 
 def prepare(trajectories: Trajectories, by: str, place: str | None = None) -> Records:

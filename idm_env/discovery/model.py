@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from itertools import product
+from dataclasses import dataclass, field, fields, replace
+from itertools import accumulate, product
 
 import numpy as np
 
 from idm_env import effects as catalogue
 from idm_env.discovery import march as twin
+from idm_env.discovery.march import Catalogue
 from idm_env.discovery.records import Records
 from idm_env.effects import Effect
 from idm_env.parameters import Parameter
@@ -21,7 +22,7 @@ class Term:
 
     ``effect`` is the catalogue's name or None for what is only located; ``what`` and ``coordinate`` say what changes
     and over which coordinate; ``form`` is NONE, CURVE or INTERVAL; ``knots`` (first, distance, count) of a curve.
-    ``starts`` are values of all parameters to start a search from; ``fixed`` are entries that are not searched.
+    ``starts`` are values of all parameters to start a search from; ``made`` is the effect with its static choices.
     """
 
     label: str
@@ -35,52 +36,57 @@ class Term:
     period: float = 0.0
     profile: tuple[float, ...] | None = None
     smoothness: float = 0.0
+    made: Effect | None = None
 
     @property
     def size(self) -> int:
         """Number of parameters."""
         return len(self.parameters)
 
-    def entries(self, slot: int) -> list[int]:
-        """Return the places in φ of the parameters, for a term whose curve lies in ``slot``."""
-        if self.form == twin.NONE:
-            return [twin.INDEX[f"{self.effect}.{p.name}"] for p in self.parameters]
-        at = twin.FIRST + twin.ROOM * slot
+    @property
+    def located(self) -> bool:
+        """Whether this is a curve or an interval without a name, which takes a slot of the loop."""
+        return self.effect is None
+
+    def entries(self, catalogue: Catalogue, slot: int) -> list[int]:
+        """Return the places in φ of the parameters, for a term without a name in ``slot``."""
+        if self.form == twin.NONE or self.profile is not None:
+            return [catalogue.index[f"{self.effect}.{p.name}"] for p in self.parameters]
+        at = catalogue.table_at(self.effect or str(slot))
         if self.form == twin.INTERVAL:
             return [at + 4, at, at + 1][: self.size]
-        if self.profile is not None:
-            return [at + twin.ROOM - 1]
         return [at + 4 + i for i in range(self.size)]
 
 
 @dataclass(frozen=True)
 class Model:
-    """Terms that are in the model, in the order of adding."""
+    """Terms that are in the model, in the order of adding, and the catalogue whose loop rolls it out."""
 
     terms: tuple[Term, ...] = ()
-    slots: np.ndarray = field(init=False)
+    catalogue: Catalogue = field(default_factory=twin.default_catalogue)
     entries: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        slots = np.zeros((twin.SLOTS, 4), np.int64)
         entries: list[int] = []
-        used = 0
-        for term in self.terms:
-            if term.form != twin.NONE:
-                what, where = twin.WHATS.index(term.what), twin.COORDINATES.index(term.coordinate)
-                slots[used] = (term.form, what, where, term.knots[2])
-            entries += term.entries(used)
-            used += term.form != twin.NONE
-        object.__setattr__(self, "slots", slots)
+        for term, slot in self._slots:
+            entries += term.entries(self.catalogue, slot)
         object.__setattr__(self, "entries", np.array(entries, dtype=np.int64))
+
+    @property
+    def _slots(self) -> list[tuple[Term, int]]:
+        """Terms with the slots of those that have no name."""
+        slots = np.cumsum([t.located for t in self.terms]) - 1
+        if len(slots) and slots[-1] >= twin.SLOTS:
+            raise ValueError(f"a model can have {twin.SLOTS} effects without a name, and {slots[-1] + 1} were given.")
+        return [(t, int(s)) for t, s in zip(self.terms, slots, strict=True)]
 
     def adding(self, term: Term) -> Model:
         """Return the model with one term more."""
-        return Model((*self.terms, term))
+        return Model((*self.terms, term), self.catalogue)
 
     def without(self, index: int) -> Model:
         """Return the model without a term."""
-        return Model(self.terms[:index] + self.terms[index + 1 :])
+        return Model(self.terms[:index] + self.terms[index + 1 :], self.catalogue)
 
     def where(self, label: str) -> slice:
         """Return which entries are those of the term ``label``."""
@@ -93,39 +99,56 @@ class Model:
         """Declarations of all entries."""
         return tuple(p for term in self.terms for p in term.parameters)
 
+    @property
+    def named(self) -> list[Effect]:
+        """Effects of the terms that have a name."""
+        return [self.catalogue.by_name[t.effect] for t in self.terms if t.effect is not None]
+
+    @property
+    def on(self) -> np.ndarray:
+        """Flags of the effects that are at work."""
+        on = np.zeros(len(self.catalogue.flags), np.int8)
+        for term, slot in self._slots:
+            name = term.effect or self.catalogue.shape(term.what, term.coordinate, str(slot))[0]
+            on[self.catalogue.flags[name]] = 1
+        return on
+
+    @property
+    def tables(self) -> np.ndarray:
+        """Form, number of knots and place in φ of every table."""
+        tables = np.array([(twin.NONE, 2, self.catalogue.table_at(n)) for n in self.catalogue.tables], np.int64)
+        for term, slot in self._slots:
+            if term.form != twin.NONE:
+                tables[self.catalogue.tables[term.effect or str(slot)], :2] = term.form, term.knots[2]
+        return tables
+
     def phi(self, values: np.ndarray) -> np.ndarray:
-        """Return φ [..., SIZE] from the values of all parameters [..., Q]."""
+        """Return φ from the values of all parameters [..., Q]."""
         values = np.asarray(values, float)
-        phi = np.zeros((*values.shape[:-1], twin.SIZE))
-        phi[..., : twin.FIRST] = twin.NULL
-        used = 0
-        for term in self.terms:
+        phi = np.tile(self.catalogue.null, (*values.shape[:-1], 1))
+        for term, slot in self._slots:
             if term.form == twin.NONE:
                 continue
-            at = twin.FIRST + twin.ROOM * used
-            used += 1
+            at = self.catalogue.table_at(term.effect or str(slot))
             phi[..., at + 3] = term.period
             if term.form == twin.CURVE:
-                phi[..., at], phi[..., at + 1] = term.knots[:2]
+                phi[..., at], phi[..., at + 1] = term.knots[0], 1.0 / term.knots[1]
                 if term.profile is not None:
                     phi[..., at + 4 : at + 4 + len(term.profile)] = term.profile
             else:
                 phi[..., at + 2] = EDGES[term.coordinate]
+            if term.located:
+                for name, weight in self.catalogue.shape(term.what, term.coordinate, str(slot))[1].items():
+                    phi[..., self.catalogue.index[name]] = weight
         phi[..., self.entries] = values
         return phi
-
-    @property
-    def lead(self) -> float:
-        """Seconds before a window in which memories are wound up on the measured record."""
-        named = [catalogue.ALL[t.effect] for t in self.terms if t.effect is not None]
-        return max((effect.wind_up_s for effect in named), default=Effect.wind_up_s)
 
 
 class Frozen(Model):
     """A model whose φ stands: only the drivers' own parameters are left to fit."""
 
     def __init__(self, model: Model, values: np.ndarray) -> None:
-        super().__init__(model.terms)
+        super().__init__(model.terms, model.catalogue)
         object.__setattr__(self, "_phi", model.phi(values))
         object.__setattr__(self, "entries", np.zeros(0, np.int64))
 
@@ -136,7 +159,7 @@ class Frozen(Model):
 
     def phi(self, values: np.ndarray) -> np.ndarray:
         """Return the same φ for every copy and group."""
-        phi: np.ndarray = np.broadcast_to(self._phi, (*values.shape[:-1], twin.SIZE))  # type: ignore[attr-defined]
+        phi: np.ndarray = np.broadcast_to(self._phi, (*values.shape[:-1], len(self._phi)))  # type: ignore[attr-defined]
         return phi
 
 
@@ -144,12 +167,20 @@ EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed"
 """Half-width over which an interval of a located effect sets in."""
 
 
-def simple(name: str) -> Term:
-    """Return the term of an effect of the catalogue that needs no place; one start for every mix of its parameters'."""
-    cls = catalogue.ALL[name]
-    parameters = tuple(_searched(p) for p in cls().parameters)
-    starts = tuple(product(*(p.starts for p in parameters)))
-    return Term(name, name, parameters, starts, what=cls.changes, coordinate="state")
+def simple(effect: str | Effect) -> Term:
+    """Return the term of an effect that needs no place; one start for every mix of its parameters'."""
+    one = catalogue.make(effect) if isinstance(effect, str) else effect
+    parameters = tuple(_searched(p) for p in one.parameters)
+    starts = tuple(product(*(_starts(p) for p in parameters)))
+    period = float(getattr(one, "period", None) or 0.0)
+    return Term(one.name, one.name, parameters, starts, what=one.changes, coordinate="state", period=period, made=one)
+
+
+def _starts(p: Parameter) -> tuple[float, ...]:
+    """Return where the search of a parameter starts: as declared; a strength else from a quarter of its default."""
+    if p.starts or p.role == "threshold":
+        return p.starts or (0.5 * p.default, p.default)
+    return (p.default if p.null is None else p.null + 0.25 * (p.default - p.null),)
 
 
 def _searched(p: Parameter) -> Parameter:
@@ -160,31 +191,42 @@ def _searched(p: Parameter) -> Parameter:
     return replace(p, low=low, high=high, default=min(max(p.default, low), high))
 
 
-def placed(name: str, *values: float, period: float = 0.0) -> Term:
+def placed(effect: str | Effect, *values: float, period: float = 0.0) -> Term:
     """Return the term of an effect that acts in one interval of places or from one moment on: strength, then places."""
-    cls = catalogue.ALL[name]
-    coordinate = {"interval": "position", "step": "time"}[cls.sought]
-    return Term(name, name, cls().parameters, (values,), what=cls.changes, coordinate=coordinate, period=period)
+    one = catalogue.make(effect) if isinstance(effect, str) else effect
+    coordinate = {"interval": "position", "step": "time"}[one.sought]
+    return Term(
+        one.name, one.name, one.parameters, (values,), what=one.changes, coordinate=coordinate, period=period, made=one,
+    )  # fmt: skip
 
 
-def unknown_profile(name: str, first: float, distance: float, count: int, period: float) -> Term:
+def unknown_profile(effect: str | Effect, first: float, distance: float, count: int, period: float) -> Term:
     """Return an effect whose profile over position is not known: one parameter at every knot."""
-    declared = catalogue.make(name, knots=tuple(first + distance * i for i in range(count))).parameters
+    one = catalogue.make(effect) if isinstance(effect, str) else effect
+    knots = tuple(first + distance * i for i in range(count))
+    declared = replace(one, knots=knots).parameters  # type: ignore[call-arg]
     parameters = tuple(replace(p, default=0.0) for p in declared)
     return Term(
-        name, name, parameters, ((0.0,) * count,), what="slope", coordinate="position", form=twin.CURVE,
-        knots=(first, distance, count), period=period, smoothness=0.03,
+        one.name, one.name, parameters, ((0.0,) * count,), what="slope", coordinate="position", form=twin.CURVE,
+        knots=(first, distance, count), period=period, smoothness=0.03, made=one,
     )  # fmt: skip
 
 
 def known_profile(name: str, first: float, distance: float, profile: Sequence[float], period: float) -> Term:
     """Return an effect whose profile over position is known, and of which some share acts."""
     places = tuple(first + distance * i for i in range(len(profile)))
-    share = tuple(replace(p, default=0.5) for p in catalogue.make(name, knots=places, profile=profile).parameters)
+    one = catalogue.make(name, knots=places, profile=tuple(profile))
+    share = tuple(replace(p, default=0.5) for p in one.parameters)
     return Term(
         name, name, share, ((0.2,),), what="share", coordinate="position", form=twin.CURVE,
-        knots=(first, distance, len(profile)), period=period, profile=tuple(profile),
+        knots=(first, distance, len(profile)), period=period, profile=tuple(profile), made=one,
     )  # fmt: skip
+
+
+def known_effect(term: Term) -> Effect:
+    """Return the effect of a term whose profile is known."""
+    first, distance, count = term.knots
+    return _made(term, tuple(float(first + distance * i) for i in range(count)))
 
 
 def interval(what: str, coordinate: str, begin: float, end: float, amount: float, period: float = 0.0) -> Term:
@@ -221,16 +263,22 @@ NEIGHBOURS = {"second leader": "second", "vehicle behind": "behind", "vehicle in
 """Column of the records that says when a neighbour is there."""
 
 
-def testable(records: Records, names: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """Return which effects the data can show at all, and why others cannot be tested."""
+def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
+    """Return by name which effects cannot be tested, and why: the data do not show them, or no loop can have them."""
     refused = {}
-    for name in names:
-        beyond = catalogue.ALL[name].beyond
-        if beyond in NEIGHBOURS:
-            column = twin.COLUMNS.index(f"{NEIGHBOURS[beyond]}_present")
+    for effect in effects:
+        if effect.beyond in NEIGHBOURS:
+            column = twin.COLUMNS.index(f"{NEIGHBOURS[effect.beyond]}_present")
             if records.signals[:, column].mean() < 0.02:
-                refused[name] = f"no {beyond} is measured"
-    return [name for name in names if name not in refused], refused
+                refused[effect.name] = f"no {effect.beyond} is measured"
+        if effect.sought in ("interval", "step") and effect.changes not in twin.PULSED:
+            refused[effect.name] = (
+                f"an effect that is sought in an interval must say which of {', '.join(twin.PULSED)} it changes, "
+                f"and changes = '{effect.changes}'"
+            )
+        if effect.kind not in catalogue.PACKAGED and (why := twin.why_not_recorded(effect, records.dt)):
+            refused[effect.name] = why
+    return refused
 
 
 def effects_of(model: Model, values: np.ndarray) -> tuple[list[Effect], dict[str, dict[str, float]]]:
@@ -258,7 +306,7 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
         edge = EDGES[term.coordinate]
         middle = max(begin + edge, end - edge)
         knots = tuple(float(k) for k in (begin - edge, begin + edge, middle, max(end, begin) + edge))
-        knots = tuple(k + 1e-6 * i for i, k in enumerate(knots))
+        knots = tuple(accumulate(knots, lambda before, k: max(k, before + 1e-6)))
         heights = [0.0, amount, amount, 0.0]
     else:
         first, distance, count = term.knots
@@ -279,10 +327,10 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
 
 def _made(term: Term, knots: tuple[float, ...] | None = None) -> Effect:
     """Return the effect of a named term: on its lap, and with the knots and the profile of its curve."""
-    assert term.effect is not None
+    assert term.made is not None
     choices: dict[str, object] = {}
     if knots is not None:
         choices |= {"knots": knots, "profile": term.profile}
-    if term.period:
-        choices["period"] = term.period
-    return catalogue.make(term.effect, **choices)
+    if any(f.name == "period" for f in fields(term.made)):
+        choices["period"] = term.period or None
+    return replace(term.made, **choices)  # type: ignore[arg-type]

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from idm_env.discovery.march import PULSED
 from idm_env.discovery.records import Rows
 from idm_env.discovery.solve import Solution, Task, equations
 
-WHATS = ("acceleration", "time_gap", "desired_speed", "accel_and_decel")
+WHATS = PULSED
 PULSE = 0.05
 
 

@@ -15,7 +15,7 @@ from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out
 from idm_env.discovery.solve import NAMES, Prior, Solution, Task, centred, finish, linearise, solve, with_noise
-from idm_env.effects import ALL, IDM
+from idm_env.effects import IDM, Effect
 from idm_env.effects.base import Sought
 from idm_env.keep import Store
 from idm_env.progress import OnProgress
@@ -66,7 +66,7 @@ class Search:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [runs]."""
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
-        wanted = [terms.simple(n) for n in self._sought("anywhere") if n not in have]
+        wanted = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
         found = []
         responses = places.respond(self.task, solution)
         for i, term in enumerate(wanted):
@@ -96,7 +96,7 @@ class Search:
 
     def pair(self, solution: Solution, names: tuple[str, str], before: np.ndarray, number: int) -> Scored:
         """Score two effects of the catalogue at once; the term that is named is the second."""
-        first, second = (terms.simple(n) for n in names)
+        first, second = (terms.simple(self.base.catalogue.by_name[n]) for n in names)
         self.on_progress(f"round {number}", 0, 1, f"{first.label} + {second.label}")
         base = replace(solution, model=solution.model.adding(first))
         # Strong starts: along the direction in which they cancel, weak ones see nothing to improve.
@@ -129,8 +129,9 @@ class Search:
         gains = 0.5 * np.log(before / held_out(self.task, best))
         return Scored(term, best, gains)
 
-    def _sought(self, what: Sought) -> list[str]:
-        return [n for n in self.names if ALL[n].sought == what]
+    def _sought(self, what: Sought) -> list[Effect]:
+        effects = [self.base.catalogue.by_name[n] for n in self.names]
+        return [e for e in effects if e.sought == what]
 
     # -- where and when ----------------------------------------------------------------------------------------------
 
@@ -139,7 +140,7 @@ class Search:
         period = self.task.rows.records.period
         result: list[Scored] = []
 
-        def interval_of(what: str, coordinate: str, open_end: bool = False, named: str = "") -> None:
+        def interval_of(what: str, coordinate: str, open_end: bool = False, named: Effect | None = None) -> None:
             width = {"position": 20.0, "time": 2.0}[coordinate]
             shortest = {"position": 2, "time": 3}[coordinate]
             found = places.scan(responses, what, coordinate, width, open_end=open_end, shortest=shortest)
@@ -148,7 +149,7 @@ class Search:
             term = _interval_term(what, coordinate, found, open_end, named, period)
             if term.label in have:
                 return
-            if not named and found.gains.mean() < WORTH:
+            if named is None and found.gains.mean() < WORTH:
                 result.append(Scored(term, None, found.gains))
                 return
             one = self._nested(solution, term, before, f"{number}/{term.label}")
@@ -181,12 +182,12 @@ class Search:
             )
 
         position = _knots(responses.coordinates["position"], 80.0, 48, period)
-        for name in self._sought("profile"):
-            curve_of(terms.unknown_profile(name, *position, period), "position")
-        for name in self._sought("interval"):
-            interval_of(ALL[name].changes, "position", named=name)
-        for name in self._sought("step"):
-            interval_of(ALL[name].changes, "time", open_end=True, named=name)
+        for effect in self._sought("profile"):
+            curve_of(terms.unknown_profile(effect, *position, period), "position")
+        for effect in self._sought("interval"):
+            interval_of(effect.changes, "position", named=effect)
+        for effect in self._sought("step"):
+            interval_of(effect.changes, "time", open_end=True, named=effect)
         if not self.located:
             return result
         for what in ("time_gap", "accel_and_decel", "acceleration"):
@@ -216,9 +217,11 @@ class Search:
         return result
 
 
-def _interval_term(what: str, coordinate: str, found: places.Found, open_end: bool, named: str, period: float) -> Term:
-    if named:
-        strength = ALL[named].strength_of(found.amount)
+def _interval_term(
+    what: str, coordinate: str, found: places.Found, open_end: bool, named: Effect | None, period: float
+) -> Term:
+    if named is not None:
+        strength = named.strength_of(found.amount)
         if open_end:
             return terms.placed(named, strength, found.begin)
         return terms.placed(named, strength, found.begin, found.end, period=period)

@@ -66,11 +66,15 @@ class Task:
             values = np.broadcast_to(values[:, None], (copies, self.groups, values.shape[-1]))
         count = rows.steps // rows.every
         gap, speed = np.empty((2, copies, len(rows), count))
-        none = np.zeros((copies, 4))
-        twin.march(
+        catalogue, dt = model.catalogue, records.dt
+        phi = np.ascontiguousarray(model.phi(values))
+        on = np.tile(model.on, (copies, 1))
+        pulse = np.zeros((copies, 3)) if pulse is None else twin.pulsed(catalogue, pulse, on, phi)
+        loop = twin.loop(catalogue, dt)
+        loop.march(
             records.signals, records.bounds, rows.record, rows.start, rows.steps, rows.group, records.length,
-            np.exp(theta), np.ascontiguousarray(model.phi(values)), model.slots, round(model.lead / records.dt),
-            rows.every, records.dt, none if pulse is None else pulse, gap, speed,
+            np.exp(theta), phi, on, model.tables, twin.back_steps(model.named, dt),
+            *twin.lead_steps(model.named, dt), rows.every, dt, loop.varying, pulse, gap, speed,
         )  # fmt: skip
         return gap, speed
 

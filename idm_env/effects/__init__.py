@@ -1,6 +1,7 @@
-"""The catalogue of effects. One entry in ``ALL`` makes an effect tested by every law, documented, accepted in YAML
-and a candidate in discovery.
-"""  # noqa: D205
+"""The catalogue of effects: one entry in ``ALL`` makes an effect tested by every law, documented and accepted in YAML.
+
+``CANDIDATES`` are what discovery tries. ``register`` enters effects of one's own.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +19,7 @@ from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLim
 from idm_env.effects.neighbours import BrakeLight, Follower, Lateral, LeaderAcceleration, SecondLeader
 from idm_env.effects.noise import Noise
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
+from idm_env.effects.registry import entered, is_candidate, lives, read
 from idm_env.effects.surroundings import Drag, Grade
 
 ALL: dict[str, type[Effect]] = {
@@ -76,8 +78,40 @@ CANDIDATES: tuple[str, ...] = (
 """Effects that discovery may add to a model, by name."""
 
 
+PACKAGED = frozenset(ALL)
+"""Names of the effects that come with the package."""
+
+
+def register(effect: type[Effect]) -> type[Effect]:
+    """Enter an effect of one's own in the catalogue of this process; returns it, so that it can decorate a class.
+
+    Its name is then known to ``make``, to YAML and to discovery, which tries it like the package's candidates if a
+    parameter has a null. ValueError if the name is taken.
+    """
+    return entered(effect, ALL)
+
+
+def candidates() -> tuple[str, ...]:
+    """Return ``CANDIDATES`` and the names of registered effects that can be absent."""
+    return (*CANDIDATES, *(name for name, effect in ALL.items() if name not in PACKAGED and is_candidate(effect)))
+
+
+def named(text: str) -> str:
+    """Return the name in the catalogue of ``delay``, or of ``my_file.py:MyEffect``, which is registered for that."""
+    return register(read(text)).kind if ":" in text else text
+
+
+def describe(effect: Effect) -> str:
+    """Return how a file names an effect's class: its name, or where it lives if the package has never seen it."""
+    return effect.kind if effect.kind in PACKAGED else lives(type(effect))
+
+
 def make(kind: str, **choices: object) -> Effect:
-    """Build an effect from its name in ``ALL`` and its static choices; ValueError names the nearest known one."""
+    """Build an effect from its name in ``ALL`` (or ``my_file.py:MyEffect``) and its static choices.
+
+    ValueError names the nearest known one.
+    """
+    kind = named(kind)
     if kind not in ALL:
         raise ValueError(f"unknown effect {shown(kind)}.{nearest(str(kind), ALL)}")
     cls = ALL[kind]
@@ -140,6 +174,10 @@ __all__ = [
     "SpeedDependentGap",
     "SpeedZone",
     "Traction",
+    "candidates",
+    "describe",
     "make",
+    "named",
+    "register",
     "unspoken",
 ]

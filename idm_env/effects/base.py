@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -57,7 +58,8 @@ class Effect:
     ``sought``      what has to be found beside the strength
     ``changes``     what it changes: an acceleration, a parameter of the driver, a perceived signal, the response
     ``beyond``      whom the record must show
-    ``wind_up_s``   seconds of the record that its memory needs before a prediction begins
+    ``wind_up_s``   seconds of the record that it needs before a prediction begins; all of it, for one that remembers,
+                    where nothing is said
     ``column``      column of a file that gives its ``profile``, if measured
     ==============  ====================================================================================================
 
@@ -96,6 +98,8 @@ class Effect:
         # Not inherited: a subclass has another equation, and what its parent promised of his is not known of it.
         cls.adds = vars(cls).get("adds", cls.hook in ("adapt", "accelerate", "limit"))
         cls.remembers = cls.remember is not Effect.remember
+        if cls.remembers and "wind_up_s" not in vars(cls):
+            cls.wind_up_s = math.inf
 
     @property
     def name(self) -> str:

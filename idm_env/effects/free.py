@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
-from idm_env.effects.places import along, interpolate
+from idm_env.effects.places import along, curve
 from idm_env.parameters import Parameter, nearest
 from idm_env.types import Driver, Scene
 
@@ -74,7 +74,7 @@ class Curve(Effect):
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the curve's acceleration (m/s²)."""
         x = feature_of(scene, self.feature, self.period)
-        return interpolate(x, self.knots, [p[f"knot_{i}"] for i in range(len(self.knots))], self.period)
+        return curve(x, p, "knot", self.knots, self.period)
 
 
 @dataclass(frozen=True)
@@ -108,5 +108,5 @@ class DriverCurve(Effect):
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the target parameter changed."""
         x = feature_of(scene, self.feature, self.period)
-        change = interpolate(x, self.knots, [p[f"knot_{i}"] for i in range(len(self.knots))], self.period)
+        change = curve(x, p, "knot", self.knots, self.period)
         return driver._replace(**{self.target: getattr(driver, self.target) * (1.0 + change)})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -35,3 +37,23 @@ def interpolate(x: Tensor, knots: tuple[float, ...], values: list[Tensor], perio
     for left, right, before, after in zip(knots[:-1], knots[1:], values[:-1], values[1:], strict=True):
         total = total + ((x - left) / (right - left)).clamp(0.0, 1.0) * (after - before)
     return total
+
+
+def curve(
+    x: Tensor,
+    p: Mapping[str, Tensor],
+    stem: str,
+    knots: tuple[float, ...],
+    period: float | None = None,
+    values: tuple[float, ...] | None = None,
+) -> Tensor:
+    """Return the curve through ``values`` at the knots, or through the parameters ``stem_0``, ``stem_1``, ….
+
+    A loop that keeps its curves as tables of numbers hands in parameters with a ``table``, and its place takes the
+    knots'.
+    """
+    table = getattr(p, "table", None)
+    if table is not None:
+        return table(x)  # type: ignore[no-any-return]
+    heights = [p[f"{stem}_{i}"] for i in range(len(knots))] if values is None else [x.new_tensor(v) for v in values]
+    return interpolate(x, knots, heights, period)

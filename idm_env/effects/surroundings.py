@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P, Sought
-from idm_env.effects.places import along, interpolate
+from idm_env.effects.places import along, curve
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -64,11 +64,7 @@ class Grade(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return gravity's part (m/s²)."""
-        if self.profile is None:
-            slopes = [p[f"slope_{i}"] for i in range(len(self.knots))]
-        else:
-            slopes = [scene.position.new_tensor(slope) for slope in self.profile]
-        slope = interpolate(along(scene.position, self.period), self.knots, slopes, self.period)
+        slope = curve(along(scene.position, self.period), p, "slope", self.knots, self.period, self.profile)
         pull = -GRAVITY * slope / torch.sqrt(1.0 + slope * slope)
         return pull if self.profile is None else p["share"] * pull
 

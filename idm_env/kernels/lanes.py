@@ -158,7 +158,7 @@ def starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
 
 
 def past_rows(past: Tensor, shape: tuple[int, ...]) -> Array:
-    """Return the past as (slots · signals, vehicles), newest slot first, or (signals, vehicles) if all slots are one."""
+    """Return the past as (slots · signals, vehicles), newest first; (signals, vehicles) where all slots are one."""
     full = past.detach().expand(*shape, *past.shape[-2:]).movedim((-2, -1), (0, 1))
     if full.stride(0) == 0:
         full = full[:1]

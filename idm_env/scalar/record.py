@@ -65,13 +65,14 @@ class Recording:
     """One step as graphs over slots.
 
     ``sense`` are the signals that the past keeps (empty where nobody looks back), ``respond`` the motion and memories
-    after the step by name, ``close`` the gap, from everybody's displacement.
+    after the step by name, ``close`` the gap, from everybody's displacement, ``begin`` memories before the first step.
     """
 
     graph: Graph
     sense: list[Node] = field(default_factory=list)
     respond: dict[str, Node] = field(default_factory=dict)
     close: dict[str, Node] = field(default_factory=dict)
+    begin: dict[str, Node] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ class _Past:
 
     def __init__(self, recording: Recording, seconds: float, dt: float) -> None:
         self._recording = recording
-        self._slots, self._dt = history.slots(seconds, dt), dt
+        self._slots, self._dt = TimeStep(history.slots(seconds, dt)), dt
 
     def at(self, scene: Scene, seconds: Any) -> Scene:
         graph = self._recording.graph
@@ -169,12 +170,13 @@ class _Recorder(Stepping):
         return super()._gaps(state, known)
 
 
-def record(simulator: Stepping, form: Form) -> Recording:
-    """Return one step of the simulator as graphs.
+def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recording:
+    """Return one step of the simulator as graphs, in ``graph`` where one is given.
 
+    The memories of ``form`` at their beginning are graphs, too (``begin``).
     ``Untraceable`` names the effect and the function for which that cannot be done.
     """
-    graph = Graph()
+    graph = Graph() if graph is None else graph
     recording = Recording(graph)
     recorder = _Recorder(
         _SeenRoad(simulator.road, graph), simulator.effects, TimeStep(simulator.dt), simulator.integration, recording
@@ -193,8 +195,14 @@ def record(simulator: Stepping, form: Form) -> Recording:
         present=read("present") if form.present else None,
         memory={name: read(f"memory of {name}") for name in form.memories},
     )
+    given = _Parameters(recorder, graph)
     try:
-        after = recorder.step(state, _inputs(form, graph), _Parameters(recorder, graph))  # type: ignore[arg-type]
+        after = recorder.step(state, _inputs(form, graph), given)  # type: ignore[arg-type]
+        scene, driver = recorder._scene(state, {}), recorder._following.driver(given[recorder._following.name])  # type: ignore[arg-type]
+        for effect in simulator.effects:
+            if effect.name in form.memories:
+                held = effect.initial_memory(scene, driver, given[effect.name])  # type: ignore[arg-type]
+                recording.begin[effect.name] = value_of(graph, held)
     except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
         raise Untraceable(
             f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}"

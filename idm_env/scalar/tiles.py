@@ -41,7 +41,9 @@ class TileText:
         self._begin("RECALLED", [row(r.slot) for r in p.recalls])
         self._begin("ON_RECALLED", [f"ON_{row(r.slot)}" for r in p.recalls])
         self._begin("AGO", [row(Slot(f"ago {i}")) for i in range(len(p.recall))])
-        self._begin("OTHER", ["DISPLACEMENT", "ON_DISPLACEMENT", "SCRATCH", "SCRATCH_TOO", *(row(s) for s in self._neighbours)])
+        self._begin(
+            "OTHER", ["DISPLACEMENT", "ON_DISPLACEMENT", "SCRATCH", "SCRATCH_TOO", *(row(s) for s in self._neighbours)]
+        )
         self._rows += [f"SENT_{row(s)}" for phase in PHASES for s in self._back[phase].sent]
         self._rows = list(dict.fromkeys([*self._rows, "SEEDED"]))
 
@@ -56,12 +58,11 @@ class TileText:
     @staticmethod
     def _chain(slots: set[Slot]) -> set[Slot]:
         """Add the nearer vehicles over which a number is handed on to those further away."""
-        return {
-            Slot(s.name, sign * k)
-            for s in slots
-            for sign in [1 if s.shift > 0 else -1]
-            for k in range(1, abs(s.shift) + 1)
-        }
+        found = set()
+        for s in slots:
+            sign = 1 if s.shift > 0 else -1
+            found |= {Slot(s.name, sign * k) for k in range(1, abs(s.shift) + 1)}
+        return found
 
     # -- where things are ----------------------------------------------------------------------------------------
 

@@ -1,0 +1,143 @@
+"""Loop over rows and time of discovery's rollout, without an equation: lines between marks are printed.
+
+This file is a template (``march``): what is printed works on the local names of ``march`` below, so the compiler sees
+one loop.
+"""
+
+# ruff: noqa: F821, F841
+# mypy: ignore-errors
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+ROOM = 68
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@compiled
+def choose(condition, a, b):
+    """Return a where the condition holds, else b."""
+    return a if condition else b
+
+
+@compiled
+def curve(p, number, tables, x):
+    """Piecewise linear through evenly spaced knots (periodic where a period is given), or a trapezoid."""
+    form, count = tables[number, 0], tables[number, 1]
+    at = tables[number, 2]
+    period = p[at + 3]
+    if period > 0.0:
+        x = x - period * np.floor(x / period)
+    if form == 2:
+        begin, end, edge, amount = p[at], p[at + 1], p[at + 2], p[at + 4]
+        up = min(max((x - begin + edge) / (2.0 * edge), 0.0), 1.0)
+        down = min(max((end + edge - x) / (2.0 * edge), 0.0), 1.0)
+        return amount * min(up, down)
+    position = (x - p[at]) * p[at + 1]
+    if period > 0.0:
+        position = position - count * np.floor(position / count)
+        low = int(position)
+        share = position - low
+        return (1.0 - share) * p[at + 4 + low % count] + share * p[at + 4 + (low + 1) % count]
+    position = min(max(position, 0.0), count - 1.0)
+    low = min(int(position), count - 2)
+    share = position - low
+    return (1.0 - share) * p[at + 4 + low] + share * p[at + 5 + low]
+
+
+@compiled
+def march(
+    signals, bounds, record, start, steps, group, length, theta, phi, on, tables, back, whole, lead, every, dt, k,
+    pulse, gap_out, speed_out,
+):  # fmt: skip
+    """Roll every row out in every copy and fill ``gap_out`` and ``speed_out`` [copies, rows, samples].
+
+    ``signals`` [samples, columns] holds all records, record r in rows ``bounds[r] : bounds[r + 1]``. Row i starts on
+    its measured state at sample ``start[i]`` of ``record[i]`` and runs ``steps`` steps. In ``lead`` steps before that
+    it is placed on the record and responds; ``whole`` winds memories up from the record's beginning. ``theta``
+    [copies, groups, 5]; ``phi`` [copies, groups, …] and ``on`` [copies, flags] as a catalogue lays them out;
+    ``tables`` [tables, 3] is (form, number of knots, place in φ); ``back`` is how many steps of the past are kept;
+    ``pulse`` [copies, 3] is (first step, end step, amount); ``k`` are constants that depend on dt. Every ``every``
+    steps a sample is kept; rows in which a record ends keep their last state.
+    """
+    rows, per_dt = len(record), 1.0 / dt
+    longest = 0
+    for r in range(len(bounds) - 1):
+        longest = max(longest, bounds[r + 1] - bounds[r])
+    h = np.empty((longest + 1 if back > 0 else 1, SIGNALS))
+    memory, kept_memory, moved = np.zeros(MEMORIES), np.zeros(MEMORIES), np.zeros(MEMORIES)
+    for c in range(theta.shape[0]):
+        flags = on[c]
+        last, kept_at = -1, 0
+        for row in range(rows):
+            r = record[row]
+            th, p = theta[c, group[row]], phi[c, group[row]]
+            begin, end, origin, own_length = bounds[r], bounds[r + 1], start[row], length[r]
+            offset = signals[origin, 18] - signals[origin, 14]
+            # <constants>
+            # </constants>
+            # Up to ``settle`` only memories are wound up, and from there to the origin the whole step, on the record.
+            settle = max(begin, origin - lead)
+            going_on = whole and r == last and kept_at <= settle
+            first = kept_at if going_on else begin if whole else settle
+            for j in range(MEMORIES):
+                memory[j] = kept_memory[j]
+            last = r
+            speed, position, accel = signals[first, 15], signals[first, 14], signals[first, 16]
+            # Before ``first`` only the past is filled.
+            i = first if going_on or back == 0 else max(begin, first - back)
+            while i < origin + steps:
+                if i + 1 >= end:
+                    for j in range((i - origin) // every, steps // every):
+                        gap_out[c, row, j], speed_out[c, row, j] = signals[end - 1, 0] - position, speed
+                    break
+                if i <= origin:
+                    position, speed = signals[i, 14], signals[i, 15]
+                    if i <= settle:
+                        accel = signals[i, 16]
+                now = i - begin
+                lead_speed, lead_accel = signals[i, 1], signals[i, 2]
+                gap = signals[i, 0] - position
+                time = signals[i, 17]
+                place = position + offset
+                pulse_now = pulse[c, 2] if i - origin >= pulse[c, 0] and i - origin < pulse[c, 1] else 0.0
+                if back > 0:
+                    carried = accel
+                    if i < origin:
+                        accel = signals[i, 16]
+                    # <sense>
+                    # </sense>
+                    accel = carried
+                if i < first:
+                    i += 1
+                    continue
+                if i == first and not going_on:
+                    # <begin>
+                    # </begin>
+                    pass  # where nothing is remembered
+                if i < settle:
+                    # <wind>
+                    # </wind>
+                    for j in range(MEMORIES):
+                        memory[j] = moved[j]
+                    i += 1
+                    continue
+                if i == settle:
+                    kept_at = i
+                    for j in range(MEMORIES):
+                        kept_memory[j] = memory[j]
+                # <respond>
+                # </respond>
+                for j in range(MEMORIES):
+                    memory[j] = moved[j]
+                accel = accel_after
+                i += 1
+                if i <= origin:
+                    continue
+                speed = speed_after
+                position += displacement
+                k_step = i - origin
+                if k_step % every == 0:
+                    gap_out[c, row, k_step // every - 1] = signals[i, 0] - position
+                    speed_out[c, row, k_step // every - 1] = speed

@@ -1,0 +1,99 @@
+"""Places in discovery's loop for what has no name: a curve over any feature that changes any number of the driver.
+
+One pair of effects stands for all curves and intervals. Which feature and which numbers is said by parameters, so that
+one compiled loop serves every choice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects.base import Effect, P
+from idm_env.effects.free import FEATURES, DriverCurve, feature_of
+from idm_env.effects.places import curve
+from idm_env.parameters import Parameter
+from idm_env.types import Driver, Scene
+
+TARGETS: dict[str, tuple[str, ...]] = {
+    "time_gap": ("time_gap",),
+    "desired_speed": ("desired_speed",),
+    "max_accel": ("max_accel",),
+    "comfort_decel": ("comfort_decel",),
+    "accel_and_decel": ("max_accel", "comfort_decel"),
+}
+"""What a curve may change, and the driver's parameters that this means; ``acceleration`` is added instead."""
+SETS = (("time_gap", "desired_speed"), ("max_accel", "comfort_decel"))
+"""Parameters that one slot may change: what a curve leaves alone must not wait for it."""
+
+
+OVER = Parameter("over", "", "1", 0.0, 0.0, len(FEATURES) - 1.0, role="shape")
+"""Which feature a curve runs over: its place in ``FEATURES``."""
+
+
+def _value(effect: Slot | Push, scene: Scene, p: P) -> Tensor:
+    """Return c."""
+    if effect.given:
+        given: Tensor = scene.input(effect.name)
+        return given
+    x: Any = 0.0
+    for number, feature in enumerate(FEATURES):
+        # Chosen, not summed: the loop need not wait for what does not count.
+        x = torch.where(p["over"] == number, feature_of(scene, feature, None), x)
+    return curve(x, p, "knot", effect.knots, None, effect.values)
+
+
+@dataclass(frozen=True)
+class Slot(Effect):
+    """Some parameters of the driver times ``1 + c``: c a curve over one feature, or the input (``given``).
+
+    Which feature and which parameters is said by parameters: ``over``, and 1 for what changes.
+    """
+
+    kind: ClassVar[str] = "slot"
+    rank: ClassVar[int] = DriverCurve.rank
+    label: str = ""
+    targets: tuple[str, ...] = SETS[0]
+    given: bool = False
+    knots: tuple[float, ...] = (0.0, 1.0)
+    values: tuple[float, ...] = (0.0, 0.0)
+
+    @property
+    def name(self) -> str:
+        """``slot_``, the first parameter that may change, and the label."""
+        return f"{self.kind}_{self.targets[0]}_{self.label}"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Which feature, and 1 for each parameter that changes."""
+        return (OVER, *(Parameter(name, "", "1", 0.0, 0.0, 1.0, null=0.0) for name in self.targets))
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the parameters changed."""
+        c = _value(self, scene, p)
+        now = {n: getattr(driver, n) for n in self.targets}
+        return driver._replace(**{n: torch.where(p[n] > 0.0, x * (1.0 + c), x) for n, x in now.items()})
+
+
+@dataclass(frozen=True)
+class Push(Effect):
+    """An added acceleration c, as in ``Slot``."""
+
+    kind: ClassVar[str] = "push"
+    declared: ClassVar[tuple[Parameter, ...]] = (OVER,)
+    label: str = ""
+    given: bool = False
+    knots: tuple[float, ...] = (0.0, 1.0)
+    values: tuple[float, ...] = (0.0, 0.0)
+
+    @property
+    def name(self) -> str:
+        """``push_`` and the label."""
+        return f"{self.kind}_{self.label}"
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return c (m/s²)."""
+        return _value(self, scene, p)

@@ -1,0 +1,91 @@
+"""An open catalogue: effects of one's own entered for this process, and where their classes live."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from idm_env.effects.base import CarFollowing, Effect
+
+
+def same_class(a: type[Effect], b: type[Effect]) -> bool:
+    """Tell whether two classes are one, or one that was read twice."""
+    return a is b or (a.__qualname__ == b.__qualname__ and _file(a) == _file(b))
+
+
+def entered(effect: type[Effect], known: dict[str, type[Effect]]) -> type[Effect]:
+    """Enter a class among the known ones; ValueError for one without a name, or with another's."""
+    if not (isinstance(effect, type) and issubclass(effect, Effect)):
+        raise ValueError(f"{effect!r} is no class of effects. Register the class, such as register(MyEffect).")
+    if not effect.kind:
+        raise ValueError(f'effect {effect.__name__} has no name. Give it one: kind = "my_effect".')
+    taken = known.get(effect.kind)
+    if taken is not None and not same_class(taken, effect):
+        raise ValueError(f"the name '{effect.kind}' of {effect.__name__} is that of {taken.__name__}. Give it another.")
+    known[effect.kind] = effect
+    return effect
+
+
+def is_candidate(effect: type[Effect]) -> bool:
+    """Tell whether a search can switch an effect on and off: it is no car-following and has a null."""
+    return not issubclass(effect, CarFollowing) and effect.hook != "place" and any(
+        p.null is not None for p in effect().parameters
+    )  # fmt: skip
+
+
+def read(where: str) -> type[Effect]:
+    """Return the class at ``my_file.py:MyEffect`` or ``my_package.my_module:MyEffect``; the file is run for that.
+
+    ValueError, in one line, where there is none.
+    """
+    place, _, name = where.rpartition(":")
+    try:
+        module = _module_of(Path(place)) if place.endswith(".py") else importlib.import_module(place)
+    except Exception as error:
+        raise ValueError(f"effect {where}: {place} cannot be read ({type(error).__name__}: {error}).") from None
+    found = getattr(module, name, None)
+    if not (isinstance(found, type) and issubclass(found, Effect)):
+        mine = {k: v for k, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__}
+        able = ", ".join(k for k, v in mine.items() if issubclass(v, Effect)) or "none"
+        raise ValueError(f"effect {where}: {place} has no class {name} of effects. It has: {able}.")
+    return found
+
+
+def lives(effect: type[Effect]) -> str:
+    """Return the place of a class as ``read`` takes it; ValueError for one inside a function."""
+    if "<locals>" in effect.__qualname__:
+        raise ValueError(f"effect {effect.__name__} lives inside a function. Move it to the top of a file to save it.")
+    module = effect.__module__
+    if module != "__main__" and not module.startswith(_PREFIX):
+        return f"{module}:{effect.__qualname__}"
+    return f"{_file(effect)}:{effect.__qualname__}"
+
+
+_PREFIX = "idm_env_effects_of_"
+
+
+def _file(effect: type[Effect]) -> str:
+    file = getattr(sys.modules.get(effect.__module__), "__file__", None)
+    return str(Path(file).resolve()) if file else effect.__module__
+
+
+def _module_of(path: Path) -> ModuleType:
+    """Run a file once per process and text, and return it as a module."""
+    full = path.resolve()
+    name = _PREFIX + hashlib.sha256(str(full).encode() + full.read_bytes()).hexdigest()[:16]
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, full)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
