@@ -38,13 +38,21 @@ def _cache_of_loops() -> str:
     return str(Path(numba.config.CACHE_DIR or library.folder()) / f"loops_{digest}")
 
 
-def exact(function: Callable[..., Any]) -> Any:
-    """Compile whatever yields values: IEEE arithmetic as written, so values do not depend on the loop around them."""
-    place, numba.config.CACHE_DIR = numba.config.CACHE_DIR, _cache_of_loops()
-    try:
-        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    finally:
-        numba.config.CACHE_DIR = place
+def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles a loop with these options of numba, in the cache of this version of it."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        place, numba.config.CACHE_DIR = numba.config.CACHE_DIR, _cache_of_loops()
+        try:
+            return numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        finally:
+            numba.config.CACHE_DIR = place
+
+    return compiled
+
+
+exact = compiler()
+"""Compiler for whatever yields values: IEEE arithmetic as written, so values do not depend on the loop around them."""
 
 TILE = 1024
 """Most vehicles per tile: some forty rows of 4 kB and the states of a time block stay in the second-level cache."""
