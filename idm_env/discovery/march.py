@@ -28,6 +28,7 @@ from idm_env.discovery.slots import SETS, TARGETS, Push
 from idm_env.discovery.slots import Slot as Changed
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.effects.free import FEATURES
+from idm_env.kernels import functions
 from idm_env.roads import Lane
 from idm_env.scalar import library
 from idm_env.scalar.graph import Slot, TimeStep
@@ -158,7 +159,7 @@ class Loop:
     @cached_property
     def march(self) -> Any:
         """The compiled function of ``march_loops``."""
-        return library.load("march", self.text).march
+        return library.load("march", self.text, (Path(functions.__file__),)).march
 
 
 def why_not_recorded(effect: Effect, dt: float = 0.1) -> str | None:

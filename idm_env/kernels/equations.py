@@ -16,25 +16,22 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from idm_env.effects.idm import SMALLEST_GAP
+from idm_env.kernels.tiles import Array, compiler
 from idm_env.types import FAR
 
-Array = NDArray[Any]
-
-exact = numba.njit(cache=True, nogil=True, error_model="numpy")
+exact = compiler()
 """Compiler for whatever yields values: IEEE arithmetic as written, so values do not depend on the loop around them."""
 
-swift = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+swift = compiler(fastmath={"contract"})
 """Compiler for derivatives: may contract a product and a sum into one rounding. Nothing that assumes away NaN."""
 
-exact_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+exact_inlined = compiler(forceinline=True)
 """As ``exact``, for the body of a loop: a call that is not inlined cannot be vectorised."""
 
-swift_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+swift_inlined = compiler(fastmath={"contract"}, forceinline=True)
 """As ``swift``, for the body of a loop."""
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.kernels.equations import Array
+from idm_env.kernels.tiles import Array
 
 Strides = tuple[int, int, int]
 

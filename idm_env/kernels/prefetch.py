@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from idm_env.kernels.equations import exact
+from idm_env.kernels.tiles import exact
 
 LINE = 64
 """Bytes of a cache line."""

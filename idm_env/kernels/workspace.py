@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from idm_env.kernels.equations import Array
+from idm_env.kernels.tiles import Array
 
 SMALLEST = 1 << 20
 """Bytes below which an allocator reuses memory well enough by itself."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from idm_env.effects import IDM, Brakes
-from idm_env.kernels import lanes
+from idm_env.kernels import dispatch, lanes
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
@@ -20,9 +20,10 @@ def held(block: int) -> float:
     params["idm"]["time_gap"].requires_grad_()
     position = (-30.0 * torch.arange(float(SIZE))).expand(ROWS, SIZE).clone()
     state = simulator.state(position, torch.full((ROWS, SIZE), 10.0), params)
-    lanes.rollout(simulator, state, {}, params, STEPS, block=block, keep=False)
+    kernel = dispatch.found(simulator, state, {}, params)
+    lanes.rollout(kernel, simulator, state, {}, params, STEPS, block=block, keep=False)
     tracemalloc.start()
-    last, _ = lanes.rollout(simulator, state, {}, params, STEPS, block=block, keep=False)
+    last, _ = lanes.rollout(kernel, simulator, state, {}, params, STEPS, block=block, keep=False)
     bytes_now, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert last.speed.requires_grad
