@@ -173,7 +173,10 @@ def explain(
     data: Data,
     out: Out = Path("out/explain"),
     by: Annotated[str, typer.Option(help="Who shares IDM parameters: driver, all, or a column.")] = "driver",
-    effects: Annotated[str | None, typer.Option(help="Candidates, by comma; default: the whole catalogue.")] = None,
+    effects: Annotated[
+        str | None,
+        typer.Option(help="Candidates, by comma: names, or my_file.py:MyEffect; default: the whole catalogue."),
+    ] = None,
     known: Annotated[str | None, typer.Option(help="Effects whose values are in the file, such as grade.")] = None,
     seed: Seed = 0,
     ring_length: RingLength = None,

@@ -197,3 +197,15 @@ def test_plot_and_effects(frame: pl.DataFrame, tmp_path: Path) -> None:
     assert done.returncode == 1 and "was not written by idm-env plot" in done.stderr and page.read_text() == "mine"
     listed = call("effects", env={**os.environ, "COLUMNS": "200"})
     assert "second_leader.weight" in listed.stdout
+
+
+def test_explain_reads_effects_from_files(frame: pl.DataFrame, tmp_path: Path) -> None:
+    """A class that is not there is one line; one that is there is tried: two runs are too few to decide."""
+    path, example = tmp_path / "data.csv", Path(__file__).parents[1] / "examples" / "add_an_effect.py"
+    frame.write_csv(path)
+    done = call("explain", path, "--effects", f"{example}:Nobody", "--out", tmp_path / "out")
+    assert done.returncode == 1 and "no class Nobody of effects. It has: Fatigue." in " ".join(done.stderr.split())
+    done = call("explain", path, "--effects", f"{example}:Fatigue", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert [c["effect"] for c in report["candidates"]] == ["fatigue"] and "only" not in report["candidates"][0]["note"]

@@ -114,7 +114,7 @@ def _eager(steps: int) -> Any:
 
 
 def discovery() -> dict[str, Any]:
-    """Return CPU ms of one Jacobian of every candidate effect by the compiled twin, and CPU seconds of a discovery.
+    """Return CPU ms of one Jacobian of every candidate effect by discovery's loop, and CPU seconds of a discovery.
 
     A generated set of 10 runs × 3 followers × 180 s without an effect; a Jacobian is a rollout of all windows of 50
     steps in one copy more than there are parameters, the drivers' five included, at the candidate's first start.

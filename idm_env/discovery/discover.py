@@ -275,7 +275,7 @@ def _finish(
 def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:
     """Return the corrected model as it is saved: effects, shared parameters, the median driver and every driver."""
     added, numbers = terms.effects_of(final.model, final.values)
-    # Effects that adapt a driver are chained in the order of the compiled twin.
+    # Effects that adapt a driver are chained as in discovery's loop.
     added.sort(key=lambda e: e.rank if e.hook == "adapt" else 0)
     seen = np.unique(prepared.group)
     middle = np.exp(np.median(theta[seen], axis=0))

@@ -200,6 +200,10 @@ def back_steps(effects: Sequence[Effect], dt: float) -> int:
 def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     graph = Regions()
     made = _recorded(catalogue, dt, graph)
+    read_tables = {node.label for node in graph.serial if node.op == "table"}
+    for name, number in catalogue.tables.items():
+        if number not in read_tables:
+            raise ValueError(f"effect '{name}' is sought as a profile and does not read it by effects.places.curve.")
     memories = list(made.begin)
     driver = {f"idm.{p.name}": f"th{i}" for i, p in enumerate(IDM.declared)}
     inputs = {slot_name(e.name, ""): "pulse_now" for e in _slots(PULSE)}

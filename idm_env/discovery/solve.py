@@ -1,6 +1,6 @@
 """Nested least squares: every trial of a candidate's parameters φ lets every driver's own parameters θ follow.
 
-Predictions come from the compiled twin, derivatives from its differences (one extra copy of the rows per parameter).
+Predictions come from the compiled loop, derivatives from its differences (one extra copy of the rows per parameter).
 Each iteration solves the normal equations of all drivers at once and eliminates their θ (Schur complement), so a step
 of φ already knows how θ will follow: variable projection (Golub and Pereyra 1973).
 """

@@ -1,4 +1,4 @@
-"""The compiled twin does what the simulator does, for every effect that discovery can name or locate."""
+"""The compiled loop does what the simulator does, for every effect that discovery can name or locate."""
 
 from __future__ import annotations
 

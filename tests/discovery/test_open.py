@@ -121,6 +121,22 @@ def test_what_cannot_be_tried_is_listed_with_its_reason() -> None:
         discover(data, effects=[Fussy])
 
 
+def test_a_profile_that_the_loop_would_not_see_is_refused() -> None:
+    @dataclass(frozen=True)
+    class Slope(Effect):
+        kind: ClassVar[str] = "slope"
+        sought: ClassVar[Any] = "profile"
+        declared: ClassVar[tuple[Parameter, ...]] = (Parameter("slope_0", "", "1", 0.1, -1.0, 1.0, null=0.0),)
+        knots: tuple[float, ...] = (0.0, 1.0)
+
+        def accelerate(self, scene: Any, driver: Any, p: Any) -> Any:
+            return p["slope_0"] * scene.position
+
+    why = march.why_not_recorded(Slope())
+    assert why is not None and "does not read it by effects.places.curve" in why
+    assert march.why_not_recorded(Mood()) is None
+
+
 def test_a_registered_effect_is_a_candidate_and_names_are_not_taken_twice() -> None:
     assert catalogue.register(Mood) is Mood and catalogue.register(Mood) is Mood
     assert "mood" in catalogue.candidates() and "brakes" not in catalogue.candidates()
