@@ -23,7 +23,7 @@ from idm_env.data import synthetic
 from idm_env.types import Record
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(
     r"(?:<!-- (?P<marker>[a-z ]+?):? (?P<told>[^\n]*?) -->\s*)?^```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL
 )
@@ -97,7 +97,7 @@ def result_model(folder: Path) -> None:
     """A saved model, as ``explain`` leaves one."""
     (folder / "result").mkdir()
     model = Model((IDM(), Brakes()), {"idm": {"time_gap": 1.2}})
-    save_model(model, folder / "result" / "model.yaml")
+    save_model(folder / "result" / "model.yaml", model)
 
 
 FILES = {"my.csv": my_csv, "result/model.yaml": result_model, "tired.csv": tired_csv}
