@@ -1,7 +1,7 @@
 """Every python block of README and of docs/ runs as it stands; blocks of one document share their names.
 
-A block whose first line is ``# file: NAME`` is also a file of that name in the folder in which the document runs. A
-comment ``<!-- needs NAME -->`` before a block leaves it out as long as the package has no such name, and
+A block, python or yaml, whose first line is ``# file: NAME`` is also a file of that name in the folder in which the
+document runs. A comment ``<!-- needs NAME -->`` before a block leaves it out as long as the package has no such name, and
 ``<!-- not run: REASON -->`` always.
 """
 
@@ -12,6 +12,7 @@ import re
 import sys
 import types
 from pathlib import Path
+from typing import NamedTuple
 
 import polars as pl
 import pytest
@@ -25,15 +26,31 @@ from idm_env.types import Record
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(
-    r"(?:<!-- (?P<marker>[a-z ]+?):? (?P<told>[^\n]*?) -->\s*)?^```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL
+    r"(?:<!-- (?P<marker>[a-z ]+?):? (?P<told>[^\n]*?) -->\s*)?^```(?P<kind>python|yaml)\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL
 )
 
 
-def blocks(path: Path) -> list[tuple[int, str, str, str]]:
-    """Return line, marker, what the marker tells, and code of every python block."""
+class Block(NamedTuple):
+    """A block: its first line, python or yaml, its marker and what that tells, and its text."""
+
+    line: int
+    kind: str
+    marker: str
+    told: str
+    code: str
+
+
+def blocks(path: Path) -> list[Block]:
+    """Return every python and yaml block of a document."""
     text = path.read_text(encoding="utf-8")
     return [
-        (text[: found.start("code")].count("\n") + 1, found["marker"] or "", found["told"] or "", found["code"])
+        Block(
+            text[: found.start("code")].count("\n") + 1,
+            found["kind"],
+            found["marker"] or "",
+            found["told"] or "",
+            found["code"],
+        )
         for found in BLOCK.finditer(text)
     ]
 
@@ -53,7 +70,7 @@ def my_csv(folder: Path) -> None:
 
 
 def tired_csv(folder: Path) -> None:
-    """Ten platoons whose drivers want to go slower by 0.3 % every second, measured with 5 cm of noise."""
+    """Ten platoons behind scripted leaders, with 5 cm of noise, whose drivers want to go slower by 0.3 % every second."""
     fatigue = importlib.import_module("fatigue").Fatigue
     simulator = Simulator(Lane(), (IDM(), fatigue(), Brakes(), Replay()), dt=0.1)
     generator = torch.Generator().manual_seed(3)
@@ -114,13 +131,15 @@ def test_every_block_runs(path: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     space = types.ModuleType(name)
     monkeypatch.setitem(sys.modules, name, space)
     made: set[str] = set()
-    for line, marker, told, code in blocks(path):
+    for line, kind, marker, told, code in blocks(path):
         assert marker in ("", "needs", "not run"), f"{path.name}:{line}: unknown marker '{marker}'"
         if marker == "not run" or (marker == "needs" and not there_is(told)):
             continue
         if code.startswith("# file: "):
             (tmp_path / code.splitlines()[0].removeprefix("# file: ")).write_text(code)
             importlib.invalidate_caches()
+        if kind == "yaml":
+            continue
         for file in [f for f in FILES if f in code and f not in made]:
             made.add(file)
             FILES[file](tmp_path)
@@ -132,9 +151,9 @@ def test_blocks_are_found_and_markers_give_a_reason() -> None:
     assert blocks(ROOT / "docs" / "architecture.md")
     for path in DOCUMENTS:
         text = path.read_text(encoding="utf-8")
-        assert text.count("```python") == len(blocks(path)), path.name
+        assert text.count("```python") + text.count("```yaml") == len(blocks(path)), path.name
         assert len(re.findall(r"^```", text, re.MULTILINE)) % 2 == 0, path.name
-        assert all(told for _, marker, told, _ in blocks(path) if marker), path.name
+        assert all(block.told for block in blocks(path) if block.marker), path.name
 
 
 @pytest.mark.parametrize("path", [*DOCUMENTS, ROOT / "CONTRIBUTING.md"], ids=lambda p: p.stem)
