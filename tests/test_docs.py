@@ -11,6 +11,7 @@ import importlib
 import re
 import sys
 import types
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ import torch
 from idm_env import IDM, Brakes, Lane, Replay, Simulator
 from idm_env.config import Model, save_model
 from idm_env.data import synthetic
+from idm_env.effects import ALL
 from idm_env.types import Record
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -123,12 +125,24 @@ FILES = {"my.csv": my_csv, "result/model.yaml": result_model, "tired.csv": tired
 """What blocks read, by the text that names it."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", [p for p in DOCUMENTS if blocks(p)], ids=lambda p: p.stem)
-def test_every_block_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In order, as somebody would type them, in a folder that has the files they read."""
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Work in an empty folder; modules read from there, and effects registered by them, are gone afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    catalogue = dict(ALL)
+    yield tmp_path
+    ALL.clear()
+    ALL.update(catalogue)
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None)).startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [p for p in DOCUMENTS if blocks(p)], ids=lambda p: p.stem)
+def test_every_block_runs(path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In order, as somebody would type them, in a folder that has the files they read."""
     name = f"docs_{path.stem.replace('-', '_').lower()}"
     space = types.ModuleType(name)
     monkeypatch.setitem(sys.modules, name, space)
@@ -137,13 +151,13 @@ def test_every_block_runs(path: Path, tmp_path: Path, monkeypatch: pytest.Monkey
         if marker == "not run" or (marker == "needs" and not there_is(told)):
             continue
         if code.startswith("# file: "):
-            (tmp_path / code.splitlines()[0].removeprefix("# file: ")).write_text(code)
+            (folder / code.splitlines()[0].removeprefix("# file: ")).write_text(code)
             importlib.invalidate_caches()
         if kind == "yaml":
             continue
         for file in [f for f in FILES if f in code and f not in made]:
             made.add(file)
-            FILES[file](tmp_path)
+            FILES[file](folder)
         exec(compile("\n" * (line - 1) + code, str(path), "exec"), space.__dict__)
 
 
