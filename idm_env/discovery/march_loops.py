@@ -4,12 +4,15 @@ This file is a template (``march``): what is printed works on the local names of
 one loop.
 """
 
-# ruff: noqa: F821, F841
+# ruff: noqa: F401, F821, F841
 # mypy: ignore-errors
 from __future__ import annotations
 
 import numba
 import numpy as np
+
+from idm_env.kernels.functions import exp_float64 as exp  # what is printed calls these two
+from idm_env.kernels.functions import sigmoid_float64 as sigmoid
 
 ROOM = 68
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
