@@ -1,0 +1,181 @@
+"""Every python block of README and of docs/ runs as it stands; blocks of one document share their names.
+
+A block, python or yaml, whose first line is ``# file: NAME`` is also a file of that name in the folder in which the
+document runs. Comments before a block: ``<!-- needs NAME -->`` leaves it out as long as the package has no such name,
+``<!-- not run: REASON -->`` always.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import polars as pl
+import pytest
+import torch
+
+from idm_env import IDM, Brakes, Lane, Replay, Simulator
+from idm_env.config import Model, save_model
+from idm_env.data import synthetic
+from idm_env.effects import ALL
+from idm_env.types import Record
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(
+    r"(?:<!-- (?P<marker>needs|not run):? (?P<told>[^\n]+?) -->\s*)?"
+    r"^```(?P<kind>python|yaml)\n(?P<code>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+class Block(NamedTuple):
+    """A block: its first line, python or yaml, its marker and what that tells, and its text."""
+
+    line: int
+    kind: str
+    marker: str
+    told: str
+    code: str
+
+
+def blocks(path: Path) -> list[Block]:
+    """Return every python and yaml block of a document."""
+    text = path.read_text(encoding="utf-8")
+    return [
+        Block(
+            text[: found.start("code")].count("\n") + 1,
+            found["kind"],
+            found["marker"] or "",
+            found["told"] or "",
+            found["code"],
+        )
+        for found in BLOCK.finditer(text)
+    ]
+
+
+def there_is(name: str) -> bool:
+    """Tell whether the package has this name."""
+    module, _, attribute = name.rpartition(".")
+    return hasattr(importlib.import_module(module), attribute)
+
+
+def my_csv(folder: Path) -> None:
+    """Three platoons of a leader and two followers, with a hidden delay."""
+    trajectories, _ = synthetic.generate(seed=4, runs=3, followers=2, seconds=40.0, effect="delay")
+    trajectories.table.select("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps").write_csv(
+        folder / "my.csv"
+    )
+
+
+def tired_csv(folder: Path) -> None:
+    """Ten platoons whose drivers want to go slower by 0.3 % every second; 5 cm of noise."""
+    fatigue = importlib.import_module("fatigue").Fatigue
+    simulator = Simulator(Lane(), (IDM(), fatigue(), Brakes(), Replay()), dt=0.1)
+    generator = torch.Generator().manual_seed(3)
+    steps, tables = 1500, []
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    for run in range(10):
+        params = simulator.defaults(dtype=torch.float64)
+        params["fatigue"]["rate"] = torch.tensor(3e-3, dtype=torch.float64)
+        params["idm"] = {name: x * torch.exp(0.1 * draw(4)) for name, x in params["idm"].items()}
+        time = torch.arange(steps + 1, dtype=torch.float64) * 0.1
+        phase = 6.28 * torch.rand(2, generator=generator, dtype=torch.float64)
+        speed = 24.0 + 5.0 * torch.sin(time / 9.0 + phase[0]) + 4.0 * torch.sin(time / 23.0 + phase[1])
+        position = 300.0 + torch.cumulative_trapezoid(speed, dx=0.1)
+        accel = torch.gradient(speed, spacing=0.1)[0][1:]
+        first = torch.tensor([True, False, False, False]).expand(steps, 4)
+        leader = (x.unsqueeze(-1).expand(steps, 4) for x in (position, speed[1:], accel))
+        start = 300.0 - 45.0 * torch.arange(4, dtype=torch.float64)
+        state = simulator.state(start, torch.full((4,), float(speed[0]), dtype=torch.float64), params)
+        _, kept = simulator.rollout(state, {"replay": Record(*leader, first)}, params, steps)
+        for vehicle in range(4):
+            tables.append(
+                pl.DataFrame(
+                    {
+                        "run_id": f"run{run}",
+                        "vehicle_id": vehicle,
+                        "leader_id": vehicle - 1 if vehicle else None,
+                        "time_s": time[1:].numpy(),
+                        "position_m": (kept.position[:, vehicle] + 0.05 * draw(steps)).numpy(),
+                        "length_m": 5.0,
+                    },
+                    schema_overrides={"leader_id": pl.Int64},
+                )
+            )
+    pl.concat(tables).write_csv(folder / "tired.csv")
+
+
+def result_model(folder: Path) -> None:
+    """A saved model, as ``explain`` leaves one."""
+    (folder / "result").mkdir()
+    model = Model((IDM(), Brakes()), {"idm": {"time_gap": 1.2}})
+    save_model(folder / "result" / "model.yaml", model)
+
+
+FILES = {"my.csv": my_csv, "result/model.yaml": result_model, "tired.csv": tired_csv}
+"""What blocks read, by the text that names it."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Work in an empty folder; modules read from there, and effects registered by them, are gone afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    catalogue = dict(ALL)
+    yield tmp_path
+    ALL.clear()
+    ALL.update(catalogue)
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None)).startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [p for p in DOCUMENTS if blocks(p)], ids=lambda p: p.stem)
+def test_every_block_runs(path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In order, as somebody would type them, in a folder that has the files they read."""
+    name = f"docs_{path.stem.replace('-', '_').lower()}"
+    space = types.ModuleType(name)
+    monkeypatch.setitem(sys.modules, name, space)
+    made: set[str] = set()
+    for line, kind, marker, told, code in blocks(path):
+        if marker == "not run" or (marker == "needs" and not there_is(told)):
+            continue
+        if code.startswith("# file: "):
+            (folder / code.splitlines()[0].removeprefix("# file: ")).write_text(code)
+            importlib.invalidate_caches()
+        if kind == "yaml":
+            continue
+        for file in [f for f in FILES if f in code and f not in made]:
+            made.add(file)
+            FILES[file](folder)
+        exec(compile("\n" * (line - 1) + code, str(path), "exec"), space.__dict__)
+
+
+def test_blocks_are_found_and_markers_give_a_reason() -> None:
+    """No document's code escapes the test by how its fence is written."""
+    assert blocks(ROOT / "docs" / "architecture.md")
+    for path in DOCUMENTS:
+        text = path.read_text(encoding="utf-8")
+        assert text.count("```python") + text.count("```yaml") == len(blocks(path)), path.name
+        assert len(re.findall(r"^```", text, re.MULTILINE)) % 2 == 0, path.name
+        assert len(re.findall("<!-- (?:needs|not run)", text)) == sum(bool(b.marker) for b in blocks(path)), path.name
+
+
+@pytest.mark.parametrize("path", [*DOCUMENTS, ROOT / "CONTRIBUTING.md"], ids=lambda p: p.stem)
+def test_files_that_documents_name_are_there(path: Path) -> None:
+    """A file that was renamed or deleted is not sent to."""
+    text = path.read_text(encoding="utf-8")
+    named = set(re.findall(r"\b((?:idm_env|tests|benchmarks|examples|configs|agents|docs)/[\w/.-]+\.\w+)", text))
+    named |= {f"{path.parent.relative_to(ROOT)}/{link}" for link in re.findall(r"\]\((?!http|#)([^)#]+)", text)}
+    missing = sorted(n for n in named if not (ROOT / n).exists())
+    assert not missing, f"{path.name} names {missing}"
