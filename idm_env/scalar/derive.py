@@ -42,10 +42,13 @@ def _div(graph: Graph, node: Node, g: Node) -> list[Share]:
 
 def _pow(graph: Graph, node: Node, g: Node) -> list[Share]:
     a, b = node.args
+    zero = graph.constant(0.0)
     lower = graph.node("pow", a, graph.sub(b, graph.constant(1.0)))
+    # The power 0 is constant, at a base of 0 as well, where the product below is no number.
+    by_base = graph.select(graph.compare("eq", b, zero), zero, graph.mul(graph.mul(g, b), lower))
     # 0 to a positive power: the logarithm is infinite, the product's limit is 0.
     log = graph.node("log", graph.select(graph.compare("eq", a, graph.constant(0.0)), graph.constant(1.0), a))
-    return [(0, graph.mul(graph.mul(g, b), lower)), (1, graph.mul(graph.mul(g, node), log))]
+    return [(0, by_base), (1, graph.mul(graph.mul(g, node), log))]
 
 
 def _abs(graph: Graph, node: Node, g: Node) -> list[Share]:

@@ -203,9 +203,11 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
             if effect.name in form.memories:
                 held = effect.initial_memory(scene, driver, given[effect.name])  # type: ignore[arg-type]
                 recording.begin[effect.name] = value_of(graph, held)
-    except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
+    except Untraceable:
+        raise
+    except Exception as error:  # an effect may do anything with what it takes for a tensor; the torch path judges it
         raise Untraceable(
-            f"effect '{graph.note}' does what cannot be recorded: {str(error).splitlines()[0]}"
+            f"effect '{graph.note}' does what cannot be recorded: {' '.join(str(error).split())}"
         ) from error
     for name in ("position", "speed", "accel"):
         recording.respond[name] = value_of(graph, getattr(after, name))

@@ -59,12 +59,21 @@ class Scalar:
 
     @classmethod
     def __torch_function__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if function is torch.Tensor.where:
+            args = _condition_first(*args)
         return _apply(getattr(function, "__name__", str(function)), args, kwargs or {})
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name not in FUNCTIONS:
             raise _refused(self.graph, f"Tensor.{name}")
+        if name == "where":
+            return lambda condition, other: _apply(name, (condition, self, other), {})
         return lambda *args, **kwargs: _apply(name, (self, *args), kwargs)
+
+
+def _condition_first(a: Any, condition: Any, b: Any) -> tuple[Any, Any, Any]:
+    """Return the arguments of the method ``a.where(condition, b)`` as those of the function."""
+    return condition, a, b
 
 
 def _refused(graph: Graph, what: str) -> Untraceable:
@@ -78,7 +87,14 @@ def _apply(name: str, args: Any, kwargs: dict[str, Any]) -> Scalar:
     plain = name.strip("_")
     if plain not in FUNCTIONS:
         raise _refused(graph, f"torch.{plain}")
-    given = {k: v for k, v in kwargs.items() if k not in ("dtype", "device", "out")}
+    kind = next((x for x in (*args, kwargs.get("dtype")) if isinstance(x, torch.dtype)), torch.float64)
+    if kind == torch.bool and plain == "to":
+        plain = "bool"
+    elif not kind.is_floating_point:
+        raise _refused(graph, f"torch.{plain} to {kind}")
+    args = [x for x in args if not isinstance(x, torch.dtype)]
+    given = {k: _node(graph, v) if isinstance(v, (Scalar, torch.Tensor)) else v for k, v in kwargs.items()
+             if k not in ("dtype", "device", "out") and not (k == "inplace" and v is False)}  # fmt: skip
     try:
         return Scalar(graph, FUNCTIONS[plain](graph, *(_node(graph, a) for a in args), **given))
     except TypeError as error:
@@ -147,7 +163,8 @@ def _value(graph: Graph, a: Node) -> Node:
 
 
 def _remainder(graph: Graph, a: Node, b: Node) -> Node:
-    return graph.sub(a, graph.mul(graph.node("floor", graph.div(a, b)), b))
+    # A division, not a product with 1/b: 49 · (1/49) is less than 1.
+    return graph.sub(a, graph.mul(graph.node("floor", graph.node("div", a, b)), b))
 
 
 def _softplus(graph: Graph, a: Node, beta: Any = 1.0, threshold: Any = 20.0) -> Node:

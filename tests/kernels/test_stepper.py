@@ -22,7 +22,7 @@ from idm_env.kernels.stepper import Stepper
 MOVING = ("position", "speed", "accel", "gap")
 TASKS = {
     "ring": {"start": "wave", "warmup": 20, "controlled": 3, "integration": "euler", "noise": 0.2},
-    "follow": {"parameters": {"idm.time_gap": [1.0 + 0.05 * i for i in range(6)]}},
+    "follow": {"parameters": {"idm.time_gap": [1.0 + 0.05 * i for i in range(7)]}},
     "platoon": {"effects": ["delay", "memory"]},
     "replay": {"controlled": 2, "model": "all"},
 }
@@ -48,9 +48,9 @@ def equal(mine, other):
 
 
 def timed(value):
-    return (
-        value[None] if isinstance(value, torch.Tensor) else type(value)(*(x if x is None else x[None] for x in value))
-    )
+    if isinstance(value, torch.Tensor):
+        return value[None]
+    return type(value)(*(x if x is None else x[None] for x in value))
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -174,9 +174,9 @@ def test_without_a_kernel_the_error_names_effect_and_cure():
     simulator, state, params = rings(torch.float64, Ring(), rows=3)
     simulator = simulator.without("control", "noise").adding(Undecided())
     stepper = Stepper(simulator)
-    with pytest.warns(UserWarning, match="effect 'undecided'"):  # noqa: PT031
-        with pytest.raises(ValueError, match=r"no kernel: effect 'undecided' uses .*Use simulator.step"):
-            stepper(state, {}, {**params, "undecided": {}})
+    why = r"no kernel: effect 'undecided' uses .*Use simulator.step"
+    with pytest.warns(UserWarning, match="effect 'undecided'"), pytest.raises(ValueError, match=why):
+        stepper(state, {}, {**params, "undecided": {}})
 
 
 # -- within environments -----------------------------------------------------------------------------------------

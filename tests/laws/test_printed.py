@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from idm_env.effects import ALL, IDM, Brakes, Effect, make
+from idm_env.effects import ALL, Effect, make
 from idm_env.effects.base import P
 from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter
