@@ -208,7 +208,7 @@ class Batch:
         assert values is not None
         if world is not None and not self._loaded:
             values.load(world)
-        given = None if action is None else action.numpy()
+        given = None if action is None else action.numpy().reshape(-1)
         used, block = self._used, self._block
         try:
             normals = self._normals(values.clock)

@@ -31,6 +31,18 @@ import numpy as np
 from numba import njit
 
 F = np.{kind}
+inlined = njit(nogil=True, error_model="numpy", forceinline=True)
+
+
+@inlined
+def larger(x, y):
+    """Comparisons so that a NaN in x stays one."""
+    return y if x < y else x
+
+
+@inlined
+def smaller(x, y):
+    return y if x > y else x
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -256,7 +268,6 @@ class RowFunction:
 
         def line(at: list[str]) -> str:
             text = self._at(args[0], at, to.kind)
-            # Comparisons so that a NaN stays one.
             if low is not None:
                 text = BINARY["maximum"].format(text, self._at(low, at, to.kind))
             if high is not None:
