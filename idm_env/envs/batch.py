@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from idm_env.envs.advance import advance_of
-from idm_env.envs.settings import Settings
+from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Untraceable
 from idm_env.tasks import Draw, World
@@ -55,8 +55,12 @@ class Outcome(NamedTuple):
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Outcome:
         """Return what ``Batch.told`` tells, sorted."""
-        rest = {n.removeprefix("info_"): x for n, x in told.items() if n.startswith("info_")}
-        return cls(*(told[n] for n in cls._fields[:4]), Whole(*(told[f"whole_{n}"] for n in Whole._fields)), rest)
+        rest = {name: told[key] for name, key in _DETAILS if key in told}
+        whole = Whole(told["whole_reward"], told["whole_terminated"], told["whole_truncated"])
+        return cls(told["observation"], told["reward"], told["terminated"], told["truncated"], whole, rest)
+
+
+_DETAILS = tuple((name, f"info_{name}") for name in INFO)
 
 
 class Batch:
@@ -77,6 +81,7 @@ class Batch:
         self._draw: Draw | None = None
         self._pool: World | None = None
         self._block: Tensor | None = None
+        self._drawn: np.ndarray | None = None
         self._used = 0
 
     def _compiled(self) -> Values | None:
@@ -173,11 +178,14 @@ class Batch:
             steps = max(1, _NORMALS_AT_ONCE // (self.count * self.task.vehicles))
             self._block = self._draw.normals(clock(), steps, self.task.vehicles, self.settings.dtype)
             self._used = 0
+            self._drawn = self._block.numpy().reshape(-1) if self._values is not None else None
         self._used += 1
         return self._block
 
-    def step(self, action: Tensor | None, live: Tensor | None = None) -> Outcome:
+    def step(self, action: Tensor | np.ndarray | None, live: Tensor | None = None) -> Outcome:
         """Advance every row; ``action`` has shape ``(n, agents)``, None leaves everybody to the drivers.
+
+        It is a tensor, or an array of the simulation's precision with numpy output.
 
         ``live`` (bool, ``(n, agents)``) leaves only single agents' vehicles to their drivers, and drops their commands.
         """
@@ -185,6 +193,8 @@ class Batch:
             told = self._step_values(action)
             if told is not None:
                 return Outcome.of(told)
+        if isinstance(action, np.ndarray):
+            action = torch.as_tensor(action, device=self.settings.device)
         before, task = self.world, self.task
         assert before is not None
         block = self._normals(lambda: before.state.step)
@@ -202,18 +212,17 @@ class Batch:
             told = {name: x.detach().cpu().numpy() for name, x in told.items()}
         return Outcome.of(told)
 
-    def _step_values(self, action: Tensor | None) -> dict[str, Any] | None:
+    def _step_values(self, action: Tensor | np.ndarray | None) -> dict[str, Any] | None:
         """Return what is told of a step by compiled loops; None, with nothing changed, where there are none."""
         values, world = self._values, self._world
         assert values is not None
         if world is not None and not self._loaded:
             values.load(world)
-        given = None if action is None else action.numpy().reshape(-1)
+        given = None if action is None else np.asarray(action).reshape(-1)
         used, block = self._used, self._block
         try:
             normals = self._normals(values.clock)
-            drawn = None if normals is None else normals.numpy().reshape(-1)
-            told = values.step(given, drawn, max(self._used - 1, 0), self.params)
+            told = values.step(given, None if normals is None else self._drawn, max(self._used - 1, 0), self.params)
         except Untraceable:
             # Said once, as a warning, where an effect is why (``kernels.printed``).
             self._values, self._used, self._block = None, used, block

@@ -16,7 +16,7 @@ from torch import Tensor
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
-from idm_env.envs.spaces import action_box, action_tensor, observation_box
+from idm_env.envs.spaces import action_box, action_of, observation_box
 from idm_env.tasks import Task
 from idm_env.types import Params, State
 
@@ -113,14 +113,14 @@ class DiffIDMEnv(TrueSpec, gymnasium.Env):
         """Advance by Δt; return observation, reward, terminated, truncated and info."""
         if not self.batch.begun:
             raise RuntimeError("step was called before reset. Call reset() first.")
-        tensor = None if action is None else action_tensor(action, self._shape, self.settings).unsqueeze(0)
+        given = None if action is None else action_of(action, self._shape, self.settings)[None]
         with torch.no_grad() if self._numpy else contextlib.nullcontext():
-            outcome = self.batch.step(tensor)
+            outcome = self.batch.step(given)
         if self.render_mode == "human":
             self.render()
-        reward, terminated, truncated = (x[0] for x in outcome.whole)
-        value = float(reward) if self._numpy else reward
-        ends = bool(terminated), bool(truncated)
+        reward, terminated, truncated = outcome.whole
+        value = reward.item() if self._numpy else reward[0]
+        ends = terminated.item(), truncated.item()
         return self._out(outcome.observation), value, *ends, single(self.batch, outcome)
 
     def _out(self, observation: Any) -> Any:

@@ -193,6 +193,12 @@ class _Plan:
     def _lay_out(self, inputs: Mapping[str, Any], state: State, many: int) -> None:
         kernel, values, rows, size = self.kernel, self.values, self.rows, self.size
         self.made = {n: np.empty(rows * math.prod(s), self.before.types[n]) for n, s in self.before.shapes.items()}
+        self.outs = list(self.made.values())
+        self.made |= {name: self.made[other] for name, (other, _) in self.before.same.items()}
+        after = self.after
+        self.answers = [(n, (rows, *s), after.types[n]) for n, s in after.shapes.items()]
+        self.same = [(n, other, (rows, *s)) for n, (other, s) in after.same.items()]
+        self.constant = {n: np.repeat(x[None], rows, 0) for n, x in after.constants.items()}
         self.names = [_place_of(n) for n in kernel.program.states]
         self.numbers = [self._input(inputs, n, many) for n in kernel.numbers]
         self.flags = [self._input(inputs, n, many) for n in kernel.flags]
@@ -253,7 +259,7 @@ class _Plan:
             ))  # fmt: skip
         self.asked = [[self._needed(n, side) for n in self.before.needs] for side in (0, 1)]
         self.told = [[self._needed(n, side) for n in self.after.needs] for side in (0, 1)]
-        self.outs = list(self.made.values())
+        self.block: Any = None
         self.params = params
 
     def _needed(self, name: str, side: int) -> Array:
@@ -280,21 +286,26 @@ class _Plan:
         if action is not None:
             asked = [action if n == "action" else x for n, x in zip(self.before.needs, asked, strict=True)]
         self.before.run(rows, asked, self.outs)
-        if self.noise_place is not None and normals is not None:
-            self.operands[self.noise_place] = normals
-        given = (*self.head[side], tuple(self.operands), *self.tail, at, *self.extent)
-        work = pool.count(rows * self.size)
-        if work == 1:
-            lane_loops.forward(*given, 0, self.tiles)
+        if normals is not self.block or self.block is None:
+            if self.noise_place is not None and normals is not None:
+                self.operands[self.noise_place] = normals
+            self.block = normals
+            self.call = [(*head, tuple(self.operands), *self.tail) for head in self.head]
+        call = self.call[side]
+        if rows * self.size < 2 * pool.GRAIN:
+            lane_loops.forward(*call, at, *self.extent, 0, self.tiles)
         else:
-            pool.split(lambda begin, end: lane_loops.forward(*given, begin, end), self.tiles, 1, work)
-        old, new = values.arrays[side], values.arrays[1 - side]
-        np.add(old["state_step"], 1, out=new["state_step"])
-        after = self.after
-        told = {n: np.empty((rows, *s), after.types[n]) for n, s in after.shapes.items()}
-        after.run(rows, self.told[side], [x.reshape(-1) for x in told.values()])
-        for name, value in after.constants.items():
-            told[name] = np.broadcast_to(value, (rows, *value.shape)).copy()
+            pool.split(
+                lambda begin, end: lane_loops.forward(*call, at, *self.extent, begin, end),
+                self.tiles, 1, pool.count(rows * self.size),
+            )  # fmt: skip
+        np.add(values.arrays[side]["state_step"], 1, out=values.arrays[1 - side]["state_step"])
+        told = {name: np.empty(shape, kind) for name, shape, kind in self.answers}
+        self.after.run(rows, self.told[side], [x.reshape(-1) for x in told.values()])
+        for name, other, shape in self.same:
+            told[name] = told[other].reshape(shape)
+        for name, value in self.constant.items():
+            told[name] = value.copy()
         return told
 
 

@@ -18,7 +18,7 @@ from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import TrueSpec
 from idm_env.envs.info import Rows
 from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
-from idm_env.envs.spaces import action_box, action_tensor, observation_box
+from idm_env.envs.spaces import action_box, action_of, observation_box
 from idm_env.types import Params, State
 
 
@@ -141,9 +141,9 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
             raise RuntimeError(
                 f"environments {over[:5].tolist()} have ended. Reset them with options={{'reset_mask': mask}}."
             )
-        tensor = None if actions is None else action_tensor(actions, self._shape, self.settings)
+        given = None if actions is None else action_of(actions, self._shape, self.settings)
         with torch.no_grad() if self._numpy else contextlib.nullcontext():
-            outcome = self.batch.step(tensor)
+            outcome = self.batch.step(given)
             observation, (reward, terminated, truncated) = outcome.observation, outcome.whole
             # Episodes that ended with the step before begin in this one: it is no step of theirs.
             stepped = ~self._ended

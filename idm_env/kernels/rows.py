@@ -82,7 +82,7 @@ class RowFunction:
 
     ``inputs`` are examples with ``rows`` rows each. ``needs`` are the names of those that are read, in the order in
     which ``run`` takes their arrays; ``shapes`` and ``types`` are those of the outputs, without rows. ``constants`` are
-    the outputs that depend on no input, without rows.
+    the outputs that depend on no input, without rows, and ``same`` those that are another one, in a shape of their own.
 
     Raises:
         Untraceable: For an operation that is not known here, or mixes rows.
@@ -107,6 +107,8 @@ class RowFunction:
             self._print(*call)
         self.constants = {name: self._plain(x) for name, x in found.items() if id(x) not in self._places}
         moving = {name: x for name, x in found.items() if id(x) in self._places}
+        self.same = self._twice(moving)
+        moving = {name: x for name, x in moving.items() if name not in self.same}
         self.shapes = {name: tuple(x.shape[1:]) for name, x in moving.items()}
         kinds = {name: self._kind(x) for name, x in moving.items()}
         real = np.dtype(np.float32 if self._floats == torch.float32 else np.float64)
@@ -127,6 +129,17 @@ class RowFunction:
     def run(self, rows: int, needed: Sequence[np.ndarray], outs: Sequence[np.ndarray]) -> None:
         """Fill ``outs``; all arrays are flat and dense, row by row."""
         self._run(rows, self._c, *needed, *self._tables, *outs)
+
+    def _twice(self, found: Mapping[str, Tensor]) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Return outputs that are the numbers of another one, with its name and their own shape without rows."""
+        first: dict[Any, str] = {}
+        twice = {}
+        for name, x in found.items():
+            strides = tuple(s for s, n in zip(x.stride()[1:], x.shape[1:], strict=True) if n > 1)
+            other = first.setdefault((self._places[id(x)][:3], strides, x.numel()), name)
+            if other != name:
+                twice[name] = (other, tuple(x.shape[1:]))
+        return twice
 
     # -- where tensors lie -----------------------------------------------------------------------------------------
 
