@@ -78,6 +78,7 @@ class Batch:
         self._world: World | None = None
         self._values = self._compiled()
         self._loaded = False
+        self._seen: np.ndarray | None = None
         self._draw: Draw | None = None
         self._pool: World | None = None
         self._block: Tensor | None = None
@@ -105,6 +106,13 @@ class Batch:
             self._world = self._values.current()
         return self._world
 
+    def glance(self) -> World:
+        """Return the worlds as they are now, for reading only and until the next step."""
+        if self._world is None and self._loaded and self._values is not None:
+            return self._values.current(own=False)
+        assert self._world is not None
+        return self._world
+
     @world.setter
     def world(self, world: World | None) -> None:
         self._world, self._loaded = world, False
@@ -117,7 +125,7 @@ class Batch:
         self.seeds[rows] = [int(s) & ((1 << 63) - 1) for s in seeds]
         self.episodes[rows] = -1
 
-    def reset(self, rows: np.ndarray | None = None, state: State | None = None) -> Tensor:
+    def reset(self, rows: np.ndarray | None = None, state: State | None = None) -> Tensor | np.ndarray:
         """Begin a new episode in all or in some rows (indices); return the observations of all of them.
 
         ``state`` replaces what would be drawn, with its graph. Everything else begins from constants.
@@ -133,13 +141,22 @@ class Batch:
             fresh = self._begin(draw)
         if state is not None:
             fresh = fresh._replace(state=self._given(state, len(index)))
-        if every or self.world is None or self._draw is None:
+        if every or not self.begun or self._draw is None:
             self.world, self._draw = fresh, draw
+        elif self._values is not None and self._loaded and self._seen is not None:
+            self._values.replace(index, fresh)
+            self._draw = Draw(self._draw.key.index_put((torch.as_tensor(index),), draw.key))
+            self._world = self._block = None
+            # Only these rows look anew.
+            self._seen = self._seen.copy()
+            self._seen[index] = self.task.observe(fresh).detach().numpy()
+            return self._seen
         else:
             where = torch.as_tensor(index, device=device)
             self.world = _map(lambda old, new: old.index_put((where,), new), self.world, fresh)
             self._draw = Draw(self._draw.key.index_put((where,), draw.key))
         self._block = None
+        assert self.world is not None
         return self.task.observe(self.world)
 
     def _begin(self, draw: Draw) -> World:
@@ -227,7 +244,7 @@ class Batch:
             # Said once, as a warning, where an effect is why (``kernels.printed``).
             self._values, self._used, self._block = None, used, block
             return None
-        self._world, self._loaded = None, True
+        self._world, self._loaded, self._seen = None, True, told["observation"]
         return told
 
     def _commanded(

@@ -91,8 +91,7 @@ class Rows:
             ended = outcome.terminated.any(-1)
             crashed = (ended.cpu().numpy() if isinstance(ended, Tensor) else ended) & rows
             if crashed.any():
-                world = self.batch.world
-                assert world is not None
+                world = self.batch.glance()
                 reasons = np.full(self.batch.count, None, dtype=object)
                 for row in np.flatnonzero(crashed):
                     reasons[row] = self.batch.task.crash_reason(world, int(row))

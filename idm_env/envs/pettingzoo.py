@@ -85,7 +85,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         # PettingZoo's own tests set it between episodes.
         self.batch.limit = self.max_cycles
         self.agents = list(self.possible_agents)
-        seen = self.batch.reset()[0].cpu().numpy()
+        seen = np.asarray(self.batch.reset()[0])
         if self.render_mode == "human":
             self.render()
         return self._by_agent(seen), {agent: self._begun(agent) for agent in self.agents}

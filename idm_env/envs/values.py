@@ -56,15 +56,25 @@ class Values:
         if key != self._key:
             self._key, self._plans, self.arrays = key, {}, ({}, {})
         self.world = world
-        state, shape = world.state, tuple(world.state.speed.shape)
+        state = world.state
         for name, x in named(world).items():
             self._put(name, x)
+        self._put("clock", _clock(state))
         if PAST in state.memory:
-            slots, past = state.memory[PAST].shape[-2], past_rows(state.memory[PAST], shape)
-            signals = state.memory[PAST].shape[-1]
-            self._put("past", torch.from_numpy(past).expand(slots * signals, -1) if signals == len(past) == 1 else (
-                torch.from_numpy(np.tile(past, (slots * signals // len(past), 1)))))
-        self._put("clock", state.step.to(state.speed.dtype).unsqueeze(-1).expand(shape))
+            self._put("past", torch.from_numpy(_past(state)))
+
+    def replace(self, rows: Array, fresh: World) -> None:
+        """Replace some rows (indices) by the worlds of ``fresh``."""
+        held, other = self.arrays[self.side], self.arrays[1 - self.side]
+        count = len(held["state_step"])
+        for name, x in (*named(fresh).items(), ("clock", _clock(fresh.state))):
+            values = x.detach().numpy()
+            held[name].reshape(count, *values.shape[1:])[rows] = values
+            if other[name] is not held[name] and name not in _DYNAMIC:
+                other[name].reshape(count, *values.shape[1:])[rows] = values
+        if PAST in fresh.state.memory:
+            past = _past(fresh.state).reshape(len(held["past"]), len(rows), -1)
+            held["past"].reshape(len(past), count, -1)[:, rows] = past
 
     def _put(self, name: str, x: Tensor) -> None:
         held, other = self.arrays[self.side], self.arrays[1 - self.side]
@@ -78,14 +88,16 @@ class Values:
         held[name] = flat if name == "past" else flat.reshape(-1)
         other[name] = held[name] if name.startswith("episode_") or name == "state_length" else held[name].copy()
 
-    def current(self) -> World:
-        """Return the worlds as tensors of their own."""
+    def current(self, own: bool = True) -> World:
+        """Return the worlds as tensors of their own, or as views that hold until the next step."""
         assert self.world is not None
         state, held = self.world.state, self.arrays[self.side]
-        leaves = {n: torch.from_numpy(held[n].copy()).view(x.shape) for n, x in named(self.world).items()}
+        if own:
+            held = {name: x.copy() for name, x in held.items()}
+        leaves = {n: torch.from_numpy(held[n]).view(x.shape) for n, x in named(self.world).items()}
         memory = {name: leaves.get(f"memory_{name}", x) for name, x in state.memory.items()}
         if PAST in memory:
-            memory[PAST] = past_tensor(held["past"].copy(), state.memory[PAST].shape[-2], tuple(state.speed.shape))
+            memory[PAST] = past_tensor(held["past"], state.memory[PAST].shape[-2], tuple(state.speed.shape))
         fields = {n.removeprefix("state_"): x for n, x in leaves.items() if n.startswith("state_")}
         episode = {n.removeprefix("episode_"): x for n, x in leaves.items() if n.startswith("episode_")}
         return World(state._replace(**fields, memory=memory), episode)
@@ -105,6 +117,15 @@ class Values:
 
 
 _DYNAMIC = {f"state_{name}" for name in ("position", "speed", "accel", "gap", "step")}
+
+
+def _clock(state: State) -> Tensor:
+    return state.step.to(state.speed.dtype).unsqueeze(-1).expand(state.speed.shape)
+
+
+def _past(state: State) -> Array:
+    past = past_rows(state.memory[PAST], tuple(state.speed.shape))
+    return np.tile(past, (math.prod(state.memory[PAST].shape[-2:]) // len(past), 1))
 
 
 def named(world: World) -> dict[str, Tensor]:
