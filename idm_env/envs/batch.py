@@ -29,7 +29,7 @@ _NORMALS_AT_ONCE = 1 << 12
 
 
 class Whole(NamedTuple):
-    """What a step gives whole environments, ``(n,)``: mean reward, terminated with the first and truncated with the last.
+    """Of whole environments, ``(n,)``: mean reward, terminated with the first agent, truncated with the last.
 
     Tensors, or arrays with numpy output.
     """

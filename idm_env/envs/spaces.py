@@ -36,7 +36,12 @@ def action_of(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor | n
 
     ValueError for a wrong shape, or values that are not finite; float32 and float64, numpy and torch are all accepted.
     """
-    if made.output == "numpy" and isinstance(action, np.ndarray) and action.dtype.kind in "fiu" and action.shape == shape:
+    if (
+        made.output == "numpy"
+        and isinstance(action, np.ndarray)
+        and action.dtype.kind in "fiu"
+        and action.shape == shape
+    ):
         array = action.astype(numpy_dtype(made.dtype))
         if math.isfinite(array.item() if array.size == 1 else array.sum()) or np.isfinite(array).all():
             return array

@@ -245,8 +245,9 @@ class RowFunction:
             c, y, n = args
             return loops(
                 shape,
-                lambda at: f"{index(to, at)} = {self._at(y, at, to.kind)} if {self._at(c, at)} "
-                f"else {self._at(n, at, to.kind)}",
+                lambda at: (
+                    f"{index(to, at)} = {self._at(y, at, to.kind)} if {self._at(c, at)} else {self._at(n, at, to.kind)}"
+                ),
             )
         if name in ("clamp", "clamp_min", "clamp_max"):
             return self._clamp(name, args, kwargs, shape, to)
@@ -258,8 +259,10 @@ class RowFunction:
             turned = {d % x.dim() - 1 for d in args[1]}
             return loops(
                 shape,
-                lambda at: f"{index(to, at)} = "
-                + self._at(args[0], [f"({shape[k] - 1} - {j})" if k in turned else j for k, j in enumerate(at)]),
+                lambda at: (
+                    f"{index(to, at)} = "
+                    + self._at(args[0], [f"({shape[k] - 1} - {j})" if k in turned else j for k, j in enumerate(at)])
+                ),
             )
         if name == "cumsum":
             return self._cumsum(args, x, to)
@@ -289,9 +292,7 @@ class RowFunction:
 
         return loops(shape, line)
 
-    def _reduce(
-        self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place
-    ) -> list[str]:
+    def _reduce(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
         source = args[0]
         given = args[1] if len(args) > 1 else kwargs.get("dim")
         dims = range(source.dim()) if given is None else [given] if isinstance(given, int) else given
@@ -317,9 +318,7 @@ class RowFunction:
 
         return loops(x.shape[1:], line)
 
-    def _joined(
-        self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place
-    ) -> list[str]:
+    def _joined(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
         dim = (args[1] if len(args) > 1 else kwargs.get("dim", 0)) % x.dim() - 1
         if dim < 0:
             raise Untraceable(f"{name} mixes rows")
@@ -361,8 +360,10 @@ class RowFunction:
                 raise Untraceable("index_select of rows")
             return loops(
                 x.shape[1:],
-                lambda at: f"{index(to, at)} = "
-                + self._at(source, [self._at(args[2], [j]) if k == dim else j for k, j in enumerate(at)]),
+                lambda at: (
+                    f"{index(to, at)} = "
+                    + self._at(source, [self._at(args[2], [j]) if k == dim else j for k, j in enumerate(at)])
+                ),
             )
         parts = args[1]
         if id(source) in self._places or any(p is None or p.dim() != 1 for p in parts):
