@@ -256,8 +256,9 @@ class _Plan:
         state = world.state._replace(
             **{n: torch.from_numpy(x).view(self.shape) for n, x in still.items() if x is not None}
         )
+        simulator = self.values.task.simulator
         made = [
-            operand(static_of(self.values.task.simulator, state, params, n).to(state.speed.dtype), self.shape[:1], self.size)
+            operand(static_of(simulator, state, params, n).to(state.speed.dtype), self.shape[:1], self.size)
             for n in (*program.statics, *program.parameters)
         ]  # fmt: skip
         self.params_of = []
