@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 import idm_env  # noqa: F401
+from idm_env.effects import CANDIDATES
 
 warnings.filterwarnings("ignore")
 
@@ -77,10 +78,53 @@ def vector(seconds: float, count: int) -> None:
 
                 def step(env=env, actions=actions, ended=ended) -> None:
                     info = env.step(actions())[4]
-                    ended[0] += int(info["_final_obs"].sum()) if info else 0
+                    ended[0] += int(np.sum(info.get("_final_obs", 0)))
 
                 per_second = rate(step, seconds) * count
                 print(f"  {name:12s} {dtype} {policy:15s} {ended[0]:6d} episodes ended {per_second / 1e6:18.2f}")
+
+
+def faces(seconds: float) -> None:
+    """Print the rates of every task, effect and output with random actions; episodes that end begin anew within."""
+    random = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 4096, 1)).astype(np.float32)
+    at = iter(range(10**9))
+    print("\nrandom actions, resets included: environments: env steps/s")
+    rows: list[tuple[str, dict[str, object], tuple[int, ...]]] = [
+        (task, {"task": task}, (1, 1024, 4096)) for task in ("ring", "follow", "platoon", "replay")
+    ]
+    rows += [("ring, torch output", {"output": "torch"}, (256, 1024))]
+    rows += [(f"ring, {name}", {"effects": [name]}, (1024,)) for name in CANDIDATES if rings(name)]
+    for name, keywords, counts in rows:
+        found = []
+        for count in counts:
+            if count == 1:
+                env = gym.make("DiffIDM-v0", **keywords)
+                env.reset(seed=0)
+
+                def step(env=env) -> None:
+                    *_, terminated, truncated, _ = env.step(random[next(at) % 64, 0])
+                    if terminated or truncated:
+                        env.reset()
+
+            else:
+                env = gym.make_vec("DiffIDM-v0", num_envs=count, **keywords)
+                env.reset(seed=0)
+
+                def step(env=env, count=count) -> None:
+                    env.step(random[next(at) % 64, :count])
+
+            step()
+            found.append(f"{count}: {rate(step, seconds) * count:12,.0f}")
+        print(f"  {name:32s} {'   '.join(found)}", flush=True)
+
+
+def rings(effect: str) -> bool:
+    """Return whether the ring takes an effect without more being said."""
+    try:
+        gym.make("DiffIDM-v0", effects=[effect], warmup=0)
+    except ValueError:
+        return False
+    return True
 
 
 def warmup(count: int) -> None:
@@ -111,6 +155,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     seconds = 0.3 if options.quick else 4.0
+    faces(seconds)
     single(seconds)
     vector(seconds, options.envs)
     warmup(options.envs)

@@ -8,29 +8,59 @@ truncated back-propagation.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from idm_env.envs.advance import advance_of
-from idm_env.envs.settings import Settings
+from idm_env.envs.settings import INFO, Settings
+from idm_env.kernels import dispatch
+from idm_env.scalar.record import Untraceable
 from idm_env.tasks import Draw, World
 from idm_env.types import Params, State
+
+if TYPE_CHECKING:
+    from idm_env.envs.values import Values
 
 _POOL_STREAM = 2
 _NORMALS_AT_ONCE = 1 << 12
 
 
-class Outcome(NamedTuple):
-    """What a step gives: observations ``(n, agents, features)``, the others ``(n, agents)``, by name in ``details``."""
+class Whole(NamedTuple):
+    """Of whole environments, ``(n,)``: mean reward, terminated with the first agent, truncated with the last.
 
-    observation: Tensor
-    reward: Tensor
-    terminated: Tensor
-    truncated: Tensor
-    details: Mapping[str, Tensor]
+    Tensors, or arrays with numpy output.
+    """
+
+    reward: Any
+    terminated: Any
+    truncated: Any
+
+
+class Outcome(NamedTuple):
+    """What a step gives: observations ``(n, agents, features)``, the others ``(n, agents)``, by name in ``details``.
+
+    Tensors, or arrays with numpy output.
+    """
+
+    observation: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+    whole: Whole
+    details: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Outcome:
+        """Return what ``Batch.told`` tells, sorted."""
+        rest = {name: told[key] for name, key in _DETAILS if key in told}
+        whole = Whole(told["whole_reward"], told["whole_terminated"], told["whole_truncated"])
+        return cls(told["observation"], told["reward"], told["terminated"], told["truncated"], whole, rest)
+
+
+_DETAILS = tuple((name, f"info_{name}") for name in INFO)
 
 
 class Batch:
@@ -45,11 +75,47 @@ class Batch:
         self.limit = made.limit
         self.seeds = np.zeros(count, dtype=np.int64)
         self.episodes = np.full(count, -1, dtype=np.int64)
-        self.world: World | None = None
+        self._world: World | None = None
+        self._values = self._compiled()
+        self._loaded = False
+        self._seen: np.ndarray | None = None
         self._draw: Draw | None = None
         self._pool: World | None = None
         self._block: Tensor | None = None
+        self._drawn: np.ndarray | None = None
         self._used = 0
+
+    def _compiled(self) -> Values | None:
+        """Return what steps without a graph, where that can be."""
+        made = self.settings
+        if made.output != "numpy" or made.device.type != "cpu" or dispatch.surroundings() is not None:
+            return None
+        from idm_env.envs.values import Values
+
+        return Values(self.task, self._commanded, self._told)
+
+    @property
+    def begun(self) -> bool:
+        """Whether there was a reset."""
+        return self._loaded or self._world is not None
+
+    @property
+    def world(self) -> World | None:
+        """The worlds as they are now, or None before the first reset."""
+        if self._world is None and self._loaded and self._values is not None:
+            self._world = self._values.current()
+        return self._world
+
+    def glance(self) -> World:
+        """Return the worlds as they are now, for reading only and until the next step."""
+        if self._world is None and self._loaded and self._values is not None:
+            return self._values.current(own=False)
+        assert self._world is not None
+        return self._world
+
+    @world.setter
+    def world(self, world: World | None) -> None:
+        self._world, self._loaded = world, False
 
     # -- beginnings ----------------------------------------------------------------------------------------------
 
@@ -59,7 +125,7 @@ class Batch:
         self.seeds[rows] = [int(s) & ((1 << 63) - 1) for s in seeds]
         self.episodes[rows] = -1
 
-    def reset(self, rows: np.ndarray | None = None, state: State | None = None) -> Tensor:
+    def reset(self, rows: np.ndarray | None = None, state: State | None = None) -> Tensor | np.ndarray:
         """Begin a new episode in all or in some rows (indices); return the observations of all of them.
 
         ``state`` replaces what would be drawn, with its graph. Everything else begins from constants.
@@ -75,13 +141,22 @@ class Batch:
             fresh = self._begin(draw)
         if state is not None:
             fresh = fresh._replace(state=self._given(state, len(index)))
-        if every or self.world is None or self._draw is None:
+        if every or not self.begun or self._draw is None:
             self.world, self._draw = fresh, draw
+        elif self._values is not None and self._loaded and self._seen is not None:
+            self._values.replace(index, fresh)
+            self._draw = Draw(self._draw.key.index_put((torch.as_tensor(index),), draw.key))
+            self._world = self._block = None
+            # Only these rows look anew.
+            self._seen = self._seen.copy()
+            self._seen[index] = self.task.observe(fresh).detach().numpy()
+            return self._seen
         else:
             where = torch.as_tensor(index, device=device)
             self.world = _map(lambda old, new: old.index_put((where,), new), self.world, fresh)
             self._draw = Draw(self._draw.key.index_put((where,), draw.key))
         self._block = None
+        assert self.world is not None
         return self.task.observe(self.world)
 
     def _begin(self, draw: Draw) -> World:
@@ -111,40 +186,100 @@ class Batch:
 
     # -- steps ---------------------------------------------------------------------------------------------------
 
-    def _normals(self, state: State) -> Tensor | None:
-        """Return the normals of this step, from a block that is drawn ahead where the batch is small."""
+    def _normals(self, clock: Callable[[], Tensor]) -> Tensor | None:
+        """Return the normals of a block of steps, drawn ahead where the batch is small; ``_used − 1`` is this step."""
         if not self.task.noisy:
             return None
         if self._block is None or self._used >= len(self._block):
             assert self._draw is not None
             steps = max(1, _NORMALS_AT_ONCE // (self.count * self.task.vehicles))
-            self._block = self._draw.normals(state.step, steps, self.task.vehicles, state.speed.dtype)
+            self._block = self._draw.normals(clock(), steps, self.task.vehicles, self.settings.dtype)
             self._used = 0
+            self._drawn = self._block.numpy().reshape(-1) if self._values is not None else None
         self._used += 1
-        return self._block[self._used - 1]
+        return self._block
 
-    def step(self, action: Tensor | None, live: Tensor | None = None) -> Outcome:
+    def step(self, action: Tensor | np.ndarray | None, live: Tensor | None = None) -> Outcome:
         """Advance every row; ``action`` has shape ``(n, agents)``, None leaves everybody to the drivers.
+
+        It is a tensor, or an array of the simulation's precision with numpy output.
 
         ``live`` (bool, ``(n, agents)``) leaves only single agents' vehicles to their drivers, and drops their commands.
         """
+        if self._values is not None and live is None:
+            told = self._step_values(action)
+            if told is not None:
+                return Outcome.of(told)
+        if isinstance(action, np.ndarray):
+            action = torch.as_tensor(action, device=self.settings.device)
         before, task = self.world, self.task
         assert before is not None
-        normals = self._normals(before.state)
-        command = None if action is None else task.command(action)
-        given = None if command is None else task.limit(before, command)
-        after = task.step(before, given, normals, self.params, live=live, advance=self.advance, limited=True)
+        block = self._normals(lambda: before.state.step)
+        normals = None if block is None else block[self._used - 1]
+        command, given, inputs = self._commanded(before, action, normals, live)
+        state = self.advance(before.state, inputs, self.params)
+        after = before._replace(state=state)
         if command is None:
-            command = after.state.speed.new_zeros(self.count, len(task.agents))
+            command = state.speed.new_zeros(self.count, len(task.agents))
         elif live is not None:
             command = torch.where(live, command, 0.0)
         self.world = after
+        told = self._told(before, command, given, after, action is not None)
+        if self.settings.output == "numpy":
+            told = {name: x.detach().cpu().numpy() for name, x in told.items()}
+        return Outcome.of(told)
+
+    def _step_values(self, action: Tensor | np.ndarray | None) -> dict[str, Any] | None:
+        """Return what is told of a step by compiled loops; None, with nothing changed, where there are none."""
+        values, world = self._values, self._world
+        assert values is not None
+        if world is not None and not self._loaded:
+            values.load(world)
+        given = None if action is None else np.asarray(action).reshape(-1)
+        used, block = self._used, self._block
+        try:
+            normals = self._normals(values.clock)
+            told = values.step(given, None if normals is None else self._drawn, max(self._used - 1, 0), self.params)
+        except Untraceable:
+            # Said once, as a warning, where an effect is why (``kernels.printed``).
+            self._values, self._used, self._block = None, used, block
+            return None
+        self._world, self._loaded, self._seen = None, True, told["observation"]
+        return told
+
+    def _commanded(
+        self, world: World, action: Tensor | None, normals: Tensor | None = None, live: Tensor | None = None
+    ) -> tuple[Tensor | None, Tensor | None, Mapping[str, Any]]:
+        """Return commands, commands as the failsafe lets them pass, and the inputs of a step."""
+        task = self.task
+        command = None if action is None else task.command(action)
+        given = None if command is None else task.limit(world, command)
+        return command, given, task.inputs(world, given, normals, live)
+
+    def _told(
+        self, before: World, command: Tensor, given: Tensor | None, after: World, commanded: bool
+    ) -> dict[str, Tensor]:
+        """Return everything that faces tell of a step, by name."""
+        task = self.task
         terminated, truncated = task.ended(after)
-        details = self._details(after, None if action is None else command, given, terminated)
+        details = self._details(after, command if commanded else None, given, terminated)
         if self.limit is not None:
             truncated = truncated | (after.state.step >= self.limit).unsqueeze(-1)
         reward = task.reward(before, command, after, terminated)
-        return Outcome(task.observe(after), reward, terminated, truncated, details)
+        if len(task.agents) == 1:
+            ends, cut = terminated[..., 0], truncated[..., 0]
+        else:
+            ends, cut = terminated.any(-1), (truncated | terminated).all(-1) & truncated.any(-1)
+        return {
+            "observation": task.observe(after),
+            "reward": reward,
+            "terminated": terminated,
+            "truncated": truncated,
+            "whole_reward": reward.mean(-1),
+            "whole_terminated": ends,
+            "whole_truncated": cut,
+            **{f"info_{name}": x for name, x in details.items()},
+        }
 
     def _details(
         self, after: World, command: Tensor | None, given: Tensor | None, crashed: Tensor
@@ -155,7 +290,7 @@ class Batch:
             # A copy: what is told of a step is not the state itself.
             found["accel"] = task.pick(after.state.accel).clone()
         if "command" in asked:
-            shape = (self.count, len(task.agents))
+            shape = (len(after.state.speed), len(task.agents))
             found["command"] = after.state.accel.new_full(shape, torch.nan) if command is None else command
         if "failsafe" in asked:
             if command is None or given is None or not task.failsafe:

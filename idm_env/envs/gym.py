@@ -13,10 +13,10 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from torch import Tensor
 
-from idm_env.envs.batch import Batch, Outcome
+from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
-from idm_env.envs.spaces import action_box, action_tensor, observation_box
+from idm_env.envs.spaces import action_box, action_of, observation_box
 from idm_env.tasks import Task
 from idm_env.types import Params, State
 
@@ -101,7 +101,7 @@ class DiffIDMEnv(TrueSpec, gymnasium.Env):
         """Begin an episode; see the class for ``seed`` and ``options``."""
         given = reset_options(options, ("state",))
         super().reset(seed=seed)
-        if seed is not None or self.batch.world is None:
+        if seed is not None or not self.batch.begun:
             # Without any seed the one that Gymnasium draws from the operating system is used.
             self.batch.seed([0], [self.np_random_seed if seed is None else seed])
         observation = self.batch.reset(state=given.get("state"))
@@ -111,29 +111,28 @@ class DiffIDMEnv(TrueSpec, gymnasium.Env):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance by Δt; return observation, reward, terminated, truncated and info."""
-        if self.batch.world is None:
+        if not self.batch.begun:
             raise RuntimeError("step was called before reset. Call reset() first.")
-        tensor = None if action is None else action_tensor(action, self._shape, self.settings).unsqueeze(0)
+        given = None if action is None else action_of(action, self._shape, self.settings)[None]
         with torch.no_grad() if self._numpy else contextlib.nullcontext():
-            outcome = self.batch.step(tensor)
-            reward = outcome.reward.mean()
+            outcome = self.batch.step(given)
         if self.render_mode == "human":
             self.render()
-        terminated, truncated = single_ends(outcome)
-        value = reward.item() if self._numpy else reward
-        ends = terminated.item() is True, truncated.item() is True
+        reward, terminated, truncated = outcome.whole
+        value = reward.item() if self._numpy else reward[0]
+        ends = terminated.item(), truncated.item()
         return self._out(outcome.observation), value, *ends, single(self.batch, outcome)
 
-    def _out(self, observation: Tensor) -> Any:
+    def _out(self, observation: Any) -> Any:
         flat = observation.reshape(-1)
-        return flat.detach().cpu().numpy() if self._numpy else flat
+        return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
     # -- gradients -----------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> State:
         """The state of the traffic, a batch of one."""
-        if self.batch.world is None:
+        if not self.batch.begun:
             raise RuntimeError("there is no state before reset. Call reset() first.")
         return self.batch.world.state
 
@@ -173,11 +172,3 @@ class DiffIDMEnv(TrueSpec, gymnasium.Env):
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the window: everything else can be pickled."""
         return {**self.__dict__, "_viewer": None}
-
-
-def single_ends(outcome: Outcome) -> tuple[Tensor, Tensor]:
-    """Return terminated (with the first agent) and truncated (with the last) of whole environments, shape ``(n,)``."""
-    if outcome.terminated.shape[-1] == 1:
-        return outcome.terminated[..., 0], outcome.truncated[..., 0]
-    terminated = outcome.terminated.any(-1)
-    return terminated, (outcome.truncated | outcome.terminated).all(-1) & outcome.truncated.any(-1)

@@ -51,11 +51,12 @@ def single(batch: Batch, outcome: Outcome) -> dict[str, Any]:
     if info.get("crash"):
         assert batch.world is not None
         info["crash_reason"] = batch.task.crash_reason(batch.world, 0)
-    return info | begun(batch)
+    info.update(begun(batch))
+    return info
 
 
-def _out(batch: Batch, value: Tensor) -> Any:
-    return value.detach().cpu().numpy() if batch.settings.output == "numpy" else value
+def _out(batch: Batch, value: Any) -> Any:
+    return value.detach().cpu().numpy() if batch.settings.output == "numpy" and isinstance(value, Tensor) else value
 
 
 class Rows:
@@ -87,10 +88,10 @@ class Rows:
             whole = value.any(-1) if name == "crash" else value
             self._put(info, name, _out(self.batch, whole), rows)
         if "crash" in outcome.details:
-            crashed = outcome.terminated.any(-1).cpu().numpy() & rows
+            ended = outcome.terminated.any(-1)
+            crashed = (ended.cpu().numpy() if isinstance(ended, Tensor) else ended) & rows
             if crashed.any():
-                world = self.batch.world
-                assert world is not None
+                world = self.batch.glance()
                 reasons = np.full(self.batch.count, None, dtype=object)
                 for row in np.flatnonzero(crashed):
                     reasons[row] = self.batch.task.crash_reason(world, int(row))

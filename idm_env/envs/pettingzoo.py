@@ -80,12 +80,12 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
 
         There are no options; PettingZoo's own tests give some, so they are left aside without a word.
         """
-        if seed is not None or self.batch.world is None:
+        if seed is not None or not self.batch.begun:
             self.batch.seed([0], [seeding.np_random(seed)[1]])
         # PettingZoo's own tests set it between episodes.
         self.batch.limit = self.max_cycles
         self.agents = list(self.possible_agents)
-        seen = self.batch.reset()[0].cpu().numpy()
+        seen = np.asarray(self.batch.reset()[0])
         if self.render_mode == "human":
             self.render()
         return self._by_agent(seen), {agent: self._begun(agent) for agent in self.agents}
@@ -108,7 +108,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
                 torch.as_tensor(commands, dtype=made.dtype, device=made.device),
                 None if everybody else torch.tensor([live], device=made.device),
             )
-        seen = self._by_agent(outcome.observation[0].cpu().numpy())
+        seen = self._by_agent(np.asarray(outcome.observation[0]))
         rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:4])
         infos = {agent: self._info(i, agent, outcome) for i, agent in enumerate(self.possible_agents) if live[i]}
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
@@ -145,7 +145,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
 
     def state(self) -> np.ndarray:
         """Return the whole traffic, within ``state_space``."""
-        if self.batch.world is None:
+        if not self.batch.begun:
             raise RuntimeError("there is no state before reset. Call reset() first.")
         traffic = self.batch.world.state
         gap = traffic.gap.clamp_max(_FARTHEST) / _GAP_SCALE
@@ -161,7 +161,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
 
         if self._viewer is None:
             self._viewer = Viewer(self.render_mode, round(1.0 / self.task.simulator.dt))
-        if self.batch.world is None:
+        if not self.batch.begun:
             raise RuntimeError("there is nothing to see before reset. Call reset() first.")
         picture: np.ndarray | None = self._viewer.show(self.task, self.batch.world.state)
         return picture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,11 +31,20 @@ def action_box(agents: int) -> Box:
     return Box(-1.0, 1.0, (agents,), np.float32)
 
 
-def action_tensor(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor:
-    """Return an action as a tensor of the simulation, with its graph.
+def action_of(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor | np.ndarray:
+    """Return an action as what ``Batch.step`` takes: an array with numpy output, else a tensor with its graph.
 
     ValueError for a wrong shape, or values that are not finite; float32 and float64, numpy and torch are all accepted.
     """
+    if (
+        made.output == "numpy"
+        and isinstance(action, np.ndarray)
+        and action.dtype.kind in "fiu"
+        and action.shape == shape
+    ):
+        array = action.astype(numpy_dtype(made.dtype))
+        if math.isfinite(array.item() if array.size == 1 else array.sum()) or np.isfinite(array).all():
+            return array
     if isinstance(action, Tensor):
         if action.dtype == torch.bool or action.is_complex():
             raise ValueError(f"an action of type {action.dtype} is not a number. Give floats in [-1, 1].")
@@ -52,4 +62,4 @@ def action_tensor(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor
     # The sum is finite only if every part is, and is one number; only a doubtful sum is looked at more closely.
     if not np.isfinite(tensor.detach().sum().item()) and not bool(torch.isfinite(tensor.detach()).all()):
         raise ValueError("action holds NaN or infinite values. Give finite numbers; those outside [-1, 1] are clipped.")
-    return tensor
+    return tensor.detach().cpu().numpy() if made.output == "numpy" else tensor

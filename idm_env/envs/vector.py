@@ -15,10 +15,10 @@ from torch import Tensor
 
 from idm_env.checks import shown, whole
 from idm_env.envs.batch import Batch, Outcome
-from idm_env.envs.gym import TrueSpec, single_ends
+from idm_env.envs.gym import TrueSpec
 from idm_env.envs.info import Rows
 from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
-from idm_env.envs.spaces import action_box, action_tensor, observation_box
+from idm_env.envs.spaces import action_box, action_of, observation_box
 from idm_env.types import Params, State
 
 
@@ -101,7 +101,7 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
                 f"options['reset_mask'] = {shown(mask)} must be a bool array of shape ({self.num_envs},) with at "
                 f"least one True."
             )
-        if self.batch.world is None and not mask.all():
+        if not self.batch.begun and not mask.all():
             raise ValueError(
                 "options['reset_mask'] leaves environments out before the first reset. Reset all of them once."
             )
@@ -109,7 +109,7 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
 
     def _seed(self, seed: int | Sequence[int | None] | None, rows: np.ndarray) -> None:
         if seed is None:
-            if self.batch.world is None:
+            if not self.batch.begun:
                 self.batch.seed(np.arange(self.num_envs), self._entropy())
             return
         if isinstance(seed, (int, np.integer)):
@@ -121,7 +121,7 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
                 raise ValueError(
                     f"seed has {len(seeds)} values for {self.num_envs} environments: give one number or one each."
                 )
-            if self.batch.world is None and None in seeds:
+            if not self.batch.begun and None in seeds:
                 self.batch.seed(np.arange(self.num_envs), self._entropy())
         given = [row for row in rows if seeds[row] is not None]
         self.batch.seed(given, [int(seeds[row] or 0) for row in given])
@@ -133,7 +133,7 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance all environments by Δt; ``None`` as actions leaves all vehicles to their drivers."""
-        if self.batch.world is None:
+        if not self.batch.begun:
             raise RuntimeError("step was called before reset. Call reset() first.")
         mode = self.autoreset_mode
         over = np.flatnonzero(self._ended)
@@ -141,19 +141,18 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
             raise RuntimeError(
                 f"environments {over[:5].tolist()} have ended. Reset them with options={{'reset_mask': mask}}."
             )
-        tensor = None if actions is None else action_tensor(actions, self._shape, self.settings)
+        given = None if actions is None else action_of(actions, self._shape, self.settings)
         with torch.no_grad() if self._numpy else contextlib.nullcontext():
-            outcome = self.batch.step(tensor)
-            observation, reward = outcome.observation, outcome.reward.mean(-1)
-            terminated, truncated = single_ends(outcome)
+            outcome = self.batch.step(given)
+            observation, (reward, terminated, truncated) = outcome.observation, outcome.whole
             # Episodes that ended with the step before begin in this one: it is no step of theirs.
             stepped = ~self._ended
             if len(over):
                 observation = self.batch.reset(over)
-                begun = torch.as_tensor(self._ended, device=reward.device)
-                reward = torch.where(begun, 0.0, reward)
-                terminated, truncated = terminated & ~begun, truncated & ~begun
-            self._ended = (terminated | truncated).cpu().numpy()
+                went_on = stepped if self._numpy else torch.as_tensor(stepped, device=reward.device)
+                reward, terminated, truncated = reward * went_on, terminated & went_on, truncated & went_on
+            ended = terminated | truncated
+            self._ended = ended if self._numpy else ended.cpu().numpy()
             same = mode is AutoresetMode.SAME_STEP and bool(self._ended.any())
             info = self._rows.stepped(outcome, ~self._ended if same else stepped)
             info |= self._rows.begun(np.ones_like(stepped))
@@ -163,12 +162,11 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
                 self._ended = np.zeros(self.num_envs, dtype=bool)
         if self.render_mode == "human":
             self.render()
-        if not self._numpy:
-            return self._out(observation), reward, terminated, truncated, info
-        ends = terminated.cpu().numpy(), truncated.cpu().numpy()
-        return self._out(observation), reward.cpu().numpy().astype(np.float64), *ends, info
+        if self._numpy:
+            reward = reward.astype(np.float64)
+        return self._out(observation), reward, terminated, truncated, info
 
-    def _final(self, observation: Tensor, outcome: Outcome) -> dict[str, Any]:
+    def _final(self, observation: Any, outcome: Outcome) -> dict[str, Any]:
         """Return the last observations and infos of the episodes that ended, as Gymnasium does; dense for torch."""
         ended, flat = self._ended.copy(), self._out(observation)
         last = self._rows.stepped(outcome, ended) | self._rows.begun(ended)
@@ -181,16 +179,16 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
             kept[i] = flat[i]
         return {"final_obs": kept, "_final_obs": ended, "final_info": last, "_final_info": ended.copy()}
 
-    def _out(self, observation: Tensor) -> Any:
+    def _out(self, observation: Any) -> Any:
         flat = observation.reshape(self.num_envs, -1)
-        return flat.detach().cpu().numpy() if self._numpy else flat
+        return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
     # -- gradients -----------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> State:
         """The state of the traffic, one row per environment."""
-        if self.batch.world is None:
+        if not self.batch.begun:
             raise RuntimeError("there is no state before reset. Call reset() first.")
         return self.batch.world.state
 

@@ -1,0 +1,383 @@
+"""A function of tensors in torch, recorded once and printed as one loop over its rows: values only, on the CPU.
+
+Tasks say in torch what agents command, see and earn. On a row of 22 vehicles each of those operations takes a
+microsecond to start and a nanosecond to do; so the operations that one call performs are recorded as torch performs
+them (``TorchDispatchMode``), for a number of rows that is no other dimension, and printed with plain indices in place
+of views. Whatever does not depend on the inputs is a constant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from idm_env.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, body, loops
+from idm_env.scalar import library
+from idm_env.scalar.record import Untraceable
+
+KINDS = {torch.float32: "f", torch.float64: "f", torch.int64: "i", torch.bool: "b"}
+TYPES = {"i": np.dtype(np.int64), "b": np.dtype(np.bool_)}
+_BLANK = {"new_zeros", "new_full", "new_ones", "zeros_like", "ones_like", "full_like"}
+
+HEADER = '''"""Printed by idm_env from one call of a task's functions; see idm_env/kernels/rows.py. Delete at will."""
+
+import numpy as np
+from numba import njit
+
+F = np.{kind}
+inlined = njit(nogil=True, error_model="numpy", forceinline=True)
+
+
+@inlined
+def larger(x, y):
+    """Comparisons so that a NaN in x stays one."""
+    return y if x < y else x
+
+
+@inlined
+def smaller(x, y):
+    return y if x > y else x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def run(rows, c, {arguments}):
+    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
+    for r in range(rows):
+'''
+
+
+class Place(NamedTuple):
+    """Where a recorded tensor lies: ``array[start + Σ index · stride]``, or a local name without strides."""
+
+    array: str
+    start: str
+    offset: int
+    strides: tuple[int, ...]
+    kind: str
+
+
+class _Recorder(TorchDispatchMode):
+    """Keeps every operation with what went in and what came out."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any], Any]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        if func._schema.is_mutable:
+            raise Untraceable(f"{func} writes in place")
+        self.calls.append((func._schema.name.removeprefix("aten::"), args, kwargs or {}, out))
+        return out
+
+
+class RowFunction:
+    """``function(**inputs)`` as compiled loops; it returns a dict of tensors, each with the rows first.
+
+    ``inputs`` are examples with ``rows`` rows each. ``needs`` are the names of those that are read, in the order in
+    which ``run`` takes their arrays; ``shapes`` and ``types`` are those of the outputs, without rows. ``constants`` are
+    the outputs that depend on no input, without rows, and ``same`` those that are another one, in a shape of their own.
+
+    Raises:
+        Untraceable: For an operation that is not known here, or mixes rows.
+    """
+
+    def __init__(self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int) -> None:
+        self._rows = rows
+        self._places: dict[int, Place] = {}
+        self._stores: dict[int, tuple[str, str, int, int]] = {}
+        self._room = {"f": 0, "i": 0, "b": 0}
+        self._constants: dict[float, int] = {}
+        self._tables: list[np.ndarray] = []
+        self._table_of: dict[int, str] = {}
+        self._lines: list[str] = []
+        with torch.no_grad(), _Recorder() as recorder:
+            found = dict(function(**inputs))
+        self._floats = next(x.dtype for x in (*inputs.values(), *found.values()) if x.is_floating_point())
+        for name, x in inputs.items():
+            kind, width = self._kind(x), x.numel() // rows
+            self._keep(x, f"in_{name}", f"r * {width}", width, kind)
+        for call in recorder.calls:
+            self._print(*call)
+        self.constants = {name: self._plain(x) for name, x in found.items() if id(x) not in self._places}
+        moving = {name: x for name, x in found.items() if id(x) in self._places}
+        self.same = self._twice(moving)
+        moving = {name: x for name, x in moving.items() if name not in self.same}
+        self.shapes = {name: tuple(x.shape[1:]) for name, x in moving.items()}
+        kinds = {name: self._kind(x) for name, x in moving.items()}
+        real = np.dtype(np.float32 if self._floats == torch.float32 else np.float64)
+        self.types = {name: TYPES.get(kind, real) for name, kind in kinds.items()}
+        for name, x in moving.items():
+            strides = tuple(math.prod(x.shape[k + 1 :]) for k in range(1, x.dim()))
+            to = Place(f"out_{name}", f"r * {math.prod(x.shape[1:])}", 0, strides, kinds[name])
+            self._lines += loops(x.shape[1:], lambda at, to=to, x=x: f"{index(to, at)} = {self._at(x, at)}")
+        text = "\n".join(self._lines)
+        self.needs = [name for name in inputs if f"in_{name}[" in text]
+        arguments = [f"in_{n}" for n in self.needs] + [f"t{k}" for k in range(len(self._tables))]
+        arguments += [f"out_{n}" for n in moving]
+        room = {kind: max(1, size) for kind, size in self._room.items()}
+        header = HEADER.format(kind=real.name, arguments=", ".join(arguments), **room)
+        self._c = np.array(list(self._constants) or [0.0], real)
+        self._run = library.load("rows", header + body(self._lines)).run
+
+    def run(self, rows: int, needed: Sequence[np.ndarray], outs: Sequence[np.ndarray]) -> None:
+        """Fill ``outs``; all arrays are flat and dense, row by row."""
+        self._run(rows, self._c, *needed, *self._tables, *outs)
+
+    def _twice(self, found: Mapping[str, Tensor]) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Return outputs that are the numbers of another one, with its name and their own shape without rows."""
+        first: dict[Any, str] = {}
+        twice = {}
+        for name, x in found.items():
+            strides = tuple(s for s, n in zip(x.stride()[1:], x.shape[1:], strict=True) if n > 1)
+            other = first.setdefault((self._places[id(x)][:3], strides, x.numel()), name)
+            if other != name:
+                twice[name] = (other, tuple(x.shape[1:]))
+        return twice
+
+    # -- where tensors lie -----------------------------------------------------------------------------------------
+
+    def _kind(self, x: Tensor) -> str:
+        if x.dtype not in KINDS:
+            raise Untraceable(f"a tensor of {x.dtype}")
+        return KINDS[x.dtype]
+
+    def _keep(self, x: Tensor, array: str, start: str, width: int, kind: str) -> None:
+        self._stores[x.untyped_storage().data_ptr()] = (array, start, width, 0)
+        self._view(x, kind)
+
+    def _view(self, x: Tensor, kind: str) -> None:
+        """Enter a tensor that looks into a known storage."""
+        array, start, width, _ = self._stores[x.untyped_storage().data_ptr()]
+        if x.dim() == 0 or x.shape[0] != self._rows or x.stride(0) != width or x.storage_offset() >= max(width, 1):
+            raise Untraceable("an operation mixes rows")
+        self._places[id(x)] = Place(array, start, x.storage_offset(), tuple(x.stride()[1:]), kind)
+
+    def _fresh(self, x: Tensor) -> Place:
+        """Give a result its place: a local name for one number a row, else a part of the workspace."""
+        kind, width = self._kind(x), x.untyped_storage().nbytes() // x.element_size() // self._rows
+        if width == 1:
+            self._keep(x, f"v{len(self._places)}", "", 1, kind)
+        else:
+            self._keep(x, kind, str(self._room[kind]), width, kind)
+            self._room[kind] += width
+        return self._places[id(x)]
+
+    def _plain(self, x: Tensor) -> np.ndarray:
+        """Return a constant, without rows."""
+        if x.dim() and x.shape[0] == self._rows:
+            if not bool(((x == x[:1]) | (x != x)).all()):
+                raise Untraceable("a constant differs by row")
+            x = x[0]
+        return x.detach().cpu().numpy()
+
+    def _number(self, value: float | int | bool, kind: str) -> str:
+        if kind == "f":
+            key = float(value)
+            if key != key:
+                return "F(np.nan)"
+            return f"c[{self._constants.setdefault(key, len(self._constants))}]"
+        return str(bool(value)) if kind == "b" else str(int(value))
+
+    def _at(self, x: Any, at: Sequence[str], kind: str | None = None) -> str:
+        """Return the text of one element; ``at`` are the indices behind the row, to which ``x`` broadcasts."""
+        if not isinstance(x, Tensor):
+            return self._number(x, kind or ("f" if isinstance(x, float) else "i"))
+        own = self._kind(x)
+        kind = kind or own
+        place = self._places.get(id(x))
+        if place is None:
+            values = self._plain(x)
+            if values.size == 1:
+                return self._number(values.item(), kind)
+            shape, place = values.shape, self._table(x, values)
+        else:
+            shape = tuple(x.shape[1:])
+        if len(shape) > len(at):
+            raise Untraceable("an operation mixes rows")
+        lined = ["0" if n == 1 else i for n, i in zip(shape, at[len(at) - len(shape) :], strict=True)]
+        text = index(place, lined)
+        return text if kind == own else f"F({text})" if kind == "f" else f"np.int64({text})"
+
+    def _table(self, x: Tensor, values: np.ndarray) -> Place:
+        if id(x) not in self._table_of:
+            self._table_of[id(x)] = f"t{len(self._tables)}"
+            real = values.astype(np.float32 if self._floats == torch.float32 else np.float64)
+            flat = real if self._kind(x) == "f" else values
+            self._tables.append(np.ascontiguousarray(flat).reshape(-1))
+        strides = tuple(math.prod(values.shape[k + 1 :]) for k in range(values.ndim))
+        return Place(self._table_of[id(x)], "0", 0, strides, self._kind(x))
+
+    # -- operations ------------------------------------------------------------------------------------------------
+
+    def _print(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> None:
+        given = [x for a in args for x in (a if isinstance(a, (list, tuple)) else (a,)) if isinstance(x, Tensor)]
+        if name in _BLANK or not any(id(x) in self._places for x in given):
+            return
+        for x in out if isinstance(out, (list, tuple)) else (out,):
+            if x.untyped_storage().data_ptr() in self._stores:
+                self._view(x, self._kind(x))
+                continue
+            if x.dim() == 0 or x.shape[0] != self._rows:
+                raise Untraceable(f"{name} mixes rows")
+            self._lines += self._compute(name, args, kwargs, x, self._fresh(x))
+
+    def _compute(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], x: Tensor, to: Place) -> list[str]:
+        shape = tuple(x.shape[1:])
+        if name in UNARY or name in ("_to_copy", "clone"):
+            form = UNARY.get(name, "{0}")
+            return loops(shape, lambda at: f"{index(to, at)} = " + form.format(self._at(args[0], at, to.kind)))
+        if name in BINARY or name in COMPARE:
+            kind = to.kind if name in BINARY else self._common(args)
+            form = BINARY.get(name) or COMPARE[name]
+            if kwargs.get("alpha", 1) != 1:
+                raise Untraceable(f"{name} with alpha")
+            if name == "pow" and args[1] in (2, 3):
+                form = "({0} * {0})" if args[1] == 2 else "({0} * {0} * {0})"
+            return loops(shape, lambda at: f"{index(to, at)} = " + form.format(*(self._at(a, at, kind) for a in args)))
+        if name == "where":
+            c, y, n = args
+            return loops(
+                shape,
+                lambda at: (
+                    f"{index(to, at)} = {self._at(y, at, to.kind)} if {self._at(c, at)} else {self._at(n, at, to.kind)}"
+                ),
+            )
+        if name in ("clamp", "clamp_min", "clamp_max"):
+            return self._clamp(name, args, kwargs, shape, to)
+        if name in REDUCE:
+            return self._reduce(name, args, kwargs, x, to)
+        if name in ("cat", "stack"):
+            return self._joined(name, args, kwargs, x, to)
+        if name == "flip":
+            turned = {d % x.dim() - 1 for d in args[1]}
+            return loops(
+                shape,
+                lambda at: (
+                    f"{index(to, at)} = "
+                    + self._at(args[0], [f"({shape[k] - 1} - {j})" if k in turned else j for k, j in enumerate(at)])
+                ),
+            )
+        if name == "cumsum":
+            return self._cumsum(args, x, to)
+        if name in ("index", "index_select"):
+            return self._picked(name, args, x, to)
+        raise Untraceable(f"operation {name}")
+
+    def _common(self, args: Sequence[Any]) -> str:
+        kinds = [
+            self._kind(a) if isinstance(a, Tensor) else "f" if isinstance(a, float) else "i" for a in args
+        ]  # fmt: skip
+        return "f" if "f" in kinds else "i" if "i" in kinds else "b"
+
+    def _clamp(
+        self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], shape: tuple[int, ...], to: Place
+    ) -> list[str]:
+        low = args[1] if name != "clamp_max" and len(args) > 1 else kwargs.get("min")
+        high = args[1] if name == "clamp_max" else args[2] if len(args) > 2 else kwargs.get("max")
+
+        def line(at: list[str]) -> str:
+            text = self._at(args[0], at, to.kind)
+            if low is not None:
+                text = BINARY["maximum"].format(text, self._at(low, at, to.kind))
+            if high is not None:
+                text = BINARY["minimum"].format(text, self._at(high, at, to.kind))
+            return f"{index(to, at)} = {text}"
+
+        return loops(shape, line)
+
+    def _reduce(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
+        source = args[0]
+        given = args[1] if len(args) > 1 else kwargs.get("dim")
+        dims = range(source.dim()) if given is None else [given] if isinstance(given, int) else given
+        gone = {d % source.dim() for d in dims or range(source.dim())}
+        if 0 in gone:
+            raise Untraceable(f"{name} mixes rows")
+        first, update, last = REDUCE[name]
+        kept = len(x.shape) == source.dim()
+
+        def line(at: list[str]) -> list[str]:
+            own = iter(at)
+            full = [f"k{d}" if d in gone else next(own) for d in range(1, source.dim())] if not kept else [
+                f"k{d}" if d in gone else at[d - 1] for d in range(1, source.dim())
+            ]  # fmt: skip
+            element = self._at(source, full, "b" if to.kind == "b" else to.kind)
+            start = first or self._at(source, ["0" if i.startswith("k") else i for i in full])
+            lines = [f"s = {start if start != '0' or to.kind != 'f' else 'F(0.0)'}"]
+            for depth, d in enumerate(sorted(gone)):
+                lines.append("    " * depth + f"for k{d} in range({source.shape[d]}):")
+            lines.append("    " * len(gone) + "s = " + update.format("s", element))
+            count = self._number(math.prod(source.shape[d] for d in gone), "f")
+            return [*lines, f"{index(to, at)} = " + last.format("s", count)]
+
+        return loops(x.shape[1:], line)
+
+    def _joined(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
+        dim = (args[1] if len(args) > 1 else kwargs.get("dim", 0)) % x.dim() - 1
+        if dim < 0:
+            raise Untraceable(f"{name} mixes rows")
+        lines, done = [], 0
+        for part in args[0]:
+            width = 1 if name == "stack" else part.shape[dim + 1]
+            shape = [*x.shape[1:]]
+            shape[dim] = width
+
+            def line(at: list[str], part: Tensor = part, done: int = done) -> str:
+                there = [f"({done} + {j})" if k == dim else j for k, j in enumerate(at)]
+                own = [j for k, j in enumerate(at) if k != dim] if name == "stack" else at
+                return f"{index(to, there)} = {self._at(part, own, to.kind)}"
+
+            lines += loops(shape, line)
+            done += width
+        return lines
+
+    def _cumsum(self, args: Sequence[Any], x: Tensor, to: Place) -> list[str]:
+        dim = args[1] % x.dim() - 1
+        if dim != x.dim() - 2:
+            raise Untraceable("cumsum over another dimension than the last")
+
+        def line(at: list[str]) -> list[str]:
+            every = [*at, "k"]
+            return [
+                f"s = {self._number(0, to.kind)}", f"for k in range({x.shape[-1]}):",
+                f"    s = s + {self._at(args[0], every, to.kind)}", f"    {index(to, every)} = s",
+            ]  # fmt: skip
+
+        return loops(x.shape[1:-1], line)
+
+    def _picked(self, name: str, args: Sequence[Any], x: Tensor, to: Place) -> list[str]:
+        """Print ``source[index, …]``: rows of a table by recorded indices, or columns by constant ones."""
+        source = args[0]
+        if name == "index_select":
+            dim = args[1] % source.dim() - 1
+            if dim < 0 or id(args[2]) in self._places:
+                raise Untraceable("index_select of rows")
+            return loops(
+                x.shape[1:],
+                lambda at: (
+                    f"{index(to, at)} = "
+                    + self._at(source, [self._at(args[2], [j]) if k == dim else j for k, j in enumerate(at)])
+                ),
+            )
+        parts = args[1]
+        if id(source) in self._places or any(p is None or p.dim() != 1 for p in parts):
+            raise Untraceable("an index into what changes")
+        values = source.detach().cpu().numpy()
+        table = self._table(source, values)
+        return loops(
+            x.shape[1:], lambda at: f"{index(to, at)} = {index(table, [*(self._at(p, []) for p in parts), *at])}"
+        )
+
+
+def index(place: Place, at: Sequence[str]) -> str:
+    """Return the text of an element: a local name, or an array with its index."""
+    if place.start == "":
+        return place.array
+    terms = [f"{i} * {s}" for i, s in zip(at, place.strides, strict=True) if i != "0" and s]
+    return f"{place.array}[{' + '.join([place.start, *([str(place.offset)] if place.offset else []), *terms])}]"

@@ -1,0 +1,115 @@
+"""Environments with numpy output step in compiled loops: single = row of a vector = the torch path, over all tasks."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import idm_env  # noqa: F401
+from idm_env.envs.values import Values
+from idm_env.kernels.rows import RowFunction
+from idm_env.scalar.record import Untraceable
+
+pytest.importorskip("numba")
+
+CASES = [
+    ("ring", {"start": "wave", "warmup": 20}),
+    ("ring", {"warmup": 5, "fuel": 0.1, "tailgating": 1.0, "controlled": 3, "failsafe": 3.0, "integration": "euler"}),
+    ("ring", {"warmup": 5, "effects": ["delay", "memory"], "parameters": {"idm.time_gap": 1.3}}),
+    ("follow", {"max_episode_steps": 25}),
+    ("platoon", {"controlled": 2, "noise": 0.1}),
+    ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
+    ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
+]
+
+
+def _same(ours, theirs):
+    if isinstance(theirs, torch.Tensor):
+        theirs = theirs.detach().numpy()
+    if isinstance(theirs, np.ndarray) and theirs.dtype != object:
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+    else:
+        assert np.array_equal(ours, theirs)
+
+
+INFOS = [*((*case, "all") for case in CASES), *((*CASES[i], "none") for i in (0, 3, 5))]
+"""All cases with infos; one of each kind without: every pair is compiled anew."""
+
+
+@pytest.mark.parametrize(("task", "keywords", "info"), INFOS)
+def test_a_single_environment_is_a_row_of_a_vector_and_the_torch_path(task, keywords, info):
+    made = {"task": task, "dtype": "float64", "info": info, **keywords}
+    single = [gym.make("DiffIDM-v0", output=o, **made) for o in ("numpy", "torch")]
+    vector = gym.make_vec("DiffIDM-v0", num_envs=3, autoreset_mode="SameStep", **made)
+    rows, _ = vector.reset(seed=4)
+    for env in single:
+        _same(env.reset(seed=4)[0], rows[0])
+    actions = np.random.default_rng(0).uniform(-1.3, 1.3, (40, 3, *single[0].action_space.shape))
+    for t, action in enumerate(actions):
+        nobody = info == "all" and t % 7 == 3
+        ours, theirs = (env.step(None if nobody else action[0]) for env in single)
+        rows, rewards, ended, cut, infos = vector.step(None if nobody else action)
+        for a, b in zip(ours[:4], theirs[:4], strict=True):
+            _same(a, b)
+        assert set(ours[4]) == set(theirs[4])
+        for name, value in theirs[4].items():
+            _same(ours[4][name], value)
+        assert (rewards[0], ended[0], cut[0]) == pytest.approx(ours[1:4], rel=1e-12)
+        last = infos["final_obs"][0] if ours[2] or ours[3] else rows[0]
+        _same(last, ours[0])
+        if ours[2] or ours[3]:
+            _same(single[0].reset()[0], rows[0])
+            single[1].reset()
+    assert single[0].unwrapped.batch._values is not None, "the torch path ran"
+    _same(single[0].unwrapped.state.gap, single[1].unwrapped.state.gap)
+    _same(vector.unwrapped.state.speed[:1], single[1].unwrapped.state.speed)
+
+
+def test_what_was_told_and_shown_before_does_not_change_with_the_next_step():
+    env = gym.make_vec("DiffIDM-v0", num_envs=2, warmup=3)
+    env.reset(seed=0)
+    action = np.ones((2, 1), np.float32)
+    first, state = env.step(action), env.unwrapped.state
+    kept = [np.array(x) for x in (*first[:2], first[4]["accel"], first[4]["command"], state.position, state.step)]
+    env.step(-action)
+    now = (*first[:2], first[4]["accel"], first[4]["command"], state.position, state.step)
+    for before, after in zip(kept, now, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_parameters_and_states_that_change_are_noticed():
+    env = gym.make("DiffIDM-v0", warmup=1, noise=0.0)
+    env.reset(seed=0)
+    inner = env.unwrapped
+    env.step(None)
+    state = inner.state
+
+    def next_speed():
+        inner.batch.world = inner.batch.world._replace(state=state)
+        env.step(None)
+        return float(inner.state.speed[0, 5])
+
+    before = next_speed()
+    inner.params["idm"]["max_accel"].mul_(2.0)
+    written = next_speed()
+    inner.params["idm"]["max_accel"] = torch.tensor(0.5)
+    assert len({before, written, next_speed()}) == 3
+
+
+def test_it_can_be_switched_off_and_torch_output_never_takes_it(monkeypatch):
+    def values(**keywords):
+        return isinstance(gym.make("DiffIDM-v0", warmup=1, **keywords).unwrapped.batch._values, Values)
+
+    assert values()
+    assert not values(output="torch")
+    monkeypatch.setenv("IDM_ENV_KERNELS", "0")
+    assert not values()
+
+
+@pytest.mark.parametrize(
+    "function",
+    [lambda x: {"y": x - x.mean(0, keepdim=True)}, lambda x: {"y": torch.sort(x).values}, lambda x: {"y": x.mean()}],
+)
+def test_a_function_that_mixes_rows_or_is_not_known_is_refused(function):
+    with pytest.raises(Untraceable):
+        RowFunction(function, {"x": torch.rand(101, 4)}, 101)
