@@ -1,7 +1,7 @@
 """Drivers behind records, compiled: rollouts and their gradients, sensitivities and normal equations, in fused passes.
 
-For any simulator on an open lane whose step can be recorded, in every integration. One vehicle of each row is simulated,
-all others are records. Time comes first, then drivers. Needs numba: ``pip install 'idm-env[kernels]'``.
+For any simulator on an open lane whose step can be recorded, in every integration. One vehicle of each row is
+simulated, all others are records. Time comes first, then drivers. Needs numba: ``pip install 'idm-env[kernels]'``.
 """
 
 from __future__ import annotations
