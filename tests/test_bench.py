@@ -24,7 +24,7 @@ def test_growth_is_the_slope():
 
 
 def test_a_small_run_writes_json_and_picture(tmp_path, monkeypatch):
-    for name in ("recorded_leaders", "rings", "discovery"):
+    for name in ("recorded_leaders", "corrected_models", "rings", "discovery"):
         monkeypatch.setattr(bench.fits, name, lambda *_: {})
     lines, seen = [], []
     result = bench.run(

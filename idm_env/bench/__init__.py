@@ -67,6 +67,7 @@ def run(
         ("memory_mb_100_steps", 2.0, lambda: memory.peaks(sizes, 100)),
         ("gradient_error", 1.0, lambda: traffic.accuracy() if numba else {}),
         ("fit", 6.0, lambda: fits.recorded_leaders(rounds) if numba else {}),
+        ("corrected", 2.0, lambda: fits.corrected_models(rounds) if numba else {}),
         ("rings", 2.0, lambda: fits.rings() if numba else {}),
         ("discovery", 6.0, lambda: fits.discovery() if numba else {}),
     ]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from idm_env.bench.measure import Case, measure
-from idm_env.effects import ALL, CANDIDATES, IDM, Brakes, Replay
+from idm_env.effects import ALL, CANDIDATES, IDM, Brakes, Replay, make
 from idm_env.kernels import dispatch
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
@@ -18,21 +18,73 @@ from idm_env.types import Record
 
 TRAJECTORIES, STEPS, SHORT = 6000, 600, 60
 ITERATIONS = 500
+CORRECTIONS = ("", "asymmetry", "lag", "memory", "leader_acceleration", "delay")
+"""Effects behind which a fit is timed; none is plain IDM."""
 
 
-def _followers(drivers: int, steps: int) -> tuple[Tensor, ...]:
-    """Return gap, speed, lead position, lead speed and the five parameters: leaders that brake and drive off again."""
-    generator = torch.Generator().manual_seed(0)
+class Followers:
+    """Drivers behind leaders that brake and drive off again, and the rollouts that a fit makes of them."""
 
-    def draw(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(*shape, generator=generator)
+    def __init__(self, drivers: int, steps: int, *effects: str) -> None:
+        from idm_env.kernels import drivers as kernels
 
-    time_s = torch.arange(steps + 1)[:, None] * 0.1
-    lead_speed = 12.0 + draw(2.0, 6.0, drivers) * torch.sin(0.2 * time_s + draw(0.0, 6.0, drivers))
-    lead_position = torch.cumsum(lead_speed * 0.1, 0)
-    bounds = ((0.8, 2.0), (1.0, 2.5), (1.0, 2.0), (1.5, 3.0), (20.0, 35.0))
-    params = torch.stack([draw(*b, drivers) for b in bounds], -1)
-    return draw(10.0, 40.0, drivers), draw(5.0, 15.0, drivers), lead_position, lead_speed, params
+        generator = torch.Generator().manual_seed(0)
+
+        def draw(low: float, high: float, *shape: int) -> Tensor:
+            return low + (high - low) * torch.rand(*shape, generator=generator)
+
+        time_s = torch.arange(steps + 1)[:, None] * 0.1
+        lead = 12.0 + draw(2.0, 6.0, drivers) * torch.sin(0.2 * time_s + draw(0.0, 6.0, drivers))
+        speed = torch.stack((lead, draw(5.0, 15.0, drivers).expand_as(lead)), -1)
+        place = torch.cumsum(lead * 0.1, 0)
+        gap = draw(10.0, 40.0, drivers)
+        position = torch.stack((place, (place[0] - 5.0 - gap).expand_as(place)), -1)
+        bounds = ((0.8, 2.0), (1.0, 2.5), (1.0, 2.0), (1.5, 3.0), (20.0, 35.0))
+        self.simulator = Simulator(Lane(), (IDM(), Brakes(), Replay(), *(make(e) for e in effects)))
+        self.steps, self.leaf = steps, torch.stack([draw(*b, drivers) for b in bounds], -1)
+        active = torch.tensor([True, False]).expand(steps, drivers, 2)
+        accel = torch.zeros_like(position)
+        records = {"position": position, "speed": speed, "accel": accel}
+        self.start = (position[0], speed[0])
+        self.inputs = {"replay": Record(position[1:], speed[1:], accel[1:], active)}
+        state = self.simulator.state(*self.start, self.params(self.leaf))
+        found = kernels.prepared(self.simulator, state, records, self.inputs, 1)
+        assert not isinstance(found, str), found
+        self.behind = found
+        ones = torch.ones(steps, drivers)
+        self._measured = torch.stack((20.0 * ones, 12.0 * ones)), torch.stack((ones, ones))
+
+    def params(self, leaf: Tensor) -> dict[str, dict[str, Tensor]]:
+        """Return defaults with each driver's own five."""
+        own = {p.name: leaf[:, j, None] for j, p in enumerate(IDM.declared)}
+        return {**self.simulator.defaults(), "idm": own}
+
+    def gradient(self, kernel: bool) -> Tensor:
+        """Return the gradient of one iteration of Adam."""
+        leaf = self.leaf.clone().requires_grad_()
+        params = self.params(leaf)
+        state = self.simulator.state(*self.start, params)
+        if kernel:
+            gap, speed = self.behind.simulate(state, params)
+        else:
+            with dispatch.off("benchmark of the torch path"):
+                _, kept = self.simulator.rollout(state, self.inputs, params, self.steps)
+            gap, speed = kept.gap[..., 1], kept.speed[..., 1]
+        ((gap - 20.0).square().mean() + (speed - 12.0).square().mean()).backward()  # type: ignore[no-untyped-call]
+        assert leaf.grad is not None
+        return leaf.grad
+
+    def _linear(self) -> tuple[Any, ...]:
+        params = self.params(self.leaf)
+        return self.simulator.state(*self.start, params), params, tuple(f"idm.{p.name}" for p in IDM.declared)
+
+    def sensitivities(self) -> object:
+        """Return gap, speed and their derivatives by the five parameters."""
+        return self.behind.sensitivities(*self._linear())
+
+    def equations(self) -> object:
+        """Return the normal equations of one step of Gauss and Newton."""
+        return self.behind.normal_equations(*self._linear(), *self._measured)
 
 
 def recorded_leaders(rounds: int) -> dict[str, Any]:
@@ -41,34 +93,14 @@ def recorded_leaders(rounds: int) -> dict[str, Any]:
     The eager path is timed over 60 of the 600 steps and multiplied by ten. Also one pass of sensitivities and of the
     normal equations, and the candidates of discovery: 30 × 20 × 4 drivers over 36 windows of 50 steps.
     """
-    from idm_env.kernels import recorded
-
-    gap, speed, lead_position, lead_speed, params = _followers(TRAJECTORIES, STEPS)
-    leaf = params.clone().requires_grad_()
-    adam = torch.optim.Adam([leaf], lr=1e-3)
-
-    def iteration() -> None:
-        adam.zero_grad()
-        out = recorded.rollout(gap, speed, lead_position, lead_speed, leaf)
-        ((out.gap - 20.0).square().mean() + (out.speed - 12.0).square().mean()).backward()
-        adam.step()
-
-    ones = torch.ones(STEPS, TRAJECTORIES)
-    candidates = _followers(30 * 20 * 4 * 36, 50)
-
-    def normal() -> object:
-        return recorded.normal_equations(
-            *given, gap_target=20 * ones, speed_target=12 * ones, gap_weight=ones, speed_weight=ones
-        )
-
-    given = (gap, speed, lead_position, lead_speed, params)
+    long, short, candidates = Followers(TRAJECTORIES, STEPS), Followers(TRAJECTORIES, SHORT), Followers(86_400, 50)
     times = measure(
         {
-            "kernel iteration": Case(iteration),
-            "eager iteration": Case(_eager(SHORT), SHORT / STEPS),
-            "sensitivities": Case(lambda: recorded.sensitivities(*given)),
-            "normal equations": Case(lambda: normal()),
-            "discovery's candidates, sensitivities": Case(lambda: recorded.sensitivities(*candidates)),
+            "kernel iteration": Case(lambda: long.gradient(True)),
+            "eager iteration": Case(lambda: short.gradient(False), SHORT / STEPS),
+            "sensitivities": Case(long.sensitivities),
+            "normal equations": Case(long.equations),
+            "discovery's candidates, sensitivities": Case(candidates.sensitivities),
         },
         min(rounds, 3),
     )
@@ -80,37 +112,26 @@ def recorded_leaders(rounds: int) -> dict[str, Any]:
     }
 
 
-def _eager(steps: int) -> Any:
-    gap, speed, lead_position, lead_speed, params = _followers(TRAJECTORIES, steps)
-    simulator = Simulator(Lane(), (IDM(), Brakes(), Replay()))
-    names = [p.name for p in IDM.declared]
-    leaf = params.clone().requires_grad_()
-    adam = torch.optim.Adam([leaf], lr=1e-3)
-    place, pace = (x[1:, :, None].expand(-1, -1, 2) for x in (lead_position, lead_speed))
-    record = Record(
-        place,
-        pace,
-        torch.zeros_like(pace),
-        torch.tensor([True, False]).expand(steps, TRAJECTORIES, 2),
-    )
-
-    def iteration() -> None:
-        adam.zero_grad()
-        own: dict[str, dict[str, Tensor]] = {
-            "idm": {name: leaf[:, j, None] for j, name in enumerate(names)},
-            "brakes": {"max_decel": torch.tensor(9.0)},
-            "replay": {},
+def corrected_models(rounds: int, drivers: int = 600, steps: int = 600) -> dict[str, dict[str, float]]:
+    """Return, by added effect, ns per driver and step of normal equations and of a gradient, and times plain IDM."""
+    models = {name or "plain": Followers(drivers, steps, *([name] if name else [])) for name in CORRECTIONS}
+    cases = {f"{name} equations": Case(made.equations, drivers * steps / 1e6) for name, made in models.items()}
+    cases |= {
+        f"{name} gradient": Case(lambda made=made: made.gradient(True), drivers * steps / 1e6)  # type: ignore[misc]
+        for name, made in models.items()
+    }
+    times = {name: t["cpu_min_ms"] for name, t in measure(cases, rounds).items()}
+    return {
+        name: {
+            what: found
+            for kind in ("equations", "gradient")
+            for what, found in (
+                (f"{kind}_ns", times[f"{name} {kind}"]),
+                (f"{kind}_times_plain", times[f"{name} {kind}"] / times[f"plain {kind}"]),
+            )
         }
-        front = lead_position[0]
-        state = simulator.state(
-            torch.stack((front, front - 5.0 - gap), -1), torch.stack((lead_speed[0], speed), -1), own
-        )
-        with dispatch.off("benchmark of the torch path"):
-            _, out = simulator.rollout(state, {"replay": record}, own, steps)
-        ((out.gap[..., 1] - 20.0).square().mean() + (out.speed[..., 1] - 12.0).square().mean()).backward()
-        adam.step()
-
-    return iteration
+        for name in models
+    }
 
 
 def discovery() -> dict[str, Any]:

@@ -9,19 +9,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from idm_env.data import DataError, Episode
-from idm_env.fitting import fast
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.tangent import TangentStep, linearised_rollout
+from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter, catalogue, nearest
 from idm_env.simulator import Simulator
 from idm_env.types import Inputs, State
+
+if TYPE_CHECKING:
+    from idm_env.kernels.drivers import Behind
 
 Objective = Literal["spacing", "speed", "both"]
 Loss = Literal["mse", "rmse"]
@@ -121,11 +124,11 @@ class Problem:
 
     def simulate(self, values: dict[str, Tensor]) -> Simulated:
         """Roll the drivers out behind their measured leaders; ``values`` are [..., rows] by parameter name."""
-        if self._fast:
-            return Simulated(*fast.simulate(self, values))
         _, driver = self.batch.columns(self.simulator)
         params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
         state = self.batch.start(self.simulator, params)
+        if self._compiled is not None:
+            return Simulated(*self._compiled.simulate(state, params, self.batch.substeps))
 
         def keep(now: State) -> tuple[Tensor, Tensor]:
             return now.gap[..., driver], now.speed[..., driver]
@@ -173,19 +176,51 @@ class Problem:
         return torch.cat([x for name, x in pair.items() if self.objective in (name, "both")])
 
     @cached_property
-    def _fast(self) -> bool:
-        return fast.matches(self)
+    def _prepared(self) -> Behind | str:
+        """The compiled rollout of these drivers, or why there is none."""
+        from idm_env.kernels import drivers
+
+        batch, (at, driver) = self.batch, self.batch.columns(self.simulator)
+        records = {"position": batch.position, "speed": batch.all_speed, "accel": batch.accel, "present": batch.present}
+        start = batch.start(self.simulator, self.params({}))
+        return drivers.prepared(
+            self.simulator, start, {n: x[:, :, at] for n, x in records.items()}, self._inputs, driver
+        )  # fmt: skip
+
+    @property
+    def _compiled(self) -> Behind | None:
+        """The compiled rollout, where there is one and kernels can run."""
+        if not self.kernels or dispatch.surroundings() is not None:
+            return None
+        return None if isinstance(self._prepared, str) else self._prepared
 
     def equations(self, own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return Σr² [S, rows], Jᵀr [S, rows, N] and JᵀJ [S, rows, N, N]; own [S, G, P], shared [S, Q]."""
-        if self._fast:
-            return fast.equations(self, self.rows(own, shared))
+        if self._compiled is not None:
+            state, params, names, start_by = self._linear(self._compiled, own, shared)
+            targets = torch.stack((self.batch.gap[1:], self.batch.speed[1:]))
+            return self._compiled.normal_equations(
+                state, params, names, targets, torch.stack(self.weights), self.batch.substeps, start_by=start_by
+            )
         residual, jacobian = self.linearise(own, shared)
         return (
             residual.square().sum(0),
             torch.einsum("tpsb,tsb->sbp", jacobian, residual),
             torch.einsum("tpsb,tqsb->sbpq", jacobian, jacobian),
         )
+
+    def _linear(
+        self, compiled: Behind, own: Tensor, shared: Tensor
+    ) -> tuple[State, dict[str, dict[str, Tensor]], tuple[str, ...], Tensor | None]:
+        """Return start, parameters, names of the free ones, and the start's derivative by these (for memories)."""
+        values = self.rows(own, shared)
+        remembers = any(e.remembers for e in self.simulator.effects)
+        if remembers:
+            values = {name: x.detach().clone().requires_grad_() for name, x in values.items()}
+        with torch.set_grad_enabled(remembers):
+            params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
+            state = self.batch.start(self.simulator, params)
+        return state, params, tuple(values), compiled.start_by(state, values)
 
     @cached_property
     def _tangent(self) -> TangentStep:
@@ -196,6 +231,12 @@ class Problem:
 
         All directions share one rollout: values once, tangents as a further batch dimension.
         """
+        if self._compiled is not None:
+            state, params, names, start_by = self._linear(self._compiled, own, shared)
+            gap, speed, gap_by, speed_by = self._compiled.sensitivities(
+                state, params, names, self.batch.substeps, start_by=start_by
+            )
+            return self.residual(Simulated(gap, speed)), self._weigh(gap_by, speed_by)
         _, driver = self.batch.columns(self.simulator)
         values = self.rows(own, shared)
         params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})

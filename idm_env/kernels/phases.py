@@ -29,3 +29,19 @@ def call(typing_context: Any, address: Any, w: Any, m: Any, k: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(types.int64, w, types.int64, k), generate
+
+
+@intrinsic
+def call_beside(typing_context: Any, address: Any, w: Any, block: Any, m: Any, k: Any) -> Any:
+    """As ``call``, with a second array: rows of which there are many alike, one set of them at a time."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def data(array: Any, kind: Any) -> Any:
+            return builder.bitcast(context.make_array(kind)(context, builder, array).data, _POINTER)
+
+        kind = ir.FunctionType(ir.VoidType(), [_POINTER, _POINTER, ir.IntType(64), _POINTER])
+        function = builder.inttoptr(arguments[0], kind.as_pointer())
+        builder.call(function, [data(arguments[1], w), data(arguments[2], block), arguments[3], data(arguments[4], k)])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, w, block, types.int64, k), generate

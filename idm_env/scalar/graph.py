@@ -160,6 +160,13 @@ class Graph:
         """Return a truth value: gt, ge, lt, le, eq or ne."""
         return self.node(op, a, b)
 
+    def again(self, node: Node, args: Sequence[Node]) -> Node:
+        """Return the same operation on other nodes."""
+        if node.op in ("add", "sub", "mul", "neg", "div", "pow", "select"):
+            made: Node = getattr(self, node.op)(*args)
+            return made
+        return self.node(node.op, *args, label=node.label, level=node.level if node.op == "past" else None)
+
     def shifted(self, node: Node, by: int) -> Node:
         """Return the same expression of the vehicle ``by`` places ahead (negative: behind)."""
         done: dict[Node, Node] = {}
@@ -236,6 +243,6 @@ def replaced(graph: Graph, outputs: Sequence[Node], places: Mapping[Node, Node])
         if node not in done:
             note, graph.note = graph.note, node.note
             changed = any(done[a] is not a for a in node.args)
-            done[node] = graph.node(node.op, *(done[a] for a in node.args), label=node.label) if changed else node
+            done[node] = graph.again(node, [done[a] for a in node.args]) if changed else node
             graph.note = note
     return [done[node] for node in outputs]

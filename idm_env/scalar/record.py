@@ -66,6 +66,7 @@ class Recording:
 
     ``sense`` are the signals that the past keeps (empty where nobody looks back), ``respond`` the motion and memories
     after the step by name, ``close`` the gap, from everybody's displacement, ``begin`` memories before the first step.
+    ``accel`` is the acceleration before it is integrated: what most of a step flows through.
     """
 
     graph: Graph
@@ -73,6 +74,7 @@ class Recording:
     respond: dict[str, Node] = field(default_factory=dict)
     close: dict[str, Node] = field(default_factory=dict)
     begin: dict[str, Node] = field(default_factory=dict)
+    accel: Node | None = None
 
 
 @dataclass(frozen=True)
@@ -155,6 +157,12 @@ class _Recorder(Stepping):
     def _history(self, state: State) -> Any:
         assert self.recording is not None
         return _Past(self.recording, self.looks_back, self.dt) if self.looks_back else None
+
+    def _respond(self, state: State, inputs: Any, params: Any) -> Any:
+        accel, scene, driver = super()._respond(state, inputs, params)
+        assert self.recording is not None
+        self.recording.accel = value_of(self.recording.graph, accel)
+        return accel, scene, driver
 
     def _gaps(self, state: State, motion: Motion) -> Any:
         # Gaps need the displacement of two vehicles: a graph of their own, from displacements that are known by then.

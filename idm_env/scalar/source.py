@@ -115,10 +115,11 @@ def body(writes: Sequence[Write], read: Read, constants: Constants) -> Body:
     return Body(used, [*loads, *lines])
 
 
-def function(name: str, doc: str, made: Body, compiler: str) -> str:
+def function(name: str, doc: str, made: Body, compiler: str, arrays: tuple[str, ...] = ("w",)) -> str:
     """Return the text of one phase: a compiled function that loops over ``m`` vehicles."""
-    text = [f"@{compiler}", f"def {name}(w_, m, k_):", f'    """{doc}"""']
-    text += [f"    {array} = carray({array}_, SIZE)" for array in ("w", "k")]
+    given = ", ".join(f"{array}_" for array in arrays)
+    text = [f"@{compiler}", f"def {name}({given}, m, k_):", f'    """{doc}"""']
+    text += [f"    {array} = carray({array}_, SIZE)" for array in (*arrays, "k")]
     text += [f"    {n} = k[{i}]" for n, i in made.constants.items()]
     text += ["    for j in range(m):", *(f"        {line}" for line in made.lines)]
     return "\n".join([*text, ""])

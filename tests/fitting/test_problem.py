@@ -73,7 +73,7 @@ def test_jacobians_are_those_of_finite_differences(
 
 @pytest.mark.parametrize("objective", ["spacing", "speed", "both"])
 @pytest.mark.parametrize("relative", [False, True])
-@pytest.mark.parametrize("integration", ["ballistic", "euler"])
+@pytest.mark.parametrize("integration", ["ballistic", "euler", "midpoint"])
 def test_kernels_and_torch_agree(
     platoon: tuple[Episodes, Truth], objective: str, relative: bool, integration: str
 ) -> None:
@@ -82,7 +82,7 @@ def test_kernels_and_torch_agree(
     slow = problem_of(platoon[0], substeps=2, objective=objective, relative=relative, kernels=False)
     slow = dataclasses.replace(slow, simulator=dataclasses.replace(slow.simulator, integration=integration))
     quick = dataclasses.replace(slow, kernels=True)
-    assert quick._fast and not slow._fast
+    assert quick._compiled is not None and slow._compiled is None
     own = torch.stack((start(slow), 1.3 * start(slow)))
     none = torch.zeros(2, 0, dtype=torch.float64)
     for a, b in zip(slow.equations(own, none), quick.equations(own, none), strict=True):
@@ -96,13 +96,30 @@ def test_kernels_and_torch_agree(
     torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-7, atol=1e-7 * float(gradients[0].abs().max()))
 
 
-def test_kernels_are_left_alone_where_they_do_not_fit(platoon: tuple[Episodes, Truth]) -> None:
-    """Another effect, another form of IDM or of the brakes means the torch path."""
-    plain = problem_of(platoon[0])
-    assert not problem_of(platoon[0], "drag")._fast
-    for effects in ((IDM(sharpness=1.0), Replay(), Brakes()), (IDM(), Replay(), Brakes(sharpness=1.0))):
-        simulator = Simulator(Lane(), effects, dt=plain.batch.step)
-        assert not dataclasses.replace(plain, simulator=simulator)._fast
+@pytest.mark.parametrize(
+    ("effects", "shared", "values"),
+    [
+        (("delay",), ("delay.delay",), (0.33,)),
+        (("memory",), ("memory.strength", "memory.memory_time"), (0.4, 60.0)),
+        (("second_leader", "follower"), ("second_leader.weight", "follower.gain"), (0.2, 0.1)),
+        (("lag", "lateral", "regime_shift"), ("lag.lag", "regime_shift.time"), (0.4, 70.0)),
+    ],
+)
+def test_a_corrected_model_is_compiled(
+    platoon: tuple[Episodes, Truth], effects: tuple[str, ...], shared: tuple[str, ...], values: tuple[float, ...]
+) -> None:
+    """Normal equations of both paths, own and shared parameters, at two starts at once; memories start from both."""
+    pytest.importorskip("numba")
+    items = Episodes(tuple(part(e, 0, 200) for e in platoon[0][:3]), ())
+    slow = problem_of(items, *effects, shared=shared, substeps=2, objective="both", kernels=False)
+    quick = dataclasses.replace(slow, kernels=True)
+    assert quick._compiled is not None
+    own = torch.stack((start(slow), 1.3 * start(slow)))
+    common = torch.tensor([values, values], dtype=torch.float64) * torch.tensor([[1.0], [0.9]], dtype=torch.float64)
+    for a, b in zip(slow.equations(own, common), quick.equations(own, common), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8 * float(a.abs().max()))
+    for a, b in zip(slow.linearise(own, common), quick.linearise(own, common), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8 * float(a.abs().max()))
 
 
 def test_a_batch_starts_measured_and_counts_only_what_was_measured(platoon: tuple[Episodes, Truth]) -> None:
