@@ -304,10 +304,10 @@ def named(d: Discovery) -> list[tuple[str, Judged, str, str]]:
     """Return name, result, colour and line style of the models compared, IDM first."""
     judgement = d.judgement
     assert judgement.before is not None
-    plain, corrected = judgement.titles
-    models = [(plain, judgement.before, BEFORE, "-")]
+    titles = judgement.titles
+    models = [(titles[0], judgement.before, BEFORE, "-")]
     if judgement.compared is not None and judgement.after is not None:
-        models.append((corrected, judgement.after, AFTER, "--"))
+        models.append((titles[1], judgement.after, AFTER, "--"))
     return models
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from idm_env.discovery import march
 from idm_env.discovery import model as terms
 from idm_env.discovery.judge import Frozen
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Model, Term
-from idm_env.discovery.records import Records, whole
+from idm_env.discovery.records import Records, Rows, whole, windows
 from idm_env.discovery.search import first_prior
 from idm_env.discovery.solve import Task
 from idm_env.effects import CANDIDATES, IDM, Brakes, Replay
@@ -112,3 +115,24 @@ def test_all_together(platoon: Records) -> None:
         tuple(terms.simple(n) for n in ("delay", "leader_acceleration", "speed_dependent_gap", "drag", "asymmetry"))
     )
     agrees(platoon, model, np.array([0.3, 0.2, 2.0, 3e-4, 0.1]))
+
+
+def test_windows_share_their_winding_up(platoon: Records) -> None:
+    """A window behind others of its record ends where it ends when it is rolled out alone."""
+    rows = windows(platoon)
+    model, values = Model((terms.simple("memory"), terms.simple("delay"))), np.array([[0.7, 40.0, 0.46]])
+
+    def ends(some: Rows) -> np.ndarray:
+        task = Task(some, None, first_prior(), np.ones(len(some)))
+        return task.predict(np.tile(THETA, (1, task.groups, 1)), model, values)[0][0]
+
+    together = ends(rows)
+    for i in (1, 5, len(rows) - 1):
+        pick = {name: getattr(rows, name)[[i]] for name in ("record", "start", "valid", "joined", "block")}
+        assert np.array_equal(ends(replace(rows, **pick))[0], together[i])
+
+
+def test_a_printed_loop_depends_on_no_number() -> None:
+    """Neither the time step nor the length of a lap makes another text, which would be compiled again."""
+    texts = {march.loop(Catalogue.of((), lap), dt).text for lap, dt in ((230.0, 0.1), (231.5, 0.1), (230.0, 0.04))}
+    assert len(texts) == 1 and march.loop(Catalogue.of(), 0.1).text not in texts
