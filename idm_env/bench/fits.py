@@ -84,7 +84,8 @@ class Followers:
 
     def equations(self) -> object:
         """Return the normal equations of one step of Gauss and Newton."""
-        return self.behind.normal_equations(*self._linear(), *self._measured)
+        targets, weights = self._measured
+        return self.behind.normal_equations(*self._linear(), targets=targets, weights=weights)
 
 
 def recorded_leaders(rounds: int) -> dict[str, Any]:

@@ -106,16 +106,16 @@ class Batch:
             self._world = self._values.current()
         return self._world
 
+    @world.setter
+    def world(self, world: World | None) -> None:
+        self._world, self._loaded = world, False
+
     def glance(self) -> World:
         """Return the worlds as they are now, for reading only and until the next step."""
         if self._world is None and self._loaded and self._values is not None:
             return self._values.current(own=False)
         assert self._world is not None
         return self._world
-
-    @world.setter
-    def world(self, world: World | None) -> None:
-        self._world, self._loaded = world, False
 
     # -- beginnings ----------------------------------------------------------------------------------------------
 

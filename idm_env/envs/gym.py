@@ -132,9 +132,10 @@ class DiffIDMEnv(TrueSpec, gymnasium.Env):
     @property
     def state(self) -> State:
         """The state of the traffic, a batch of one."""
-        if not self.batch.begun:
+        world = self.batch.world
+        if world is None:
             raise RuntimeError("there is no state before reset. Call reset() first.")
-        return self.batch.world.state
+        return world.state
 
     @property
     def params(self) -> Params:

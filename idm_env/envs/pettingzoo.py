@@ -145,9 +145,10 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
 
     def state(self) -> np.ndarray:
         """Return the whole traffic, within ``state_space``."""
-        if not self.batch.begun:
+        world = self.batch.world
+        if world is None:
             raise RuntimeError("there is no state before reset. Call reset() first.")
-        traffic = self.batch.world.state
+        traffic = world.state
         gap = traffic.gap.clamp_max(_FARTHEST) / _GAP_SCALE
         seen = torch.cat((traffic.speed / _SPEED_SCALE, gap), dim=-1)[0].cpu().numpy()
         return np.clip(seen, self.state_space.low, self.state_space.high)
@@ -163,7 +164,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
             self._viewer = Viewer(self.render_mode, round(1.0 / self.task.simulator.dt))
         if not self.batch.begun:
             raise RuntimeError("there is nothing to see before reset. Call reset() first.")
-        picture: np.ndarray | None = self._viewer.show(self.task, self.batch.world.state)
+        picture: np.ndarray | None = self._viewer.show(self.task, self.batch.glance().state)
         return picture
 
     def close(self) -> None:

@@ -21,15 +21,15 @@ from idm_env.kernels import threads as pool
 from idm_env.kernels.lanes import part_of, past_rows, past_tensor, static_of
 from idm_env.kernels.operands import Strides, operand, table
 from idm_env.kernels.printed import TileKernel, tile_kernel
-from idm_env.kernels.rows import RowFunction, Untraceable
-from idm_env.scalar.record import Form, slot_name
+from idm_env.kernels.rows import RowFunction
+from idm_env.scalar.record import Form, Untraceable, slot_name
 from idm_env.tasks import Task, World
 from idm_env.types import Params, State
 
 Array = np.ndarray
 Before = Callable[[World, Tensor | None], tuple[Tensor | None, Tensor | None, Mapping[str, Any]]]
 """World and actions → commands, commands as they are let pass, and the inputs of the step."""
-After = Callable[[World, Tensor | None, Tensor | None, World, bool], dict[str, Tensor]]
+After = Callable[[World, Tensor, Tensor | None, World, bool], dict[str, Tensor]]
 """World, commands, commands let pass, world Δt later, whether anybody commanded → everything that faces tell."""
 NOISE = slot_name("noise", "")
 
@@ -141,7 +141,7 @@ def _world(leaves: Mapping[str, Tensor], like: World, prefix: str = "") -> World
     own = {n.removeprefix(prefix): x for n, x in leaves.items() if n.startswith(prefix)}
     fields = {n.removeprefix("state_"): x for n, x in own.items() if n.startswith("state_")}
     episode = {n.removeprefix("episode_"): x for n, x in own.items() if n.startswith("episode_")}
-    return World(like.state._replace(**fields), episode)
+    return World(like.state._replace(**fields), episode)  # type: ignore[arg-type]
 
 
 class _Plan:
@@ -254,7 +254,7 @@ class _Plan:
         assert world is not None
         still = {n: self.values.arrays[0].get(f"state_{n}") for n in ("length", "present")}
         state = world.state._replace(
-            **{n: torch.from_numpy(x).view(self.shape) for n, x in still.items() if x is not None}
+            **{n: torch.from_numpy(x).view(self.shape) for n, x in still.items() if x is not None}  # type: ignore[arg-type]
         )
         simulator = self.values.task.simulator
         made = [

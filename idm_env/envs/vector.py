@@ -188,9 +188,10 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
     @property
     def state(self) -> State:
         """The state of the traffic, one row per environment."""
-        if not self.batch.begun:
+        world = self.batch.world
+        if world is None:
             raise RuntimeError("there is no state before reset. Call reset() first.")
-        return self.batch.world.state
+        return world.state
 
     @property
     def params(self) -> Params:

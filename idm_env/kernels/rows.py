@@ -116,7 +116,11 @@ class RowFunction:
         for name, x in moving.items():
             strides = tuple(math.prod(x.shape[k + 1 :]) for k in range(1, x.dim()))
             to = Place(f"out_{name}", f"r * {math.prod(x.shape[1:])}", 0, strides, kinds[name])
-            self._lines += loops(x.shape[1:], lambda at, to=to, x=x: f"{index(to, at)} = {self._at(x, at)}")
+
+            def line(at: Any, to: Place = to, x: Tensor = x) -> str:
+                return f"{index(to, at)} = {self._at(x, at)}"
+
+            self._lines += loops(x.shape[1:], line)
         text = "\n".join(self._lines)
         self.needs = [name for name in inputs if f"in_{name}[" in text]
         arguments = [f"in_{n}" for n in self.needs] + [f"t{k}" for k in range(len(self._tables))]
@@ -157,7 +161,7 @@ class RowFunction:
         array, start, width, _ = self._stores[x.untyped_storage().data_ptr()]
         if x.dim() == 0 or x.shape[0] != self._rows or x.stride(0) != width or x.storage_offset() >= max(width, 1):
             raise Untraceable("an operation mixes rows")
-        self._places[id(x)] = Place(array, start, x.storage_offset(), tuple(x.stride()[1:]), kind)
+        self._places[id(x)] = Place(array, start, int(x.storage_offset()), tuple(x.stride()[1:]), kind)
 
     def _fresh(self, x: Tensor) -> Place:
         """Give a result its place: a local name for one number a row, else a part of the workspace."""
