@@ -84,8 +84,8 @@ class Followers:
 
     def equations(self) -> object:
         """Return the normal equations of one step of Gauss and Newton."""
-        targets, weights = self._measured
-        return self.behind.normal_equations(*self._linear(), targets=targets, weights=weights)
+        state, params, names = self._linear()
+        return self.behind.normal_equations(state, params, names, *self._measured)
 
 
 def recorded_leaders(rounds: int) -> dict[str, Any]:
