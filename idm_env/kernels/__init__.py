@@ -1,12 +1,10 @@
-"""Fused CPU kernels for the common simulators, compiled by numba: a second source of ``Simulator.step``'s mathematics.
+"""Compiled CPU kernels: loops without an equation, around phases that ``scalar`` prints from the recorded step.
 
-Values and gradients agree with the torch path to rounding, and parity tests hold both together. Values are the same
-bits with and without a graph: which path runs never depends on ``requires_grad``.
-Importing this package imports no numba; its modules do. The first rollout of a precision compiles: 10 s of one core
-forward and 10 s backward, kept on disk (numba's cache, beside the package or in ``NUMBA_CACHE_DIR``); in later
-processes it costs half a second (2 cores, AMD EPYC, AVX-512, November 2026). For those who change a kernel: numba
-notices a change of the file that holds a function, not of one that it calls, so delete ``*.nbi`` after editing
-``equations.py``.
+Values and gradients agree with the torch path to rounding, and laws over all effects hold both together. Values are the
+same bits with and without a graph: which path runs never depends on ``requires_grad``. Importing this package imports
+no numba; its modules do. Loops compile once per precision, the phases of a new set of effects in one or two seconds of
+one core; both are kept on disk, in the folder of ``scalar.library`` or in ``NUMBA_CACHE_DIR``, under names that are
+digests of their text, so nothing has to be deleted after an edit.
 """
 
 from __future__ import annotations

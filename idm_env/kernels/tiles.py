@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from idm_env.scalar import library
 
-settings: Any = numba.config
 Array = NDArray[Any]
+
+_settings: Any = numba.config
 
 
 @lru_cache(maxsize=1)
@@ -36,18 +37,18 @@ def _cache_of_loops() -> str:
     """
     sources = sorted(Path(__file__).parent.glob("*.py"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
-    return str(Path(settings.CACHE_DIR or library.folder()) / f"loops_{digest}")
+    return str(Path(_settings.CACHE_DIR or library.folder()) / f"loops_{digest}")
 
 
 def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a loop with these options of numba, in the cache of this version of it."""
 
     def compiled(function: Callable[..., Any]) -> Any:
-        place, settings.CACHE_DIR = settings.CACHE_DIR, _cache_of_loops()
+        place, _settings.CACHE_DIR = _settings.CACHE_DIR, _cache_of_loops()
         try:
             return numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
         finally:
-            settings.CACHE_DIR = place
+            _settings.CACHE_DIR = place
 
     return compiled
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from idm_env.types import Inputs, Params, State
 
 Advance = Callable[[State, Inputs, Params], State]
-"""One step of a simulator: ``Simulator.step``, or a fused kernel that gives the same."""
+"""One step of a simulator: ``Simulator.step``, or a kernel that gives the same."""
 
 NOBODY = "—"
 """Id of a slot in which no recorded vehicle is."""
