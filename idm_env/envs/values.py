@@ -19,7 +19,7 @@ from idm_env.history import PAST
 from idm_env.kernels import lane_loops, tiles
 from idm_env.kernels import threads as pool
 from idm_env.kernels.lanes import part_of, past_rows, past_tensor, static_of
-from idm_env.kernels.operands import Strides, operand, table
+from idm_env.kernels.operands import FLAGS, OPERANDS, STATES, Strides, filled, operand, table
 from idm_env.kernels.printed import TileKernel, tile_kernel
 from idm_env.kernels.rows import RowFunction
 from idm_env.scalar.record import Form, Untraceable, slot_name
@@ -27,11 +27,10 @@ from idm_env.tasks import Task, World
 from idm_env.types import Params, State
 
 Array = np.ndarray
-Before = Callable[[World, Tensor | None], tuple[Tensor | None, Tensor | None, Mapping[str, Any]]]
-"""World and actions → commands, commands as they are let pass, and the inputs of the step."""
+Before = Callable[[World, Tensor | None, Tensor | None], tuple[Tensor | None, Tensor | None, Mapping[str, Any]]]
+"""World, actions and normals → commands, commands as they are let pass, and the inputs of the step."""
 After = Callable[[World, Tensor, Tensor | None, World, bool], dict[str, Tensor]]
 """World, commands, commands let pass, world Δt later, whether anybody commanded → everything that faces tell."""
-NOISE = slot_name("noise", "")
 
 
 class Values:
@@ -160,9 +159,9 @@ class _Plan:
         sample = {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in named(world).items()}
         if not idle:
             sample["action"] = torch.zeros(many, len(task.agents), dtype=kind)
-        inputs = self._record_before(sample, world)
-        if noisy:
-            inputs["noise"] = torch.zeros(many, self.size, dtype=kind)
+        normals = torch.zeros(many, self.size, dtype=kind) if noisy else None
+        self.normals_slot = ""
+        inputs = self._record_before(sample, world, normals)
         self.kernel = self._kernel(state, inputs)
         self._record_after(sample, world)
         self._lay_out(inputs, state, many)
@@ -170,16 +169,18 @@ class _Plan:
 
     # -- recording -------------------------------------------------------------------------------------------------
 
-    def _record_before(self, sample: dict[str, Tensor], world: World) -> dict[str, Any]:
+    def _record_before(self, sample: dict[str, Tensor], world: World, normals: Tensor | None) -> dict[str, Any]:
         seen: dict[str, Any] = {}
 
         def before(**leaves: Tensor) -> dict[str, Tensor]:
-            command, given, inputs = self.values._before(_world(leaves, world), leaves.get("action"))
+            command, given, inputs = self.values._before(_world(leaves, world), leaves.get("action"), normals)
             seen.update(inputs)
             out = {} if command is None or given is None else {"command": command, "given": given}
             for effect, value in inputs.items():
                 for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
-                    if x is not None:
+                    if x is not None and x is normals:
+                        self.normals_slot = slot_name(effect, part)
+                    elif x is not None:
                         out[slot_name(effect, part).replace(" ", "_")] = x
             return out
 
@@ -223,7 +224,7 @@ class _Plan:
         self.names = [_place_of(n) for n in kernel.program.states]
         self.numbers = [self._input(inputs, n, many) for n in kernel.numbers]
         self.flags = [self._input(inputs, n, many) for n in kernel.flags]
-        self.noise_at = kernel.numbers.index(NOISE) if NOISE in kernel.numbers else None
+        self.noise_at = kernel.numbers.index(self.normals_slot) if self.normals_slot in kernel.numbers else None
         self.slots = state.memory[PAST].shape[-2] if kernel.signals else 0
         nothing = np.zeros((1, 1), self.real)
         for held in values.arrays:
@@ -236,7 +237,7 @@ class _Plan:
 
     def _input(self, inputs: Mapping[str, Any], slot: str, many: int) -> tuple[Array, Strides]:
         """Return where the kernel finds an input: an array that ``before`` fills, a constant, or later the noise."""
-        if slot == NOISE:
+        if slot == self.normals_slot:
             return np.empty(0, self.real), (self.rows * self.size, self.size, 1)
         name = slot.replace(" ", "_")
         if name in self.made:
@@ -270,13 +271,14 @@ class _Plan:
         every = [*(s for _, s in made), *(s for _, s in self.flags), (0, self.size, 1)]
         self.operands = [a for a, _ in made]
         self.noise_place = None if self.noise_at is None else len(made) - len(self.numbers) + self.noise_at
-        flags = tuple(a for a, _ in self.flags) or (np.zeros(1, np.uint8),)
+        flags = filled([a for a, _ in self.flags], FLAGS)
         kernel, kind = self.kernel, self.real.name
         self.head, self.tail = [], (flags, table(every), kernel.constants[kind])
         for side in (0, 1):
             old, new = self.values.arrays[side], self.values.arrays[1 - side]
+            start, ends = (filled([x[n] for n in self.names], STATES) for x in (old, new))
             self.head.append((
-                tuple(old[n] for n in self.names), tuple(new[n] for n in self.names), old["past"], new["past"],
+                start, ends, old["past"], new["past"],
                 self.slots, self.kept, kernel.measures, kernel.forward(kind), kernel.looks, kernel.recalls, kernel.read,
             ))  # fmt: skip
         self.asked = [[self._needed(n, side) for n in self.before.needs] for side in (0, 1)]
@@ -312,7 +314,7 @@ class _Plan:
             if self.noise_place is not None and normals is not None:
                 self.operands[self.noise_place] = normals
             self.block = normals
-            self.call = [(*head, tuple(self.operands), *self.tail) for head in self.head]
+            self.call = [(*head, filled(self.operands, OPERANDS), *self.tail) for head in self.head]
         call = self.call[side]
         if rows * self.size < 2 * pool.GRAIN:
             lane_loops.forward(*call, at, *self.extent, 0, self.tiles)

@@ -19,7 +19,7 @@ from torch import Tensor
 from idm_env.history import PAST
 from idm_env.kernels import lane_adjoint, lane_loops, tiles
 from idm_env.kernels import threads as pool
-from idm_env.kernels.operands import Strides, dense, operand, reduced, table
+from idm_env.kernels.operands import FLAGS, OPERANDS, STATES, Strides, dense, filled, operand, reduced, table
 from idm_env.kernels.printed import TileKernel
 from idm_env.kernels.tiles import Array
 from idm_env.kernels.workspace import take
@@ -188,7 +188,7 @@ def _plan(
     tape = torch.is_grad_enabled() and any(x.requires_grad for x in differentiated)
     plan = _Plan(
         kernel, simulator, state, inputs, params, steps, min(block, steps), keep, tape,
-        tuple(a for a, _ in made) or (nothing[0],), tuple(a for a, _ in flags) or (np.zeros(1, np.uint8),), strides,
+        filled([a for a, _ in made] or [nothing[0]], OPERANDS), filled([a for a, _ in flags], FLAGS), strides,
         threads,
     )  # fmt: skip
     return plan, differentiated
@@ -221,7 +221,7 @@ def _forward(plan: _Plan, start: list[Array], past: Array) -> tuple[list[Array],
             ends = [take((plan.count,), plan.kind) if i in wanted else plan.nothing for i in range(len(program.states))]
             spare.append(ends)
         after = plan.past()
-        plan.forward(first, steps, tuple(now), tuple(ends), before, after, plan.slots, kept)
+        plan.forward(first, steps, filled(now, STATES), filled(ends, STATES), before, after, plan.slots, kept)
         now, before = ends, after
     return now, before, kept, tape
 
@@ -284,7 +284,7 @@ def _backward(
         ]  # fmt: skip
         before = plan.past()
         plan.backward(
-            first, steps, tuple(start), past, plan.slots, along, tuple(on), tuple(begin),
+            first, steps, filled(start, STATES), past, plan.slots, along, filled(on, STATES), filled(begin, STATES),
             on_past, before, on_parameters, number == len(blocks) - 1, on_inputs,
         )  # fmt: skip
         on, on_past = begin, before

@@ -17,7 +17,7 @@ from idm_env.history import PAST
 from idm_env.kernels import lane_loops, tiles
 from idm_env.kernels import threads as pool
 from idm_env.kernels.lanes import part_of, past_rows, past_tensor, starts, state_after, static_of
-from idm_env.kernels.operands import Strides, dense, operand, table
+from idm_env.kernels.operands import FLAGS, OPERANDS, STATES, Strides, dense, filled, operand, table
 from idm_env.kernels.printed import TileKernel, tile_kernel
 from idm_env.kernels.tiles import Array
 from idm_env.scalar.record import Form
@@ -55,18 +55,18 @@ class Stepper:
         flags = [operand(part_of(inputs, n), batch, size, steps) for n in kernel.flags]
         strides = table([*(s for _, s in made), *(s for _, s in flags), (0, size, 1)])
         precision = np.dtype(np.float32 if kind == torch.float32 else np.float64)
-        start = tuple(dense(x.to(kind), shape) for x in starts(state, program.states))
+        start = filled([dense(x.to(kind), shape) for x in starts(state, program.states)], STATES)
         count, rows = math.prod(shape), math.prod(batch)
-        ends = tuple(np.empty(count, precision) for _ in program.states)
+        ends = [np.empty(count, precision) for _ in program.states]
         slots = state.memory[PAST].shape[-2] if kernel.signals else 0
         before = past_rows(state.memory[PAST], shape) if slots else np.zeros((1, 1), precision)
         after = np.empty((max(slots * kernel.signals, 1), count if slots else 1), precision)
         wide = tiles.NARROW if slots and size <= tiles.NARROW else tiles.width(size, steps)
         around = tiles.halo(steps, program.reach)
         given = (
-            start, ends, before, after, slots, np.empty((4, 0, 1), precision), kernel.measures,
+            start, filled(ends, STATES), before, after, slots, np.empty((4, 0, 1), precision), kernel.measures,
             kernel.forward(precision.name), kernel.looks, kernel.recalls, kernel.read,
-            tuple(a for a, _ in made), tuple(a for a, _ in flags) or (np.zeros(1, np.uint8),), strides,
+            filled([a for a, _ in made], OPERANDS), filled([a for a, _ in flags], FLAGS), strides,
             kernel.constants[precision.name], 0, steps, rows, size, wide, around,
         )  # fmt: skip
         pool.split(
