@@ -21,7 +21,7 @@ ALLOWED = {
     "roads": {"types"},
     "history": {"types"},
     "step": {"types", "parameters", "effects", "roads", "history"},
-    "scalar": {"types", "roads", "history", "step"},
+    "scalar": {"types", "effects", "roads", "history", "step"},
     "kernels": {"types", "effects", "roads", "history", "step", "scalar"},
     "simulator": {"types", "parameters", "step", "kernels", "compiled"},
     "compiled": {"types", "simulator"},
