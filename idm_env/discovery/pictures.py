@@ -83,7 +83,9 @@ def ranking(this: Round) -> Figure:
     """Bars of all candidates of a round, best on top."""
     order = np.argsort(this.tested.gain)[-22:]
     gain = 100 * (1 - np.exp(-this.tested.gain[order]))
-    low, high = (100 * (1 - np.exp(-this.tested.interval[order, k])) for k in range(2))
+    ends = this.tested.interval[order]
+    known = np.isfinite(ends).all(1)  # a single run tells no interval
+    low, high = (np.where(known, 100 * (1 - np.exp(-np.where(known, e, 0.0))), gain) for e in ends.T)
     figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.24 * len(order) + 1.0))
     colours = [AFTER if p < 0.05 else GREY for p in this.tested.p_value[order]]
     axes.barh(range(len(order)), gain, color=colours)

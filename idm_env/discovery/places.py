@@ -172,7 +172,8 @@ def _best(matrix: np.ndarray, vector: np.ndarray, allowed: np.ndarray) -> tuple[
     push = along[up] - along[i]
     # A little ridge keeps intervals that hardly anybody passed from winning by chance.
     weight = weight + 0.02 * np.trace(matrix) / count
-    gain = np.where(allowed, push**2 / np.maximum(weight, 1e-12), -np.inf)
+    weight = np.maximum(weight, 1e-12)  # of a single run, left out, nothing remains
+    gain = np.where(allowed, push**2 / weight, -np.inf)
     at = np.unravel_index(gain.argmax(), gain.shape)
     return int(at[0]), int(at[1]), float(push[at] / weight[at]), float(gain[at])
 

@@ -111,7 +111,8 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
         return ""
     figure = refusal.figure
     return {
-        Reason.FEW_RUNS: f"only {figure:.0f} runs are left to choose on: the smallest p-value is {2.0**-figure:.2g}"
+        Reason.FEW_RUNS: f"only {figure:.0f} run{' is' if figure == 1 else 's are'} left to choose on: "
+        f"the smallest p-value is {2.0**-figure:.2g}"
         if figure == figure else "",
         Reason.NO_GAIN: "no candidate gains enough on held-out runs",
         Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",

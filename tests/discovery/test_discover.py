@@ -81,6 +81,15 @@ def test_few_runs_cannot_tell() -> None:
     assert found.report["found"] == []
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_single_run_is_told_and_drawn(tmp_path: Path) -> None:
+    """Nothing can be left out for a gain: its interval has no ends, which no axis can show."""
+    found = discover(data(None, runs=1), effects=("lag", "drag", "speed_zone"))
+    assert "only 1 run is left" in found.report["sentence"]
+    assert all(None in c["interval"] for c in found.report["candidates"])
+    assert write_report(found, tmp_path)["report.html"].exists()
+
+
 def test_one_candidate_alone_may_be_asked_for() -> None:
     """The round after its addition has nothing left to try."""
     found = discover(data("leader_acceleration"), effects=["leader_acceleration"])
