@@ -244,15 +244,10 @@ def _fit_page(
     if held is not None:
         lead += f" On {held['episodes']} episodes held out: {held['gap_rmse_m']:.2f} m."
     rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": "held out", **held}])
-    names = {
-        "": "", "gap_rmse_m": "gap RMSE (m)", "gap_rmse_median_m": "median gap RMSE (m)",
-        "gap_mae_m": "mean |gap error| (m)", "speed_rmse_mps": "speed RMSE (m/s)", "collisions": "collisions",
-        "episodes": "episodes",
-    }  # fmt: skip
     return [
         page.lead(lead),
         page.lead(result["at_bounds"]),
-        page.table([{title: row[name] for name, title in names.items()} for row in rows]),
+        _errors_table(rows),
         page.note(
             f"{result['fit']['converged']} of {result['fit']['groups']} groups converged. A value on its bound is not "
             "an estimate: the data would have it beyond."
@@ -355,7 +350,7 @@ def _simulate_file(source: Source, model_path: Path, out: Path, seed: int, progr
             f"{error.summary()['gap_rmse_m']:.2f} m, {result['fitted_on']['words']} {matched} of them have driver "
             "parameters of their own."
         ),
-        page.table([error.summary()]),
+        _errors_table([error.summary()]),
         pictures.examples(problem, error, simulated),
         page.heading("Residuals"),
         pictures.residuals(problem, simulated),
@@ -365,6 +360,16 @@ def _simulate_file(source: Source, model_path: Path, out: Path, seed: int, progr
     ]
     page.write_page(out / "report.html", f"{model_path.name} behind the leaders of {source.path.name}", blocks)
     return result
+
+
+def _errors_table(rows: list[dict[str, Any]]) -> page.Block:
+    """Return a table of errors under their names in words and units."""
+    names = {
+        "": "", "gap_rmse_m": "gap RMSE (m)", "gap_rmse_median_m": "median gap RMSE (m)",
+        "gap_mae_m": "mean |gap error| (m)", "speed_rmse_mps": "speed RMSE (m/s)", "collisions": "collisions",
+        "episodes": "episodes",
+    }  # fmt: skip
+    return page.table([{title: row[name] for name, title in names.items() if name in row} for row in rows])
 
 
 def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, torch.Tensor, int]:

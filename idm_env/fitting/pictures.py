@@ -102,10 +102,11 @@ def space_time(problem: Problem, simulated: Simulated) -> list[page.Block]:
         model.append(diagrams.Line(episode.key, episode.time_s, lead - gap, speed))
     panels = [diagrams.Panel(title, tuple(lines)) for title, lines in (("measured", measured), ("simulated", model))]
     where = f"run {run}" + (f", lane {lane}" if lane >= 0 else "")
+    word = "episode" if len(rows) == 1 else "episodes"
     return [
         page.picture(
             diagrams.figure_of(panels, columns=2),
-            f"{len(rows)} episodes of {where}, the largest of {len(place)}: measured left, and right each driver "
+            f"{len(rows)} {word} of {where}, the largest of {len(place)}: measured left, and right each driver "
             "simulated alone behind its measured leader. Colours are speeds.",
         )
     ]

@@ -80,7 +80,10 @@ def _predict_files(
     progress("writing", 0, 0, "the report")
     report, pictures = _report(parts.summaries())
     if not report["scenarios"]:
-        first = report["left_out"][0]["reason"] if report["left_out"] else "no file was given"
+        left = report["left_out"]
+        first = left[0]["reason"] if left else "no file was given"
+        if len(left) > 1:
+            first = f"{first} And {len(left) - 1} more: {'; '.join(str(each['reason']) for each in left[1:])}"
         parts.remove()
         raise DataError(f"no scenario can be used: {first}")
     parts.join("predictions", out / "predictions.parquet")

@@ -72,6 +72,8 @@ def test_simulate_repeats_what_fit_reported(file: Path, tmp_path: Path) -> None:
     result = simulate_file(Source(file, smooth=True), tmp_path / "fit" / "model.yaml", tmp_path / "sim")
     assert result["drivers_with_own_parameters"] == 8
     assert result["error"]["gap_rmse_m"] == pytest.approx(fitted["fit"]["gap_rmse_m"], rel=1e-6)
+    report = (tmp_path / "sim" / "report.html").read_text()
+    assert "gap RMSE (m)" in report and "gap_rmse_m" not in report
     table = pl.read_parquet(tmp_path / "sim" / "simulated.parquet")
     assert table.null_count().sum_horizontal().item() == 0
     difference = table["gap_m"] - table["measured_gap_m"]

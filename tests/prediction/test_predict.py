@@ -286,6 +286,9 @@ def test_files_report_and_bad_input(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "report.html").read_text().count("data:image/png") == 4
     with pytest.raises(DataError, match="no scenario can be used"):
         predict_files([tmp_path / "broken.json"], tmp_path / "none")
+    (tmp_path / "also_broken.json").write_text("{")
+    with pytest.raises(DataError, match=r"broken.json.*And 1 more: also_broken.json"):
+        predict_files([tmp_path / "broken.json", tmp_path / "also_broken.json"], tmp_path / "none")
 
 
 def test_an_interrupted_run_goes_on_after_the_last_file(tmp_path: Path) -> None:
