@@ -19,12 +19,23 @@ def advance_of(simulator: Simulator, output: str, device: torch.device) -> Advan
     """
     if output != "numpy" or device.type != "cpu" or dispatch.surroundings() is not None:
         return simulator.step
-    from idm_env.kernels.stepper import Stepper
+    return Kernel(simulator)
 
-    stepper = Stepper(simulator)
 
-    def advance(state: State, inputs: Inputs, params: Params) -> State:
-        fits = not isinstance(stepper.kernel(state, inputs), str)
-        return (stepper if fits else simulator.step)(state, inputs, params)
+class Kernel:
+    """A simulator's kernel where there is one for what is given, else its own step."""
 
-    return advance
+    def __init__(self, simulator: Simulator) -> None:
+        from idm_env.kernels.stepper import Stepper
+
+        self.simulator = simulator
+        self._stepper = Stepper(simulator)
+
+    def __reduce__(self) -> tuple[type[Kernel], tuple[Simulator]]:
+        # Compiled code stays here; a copy in another process finds its own.
+        return Kernel, (self.simulator,)
+
+    def __call__(self, state: State, inputs: Inputs, params: Params) -> State:
+        """Return the state Δt later."""
+        fits = not isinstance(self._stepper.kernel(state, inputs), str)
+        return (self._stepper if fits else self.simulator.step)(state, inputs, params)
