@@ -8,7 +8,7 @@ import idm_env  # registers DiffIDM-v0
 torch.manual_seed(0)
 torch.set_num_threads(1)
 # Human drivers have had 300 s to grow a wave; the failsafe brakes for the queue, and learning must drive on from there.
-ring = {"task": "ring", "output": "torch", "warmup": 3000, "warmup_pool": 64, "failsafe": 3.0}
+ring = {"task": "ring", "output": "torch", "observation": "raw", "warmup": 3000, "warmup_pool": 64, "failsafe": 3.0}
 env = gymnasium.make_vec("DiffIDM-v0", num_envs=24, autoreset_mode="SameStep", max_episode_steps=3000, **ring)
 test = gymnasium.make_vec("DiffIDM-v0", num_envs=4, autoreset_mode="Disabled", max_episode_steps=-1, **ring)
 
@@ -25,14 +25,14 @@ def speeds_under(policy):
     return float(every.mean()), float(every.std((0, 2)).max())
 
 
-scale = torch.tensor([0.15, 0.05, 0.01])  # of v/15, (v_lead − v)/15 and headway/270 in a wave
+middle, scale = torch.tensor([3.75, 0.0, 10.8]), torch.tensor([2.25, 0.75, 2.7])  # v, v_lead − v, headway in a wave
 net = torch.nn.Sequential(torch.nn.Linear(3, 32), torch.nn.Tanh(), torch.nn.Linear(32, 1), torch.nn.Tanh())
 with torch.no_grad():
     net[2].weight.mul_(0.01)
 
 
 def policy(observation):
-    return net((observation - torch.tensor([0.25, 0.0, 0.04])) / scale)
+    return net((observation - middle) / scale)
 
 
 human, untrained = speeds_under(None), speeds_under(policy)

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -22,10 +22,8 @@ from idm_env.history import PAST, History
 from idm_env.roads.base import Road
 from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 Integration = Literal["ballistic", "euler", "midpoint"]
+S = TypeVar("S", bound="Stepping")
 
 
 @dataclass(frozen=True)
@@ -72,11 +70,11 @@ class Stepping:
 
     # -- composition ---------------------------------------------------------------------------------------------
 
-    def adding(self, *effects: Effect) -> Self:
+    def adding(self: S, *effects: Effect) -> S:
         """Return this simulator with more effects."""
         return dataclasses.replace(self, effects=(*self.effects, *effects))
 
-    def without(self, *names: str) -> Self:
+    def without(self: S, *names: str) -> S:
         """Return this simulator without the named effects; ValueError if one is not there."""
         for name in names:
             if name not in self.by_name:

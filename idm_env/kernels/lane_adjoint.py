@@ -37,6 +37,7 @@ from idm_env.kernels.lane_loops import (
     load_inputs,
     load_past,
     load_static,
+    look,
     perceive,
     step,
     store_past,
@@ -94,6 +95,8 @@ def step_back(w, h, ah, n, size, measures, phases, back, looks, recalls, sends, 
     """Carry the adjoint of a tile back by one step, in place; the states are those before that step."""
     m, signals = padded(n), measures[SIGNALS]
     perceive(w, h, n, size, measures, phases, looks, recalls, k, now)
+    if measures[NUMBERS] + measures[FLAGS]:
+        look(w, n, size, measures, looks, CLOSE)  # whose neighbour comes or goes is an input of this step
     for phase in (CLOSE, RESPOND):
         call(back[phase], w, m, k)  # type: ignore[call-arg]
         send(w, n, size, measures, sends, phase)

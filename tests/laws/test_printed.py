@@ -235,7 +235,7 @@ def test_all_effects_at_once(road: Road, integration: str, dtype: torch.dtype) -
     simulator = together(road, integration)
     double = dtype == torch.float64
     agree(Case(simulator, lively(road), 10, dtype), *((1e-12, 1e-11) if double else (2e-5, 2e-3)))
-    if double:
+    if double and isinstance(road, Lane):  # vehicles that overlap fit no ring
         agree(Case(simulator, kinks(), 2, dtype), 1e-12, 1e-11)
 
 
