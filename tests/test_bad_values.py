@@ -359,7 +359,12 @@ def test_a_hollow_checkpoint_of_an_agent_is_one_line(tmp_path: Path) -> None:
     common.save(path, policy, "apg", {"task": "ring"}, {"update": 3})
     whole, content = path.read_bytes(), torch.load(path, weights_only=True)
     hollow: list[Any] = [{key: value for key, value in content.items() if key != name} for name in content]
-    hollow += [{"schema": content["schema"]}, {**content, "policy": {"made": {}, "state": {}}}, {**content, "policy": {"made": 1}}, [1]]
+    hollow += [
+        {"schema": content["schema"]},
+        {**content, "policy": {"made": {}, "state": {}}},
+        {**content, "policy": {"made": 1}},
+        [1],
+    ]
     for broken in hollow:
         torch.save(broken, path)
         with pytest.raises(ValueError, match=r"broken.*without --resume") as told:
