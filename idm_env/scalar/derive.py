@@ -6,7 +6,7 @@ equal numbers one half each.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 from idm_env.scalar.graph import Graph, Node, ordered
 
@@ -130,8 +130,3 @@ def _moving(order: Sequence[Node]) -> set[Node]:
         if node.op == "input" or any(a in moving for a in node.args):
             moving.add(node)
     return moving
-
-
-def jacobian(graph: Graph, outputs: Sequence[Node]) -> list[Mapping[Node, Node]]:
-    """Return, for every output, its derivatives by the leaves that it depends on."""
-    return [adjoint(graph, [output], [graph.constant(1.0)]) for output in outputs]
