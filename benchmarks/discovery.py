@@ -30,6 +30,7 @@ TRUE = {
     "leader_acceleration": ("gain", 1.0),
     "brake_light": ("gain", 1.0), "asymmetry": ("strength", 1.0), "power_limit": ("power", 1.0),
     "drag": ("coefficient", 1.0), "speed_dependent_gap": ("extra_gap", 1.0), "memory": ("strength", 1.0),
+    "speed_time_gap": ("slope", 1.0), "set_point_asymmetry": ("strength", 1.0), "relaxation": ("strength", 1.0),
     "follower": ("gain", 1.0), "dead_zone": ("threshold", 1.0), "action_point": ("threshold", 1.0),
     "speed_zone": ("factor", 1.0), "regime_shift": ("strength", 1.0), "lateral": ("gain", 1.0),
     # The driver goes by the true gap, which is the measured one less the bias.
@@ -154,7 +155,8 @@ def oracle(found: Any, truth: Any) -> float | None:
             values += [strength, hidden.SHIFT_TIME_S]
         else:
             term = terms.simple(name)
-            values += [TRUE[name][1] * strength, *([hidden.MEMORY_TIME_S] if name == "memory" else [])]
+            times = {"memory": [hidden.MEMORY_TIME_S], "relaxation": [hidden.RELAXATION_TIME_S]}
+            values += [TRUE[name][1] * strength, *times.get(name, [])]
         model = model.adding(term)
     kept = found.records.of_runs(found.report["error"]["held_out_runs"])
     prior = found.final.prior if found.report["found"] else found.null.prior

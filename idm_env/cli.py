@@ -82,6 +82,12 @@ Window = Annotated[
     float | None, _ranged(help="Cut longer stretches into windows of so many seconds.", low=1.0, high=1e6, unit="s")
 ]
 Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
+Base = Annotated[
+    str | None,
+    typer.Option(
+        help="Car-following law: idm (the default), idm_plus, iidm, fvdm, gipps, constant_time_gap, my_file.py:MyLaw."
+    ),
+]
 Step = Annotated[
     float | None, _ranged("--dt", help="Use every n-th sample, to this step (s).", low=0.001, high=100.0, unit="s")
 ]
@@ -131,6 +137,7 @@ def fit(
         int | None, _ranged(help="Simulated steps per sample; default: steps of 25 ms.", low=1, high=1000)
     ] = None,
     model: Corrected = None,
+    base: Base = None,
     seed: Seed = 0,
     ring_length: RingLength = None,
     place: Place = None,
@@ -142,7 +149,7 @@ def fit(
     where: Where = None,
     resume: Resume = False,
 ) -> None:
-    """Calibrate IDM by gradients through the simulator: parameters with standard errors, per driver, group or pooled.
+    """Calibrate IDM, or another law, by gradients through the simulator, per driver, group or pooled.
 
     Writes parameters.parquet, model.yaml, report.json and report.html.
     """
@@ -156,7 +163,7 @@ def fit(
         _work_begins()
         source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
         options = Options(
-            by, share, objective, relative, loss, method, integration, starts, seed, substeps, model,  # type: ignore[arg-type]
+            by, share, objective, relative, loss, method, integration, starts, seed, substeps, model, base,  # type: ignore[arg-type]
         )  # fmt: skip
         result = fit_file(source, options, out, resume=resume, on_progress=report)
     rows = [{"": "fitted", **result["fit"]}]
@@ -307,7 +314,8 @@ def demo(
 @app.command()
 def simulate(
     data: Data,
-    model: Annotated[Path, typer.Option(help="A model.yaml of fit or explain, or one of your own.")],
+    model: Annotated[Path | None, typer.Option(help="A model.yaml of fit or explain, or one of your own.")] = None,
+    base: Base = None,
     out: Out = Path("out/simulate"),
     seed: Seed = 0,
     ring_length: RingLength = None,
@@ -325,7 +333,7 @@ def simulate(
 
         _work_begins()
         source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
-        result = simulate_file(source, model, out, seed=seed, on_progress=report)
+        result = simulate_file(source, model, out, base=base, seed=seed, on_progress=report)
     _show("Errors in free simulation", [result["error"]])
     console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)
     _done(out, result["data"]["account"])

@@ -90,6 +90,11 @@ class Stepping:
     def _following(self) -> CarFollowing:
         return next(e for e in self.effects if isinstance(e, CarFollowing))
 
+    @property
+    def base(self) -> CarFollowing:
+        """The car-following effect: what wants an acceleration before any other effect, and owns the driver."""
+        return self._following
+
     @cached_property
     def _hooks(self) -> dict[Hook, tuple[Effect, ...]]:
         hooks: dict[Hook, tuple[Effect, ...]] = {

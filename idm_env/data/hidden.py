@@ -15,6 +15,9 @@ HARDEST_BRAKING = 9.0
 MEMORY_TIME_S = 120.0
 ZONE_M = (800.0, 1500.0)
 SHIFT_TIME_S = 100.0
+REFERENCE_SPEED = 20.0
+SIGN_WIDTH = 0.3
+RELAXATION_TIME_S = 15.0
 PRESSURE_CAP = 4.0
 REACH_M = 25.0
 
@@ -47,6 +50,9 @@ EFFECTS: dict[str, Strength] = {
     "regime_shift": Strength("k", 0.35, 0.175),
     "lateral": Strength("per_s", 0.1, 0.05),
     "gap_bias": Strength("bias_m", 1.5, 0.75),
+    "speed_time_gap": Strength("k", -0.4, -0.2),
+    "set_point_asymmetry": Strength("k", 0.2, 0.1),
+    "relaxation": Strength("beta", 0.7, 0.35),
 }
 """Every effect of the catalogue. ``gap_bias`` changes the measured gap, not the motion."""
 
@@ -77,6 +83,8 @@ class View:
     beside_distance: np.ndarray
     beside_speed: np.ndarray
     memory: np.ndarray
+    lead_accel: np.ndarray
+    habit: np.ndarray
 
 
 def slope(position: np.ndarray, steepest: float) -> np.ndarray:
@@ -150,10 +158,25 @@ def _adapted(view: View, drivers: Drivers, on: dict[str, float]) -> tuple[np.nda
         time_gap = time_gap * (1 + on["memory"] * (1 - view.memory))
     if "regime_shift" in on:
         time_gap = time_gap * (1 + on["regime_shift"] * (view.time > SHIFT_TIME_S))
+    if "speed_time_gap" in on:
+        time_gap = time_gap * np.maximum(1 + on["speed_time_gap"] * (view.speed / REFERENCE_SPEED - 1), 0.1)
+    if "set_point_asymmetry" in on:
+        branch = view.lead_accel / np.hypot(view.lead_accel, SIGN_WIDTH)
+        time_gap = time_gap * (1 + on["set_point_asymmetry"] * branch)
+    if "relaxation" in on:
+        time_gap = time_gap * (1 + on["relaxation"] * (view.habit - 1))
     if "speed_zone" in on:
         inside = (view.position > ZONE_M[0]) & (view.position < ZONE_M[1])
         top = np.where(inside, on["speed_zone"] * top, top)
     return time_gap, top
+
+
+def habit_of(gap: np.ndarray, speed: np.ndarray, drivers: Drivers) -> np.ndarray:
+    """Return the gap relative to that of equilibrium, which drivers get used to."""
+    wanted = (drivers.min_gap + speed * drivers.time_gap) / np.sqrt(
+        np.maximum(1 - (speed / drivers.desired_speed) ** 4, 0.1)
+    )
+    return np.clip(gap / wanted, 0.2, 2.0)
 
 
 def _desired_gap(speed: np.ndarray, closing: np.ndarray, time_gap: np.ndarray, drivers: Drivers) -> np.ndarray:

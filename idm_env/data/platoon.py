@@ -76,12 +76,13 @@ class Platoon:
         return out
 
     def _start(self) -> np.ndarray:
-        """Return the state [4, runs, followers]: position, speed, lagged acceleration and memory."""
+        """Return the state [5, runs, followers]: position, speed, lagged acceleration, memory of speed and of gap."""
         speed = np.broadcast_to(self.leader.speed[0][:, None], self.drivers.time_gap.shape)
         desired = self.drivers.min_gap + speed * self.drivers.time_gap
         gap = desired / np.sqrt(1 - np.minimum(speed / self.drivers.desired_speed, 0.95) ** 4)
         position = self.leader.position[0][:, None] - np.cumsum(gap + self.lengths[:, :-1], axis=1)
-        return np.stack([position, speed, np.zeros_like(speed), speed / self.drivers.desired_speed])
+        zero = np.zeros_like(speed)
+        return np.stack([position, speed, zero, speed / self.drivers.desired_speed, 1.0 + zero])
 
     def _rates(self, k: int, known: int, state: np.ndarray) -> np.ndarray:
         """Return the time derivative of the state at fine step k; what drivers saw is recorded up to step `known`."""
@@ -97,6 +98,7 @@ class Platoon:
         rates[1] = np.where((state[1] <= 0) & (rates[1] < 0), 0.0, rates[1])
         rates[2] = (accel - state[2]) / self.on["lag"] if "lag" in self.on else 0.0
         rates[3] = (state[1] / self.drivers.desired_speed - state[3]) / hidden.MEMORY_TIME_S
+        rates[4] = (hidden.habit_of(view.gap, view.speed, self.drivers) - state[4]) / hidden.RELAXATION_TIME_S
         return rates
 
     def _chained(self, k: int, accel: np.ndarray, speed: np.ndarray, lagged: np.ndarray) -> np.ndarray:
@@ -141,6 +143,9 @@ class Platoon:
             beside_distance=distance,
             beside_speed=beside_speed,
             memory=state[3],
+            # What the vehicle ahead did a fine step ago: what it does now depends on what it sees now.
+            lead_accel=np.concatenate([self.leader.accel[k][:, None], self._held[:, :-1]], axis=1),
+            habit=state[4],
         )
 
     def _nearest(self, k: int, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

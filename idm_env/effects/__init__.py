@@ -13,6 +13,7 @@ from idm_env.checks import nearest, shown
 from idm_env.effects.actions import Control, Replay
 from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
 from idm_env.effects.base import CarFollowing, Effect
+from idm_env.effects.bases import FVDM, IIDM, ConstantTimeGap, Gipps, IDMPlus
 from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
 from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
@@ -21,11 +22,17 @@ from idm_env.effects.noise import Noise
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.registry import entered, is_candidate, lives, read
 from idm_env.effects.surroundings import Drag, Grade
+from idm_env.effects.time_gaps import Relaxation, SetPointAsymmetry, SpeedTimeGap
 
 ALL: dict[str, type[Effect]] = {
     effect.kind: effect
     for effect in (
         IDM,
+        IDMPlus,
+        IIDM,
+        FVDM,
+        Gipps,
+        ConstantTimeGap,
         Brakes,
         Traction,
         Control,
@@ -39,6 +46,9 @@ ALL: dict[str, type[Effect]] = {
         PowerLimit,
         Drag,
         SpeedDependentGap,
+        SpeedTimeGap,
+        SetPointAsymmetry,
+        Relaxation,
         LongMemory,
         Follower,
         DeadZone,
@@ -65,6 +75,9 @@ CANDIDATES: tuple[str, ...] = (
     "power_limit",
     "drag",
     "speed_dependent_gap",
+    "speed_time_gap",
+    "set_point_asymmetry",
+    "relaxation",
     "memory",
     "follower",
     "dead_zone",
@@ -76,6 +89,10 @@ CANDIDATES: tuple[str, ...] = (
     "gap_bias",
 )
 """Effects that discovery may add to a model, by name."""
+
+
+BASES: tuple[str, ...] = tuple(name for name, effect in ALL.items() if issubclass(effect, CarFollowing))
+"""Car-following laws, by name: a simulator has exactly one of them."""
 
 
 PACKAGED = frozenset(ALL)
@@ -94,6 +111,20 @@ def register(effect: type[Effect]) -> type[Effect]:
 def candidates() -> tuple[str, ...]:
     """Return ``CANDIDATES`` and the names of registered effects that can be absent."""
     return (*CANDIDATES, *(name for name, effect in ALL.items() if name not in PACKAGED and is_candidate(effect)))
+
+
+def base_named(kind: str) -> CarFollowing:
+    """Return the car-following law of this name (or ``my_file.py:MyLaw``), as its defaults make it.
+
+    ValueError, in one line, for what is none.
+    """
+    made = make(kind) if ":" in kind or kind in ALL else None
+    if not isinstance(made, CarFollowing):
+        laws = {name: None for name, effect in ALL.items() if issubclass(effect, CarFollowing)}
+        raise ValueError(
+            f"base {shown(kind)} is no car-following law.{nearest(kind, laws)} There are: {', '.join(laws)}."
+        )
+    return made
 
 
 def named(text: str) -> str:
@@ -144,13 +175,17 @@ def _fits(value: object, hint: Any) -> bool:
 
 __all__ = [
     "ALL",
+    "BASES",
     "CANDIDATES",
+    "FVDM",
     "IDM",
+    "IIDM",
     "ActionPoint",
     "Asymmetry",
     "BrakeLight",
     "Brakes",
     "CarFollowing",
+    "ConstantTimeGap",
     "Control",
     "Curve",
     "DeadZone",
@@ -160,7 +195,9 @@ __all__ = [
     "Effect",
     "Follower",
     "GapBias",
+    "Gipps",
     "Grade",
+    "IDMPlus",
     "ImaginedLeader",
     "Lag",
     "Lateral",
@@ -169,11 +206,15 @@ __all__ = [
     "Noise",
     "PowerLimit",
     "RegimeShift",
+    "Relaxation",
     "Replay",
     "SecondLeader",
+    "SetPointAsymmetry",
     "SpeedDependentGap",
+    "SpeedTimeGap",
     "SpeedZone",
     "Traction",
+    "base_named",
     "candidates",
     "describe",
     "make",

@@ -58,6 +58,8 @@ class IDM(CarFollowing):
 
     kind: ClassVar[str] = "idm"
     adds: ClassVar[bool] = False
+    title: ClassVar[str] = "IDM"
+    equation: ClassVar[str] = "a [1 − (v/v0)⁴ − (s*/s)²]"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("max_accel", "a", "m/s²", 1.4, 0.1, 10.0, role="shape"),
         Parameter("comfort_decel", "b", "m/s²", 2.0, 0.1, 10.0, role="shape"),

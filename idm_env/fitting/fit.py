@@ -14,12 +14,12 @@ from torch import Tensor
 
 from idm_env import keep
 from idm_env.data import Episode
-from idm_env.effects import IDM, Brakes, Replay
+from idm_env.effects import IDM, Brakes, CarFollowing, Replay
 from idm_env.fitting.adam import adam
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.levenberg import Normal, Progress, minimise, normal
 from idm_env.fitting.prior import Prior
-from idm_env.fitting.problem import IDM_NAMES, Loss, Objective, Problem, group_of
+from idm_env.fitting.problem import Loss, Objective, Problem, group_of
 from idm_env.fitting.uncertainty import Uncertainty, uncertainty
 from idm_env.progress import OnProgress
 from idm_env.roads import Lane
@@ -74,9 +74,14 @@ class Fit:
         return rows
 
 
-def base_simulator(dt: float = 0.1, **choices: Any) -> Simulator:
-    """Return what is calibrated: IDM and brakes in a lane behind replayed neighbours."""
-    return Simulator(Lane(), (IDM(), Replay(), Brakes()), dt=dt, **choices)
+def base_simulator(dt: float = 0.1, base: CarFollowing | None = None, **choices: Any) -> Simulator:
+    """Return what is calibrated: a car-following law (IDM) and brakes in a lane behind replayed neighbours."""
+    return Simulator(Lane(), (base or IDM(), Replay(), Brakes()), dt=dt, **choices)
+
+
+def own_names(simulator: Simulator) -> tuple[str, ...]:
+    """Return the full names of the parameters that a driver has of his own: those of the car-following law."""
+    return tuple(f"{simulator.base.name}.{p.name}" for p in simulator.base.declared)
 
 
 def fingerprint(problem: Problem, *options: object) -> str:
@@ -96,7 +101,7 @@ def fit(
     *,
     by: str = "driver",
     simulator: Simulator | None = None,
-    free: Sequence[str] = IDM_NAMES,
+    free: Sequence[str] | None = None,
     shared: Sequence[str] = (),
     objective: Objective = "spacing",
     relative: bool = False,
@@ -116,6 +121,7 @@ def fit(
 ) -> Fit:
     """Calibrate ``free`` parameters per group of drivers, and ``shared`` ones for all, behind the measured leaders.
 
+    Where ``free`` is not given it is the car-following law's parameters (IDM's, unless ``simulator`` has another).
     ``by`` is ``driver``, ``all`` or a column. ``method`` is ``lm`` (Levenberg–Marquardt with exact forward-mode
     Jacobians, from ``starts`` starts per group, the pooled optimum among them) or ``adam`` (500 steps of reverse
     mode, learning rate 0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead;
@@ -134,7 +140,7 @@ def fit(
     group, names = group_of(batch.episodes, by)
     simulator = dataclasses.replace(simulator or base_simulator(), dt=batch.step)
     problem = Problem(
-        simulator, batch, tuple(free), tuple(shared), group, names,
+        simulator, batch, own_names(simulator) if free is None else tuple(free), tuple(shared), group, names,
         objective=objective, relative=relative, loss=loss, skip=skip, fixed=dict(fixed or {}), prior=prior,
     )  # fmt: skip
     saved = keep.Store(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)

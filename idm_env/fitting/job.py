@@ -16,7 +16,7 @@ from idm_env import report as page
 from idm_env.config import Model, Numbers, load_model, save_model
 from idm_env.data import LEADER_LOST_GAP_M, DataError, Episodes, Repair, Trajectories, episodes, load
 from idm_env.data.fingerprint import fingerprints, fitted_on
-from idm_env.effects import Effect, Replay
+from idm_env.effects import Brakes, Effect, Replay, base_named
 from idm_env.fitting import drivers, pictures
 from idm_env.fitting.batch import Batch, windows
 from idm_env.fitting.evaluate import Errors, errors, own_for
@@ -80,16 +80,22 @@ class Options:
     seed: int = 0
     substeps: int | None = None
     model: str | None = None
+    base: str | None = None
 
     def simulator(self) -> tuple[Simulator, dict[str, float]]:
-        """Return what is calibrated and the parameters that stay: IDM, or a saved model whose effects are kept."""
+        """Return what is calibrated and the parameters that stay.
+
+        That is the car-following law ``base`` (None: IDM), or a saved model, whose effects are kept.
+        """
         if self.model is None:
-            return base_simulator(integration=self.integration), {}
+            return base_simulator(base=base_named(self.base or "idm"), integration=self.integration), {}
+        if self.base is not None:
+            raise ValueError(f"base = '{self.base}', and the model {self.model} has one. Leave one of them out.")
         saved = load_model(Path(self.model))
         simulator = Simulator(Lane(), _behind_records(saved), dt=saved.dt, integration=saved.integration)
         kept = {
             f"{effect}.{name}": float(value)
-            for effect, parameters in saved.parameters.items() if effect != "idm"
+            for effect, parameters in saved.parameters.items() if effect != simulator.base.name
             for name, value in parameters.items()
         }  # fmt: skip
         return simulator, kept
@@ -104,7 +110,7 @@ def _behind_records(model: Model) -> tuple[Effect, ...]:
 def fit_file(
     source: Source, options: Options, out: Path, *, resume: bool = False, on_progress: OnProgress | None = None
 ) -> dict[str, Any]:
-    """Fit IDM to a file and return the report; write it, the parameters and the model.
+    """Fit IDM, or another car-following law, to a file and return the report; write it, the parameters and the model.
 
     Writes ``parameters.parquet`` (one row per group and parameter), ``drivers.csv`` (one row per group),
     ``model.yaml``, ``report.json`` and ``report.html``.
@@ -169,9 +175,8 @@ def _fit_file(source: Source, options: Options, out: Path, resume: bool, progres
     model = dataclasses.replace(model_of(found, options.by), substeps=options.substeps, fitted_on=marked)
     save_model(out / "model.yaml", model)
     page.write_json(out / "report.json", result)
-    page.write_page(
-        out / "report.html", f"IDM fitted to {source.path.name}", _fit_page(result, found, error, simulated, table)
-    )
+    title = f"{simulator.base.title} fitted to {source.path.name}"
+    page.write_page(out / "report.html", title, _fit_page(result, found, error, simulated, table))
     return result
 
 
@@ -304,19 +309,31 @@ def _seen(model: Model, trajectories: Trajectories, items: Episodes, error: Erro
 
 
 def simulate_file(
-    source: Source, model_path: Path, out: Path, *, seed: int = 0, on_progress: OnProgress | None = None
+    source: Source,
+    model_path: Path | None,
+    out: Path,
+    *,
+    base: str | None = None,
+    seed: int = 0,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Roll a saved model behind the measured leaders; write simulated.parquet, report.json and report.html.
+
+    Instead of a model, ``base`` names a car-following law, which is taken with its defaults.
 
     A driver takes the parameters of ``drivers`` whose key is his, by the model's ``by``, otherwise the model's own.
     Noise is drawn with ``seed``.
     """
+    if (model_path is None) == (base is None):
+        raise ValueError("simulate takes either a model (--model) or a car-following law (--base). Give one of them.")
     with keep.results(out, SIMULATED, (source.path, model_path)):
-        return _simulate_file(source, model_path, out, seed, on_progress or silent)
+        model = load_model(model_path) if model_path else Model((base_named(base or ""), Brakes()))
+        return _simulate_file(source, model, str(model_path or base), out, seed, on_progress or silent)
 
 
-def _simulate_file(source: Source, model_path: Path, out: Path, seed: int, progress: OnProgress) -> dict[str, Any]:
-    model = load_model(model_path)
+def _simulate_file(
+    source: Source, model: Model, name: str, out: Path, seed: int, progress: OnProgress
+) -> dict[str, Any]:
     progress("reading", 0, 0, source.path.name)
     trajectories = source.trajectories()
     items = source.episodes(trajectories)
@@ -330,7 +347,7 @@ def _simulate_file(source: Source, model_path: Path, out: Path, seed: int, progr
     result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
-        "model": str(model_path),
+        "model": name,
         "data": {
             **trajectories.summary(),
             "left_out": [str(r) for r in items.left_out],
@@ -358,7 +375,7 @@ def _simulate_file(source: Source, model_path: Path, out: Path, seed: int, progr
         *pictures.space_time(problem, simulated),
         *_data_section(result),
     ]
-    page.write_page(out / "report.html", f"{model_path.name} behind the leaders of {source.path.name}", blocks)
+    page.write_page(out / "report.html", f"{Path(name).name} behind the leaders of {source.path.name}", blocks)
     return result
 
 

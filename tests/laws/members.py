@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from idm_env.effects import ALL, IDM, Brakes, Curve, DriverCurve, Effect, Grade, Noise
+from idm_env.effects import ALL, IDM, Brakes, CarFollowing, Curve, DriverCurve, Effect, Grade, Noise
 from idm_env.effects.free import FEATURES
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
@@ -33,8 +33,9 @@ def label(effect: Effect) -> str:
 
 
 def around(effect: Effect, road: Lane | Ring | None = None, **options: object) -> Simulator:
-    """Return a simulator of IDM and Brakes with ``effect`` in it."""
-    base = [e for e in (IDM(), Brakes()) if e.name != effect.name]
+    """Return a simulator of IDM and Brakes with ``effect`` in it, in the place of IDM if it is car-following."""
+    following = () if isinstance(effect, CarFollowing) else (IDM(),)
+    base = [e for e in (*following, Brakes()) if e.name != effect.name]
     return Simulator(road or Lane(), (*base, effect), **options)  # type: ignore[arg-type]
 
 

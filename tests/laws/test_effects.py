@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from idm_env import parameters
-from idm_env.effects import ALL, CANDIDATES, IDM, Brakes, CarFollowing, Effect, make
+from idm_env.effects import ALL, BASES, CANDIDATES, IDM, Brakes, CarFollowing, Effect, make
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.types import Scene
@@ -254,6 +254,9 @@ def test_two_hooks_or_none_are_refused() -> None:
 
 def test_car_following_is_the_only_effect_with_a_driver() -> None:
     """Exactly one car-following effect per simulator, or an error that says so."""
-    assert [name for name, cls in ALL.items() if issubclass(cls, CarFollowing)] == ["idm"]
+    assert list(BASES) == [name for name, cls in ALL.items() if issubclass(cls, CarFollowing)]
+    assert not set(BASES) & set(CANDIDATES)
+    with pytest.raises(ValueError, match="exactly one car-following effect"):
+        Simulator(Lane(), (IDM(), make("iidm"), Brakes()))
     with pytest.raises(ValueError, match="exactly one car-following effect, got none"):
         Simulator(Lane(), (Brakes(),))

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from idm_env.effects import ALL, Effect, make
+from idm_env.effects import ALL, BASES, Effect, make
 from idm_env.effects.base import P
 from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter
@@ -94,7 +94,8 @@ every = pytest.mark.parametrize("effect", [*MEMBERS, *MINE], ids=label)
 
 def together(road: Road, integration: str = "ballistic") -> Simulator:
     """Return one simulator of the whole catalogue, and of the effects above."""
-    catalogue = [make(name) for name in ALL if name not in ("curve", "driver_curve")]
+    others = {"curve", "driver_curve", *BASES} - {"idm"}
+    catalogue = [make(name) for name in ALL if name not in others]
     curves = [make("curve", feature="speed", knots=(-1.0, 3.0, 8.0, 15.0)), make("driver_curve", target="time_gap")]
     return Simulator(road, (*catalogue, *curves, *MINE), 0.1, integration)  # type: ignore[arg-type]
 

@@ -1,0 +1,133 @@
+"""How a driver's time gap varies: with speed, with the leader's acceleration, with habit (hook ``adapt``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects.base import Effect, P
+from idm_env.parameters import Parameter
+from idm_env.types import Driver, Scene
+
+
+@dataclass(frozen=True)
+class SpeedTimeGap(Effect):
+    """A time gap linear in speed: ``T → T max(1 + k (v/v_r − 1), 0.1)``, T being the time gap at v_r = ``reference``.
+
+    Range policies that are quadratic in speed, s = A + T v + G v², are of this kind (Zhou and Peng 2005, IEEE Trans.
+    Intell. Transp. Syst. 6, 229). ``reference`` in m/s.
+    """
+
+    kind: ClassVar[str] = "speed_time_gap"
+    rank: ClassVar[int] = 2
+    title: ClassVar[str] = "speed-dependent time gap"
+    equation: ClassVar[str] = "T → T (1 + k (v / (20 m/s) − 1))"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers keep shorter time gaps the faster they go, where IDM keeps one",
+        "drivers keep longer time gaps the faster they go, where IDM keeps one",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("speed_dependent_gap", "drag", "min_gap and time_gap together")
+    told_by: ClassVar[str] = "following at 5 to 35 m/s by one driver tells a line over speed from a root and from drag"
+    changes: ClassVar[str] = "time_gap"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("slope", "k", "1", -0.3, -0.95, 2.0, null=0.0, starts=(0.1,)),
+    )
+    reference: float = 20.0
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the time gap of this speed."""
+        factor = 1.0 + p["slope"] * (scene.speed * (1.0 / self.reference) - 1.0)
+        return driver._replace(time_gap=driver.time_gap * factor.clamp_min(0.1))
+
+
+@dataclass(frozen=True)
+class SetPointAsymmetry(Effect):
+    """Another time gap behind an accelerating leader than behind a braking one: ``T → T (1 + k a_l/√(a_l² + w²))``.
+
+    The fraction is a smooth sign of the leader's acceleration a_l, with w = ``width`` (m/s²). Trajectories of drivers
+    and controllers run in loops through the plane of speed and gap: two branches, one for accelerating and one for
+    braking traffic (Newell 1965 for traffic; Yeo and Skabardonis 2009 in measured platoons).
+    """
+
+    kind: ClassVar[str] = "set_point_asymmetry"
+    rank: ClassVar[int] = 2
+    title: ClassVar[str] = "asymmetric time gap"
+    equation: ClassVar[str] = "T → T (1 + k a_lead / √(a_lead² + 0.09 m²/s⁴))"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers keep shorter time gaps behind accelerating leaders than behind braking ones, where IDM keeps one",
+        "drivers keep longer time gaps behind accelerating leaders than behind braking ones, where IDM keeps one",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("leader_acceleration", "asymmetry", "brake_light")
+    told_by: ClassVar[str] = (
+        "leaders that accelerate or brake gently for 10 s and longer tell a time gap, which saturates and lasts, from "
+        "answers to the acceleration"
+    )
+    changes: ClassVar[str] = "time_gap"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("strength", "k", "1", 0.15, -0.8, 0.8, null=0.0, starts=(0.05,)),
+    )
+    width: float = 0.3
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the time gap of this branch."""
+        accel = scene.leader.accel
+        sign = accel / torch.sqrt(accel * accel + self.width**2) * scene.leader.present
+        return driver._replace(time_gap=driver.time_gap * (1.0 + p["strength"] * sign))
+
+
+@dataclass(frozen=True)
+class Relaxation(Effect):
+    """Drivers accept the gap that they have had in the last seconds, and only slowly return to their own.
+
+    ::
+
+        T → T (1 + β (m − 1)),   τ dm/dt = q − m,   q = s √(1 − (v/v0)⁴) / (s0 + v T)
+
+    m is the memory of q, the gap relative to the one that an IDM driver keeps in equilibrium, between 0.2 and 2 and 1
+    where nobody is ahead; it starts at q. Whoever has another gap than he wants, after a cut-in or because he is that
+    kind of day, so starts from the time gap of that gap and returns with the time constant τ / (1 − β): the relaxation
+    that Laval and Leclercq (2008, Transp. Res. B 42, 511) put after lane changes, here for whatever brought it about.
+    """
+
+    kind: ClassVar[str] = "relaxation"
+    rank: ClassVar[int] = 2
+    title: ClassVar[str] = "relaxation of the time gap"
+    equation: ClassVar[str] = "T → T (1 + β (m − 1)), τ dm/dt = s √(1 − (v/v0)⁴) / (s0 + v T) − m"
+    wording: ClassVar[tuple[str, str]] = (
+        "",
+        "drivers accept the time gap that they have had for a while and return to their own slowly, where IDM goes "
+        "back to it at once",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("memory", "regime_shift", "max_accel")
+    told_by: ClassVar[str] = "gaps that a cut-in or a hard brake left far from the usual one, followed for a minute"
+    changes: ClassVar[str] = "time_gap"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("strength", "β", "1", 0.5, 0.0, 0.95, null=0.0, starts=(0.3,)),
+        Parameter("memory_time", "τ", "s", 15.0, 2.0, 200.0, role="shape", starts=(8.0, 30.0)),
+    )
+
+    def _kept(self, scene: Scene, driver: Driver, time_gap: Tensor) -> Tensor:
+        """Return q: the gap relative to that of an equilibrium with ``time_gap``."""
+        ratio = scene.speed / driver.desired_speed
+        square = ratio * ratio
+        free = torch.sqrt((1.0 - square * square).clamp_min(0.1))
+        wanted = driver.min_gap + scene.speed * time_gap + driver.extra_gap
+        kept = (scene.leader.gap * free / wanted.clamp_min(0.1)).clamp(0.2, 2.0)
+        return 1.0 + (kept - 1.0) * scene.leader.present
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return m = q."""
+        return self._kept(scene, driver, driver.time_gap)
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the time gap in force."""
+        return driver._replace(time_gap=driver.time_gap * (1.0 + p["strength"] * (scene.memory[self.name] - 1.0)))
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Relax m towards q, counted from the time gap that the driver would keep without this memory."""
+        level = scene.memory[self.name]
+        own = driver.time_gap / (1.0 + p["strength"] * (level - 1.0))
+        return level + (self._kept(scene, driver, own) - level) * -torch.expm1(-scene.dt / p["memory_time"])
