@@ -59,12 +59,12 @@ def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> D
     kept: list[tuple[Tensor, ...]] = []
     with torch.inference_mode():
         for t in range(steps):
-            if task.noisy and t % BLOCK == 0:
-                normals = draw.normals(world.state.step, BLOCK, task.vehicles, like.dtype)
+            if t % BLOCK == 0:
+                normals = task.normals(draw, world.state.step, BLOCK, like.dtype)
             action = None if act is None else act(task.observe(world).flatten(1))
             command = None if action is None else task.command(action)
-            noise = normals[t % BLOCK] if task.noisy else None
-            after = task.step(world, command, noise, params, advance=advance)
+            now = {name: x[t % BLOCK] for name, x in normals.items()}
+            after = task.step(world, command, now, params, advance=advance)
             reward = task.reward(world, none if command is None else command, after) if rewards else none
             world = after
             kept.append(

@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from idm_env import parameters
 from idm_env.kernels import dispatch
-from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead
+from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead, normals
 from idm_env.types import Inputs, Params, State
 
 
@@ -47,6 +47,12 @@ class Simulator(Stepping):
         return Compiled(self.road, self.effects, self.dt, self.integration, backend, dynamic)
 
     def _covered(self, inputs: Inputs, steps: int) -> None:
+        undrawn = next((name for name in self.draws if name not in inputs), None)
+        if undrawn is not None:
+            raise ValueError(
+                f"effect '{undrawn}' takes normals, and none were given. Draw them with seed=…, or pass "
+                f"inputs={{'{undrawn}': …}}."
+            )
         for name, value in inputs.items():
             if name not in self.by_name:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
@@ -63,6 +69,14 @@ class Simulator(Stepping):
         unbound = {name: _unbind(value) for name, value in inputs.items()}
         return [{name: value[t] for name, value in unbound.items()} for t in range(steps)]
 
+    def drawn(self, like: Tensor, inputs: Inputs, steps: int, seed: int) -> dict[str, Any]:
+        """Return ``inputs`` and, for every effect that draws and is not among them, normals of that many steps.
+
+        ``like`` has the shape ``(…, vehicles)``. The same seed gives the same normals, whatever else is simulated.
+        """
+        missing = (name for name in self.draws if name not in inputs)
+        return {**inputs, **{name: normals(name, seed, like, steps) for name in missing}}
+
     def rollout(
         self,
         state: State,
@@ -72,6 +86,7 @@ class Simulator(Stepping):
         *,
         checkpoint_every: int = 0,
         keep: Callable[[State], tuple[Tensor, ...]] | None = _kept,
+        seed: int | None = None,
     ) -> tuple[State, Any]:
         """Repeat ``step``; return the last state and what ``keep`` takes of every state after a step, time first.
 
@@ -81,8 +96,11 @@ class Simulator(Stepping):
 
         ``inputs`` carry a leading time dimension of at least ``steps``. ``checkpoint_every`` k > 0 saves the graph's
         tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps
-        instead of ``steps``, for about one more forward pass. ValueError for inputs that are too short or of no effect.
+        instead of ``steps``, for about one more forward pass. ``seed`` draws the normals that no input
+        gives (``drawn``). ValueError for inputs that are too short or of no effect.
         """
+        if seed is not None:
+            inputs = self.drawn(state.speed, inputs, steps, seed)
         if steps > 0 and keep in (_kept, None):
             self._covered(inputs, steps)
             fast = dispatch.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)

@@ -7,6 +7,7 @@ where they came from, and prints compiled code from that.
 from __future__ import annotations
 
 import dataclasses
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -115,6 +116,11 @@ class Stepping:
         return max((e.looks_back for e in self.effects), default=0.0)
 
     @cached_property
+    def draws(self) -> tuple[str, ...]:
+        """Names of the effects whose input is one standard normal per vehicle and step."""
+        return tuple(e.name for e in self.effects if e.draws)
+
+    @cached_property
     def _needs(self) -> frozenset[str]:
         return frozenset().union(*(e.needs for e in self.effects))
 
@@ -152,11 +158,14 @@ class Stepping:
         present: Tensor | None = None,
         step: Tensor | int = 0,
         circumference: Tensor | float | None = None,
+        seed: int | None = None,
     ) -> State:
         """Return the state at the start, with gaps built from positions (differentiably) and memories filled.
 
         ``position`` and ``speed`` have shape ``(..., vehicles)``, front first; ``length`` (m) broadcasts; ``step`` sets
-        the clock; ``circumference`` (m) is a ring's, one per batch row. ValueError for shapes that do not fit.
+        the clock; ``circumference`` (m) is a ring's, one per batch row. ``seed`` draws how drivers who drift are at the
+        start, from how they are in the long run; without it they begin at their mean. ValueError for shapes that do
+        not fit.
         """
         if position.shape != speed.shape or position.dim() == 0:
             raise ValueError(
@@ -183,7 +192,8 @@ class Stepping:
         for effect in self.effects:
             held = effect.initial_memory(scene, driver, dict(params[effect.name]))
             if held is not None:
-                memory[effect.name] = held
+                drawn = effect.draws and seed is not None
+                memory[effect.name] = normals(f"{effect.name} at the start", seed or 0, held) if drawn else held
         if self.looks_back:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
         return start._replace(memory=memory)
@@ -297,6 +307,13 @@ def ballistic(speed: Tensor, accel: Tensor, dt: float) -> tuple[Tensor, Tensor, 
 def euler(speed: Tensor, accel: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return displacement (m), new speed and acceleration of the paper's explicit Euler: ``x += v Δt``, old v."""
     return speed * dt, (speed + accel * dt).clamp_min(0.0), accel
+
+
+def normals(what: str, seed: int, like: Tensor, *leading: int) -> Tensor:
+    """Return standard normals (…leading, *like.shape), the same for the same seed and ``what`` they are for."""
+    generator = torch.Generator().manual_seed(zlib.crc32(f"{seed} {what}".encode()))
+    drawn = torch.randn((*leading, *like.shape), generator=generator, dtype=torch.float64)
+    return drawn.to(device=like.device, dtype=like.dtype)
 
 
 def half_ahead(scene: Scene) -> Scene:

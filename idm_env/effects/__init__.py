@@ -18,7 +18,7 @@ from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
 from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
 from idm_env.effects.neighbours import BrakeLight, Follower, Lateral, LeaderAcceleration, SecondLeader
-from idm_env.effects.noise import Noise
+from idm_env.effects.noise import AccelNoise, Noise, PerceptionNoise, Wander
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.registry import entered, is_candidate, lives, read
 from idm_env.effects.surroundings import Drag, Grade
@@ -60,6 +60,9 @@ ALL: dict[str, type[Effect]] = {
         GapBias,
         ImaginedLeader,
         Noise,
+        AccelNoise,
+        Wander,
+        PerceptionNoise,
         Curve,
         DriverCurve,
     )
@@ -180,6 +183,7 @@ __all__ = [
     "FVDM",
     "IDM",
     "IIDM",
+    "AccelNoise",
     "ActionPoint",
     "Asymmetry",
     "BrakeLight",
@@ -204,6 +208,7 @@ __all__ = [
     "LeaderAcceleration",
     "LongMemory",
     "Noise",
+    "PerceptionNoise",
     "PowerLimit",
     "RegimeShift",
     "Relaxation",
@@ -214,6 +219,7 @@ __all__ = [
     "SpeedTimeGap",
     "SpeedZone",
     "Traction",
+    "Wander",
     "base_named",
     "candidates",
     "describe",

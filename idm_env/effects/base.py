@@ -42,7 +42,9 @@ class Effect:
     perceived one; ``rank`` orders perceptions and limits, low first, and what discovery adds to a driver; ``adds`` says
     whether the effect can lift an acceleration above what the driver wants by himself, which is taken for granted of
     every effect that adapts, accelerates or limits and does not deny it: a simulator with such an effect has tyres
-    (``Traction``). Dataclass fields are the static choices.
+    (``Traction``). ``draws`` marks effects whose input is one standard normal per vehicle and step, which whoever runs
+    the simulator draws; the memory of such an effect, if it has one, is a standard normal in the long run. Dataclass
+    fields are the static choices.
 
     What a search and a report have to know of an effect stands beside its equation, too:
 
@@ -73,6 +75,7 @@ class Effect:
     remembers: ClassVar[bool] = False
     rank: ClassVar[int] = 0
     adds: ClassVar[bool] = False
+    draws: ClassVar[bool] = False
     hook: ClassVar[Hook]
 
     title: ClassVar[str] = ""

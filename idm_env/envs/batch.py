@@ -81,8 +81,9 @@ class Batch:
         self._seen: np.ndarray | None = None
         self._draw: Draw | None = None
         self._pool: World | None = None
-        self._block: Tensor | None = None
-        self._drawn: np.ndarray | None = None
+        self._block: dict[str, Tensor] | None = None
+        self._drawn: dict[str, np.ndarray] = {}
+        self._ahead = 0
         self._used = 0
 
     def _compiled(self) -> Values | None:
@@ -186,16 +187,17 @@ class Batch:
 
     # -- steps ---------------------------------------------------------------------------------------------------
 
-    def _normals(self, clock: Callable[[], Tensor]) -> Tensor | None:
+    def _normals(self, clock: Callable[[], Tensor]) -> dict[str, Tensor] | None:
         """Return the normals of a block of steps, drawn ahead where the batch is small; ``_used − 1`` is this step."""
-        if not self.task.noisy:
+        if not self.task.simulator.draws:
             return None
-        if self._block is None or self._used >= len(self._block):
+        if self._block is None or self._used >= self._ahead:
             assert self._draw is not None
-            steps = max(1, _NORMALS_AT_ONCE // (self.count * self.task.vehicles))
-            self._block = self._draw.normals(clock(), steps, self.task.vehicles, self.settings.dtype)
+            self._ahead = max(1, _NORMALS_AT_ONCE // (self.count * self.task.vehicles))
+            self._block = self.task.normals(self._draw, clock(), self._ahead, self.settings.dtype)
             self._used = 0
-            self._drawn = self._block.numpy().reshape(-1) if self._values is not None else None
+            if self._values is not None:
+                self._drawn = {name: x.numpy().reshape(-1) for name, x in self._block.items()}
         self._used += 1
         return self._block
 
@@ -215,7 +217,7 @@ class Batch:
         before, task = self.world, self.task
         assert before is not None
         block = self._normals(lambda: before.state.step)
-        normals = None if block is None else block[self._used - 1]
+        normals = None if block is None else {name: x[self._used - 1] for name, x in block.items()}
         command, given, inputs = self._commanded(before, action, normals, live)
         state = self.advance(before.state, inputs, self.params)
         after = before._replace(state=state)
@@ -248,7 +250,11 @@ class Batch:
         return told
 
     def _commanded(
-        self, world: World, action: Tensor | None, normals: Tensor | None = None, live: Tensor | None = None
+        self,
+        world: World,
+        action: Tensor | None,
+        normals: Mapping[str, Tensor] | None = None,
+        live: Tensor | None = None,
     ) -> tuple[Tensor | None, Tensor | None, Mapping[str, Any]]:
         """Return commands, commands as the failsafe lets them pass, and the inputs of a step."""
         task = self.task

@@ -27,7 +27,9 @@ from idm_env.tasks import Task, World
 from idm_env.types import Params, State
 
 Array = np.ndarray
-Before = Callable[[World, Tensor | None, Tensor | None], tuple[Tensor | None, Tensor | None, Mapping[str, Any]]]
+Before = Callable[
+    [World, Tensor | None, Mapping[str, Tensor] | None], tuple[Tensor | None, Tensor | None, Mapping[str, Any]]
+]
 """World, actions and normals → commands, commands as they are let pass, and the inputs of the step."""
 After = Callable[[World, Tensor, Tensor | None, World, bool], dict[str, Tensor]]
 """World, commands, commands let pass, world Δt later, whether anybody commanded → everything that faces tell."""
@@ -105,11 +107,11 @@ class Values:
         """Return the steps of all rows, as they are now."""
         return torch.from_numpy(self.arrays[self.side]["state_step"])
 
-    def step(self, action: Array | None, normals: Array | None, at: int, params: Params) -> dict[str, Array]:
-        """Advance all rows; ``normals`` is a block of the noise (steps, rows, vehicles), ``at`` the step in it."""
+    def step(self, action: Array | None, normals: dict[str, Array] | None, at: int, params: Params) -> dict[str, Array]:
+        """Advance all rows; ``normals`` are blocks (steps, rows, vehicles) by effect, ``at`` the step in them."""
         plan = self._plans.get(action is None)
         if plan is None:
-            plan = self._plans[action is None] = _Plan(self, action is None, params, normals is not None)
+            plan = self._plans[action is None] = _Plan(self, action is None, params, tuple(normals or ()))
         told = plan.run(action, normals, at, params)
         self.side = 1 - self.side
         return told
@@ -146,7 +148,7 @@ def _world(leaves: Mapping[str, Tensor], like: World, prefix: str = "") -> World
 class _Plan:
     """What is laid out for steps with a command, or for those without."""
 
-    def __init__(self, values: Values, idle: bool, params: Params, noisy: bool) -> None:
+    def __init__(self, values: Values, idle: bool, params: Params, draws: tuple[str, ...]) -> None:
         world = values.world
         assert world is not None
         self.values, self.idle = values, idle
@@ -159,8 +161,8 @@ class _Plan:
         sample = {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in named(world).items()}
         if not idle:
             sample["action"] = torch.zeros(many, len(task.agents), dtype=kind)
-        normals = torch.zeros(many, self.size, dtype=kind) if noisy else None
-        self.normals_slot = ""
+        normals = {name: torch.zeros(many, self.size, dtype=kind) for name in draws}
+        self.normals_of: dict[str, str] = {}
         inputs = self._record_before(sample, world, normals)
         self.kernel = self._kernel(state, inputs)
         self._record_after(sample, world)
@@ -169,17 +171,17 @@ class _Plan:
 
     # -- recording -------------------------------------------------------------------------------------------------
 
-    def _record_before(self, sample: dict[str, Tensor], world: World, normals: Tensor | None) -> dict[str, Any]:
+    def _record_before(self, sample: dict[str, Tensor], world: World, normals: dict[str, Tensor]) -> dict[str, Any]:
         seen: dict[str, Any] = {}
 
         def before(**leaves: Tensor) -> dict[str, Tensor]:
-            command, given, inputs = self.values._before(_world(leaves, world), leaves.get("action"), normals)
+            command, given, inputs = self.values._before(_world(leaves, world), leaves.get("action"), normals or None)
             seen.update(inputs)
             out = {} if command is None or given is None else {"command": command, "given": given}
             for effect, value in inputs.items():
                 for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
-                    if x is not None and x is normals:
-                        self.normals_slot = slot_name(effect, part)
+                    if x is not None and x is normals.get(effect):
+                        self.normals_of[slot_name(effect, part)] = effect
                     elif x is not None:
                         out[slot_name(effect, part).replace(" ", "_")] = x
             return out
@@ -224,7 +226,6 @@ class _Plan:
         self.names = [_place_of(n) for n in kernel.program.states]
         self.numbers = [self._input(inputs, n, many) for n in kernel.numbers]
         self.flags = [self._input(inputs, n, many) for n in kernel.flags]
-        self.noise_at = kernel.numbers.index(self.normals_slot) if self.normals_slot in kernel.numbers else None
         self.slots = state.memory[PAST].shape[-2] if kernel.signals else 0
         nothing = np.zeros((1, 1), self.real)
         for held in values.arrays:
@@ -237,7 +238,7 @@ class _Plan:
 
     def _input(self, inputs: Mapping[str, Any], slot: str, many: int) -> tuple[Array, Strides]:
         """Return where the kernel finds an input: an array that ``before`` fills, a constant, or later the noise."""
-        if slot == self.normals_slot:
+        if slot in self.normals_of:
             return np.empty(0, self.real), (self.rows * self.size, self.size, 1)
         name = slot.replace(" ", "_")
         if name in self.made:
@@ -270,7 +271,10 @@ class _Plan:
         made += self.numbers
         every = [*(s for _, s in made), *(s for _, s in self.flags), (0, self.size, 1)]
         self.operands = [a for a, _ in made]
-        self.noise_place = None if self.noise_at is None else len(made) - len(self.numbers) + self.noise_at
+        first = len(made) - len(self.numbers)
+        self.normals_at = {
+            first + i: self.normals_of[n] for i, n in enumerate(self.kernel.numbers) if n in self.normals_of
+        }
         flags = filled([a for a, _ in self.flags], FLAGS)
         kernel, kind = self.kernel, self.real.name
         self.head, self.tail = [], (flags, table(every), kernel.constants[kind])
@@ -296,7 +300,7 @@ class _Plan:
 
     # -- steps -----------------------------------------------------------------------------------------------------
 
-    def run(self, action: Array | None, normals: Array | None, at: int, params: Params) -> dict[str, Array]:
+    def run(self, action: Array | None, normals: dict[str, Array] | None, at: int, params: Params) -> dict[str, Array]:
         """Do one step."""
         values, rows = self.values, self.rows
         side = values.side
@@ -311,8 +315,8 @@ class _Plan:
             asked = [action if n == "action" else x for n, x in zip(self.before.needs, asked, strict=True)]
         self.before.run(rows, asked, self.outs)
         if normals is not self.block or self.block is None:
-            if self.noise_place is not None and normals is not None:
-                self.operands[self.noise_place] = normals
+            for place, effect in self.normals_at.items():
+                self.operands[place] = (normals or {})[effect]
             self.block = normals
             self.call = [(*head, filled(self.operands, OPERANDS), *self.tail) for head in self.head]
         call = self.call[side]

@@ -159,7 +159,7 @@ class Batch:
     def inputs(self, simulator: Simulator, seed: int = 0) -> Inputs:
         """Return the record of everybody but the driver, and what other effects take from the measurement.
 
-        Normals of ``noise`` are drawn with ``seed``. DataError for an effect whose input no measurement has.
+        Normals are drawn with ``seed``. DataError for an effect whose input no measurement has.
         """
         at, driver = self.columns(simulator)
         position = self.position[1:, :, at]
@@ -176,9 +176,7 @@ class Batch:
         if "lateral" in simulator.by_name:
             distance, speed, present = (x[:-1, :, None].expand_as(position) for x in self.beside)
             inputs["lateral"] = Adjacent(distance, speed, present)
-        if "noise" in simulator.by_name:
-            generator = torch.Generator().manual_seed(seed)
-            inputs["noise"] = torch.randn(position.shape, generator=generator, dtype=position.dtype)
+        inputs = simulator.drawn(position[0], inputs, len(position), seed)
         for name in ("control", "imagined"):
             if name in simulator.by_name:
                 raise DataError(

@@ -188,7 +188,7 @@ class Task(abc.ABC):
         made = behaviour(self.own_effects, extra, own, self.effects, self.parameters, self.dt, self.integration)
         if self.noise:
             made.parameters.setdefault("noise", {}).setdefault("sigma", self.noise * math.sqrt(made.dt))
-        given = {"noise", *(effect.name for effect in self.machinery)}
+        given = {effect.name for effect in self.machinery}
         for effect in made.effects:
             if effect.name in _TAKE_INPUTS - given:
                 raise ValueError(
@@ -201,11 +201,6 @@ class Task(abc.ABC):
         """The simulator of this task."""
         made = self._behaviour
         return Simulator(self.road, made.effects, made.dt, made.integration)
-
-    @cached_property
-    def noisy(self) -> bool:
-        """Whether the drivers' noise is drawn."""
-        return "noise" in self.simulator.by_name
 
     @cached_property
     def _tensors(self) -> dict[tuple[str, torch.device, torch.dtype], Tensor]:
@@ -246,16 +241,34 @@ class Task(abc.ABC):
 
     def reset(self, draw: Draw, params: Params) -> World:
         """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control."""
-        world = self.begin(draw, params)
-        rows, width = world.state.speed.shape
-        block = max(16, _NORMALS_AT_ONCE // max(rows * width, 1))
+        world = self._unsteady(self.begin(draw, params), draw)
+        speed = world.state.speed
+        block = max(16, _NORMALS_AT_ONCE // max(speed.numel(), 1))
         for first in range(0, self.warmup, block):
             steps = min(block, self.warmup - first)
-            inputs = self._idle(world, steps)
-            if self.noisy:
-                inputs["noise"] = draw.normals(world.state.step, steps, width, world.state.speed.dtype)
+            inputs = {**self._idle(world, steps), **self.normals(draw, world.state.step, steps, speed.dtype)}
             world = world._replace(state=self.simulator.rollout(world.state, inputs, params, steps, keep=None)[0])
         return world
+
+    def _unsteady(self, world: World, draw: Draw) -> World:
+        """Return the worlds with drivers who drift as they are in the long run, rather than all at their mean."""
+        state, names = world.state, [name for name in self.simulator.draws if name in world.state.memory]
+        first = torch.zeros_like(draw.key)
+        levels = {
+            name: draw.stream(f"{name} at the start").normals(first, 1, self.vehicles, state.speed.dtype)[0]
+            for name in names
+        }
+        return world._replace(state=state._replace(memory={**state.memory, **levels})) if names else world
+
+    def normals(self, draw: Draw, step: Tensor, steps: int, dtype: torch.dtype) -> dict[str, Tensor]:
+        """Return standard normals ``(steps, environments, vehicles)`` from ``step`` on, of every effect that draws.
+
+        Each effect's are its own, whatever others there are.
+        """
+        return {
+            name: (draw if name == Noise.kind else draw.stream(name)).normals(step, steps, self.vehicles, dtype)
+            for name in self.simulator.draws
+        }
 
     def _idle(self, world: World, steps: int) -> dict[str, Any]:
         """Return the inputs of some steps without any command, time first."""
@@ -303,9 +316,9 @@ class Task(abc.ABC):
         return torch.minimum(command, self.safe_command(world)) if self.failsafe else command
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
-        """Return the inputs of one step: the command (m/s², None for nobody) and the noise's normals.
+        """Return the inputs of one step: the command (m/s², None for nobody) and the normals of effects that draw.
 
         ``live`` (bool, ``(…, agents)``) says which agents still command; the others' vehicles go back to their drivers.
         """
@@ -321,22 +334,20 @@ class Task(abc.ABC):
                 live = None if live is None else live.index_select(-1, slot)
             active = active if live is None else active & live
             inputs = {"control": Command(command, active)}
-        if normals is not None:
-            inputs["noise"] = normals
-        return inputs
+        return {**inputs, **(normals or {})}
 
     def step(
         self,
         world: World,
         command: Tensor | None,
-        normals: Tensor | None,
+        normals: Mapping[str, Tensor] | None,
         params: Params,
         *,
         live: Tensor | None = None,
         advance: Advance | None = None,
         limited: bool = False,
     ) -> World:
-        """Return the world Δt later. ``command`` (m/s²) has shape ``(…, agents)``, ``normals`` ``(…, vehicles)``.
+        """Return the world Δt later. ``command`` (m/s²) is ``(…, agents)``, each of ``normals`` ``(…, vehicles)``.
 
         ``limited`` says that ``limit`` was called already.
         """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -138,7 +139,7 @@ class FollowTask(Task):
         return motion[episode["trace"], (episode["start"] + step).clamp(0, motion.shape[1] - 1)]
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, with the leader's record at its end."""
         inputs = dict(super().inputs(world, command, normals, live))

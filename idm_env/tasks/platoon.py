@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -118,7 +118,7 @@ class PlatoonTask(Task):
         return torch.stack((position, speed, accel), dim=-1)
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, with the head's motion at its end."""
         inputs = dict(super().inputs(world, command, normals, live))

@@ -8,6 +8,7 @@ of the two halves of one hash. Everything is a handful of integer operations on 
 from __future__ import annotations
 
 import math
+import zlib
 from typing import NamedTuple
 
 import torch
@@ -41,6 +42,10 @@ class Draw(NamedTuple):
     def of(cls, seed: Tensor, episode: Tensor) -> Draw:
         """Return the keys of seeds and episode numbers, both int64."""
         return cls(mix(mix(seed + GOLDEN) + episode * _SECOND))
+
+    def stream(self, name: str) -> Draw:
+        """Return the randomness of something that has a name, independent of the episode's other randomness."""
+        return Draw(mix(self.key ^ (zlib.crc32(name.encode()) << 20)))
 
     def uniforms(self, stream: int, width: int, dtype: torch.dtype) -> Tensor:
         """Return uniforms in (0, 1), shape ``(environments, width)``; each ``stream`` is independent of the others."""

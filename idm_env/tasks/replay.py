@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -244,7 +244,7 @@ class ReplayTask(Task):
         return motion[inside], present[inside]
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, with the record at its end; who is not there yet is placed by it."""
         inputs = dict(super().inputs(world, command, normals, live))

@@ -21,8 +21,8 @@ from idm_env.types import Params
 if TYPE_CHECKING:
     from idm_env.fitting.fit import Fit
 
-_OTHERS = ("control", "noise", "replay")
-"""Effects through which a task acts: no driver's, so they are left out of what is fitted."""
+_OTHERS = ("control", "replay")
+"""Effects through which a task acts: no driver's, so they are left out of what is fitted, and so is drift."""
 
 
 class ParameterFitting:
@@ -64,7 +64,7 @@ class ParameterFitting:
         task, params = _task_of(env)
         following = next(e for e in task.simulator.effects if e.name not in _OTHERS and hasattr(e, "driver"))
         self.free = tuple(f"{following.name}.{p.name}" for p in following.parameters) if free is None else tuple(free)
-        effects = tuple(e for e in task.simulator.effects if e.name not in _OTHERS)
+        effects = tuple(e for e in task.simulator.effects if e.name not in _OTHERS and not e.draws)
         simulator = Simulator(Lane(), (*effects, Replay()), task.simulator.dt, task.simulator.integration)
         self.episodes = _episodes(trajectories, simulator.dt)
         self.by = by
@@ -169,7 +169,7 @@ class ParameterFitting:
 
         found = {name: float(value[group].detach()) for name, value in self.values().items()}
         simulator = self.problem.simulator
-        effects = tuple(e for e in simulator.effects if e.name not in _OTHERS)
+        effects = tuple(e for e in simulator.effects if e.name not in _OTHERS and not e.draws)
         return Model(effects, numbers({**self.fixed, **found}), simulator.dt, simulator.integration)
 
 

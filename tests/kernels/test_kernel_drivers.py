@@ -71,13 +71,13 @@ class Measured:
         every = {
             "replay": lambda: record,
             "control": lambda: Command(self.draw(-1, 1, *full), ~active),
-            "noise": lambda: torch.randn(full, generator=self.generator, dtype=torch.float64).to(self.dtype),
             "imagined": lambda: Imagined(self.draw(5, 20, *full), self.draw(-1, 1, *full)),
             "lateral": lambda: Adjacent(
                 self.draw(-20, 20, *full), self.draw(0, 9, *full), (self.draw(0, 1, *full) > 0.4).to(self.dtype)
             ),
         }
-        return {name: make() for name, make in every.items() if name in self.simulator.by_name}
+        given = {name: make() for name, make in every.items() if name in self.simulator.by_name}
+        return self.simulator.drawn(self.records["speed"][0], given, self.steps, seed=3)
 
     def make_params(self) -> dict[str, dict[str, Tensor]]:
         made: dict[str, dict[str, Tensor]] = {}

@@ -63,7 +63,7 @@ def test_a_step_is_that_of_the_simulator_and_of_a_rollout(name, dtype):
     slow, fast = world, world
     seen = []
     for t in range(60):
-        normals = draw.normals(slow.state.step, 1, task.vehicles, dtype)[0] if task.noisy else None
+        normals = {name: x[0] for name, x in task.normals(draw, slow.state.step, 1, dtype).items()}
         command = torch.full((3, len(task.agents)), 0.3 * (t % 3) - 0.3, dtype=dtype)
         inputs = dict(task.inputs(slow, command, normals))
         if name == "replay":  # the made-up scene shows everybody all the time; here they come and go

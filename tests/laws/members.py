@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from idm_env.effects import ALL, IDM, Brakes, CarFollowing, Curve, DriverCurve, Effect, Grade, Noise
+from idm_env.effects import ALL, IDM, Brakes, CarFollowing, Curve, DriverCurve, Effect, Grade, PerceptionNoise, Wander
 from idm_env.effects.free import FEATURES
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
@@ -21,7 +21,9 @@ MEMBERS: list[Effect] = [
     Brakes(sharpness=1.0),
     Grade(profile=(0.0, 0.02, -0.03, 0.01, 0.0)),
     Grade(period=1200.0),
-    Noise(correlated=True),
+    Wander(of="desired_speed"),
+    Wander(of="min_gap"),
+    PerceptionNoise(signal="closing_speed"),
     *(Curve(feature=f, knots=(-1.0, 3.0, 8.0, 15.0)) for f in FEATURES),
     *(DriverCurve(target=t) for t in ("desired_speed", "max_accel", "comfort_decel", "min_gap")),
 ]
@@ -66,11 +68,11 @@ def inputs_for(simulator: Simulator, steps: int, like: Tensor) -> dict[str, obje
         "replay": lambda: Record(
             (320.0 + 8.0 * simulator.dt * time + 0 * draw()).to(like.dtype), 8.0 + 0 * draw(), 0 * draw(), first
         ),
-        "noise": lambda: torch.randn((steps, *like.shape), generator=generator, dtype=DTYPE).to(like.dtype),
         "imagined": lambda: Imagined(10.0 + 5.0 * draw(), draw() - 0.5),
         "lateral": lambda: Adjacent(20.0 * (draw() - 0.5), 6.0 + draw(), torch.ones_like(draw())),
     }
-    return {name: make() for name, make in every.items() if name in simulator.by_name}
+    given = {name: make() for name, make in every.items() if name in simulator.by_name}
+    return simulator.drawn(like, given, steps, seed=11)
 
 
 def with_leaves(params: Params, effect: str) -> tuple[dict[str, dict[str, Tensor]], dict[str, Tensor]]:

@@ -227,7 +227,7 @@ def test_errors_name_value_rule_and_cure() -> None:
     simulator = Simulator(Lane(), (IDM(), make("noise"), Brakes()))
     params = simulator.defaults()
     state = start(simulator, params, torch.float32)
-    with pytest.raises(ValueError, match="'noise' takes an input"):
+    with pytest.raises(ValueError, match="'noise' takes normals"):
         simulator.rollout(state, {}, params, 3)
     with pytest.raises(ValueError, match="covers 2 steps of 3"):
         simulator.rollout(state, {"noise": torch.zeros(2, N)}, params, 3)

@@ -75,7 +75,7 @@ def test_where_there_is_room_a_command_is_left_as_it_is():
     free, guarded = (make_task("ring", warmup=200, failsafe=b) for b in (0.0, 3.0))
     world, params = start(free)
     command = torch.tensor([[0.3], [-0.7]], dtype=torch.float64)
-    normals = torch.zeros(2, 22, dtype=torch.float64)
+    normals = {"noise": torch.zeros(2, 22, dtype=torch.float64)}
     assert bool((guarded.safe_command(world) > command).all())
     one, other = (task.step(world, command, normals, params).state for task in (free, guarded))
     assert torch.equal(one.speed, other.speed)

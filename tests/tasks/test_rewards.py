@@ -35,11 +35,11 @@ def returns(task, kind):
     params = task.params(torch.float64, "cpu")
     draw = Draw.of(torch.arange(COUNT), torch.zeros(COUNT, dtype=torch.int64))
     world = task.reset(draw, params)
-    normals = draw.normals(world.state.step, STEPS, task.vehicles, torch.float64) if task.noisy else None
+    normals = task.normals(draw, world.state.step, STEPS, torch.float64)
     total, live = torch.zeros(COUNT, dtype=torch.float64), torch.ones(COUNT, dtype=torch.bool)
     for t in range(STEPS):
         command = task.command(wild(task, kind, t))
-        after = task.step(world, command, None if normals is None else normals[t], params)
+        after = task.step(world, command, {name: x[t] for name, x in normals.items()}, params)
         total += torch.where(live, task.reward(world, command, after).mean(-1), 0.0)
         live &= ~task.ended(after).terminated.any(-1)
         world = after

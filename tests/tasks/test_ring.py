@@ -67,10 +67,10 @@ def test_without_control_the_wave_emerges_and_costs_a_third_of_the_speed():
     with torch.no_grad():
         world, params = start(task, count=12)
         speeds = []
-        noise = Draw.of(torch.arange(12), torch.ones(12, dtype=torch.int64))
-        normals = noise.normals(torch.zeros(12, dtype=torch.int64), 3000, 22, torch.float64)
+        draw = Draw.of(torch.arange(12), torch.ones(12, dtype=torch.int64))
+        normals = task.normals(draw, torch.zeros(12, dtype=torch.int64), 3000, torch.float64)["noise"]
         for t in range(3000):
-            world = task.step(world, None, normals[t], params)
+            world = task.step(world, None, {"noise": normals[t]}, params)
             speeds.append(world.state.speed)
     speed = torch.stack(speeds)
     even = metrics.equilibrium_speed((world.state.gap + 5.0).mean(-1) - 5.0, params["idm"])

@@ -244,27 +244,6 @@ def test_memory_relaxes_with_its_time() -> None:
     assert end.memory["memory"][0].item() == pytest.approx(math.exp(-1.0), rel=1e-6)
 
 
-def test_ornstein_uhlenbeck_noise_has_unit_variance_and_its_memory_time() -> None:
-    """Statistics of 4000 independent processes."""
-    from idm_env.effects import Noise
-
-    noise = Noise(correlated=True)
-    simulator = Simulator(Lane(), (IDM(), noise, Brakes()))
-    params = simulator.defaults(dtype=DTYPE)
-    n, steps = 4000, 120
-    generator = torch.Generator().manual_seed(1)
-    state = simulator.state(torch.zeros(n, 1, dtype=DTYPE), torch.full((n, 1), 20.0, dtype=DTYPE), params)
-    normals = torch.randn(steps, n, 1, generator=generator, dtype=DTYPE)
-    levels = []
-    for k in range(steps):
-        state = simulator.step(state, {"noise": normals[k]}, params)
-        levels.append(state.memory["noise"])
-    x = torch.stack(levels)[60:, :, 0]
-    assert x.var().item() == pytest.approx(1.0, abs=0.05)
-    correlation = (x[20:] * x[:-20]).mean() / x.var()
-    assert correlation.item() == pytest.approx(math.exp(-1.0), abs=0.05)
-
-
 def test_gravity_on_a_known_slope() -> None:
     """Five percent uphill costs g sin(arctan 0.05)."""
     from idm_env.effects import Grade
