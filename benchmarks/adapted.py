@@ -19,6 +19,7 @@ import numpy as np
 from idm_env.data import load
 from idm_env.discovery import judge, records, search
 from idm_env.discovery import model as terms
+from idm_env.discovery import weight as weighing
 from idm_env.discovery.discover import prepare
 from idm_env.discovery.model import Frozen, Model
 from idm_env.discovery.solve import Solution, Task
@@ -32,12 +33,15 @@ def fitted(training: records.Records) -> list[Solution]:
     rows = records.windows(training)
     task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
     theta = np.tile(task.prior.centre, (task.groups, 1))
-    found = []
+    found: list[Solution] = []
     for name in (None, *EFFECTS):
         model = Model() if name is None else Model((terms.simple(name),))
         searching = search.Search(task, (), False, Store(None, "", False), lambda *_: None)
         starts = [np.zeros(0)] if name is None else [np.array(s) for s in terms.simple(name).starts]
-        found.append(min((searching.null(model, theta, s) for s in starts), key=lambda s: s.cost))
+        best = min((searching.null(model, theta, s) for s in starts), key=lambda s: s.cost)
+        # The weight of the prior is that of IDM, chosen before any effect.
+        weight = found[0].prior.alike_s if found else weighing.chosen(training, best).alike_s
+        found.append(searching.weigh(best, weight))
     return found
 
 

@@ -19,6 +19,7 @@ from idm_env.data.fingerprint import fitted_on
 from idm_env.discovery import judge, places, records, search, summary, words
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
+from idm_env.discovery import weight as weighing
 from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.decide import Round, decide
 from idm_env.discovery.model import Model, Term
@@ -117,6 +118,9 @@ def discover(
     )
     progress("null", 0, 0, "idm")
     null = searching.null(base, theta)
+    progress("weight of the prior", 0, 0, "idm")
+    weight = weighing.chosen(prepared.of_runs(fit_runs), null)
+    null = searching.weigh(null, weight.alike_s)
     null, steps, rounds = decide(searching, null, seed)
     saved.remove()
     progress("final check", 0, 0, "runs kept for the end")
@@ -135,6 +139,7 @@ def discover(
     )
     report = discovery.report
     report["calibration"] = calibrated
+    report["prior"] = {"alike_s": weight.alike_s, "tried_s": weighing.GRID_S, "gap_rmse_m": weight.gap_rmse_m}
     report["details"] += words.cautions(report["data"]["at_bounds"], calibrated["groups"], calibrated["converged"])
     return discovery
 

@@ -15,9 +15,6 @@ from idm_env.discovery.noise import HEAVY
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.solve import Prior, Solution, Task, cost_of, solve
 
-CORRELATION_S = 5.0
-"""Time over which errors of free simulation stay alike (s)."""
-
 
 @dataclass(frozen=True, eq=False)
 class Judged:
@@ -92,9 +89,20 @@ def calibrate(
 ) -> Solution:  # fmt: skip
     """Fit θ of every group in free simulation behind the measured leader, with φ as it stands.
 
-    From two starts, the prior's centre and ``start`` [G, 5]; every group keeps the better one. A first fit tells how
-    large errors are; in the second, errors of ``CORRELATION_S`` seconds count as one, so that the population, as prior,
-    speaks for a driver whose record is short or noisy.
+    A first fit tells how large errors are; in the second, errors of ``prior.alike_s`` seconds count as one, so that the
+    population, as prior, speaks for a driver whose record is short or noisy.
+    """
+    task, theta = unweighed(records, model, values, prior, rows, start)
+    return weighed(task, model, values, theta)
+
+
+def unweighed(
+    records: Records, model: Model, values: np.ndarray, prior: Prior, rows: Rows | None = None,
+    start: np.ndarray | None = None,
+) -> tuple[Task, np.ndarray]:  # fmt: skip
+    """Return the task of a calibration and its first fit: log θ [G, 5] with a prior that hardly weighs anything.
+
+    From two starts, the prior's centre and ``start`` [G, 5]; every group keeps the better one.
     """
     rows = whole(records) if rows is None else rows
     frozen, empty = Frozen(model, values), np.zeros(0)
@@ -105,12 +113,17 @@ def calibrate(
         for x in (centre, *([] if start is None else [start]))
     ]
     costs = np.stack([cost_of(task, f.theta[None], f.linear.residual[None])[0] for f in fits])
-    theta = np.where((costs.argmin(0) == 0)[:, None], fits[0].theta, fits[-1].theta)
-    residual = task.residual(task.errors(theta[None], frozen, np.zeros((1, 0))))[0]
-    square = (residual**2).sum(1) * task.sigma**2 / np.maximum(rows.valid.sum(1), 1)
-    correlated = CORRELATION_S / (rows.every * records.dt)
+    return task, np.where((costs.argmin(0) == 0)[:, None], fits[0].theta, fits[-1].theta)
+
+
+def weighed(task: Task, model: Model, values: np.ndarray, theta: np.ndarray) -> Solution:
+    """Return the calibration in which errors of ``alike_s`` seconds count as one, from a first fit [G, 5]."""
+    rows, frozen = task.rows, Frozen(model, values)
+    errors = task.errors(theta[None], frozen, np.zeros((1, 0)))[0]
+    square = (errors**2).sum(1) / np.maximum(rows.valid.sum(1), 1)
+    correlated = task.prior.alike_s / (rows.every * rows.records.dt)
     sigma = float(np.sqrt(max(np.median(square), 1e-4) * correlated))
-    return solve(replace(task, sigma=sigma), frozen, theta, empty, iterations=25, tolerance=1e-5)
+    return solve(replace(task, sigma=sigma), frozen, theta, np.zeros(0), iterations=25, tolerance=1e-5)
 
 
 def free_run_squares(records: Records, s: Solution) -> np.ndarray:

@@ -207,7 +207,8 @@ def _moved(d: Discovery) -> Iterator[Block]:
         yield pages.note(
             "The search starts from IDM calibrated in free simulation behind the measured leaders, by exact gradients "
             f"through the simulator: {start['episodes']} windows of the fitting runs, mean gap RMSE "
-            f"{number(start['gap_rmse_m'])} m, {start['converged']} of {start['groups']} groups converged."
+            f"{number(start['gap_rmse_m'])} m, {start['converged']} of {start['groups']} groups converged. "
+            + words.weight(r["prior"])
         )
     declared = {p.name: p for p in IDM.declared}
     rows = []

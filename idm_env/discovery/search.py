@@ -57,10 +57,15 @@ class Search:
             solution = solve(self.task, model, solution.theta, solution.values, iterations=6)
         return solution
 
+    def weigh(self, null: Solution, alike_s: float) -> Solution:
+        """Set the weight of the prior in free simulation; return the null with it."""
+        self.task = replace(self.task, prior=replace(self.task.prior, alike_s=alike_s))
+        return replace(null, prior=replace(null.prior, alike_s=alike_s))
+
     def _renoised(self, solution: Solution) -> Task:
         errors = self.task.errors(solution.theta[None], solution.model, solution.values[None])[0]
         task = with_noise(self.task, noises.estimate(errors, self.task.rows.joined))
-        return replace(task, prior=population(solution.theta, task.rows))
+        return replace(task, prior=replace(population(solution.theta, task.rows), alike_s=task.prior.alike_s))
 
     def round(self, solution: Solution, number: int) -> tuple[list[Scored], np.ndarray]:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [runs]."""

@@ -30,11 +30,15 @@ LONGEST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Log-normal prior of θ: centre [5] and width [5] of log θ; ``free`` lets the centre follow the drivers."""
+    """Log-normal prior of θ: centre [5] and width [5] of log θ; ``free`` lets the centre follow the drivers.
+
+    ``alike_s`` is its weight in free simulation, where errors of so many seconds count as one (``weight.chosen``).
+    """
 
     centre: np.ndarray
     width: np.ndarray
     free: bool = True
+    alike_s: float = 5.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -209,6 +209,19 @@ def cautions(at_bounds: Mapping[str, int], groups: int, converged: int) -> list[
     return parts
 
 
+def weight(prior: Mapping[str, Any]) -> str:
+    """Say how much the population weighs for one driver, and what other weights would have done."""
+    tried = ", ".join(
+        f"{number(seconds)} s {number(error)} m"
+        for seconds, error in zip(prior["tried_s"], prior["gap_rmse_m"], strict=True)
+    )
+    return (
+        f"Before any effect was judged, the population's weight for a driver was chosen by the gap in free simulation "
+        f"of stretches that his parameters had not seen, on the runs that choose: errors of "
+        f"{number(prior['alike_s'])} s count as one ({tried})."
+    )
+
+
 def spoken(item: str) -> str:
     """Return an entry of ``looks_like`` in plain words: its first word may be a candidate or a parameter."""
     first, _, rest = item.partition(" ")

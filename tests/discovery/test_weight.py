@@ -1,0 +1,51 @@
+"""The weight of the prior is chosen by what drivers' parameters have not seen, before any effect is judged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from idm_env.data import episodes, synthetic
+from idm_env.discovery import judge, words
+from idm_env.discovery import weight as weighing
+from idm_env.discovery.model import Model
+from idm_env.discovery.records import Records, gather, windows
+from idm_env.discovery.search import first_noise, first_prior
+from idm_env.discovery.solve import Solution, Task, solve
+
+
+def fitted(seconds: float, ou: float, spread: float, seed: int = 5) -> tuple[Records, Solution]:
+    made, _ = synthetic.generate(seed, runs=10, followers=2, seconds=seconds, ou=ou, spread=spread)
+    records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
+    rows = windows(records)
+    task = Task(rows, first_noise(rows), first_prior(), np.ones(len(rows)))
+    null = solve(task, Model(), np.tile(first_prior().centre, (task.groups, 1)), np.zeros(0))
+    seen = null.theta[np.unique(records.group)]
+    return records, replace(null, prior=replace(first_prior(), centre=np.median(seen, axis=0), width=np.full(5, 0.3)))
+
+
+def test_short_noisy_records_of_like_drivers_lean_on_the_population() -> None:
+    records, null = fitted(60.0, ou=0.3, spread=0.05)
+    weight = weighing.chosen(records, null)
+    assert weight.alike_s >= 50.0
+    lightest, heaviest = weight.gap_rmse_m[0], min(weight.gap_rmse_m)
+    assert heaviest < 0.9 * lightest
+    # Drivers that were never seen are predicted better, too.
+    others, _ = fitted(60.0, ou=0.3, spread=0.05, seed=6)
+    errors = [
+        judge.judge(others, Model(), np.zeros(0), replace(null.prior, alike_s=s), None, True).summary()["gap_rmse_m"]
+        for s in (5.0, weight.alike_s)
+    ]
+    assert errors[1] < 0.95 * errors[0]
+
+
+def test_long_clean_records_of_unlike_drivers_speak_for_themselves() -> None:
+    records, null = fitted(120.0, ou=0.0, spread=0.5)
+    assert weighing.chosen(records, null).alike_s == pytest.approx(5.0)
+
+
+def test_the_weight_is_told() -> None:
+    told = words.weight({"alike_s": 50.0, "tried_s": (5.0, 50.0), "gap_rmse_m": (5.04, 3.82)})
+    assert "errors of 50 s count as one (5 s 5.04 m, 50 s 3.82 m)" in told
