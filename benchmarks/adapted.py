@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from idm_env.data import load
-from idm_env.discovery import judge, records, search
+from idm_env.discovery import free, judge, records, search
 from idm_env.discovery import model as terms
-from idm_env.discovery import weight as weighing
 from idm_env.discovery.discover import prepare
 from idm_env.discovery.model import Frozen, Model
 from idm_env.discovery.solve import Solution, Task
@@ -33,15 +32,14 @@ def fitted(training: records.Records) -> list[Solution]:
     rows = records.windows(training)
     task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
     theta = np.tile(task.prior.centre, (task.groups, 1))
-    found: list[Solution] = []
+    found = []
     for name in (None, *EFFECTS):
         model = Model() if name is None else Model((terms.simple(name),))
         searching = search.Search(task, (), False, Store(None, "", False), lambda *_: None)
         starts = [np.zeros(0)] if name is None else [np.array(s) for s in terms.simple(name).starts]
         best = min((searching.null(model, theta, s) for s in starts), key=lambda s: s.cost)
-        # The weight of the prior is that of IDM, chosen before any effect.
-        weight = found[0].prior.alike_s if found else weighing.chosen(training, best).alike_s
-        found.append(searching.weigh(best, weight))
+        stand = free.stand(training, best.model, best.values, best.prior, best.theta)
+        found.append(searching.weigh(best, stand.task.prior.alike_s))
     return found
 
 

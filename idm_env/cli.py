@@ -237,7 +237,7 @@ def _explain(
 
 
 def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
-    from idm_env.discovery.words import ERRORS, weight
+    from idm_env.discovery.words import ERRORS, ceilings, weight
     from idm_env.report import account
 
     console.print(f"Verdict: [bold]{result['verdict'].replace('_', ' ')}[/bold]. ", end="")
@@ -251,6 +251,9 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
     if result["interval"]:
         console.print(result["interval"], style="dim", highlight=False)
     console.print(weight(result["prior"]), style="dim", highlight=False)
+    if before is not None:
+        told = ceilings(result["ceilings"], before["gap_rmse_m"])
+        console.print(f"What could be explained at all: {told}", style="dim", highlight=False)
     files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
     best = ", which predicts best" if len(files) > 1 else ""
     console.print(

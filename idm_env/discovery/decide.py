@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import ttest_1samp
 
-from idm_env.discovery import judge, places
+from idm_env.discovery import free, judge, places, together
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import whole
-from idm_env.discovery.score import Tested, held_out, westfall_young
+from idm_env.discovery.score import ALPHA, FREE_SHARE, Tested, at_level, held_out, log_gain, westfall_young
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.solve import Solution, solve
+from idm_env.discovery.units import smallest_p
 from idm_env.discovery.verdict import Reason, Refusal
 from idm_env.effects import ALL
 
-ALPHA = 0.05
 LEAST_GAIN = 0.005
 """Least gain in the logarithm of the whitened 5 s prediction error, on held-out runs."""
 LEAST_SHARE = 0.5
-FEWEST_RUNS = 5
+FEWEST_RUNS = 3
+"""To choose on: of fewer, what is left when one is left out is a single run."""
 MOST_ROUNDS = 3
 SAME = 0.15
 """Candidates whose gain is within this share of the best one's are told apart by nothing but their names."""
@@ -45,13 +47,38 @@ class Round:
     share: float = float("nan")
     refusal: Refusal | None = None
     partial: int | None = None
+    free: bool = False
+    """Whether gains are those of free simulation, and not of predictions in windows."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether any candidate gained enough, beyond chance."""
+        least = together.LEAST_GAIN if self.free else LEAST_GAIN
+        return bool(((self.tested.p_value < ALPHA) & (self.tested.gain >= least)).any())
 
 
-def decide(searching: Search, null: Solution, seed: int) -> tuple[Solution, list[Solution], list[Round]]:
-    """Return the null, the models after every addition (the last without what is not needed), and what was seen.
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """The null, models after every addition (the last without what is not needed), what was seen, and what joins.
+
+    ``stand`` is IDM in free simulation, before anything was added.
+
+    ``joined`` are terms that hold together in free simulation, beside what predictions in windows tell.
+    """
+
+    null: Solution
+    steps: list[Solution]
+    rounds: list[Round]
+    joined: together.Joined | None
+    stand: free.Stand
+
+
+def decide(searching: Search, null: Solution, seed: int) -> Decided:
+    """Decide what is added to the null, on the runs that may choose.
 
     A latency shorter than a step of the data becomes part of the null: it is how they were integrated or recorded.
     """
+    at, null = weighed(searching, null)
     null, steps, rounds = _rounds(searching, null, seed)
     if len(steps) == len(rounds) - 1:
         pair = _pairs(searching, steps[-1] if steps else null, rounds[-1], seed)
@@ -61,8 +88,31 @@ def decide(searching: Search, null: Solution, seed: int) -> tuple[Solution, list
             assert chosen is not None
             steps.append(searching.null(chosen.model, chosen.theta, chosen.values))
     if steps:
-        steps[-1] = _delete(searching, steps[-1], len(null.model.terms))
-    return null, steps, rounds
+        steps[-1] = weighed(searching, _delete(searching, steps[-1], len(null.model.terms)))[1]
+    joined = _joined(searching, null, steps, rounds, seed)
+    return Decided(null, steps, rounds, joined, at)
+
+
+def _joined(
+    searching: Search, null: Solution, steps: list[Solution], rounds: list[Round], seed: int
+) -> together.Joined | None:
+    """Return what holds in free simulation beside what windows told, and add to ``rounds`` what was seen."""
+    now, last = steps[-1] if steps else null, rounds[-1]
+    few = last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS
+    if few or (steps and _at_floor(searching, now)):
+        return None
+    joined, forward = together.grow(searching, weighed(searching, now)[0], len(null.model.terms), seed)
+    rounds += [
+        Round(s.scored, s.tested, last.before, last.left, s.winner, equivalent=s.equivalent, free=True)
+        for s in forward if s.scored
+    ]  # fmt: skip
+    return joined
+
+
+def weighed(searching: Search, now: Solution) -> tuple[free.Stand, Solution]:
+    """Return how a model of windows stands in free simulation of the runs that may choose, and it with that weight."""
+    at = free.stand(searching.task.rows.records, now.model, now.values, now.prior, now.theta)
+    return at, searching.weigh(now, at.task.prior.alike_s)
 
 
 def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, list[Solution], list[Round]]:
@@ -80,12 +130,12 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
             raise ValueError(
                 f"{', '.join(searching.names)}: no place or time in these data is long enough to be tried."
             )
-        tested = westfall_young(np.array([s.gains for s in scored]), seed)
+        tested = _tested(searching, scored, seed)
         order = np.argsort(-tested.gain)
         fitted = [i for i in order if scored[i].solution is not None and tested.p_value[i] < 2 * ALPHA]
         if fitted and tested.gain[fitted[0]] > 0.3 * LEAST_GAIN:
             now, scored = searching.again(now, scored[fitted[0]], scored)
-            tested = westfall_young(np.array([s.gains for s in scored]), seed)
+            tested = _tested(searching, scored, seed)
         left = judge.ceiling(places.respond(searching.task, now))
         this = Round(scored, tested, before, left, None)
         rounds.append(this)
@@ -94,13 +144,18 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
             break
         chosen = scored[this.winner].solution
         assert chosen is not None
-        now = searching.null(chosen.model, chosen.theta, chosen.values)
+        now = weighed(searching, searching.null(chosen.model, chosen.theta, chosen.values))[1]
         if not steps and _is_a_step(now, searching.task.rows.records.dt):
             null = now
             rounds.pop()
         else:
             steps.append(now)
     return null, steps, rounds
+
+
+def _tested(searching: Search, scored: Sequence[Scored], seed: int) -> Tested:
+    """Test candidates in windows, at their share of the level."""
+    return at_level(westfall_young(np.array([s.gains for s in scored]), seed, searching.units.run), 1.0 - FREE_SHARE)
 
 
 def _is_a_step(now: Solution, dt: float) -> bool:
@@ -121,18 +176,18 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     Tested with the whole list of the round that had no winner, as candidates more.
     """
     have = {t.label for t in now.model.terms}
-    free = [n for n in searching.names if n not in have]
+    left = [n for n in searching.names if n not in have]
     late = any(_late(t.effect) for t in now.model.terms)
     wanted = [
-        (name, other) for name in free for other in ALL[name].cancels
-        if other in free and not (late and (_late(name) or _late(other)))
+        (name, other) for name in left for other in ALL[name].cancels
+        if other in left and not (late and (_late(name) or _late(other)))
     ]  # fmt: skip
     if not wanted or (last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS):
         return None
     number = len(have) + 1
     before = held_out(searching.task, now)
     scored = [searching.pair(now, pair, before, number) for pair in wanted]
-    tested = westfall_young(np.array([s.gains for s in (*last.scored, *scored)]), seed)
+    tested = _tested(searching, (*last.scored, *scored), seed)
     mine = Tested(*(x[len(last.scored) :] for x in (tested.p_value, tested.gain, tested.interval)))
     this = Round(scored, mine, before, last.left, None)
     _choose(searching, now, this)
@@ -157,8 +212,9 @@ def _late(name: str | None) -> bool:
 
 def _choose(searching: Search, now: Solution, this: Round) -> None:
     """Set the winner of a round, or say why there is none."""
-    runs = len(this.before)
-    if runs < FEWEST_RUNS:
+    run = searching.units.run
+    runs = len(np.unique(run))
+    if runs < FEWEST_RUNS or smallest_p(run) >= ALPHA * (1.0 - FREE_SHARE):
         this.refusal = Refusal(Reason.FEW_RUNS, figure=runs)
         return
     tested, scored = this.tested, this.scored
@@ -205,7 +261,7 @@ def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
     before, after = (judge.free_run_squares(prepared, s) for s in (now, chosen))
     if after.sum() <= 1.02**2 * before.sum():
         return True
-    return bool(ttest_1samp(np.log(after / before), 0.0, alternative="greater").pvalue > ALPHA)
+    return bool(ttest_1samp(log_gain(after, before), 0.0, alternative="greater").pvalue > ALPHA)
 
 
 def _delete(searching: Search, final: Solution, base: int) -> Solution:
@@ -217,7 +273,7 @@ def _delete(searching: Search, final: Solution, base: int) -> Solution:
             begin = sum(t.size for t in final.model.terms[:index])
             keep = np.delete(final.values, np.arange(begin, begin + final.model.terms[index].size))
             less = solve(searching.task, final.model.without(index), final.theta, keep)
-            losses.append((float(0.5 * np.log(held_out(searching.task, less) / now).mean()), index, less))
+            losses.append((float(log_gain(held_out(searching.task, less), now).mean()), index, less))
         loss, _, less = min(losses, key=lambda x: x[0])
         if loss >= LEAST_GAIN:
             break

@@ -16,12 +16,11 @@ from idm_env.checks import nearest
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import judge, places, records, search, summary, words
+from idm_env.discovery import ceilings, free, judge, places, records, search, summary, words
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
-from idm_env.discovery import weight as weighing
 from idm_env.discovery.calibrate import calibrate
-from idm_env.discovery.decide import Round, decide
+from idm_env.discovery.decide import Decided, Round, decide
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
@@ -118,10 +117,7 @@ def discover(
     )
     progress("null", 0, 0, "idm")
     null = searching.null(base, theta)
-    progress("weight of the prior", 0, 0, "idm")
-    weight = weighing.chosen(prepared.of_runs(fit_runs), null)
-    null = searching.weigh(null, weight.alike_s)
-    null, steps, rounds = decide(searching, null, seed)
+    decided = decide(searching, null, seed)
     saved.remove()
     progress("final check", 0, 0, "runs kept for the end")
     discovery = _finish(
@@ -130,16 +126,20 @@ def discover(
         fit_runs,
         kept_runs,
         searching,
-        null,
-        steps,
-        rounds,
+        decided,
         refused,
         by,
         seed,
     )
     report = discovery.report
     report["calibration"] = calibrated
-    report["prior"] = {"alike_s": weight.alike_s, "tried_s": weighing.GRID_S, "gap_rmse_m": weight.gap_rmse_m}
+    report["prior"] = {
+        "alike_s": decided.null.prior.alike_s, "tried_s": list(free.GRID_S), "gap_rmse_m": list(decided.stand.rmse_m),
+        "alike_s_after": discovery.final.prior.alike_s,
+    }  # fmt: skip
+    kept = prepared.of_runs(kept_runs) if kept_runs else prepared
+    report["ceilings"] = ceilings.told(decided.stand, kept, decided.null)
+    report["error"]["floor"] = ceilings.floor(kept, ceilings.drift(trajectories))
     report["details"] += words.cautions(report["data"]["at_bounds"], calibrated["groups"], calibrated["converged"])
     return discovery
 
@@ -233,15 +233,16 @@ def _known_term(prepared: Records, name: str) -> Term:
 
 def _finish(
     trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], searching: Search,
-    null: Solution, steps: list[Solution], rounds: list[Round], refused: dict[str, str], by: str, seed: int,
+    decided: Decided, refused: dict[str, str], by: str, seed: int,
 ) -> Discovery:  # fmt: skip
     adapt = by == "driver"
+    null, rounds = decided.null, decided.rounds
     fit_records = prepared.of_runs(fit_runs)
     kept = prepared.of_runs(kept_runs) if kept_runs else None
     final, refusal = null, rounds[0].refusal
     if kept is not None:
         # The lockbox is looked into once for every addition, and only to end there.
-        for s in steps:
+        for s in decided.steps:
             if judge.confirmed(kept, searching.task, final, s) <= 0:
                 refusal = Refusal(Reason.LOCKBOX)
                 break
@@ -262,6 +263,19 @@ def _finish(
     judgement = summary.Judgement(null, compared, added, refusal, before, after, seed)
     if added and judgement.errors and not improves(judgement.errors):
         judgement = replace(judgement, added=False, refusal=Refusal(Reason.HELD_OUT))
+    if decided.joined is not None and before is not None:
+        # What was found in free simulation takes the place of what windows found where it does better there.
+        theta, there = judged(decided.joined.solution)
+        assert there is not None
+        now = after if judgement.added and after is not None else before
+        if there.summary()["gap_rmse_m"] < now.summary()["gap_rmse_m"]:
+            other = replace(
+                judgement, compared=free.in_windows(searching.task, decided.joined.solution), added=True, refusal=None,
+                after=there, intervals=decided.joined.intervals,
+            )  # fmt: skip
+            if improves(other.errors):
+                judgement, last = other, theta
+                compared = other.compared
     report = summary.report(
         trajectories, prepared, fit_runs, kept_runs, searching.task, judgement, rounds, refused, [first, last], by
     )

@@ -14,6 +14,7 @@ from idm_env.discovery.model import Frozen, Model
 from idm_env.discovery.noise import HEAVY
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.solve import Prior, Solution, Task, cost_of, solve
+from idm_env.discovery.units import units
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,24 +119,27 @@ def unweighed(
 
 def weighed(task: Task, model: Model, values: np.ndarray, theta: np.ndarray) -> Solution:
     """Return the calibration in which errors of ``alike_s`` seconds count as one, from a first fit [G, 5]."""
-    rows, frozen = task.rows, Frozen(model, values)
-    errors = task.errors(theta[None], frozen, np.zeros((1, 0)))[0]
+    task = scaled(task, model, values, theta)
+    return solve(task, Frozen(model, values), theta, np.zeros(0), iterations=25, tolerance=1e-5)
+
+
+def scaled(task: Task, model: Model, values: np.ndarray, theta: np.ndarray) -> Task:
+    """Return a task of free simulation in whose cost errors of ``alike_s`` seconds, as large as at θ, count as one."""
+    rows = task.rows
+    errors = task.errors(theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
     square = (errors**2).sum(1) / np.maximum(rows.valid.sum(1), 1)
     correlated = task.prior.alike_s / (rows.every * rows.records.dt)
-    sigma = float(np.sqrt(max(np.median(square), 1e-4) * correlated))
-    return solve(replace(task, sigma=sigma), frozen, theta, np.zeros(0), iterations=25, tolerance=1e-5)
+    return replace(task, sigma=float(np.sqrt(max(np.median(square), 1e-4) * correlated)))
 
 
 def free_run_squares(records: Records, s: Solution) -> np.ndarray:
-    """Return every run's squared gap errors (m²) of free simulation with θ fitted to it; one counts as 30 m at most."""
+    """Return every unit's squared gap errors (m²) of free simulation with θ fitted to it; one counts 30 m at most."""
     model, values, prior = s.model, s.values, s.prior
     fitted = calibrate(records, model, values, prior, start=s.theta)
     rows = whole(records)
     task = Task(rows, None, prior, np.ones(len(rows)))
     errors = task.errors(fitted.theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
-    squares = np.zeros(len(records.runs))
-    np.add.at(squares, rows.run, (np.clip(errors, -30.0, 30.0) ** 2).sum(1))
-    return squares
+    return units(records).sums(rows.record, (np.clip(errors, -30.0, 30.0) ** 2).sum(1))
 
 
 def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> float:
@@ -213,7 +217,7 @@ def floor(records: Records) -> dict[str, float]:
 
 
 def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarray:
-    """Return the honest gain of every run [runs] from any smooth acceleration over the state: what is left to explain.
+    """Return the honest gain of every unit [units] from any smooth acceleration over the state: what is left.
 
     A ridge regression on products of speed, gap, closing speed and the leader's acceleration, and on what the leader
     did up to 1.5 s ago, through the responses of the predictions, projected off the drivers' own parameters. It knows

@@ -7,9 +7,11 @@ from typing import Any
 
 from idm_env import report as pages
 from idm_env.discovery import pictures, words
-from idm_env.discovery.decide import ALPHA, LEAST_GAIN, LEAST_SHARE
+from idm_env.discovery.decide import LEAST_GAIN, LEAST_SHARE
 from idm_env.discovery.discover import Discovery
-from idm_env.discovery.verdict import Verdict
+from idm_env.discovery.score import ALPHA, FREE_SHARE
+from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
+from idm_env.discovery.verdict import HOLDS, Verdict
 from idm_env.discovery.words import percent as change
 from idm_env.effects import IDM
 from idm_env.report import Block
@@ -145,6 +147,13 @@ def _errors(d: Discovery) -> Iterator[Block]:
         f"Models: {files}.{best} Both are calibrated the same way. Runs kept back: "
         + ", ".join(pages.shortened(r["error"]["held_out_runs"], 20))
     )
+    told = words.ceilings(r["ceilings"], r["error"]["before"]["gap_rmse_m"])
+    drift = r["error"]["floor"]["drift_m_per_sqrt_s"]
+    if drift > 0.0:
+        told += (
+            f" The measured gap wanders by {number(drift, 2)} m per √s against integrated speeds: part of the noise."
+        )
+    yield pages.note(f"What could be explained at all: {told}")
     partial = r["partial"]
     if partial:
         yield pages.note(
@@ -249,6 +258,7 @@ def _tried(r: dict[str, Any]) -> Iterator[Block]:
         {
             "candidate": words.plain(c["effect"]),
             "round": str(c["round"]),
+            "errors of": c["errors"] or "–",
             "held-out gain": percent(c["held_out_gain"], 2),
             "95 % interval": "–" if None in c["interval"] else " … ".join(percent(x, 2) for x in c["interval"]),
             "p": number(c["p_value"], 2),
@@ -270,9 +280,12 @@ def _tried(r: dict[str, Any]) -> Iterator[Block]:
         f"The drivers' own parameters and every candidate are fitted to predictions {number(r['data']['horizon_s'])} s "
         "ahead, all judged by one model of noise (correlated within and between windows, so that drivers' own noise is "
         "not taken for an effect). Every trial of a candidate lets all drivers re-adjust. Its gain is measured on runs "
-        "that its parameters have not seen, and tested by sign flips of whole runs with the maximum over the whole "
-        f"list (Westfall and Young). It must be significant at {percent(ALPHA)}, gain at least "
-        f"{percent(LEAST_GAIN, 1)}, explain at least {percent(LEAST_SHARE)} of what any smooth function of the state "
-        "explains, not make free simulation worse, and hold on the runs kept back, where it is called an improvement "
-        "only if an error falls, and none is worse unless another is better."
+        "that its parameters have not seen, and tested by sign flips of whole runs (of followers within their runs, "
+        f"where fewer than {ENOUGH_RUNS}, in free simulation {MANY_RUNS}, are left to choose on) with the maximum over "
+        "the whole list (Westfall and Young). Gains in free simulation, of stretches that the drivers' parameters have "
+        f"not seen, have a share of {FREE_SHARE:.0%} of the test's level. It must be significant at {percent(ALPHA)}, "
+        f"gain at least {percent(LEAST_GAIN, 1)}, explain at least {percent(LEAST_SHARE)} of what any smooth function "
+        "of the state explains, not make free simulation worse, and hold on the runs kept back, where it is called an "
+        "improvement only if an error falls, none is worse, and the gap in free simulation rises by "
+        f"{HOLDS - 1.0:.0%} at most."
     )

@@ -14,6 +14,7 @@ import numpy as np
 from idm_env.discovery.march import PULSED
 from idm_env.discovery.records import Rows
 from idm_env.discovery.solve import Solution, Task, equations
+from idm_env.discovery.units import Units, units
 
 WHATS = PULSED
 PULSE = 0.05
@@ -21,9 +22,13 @@ PULSE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Responses [what, second, R, m] per unit, residual [R, m], and every row's coordinates in every second [R, J]."""
+    """Responses [what, second, R, m] per unit, residual [R, m], and every row's coordinates in every second [R, J].
+
+    ``units`` are what a test counts, and ``square`` [units] the squared residuals there.
+    """
 
     rows: Rows
+    units: Units
     change: np.ndarray
     residual: np.ndarray
     by_theta: np.ndarray
@@ -32,7 +37,7 @@ class Responses:
     square: np.ndarray
 
     def design(self, what: str, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return per run the matrix [runs, B, B] and vector [runs, B] of a basis [R, J, B] over the coordinates.
+        """Return per unit the matrix [units, B, B] and vector [units, B] of a basis [R, J, B] over the coordinates.
 
         Both are projected off what re-calibrated drivers would absorb.
         """
@@ -43,12 +48,12 @@ class Responses:
         np.add.at(cross, rows.group, np.einsum("rmi,rmb->rib", self.by_theta, response))
         follow = np.einsum("gij,gjb->gib", self.absorbed, cross)
         response -= np.einsum("rmi,rib->rmb", self.by_theta, follow[rows.group])
-        runs = len(rows.records.runs)
-        matrix, vector = np.zeros((runs, count, count)), np.zeros((runs, count))
-        for run in range(runs):
-            mine = response[rows.run == run].reshape(-1, count)
-            matrix[run] = mine.T @ mine
-            vector[run] = -mine.T @ self.residual[rows.run == run].reshape(-1)
+        of = self.units.of_record[rows.record]
+        matrix, vector = np.zeros((len(self.units), count, count)), np.zeros((len(self.units), count))
+        for unit in range(len(self.units)):
+            mine = response[of == unit].reshape(-1, count)
+            matrix[unit] = mine.T @ mine
+            vector[unit] = -mine.T @ self.residual[of == unit].reshape(-1)
         return matrix, vector
 
 
@@ -78,19 +83,19 @@ def respond(task: Task, solution: Solution) -> Responses:
     }
     linear = solution.linear
     matrix = equations(task, solution.model, solution.theta, solution.values, linear)[1]
-    square = np.zeros(len(records.runs))
-    np.add.at(square, rows.run, (linear.residual**2).sum(-1) * task.counts)
+    counted = units(records)
+    square = counted.sums(rows.record, (linear.residual**2).sum(-1) * task.counts)
     return Responses(
-        rows, change, linear.residual * counts, linear.by_theta * counts[:, :, None],
+        rows, counted, change, linear.residual * counts, linear.by_theta * counts[:, :, None],
         np.linalg.inv(matrix + 1e-9 * np.eye(5)), coordinates, square,
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The best interval [begin, end) and amount on all runs, its linear gain, and honest gains of every run.
+    """The best interval [begin, end) and amount on all runs, its linear gain, and honest gains of every unit.
 
-    ``gains`` [runs] is the gain in log RMSE of each run with interval and amount from the other runs; ``stable`` [runs]
+    ``gains`` [units] is the gain in log RMSE of each with interval and amount from the other runs; ``stable`` [units]
     says whether they chose nearly the same interval.
     """
 
@@ -126,21 +131,27 @@ def scan(
     basis = np.zeros((*values.shape, count))
     np.put_along_axis(basis, index[..., None], 1.0, axis=-1)
     matrix, vector = responses.design(what, basis)
-    runs = len(vector)
     allowed = _allowed(count, open_end, shortest, coordinate == "time" and not open_end)
     if not allowed.any():
         return None
     total = _best(matrix.sum(0), vector.sum(0), allowed)
-    gains, stable = np.zeros(runs), np.zeros(runs, bool)
-    for run in range(runs):
-        i, j, amount, _ = _best(matrix.sum(0) - matrix[run], vector.sum(0) - vector[run], allowed)
+    gains, stable = np.zeros(len(vector)), np.zeros(len(vector), bool)
+    for mine in _by_run(responses):
+        i, j, amount, _ = _best(matrix.sum(0) - matrix[mine].sum(0), vector.sum(0) - vector[mine].sum(0), allowed)
         pick = np.zeros(count)
         pick[i : j + 1] = 1.0
-        gained = 2 * amount * pick @ vector[run] - amount**2 * pick @ matrix[run] @ pick
-        gains[run] = log_gain(gained, responses.square[run])
-        stable[run] = abs(i - total[0]) <= 1 and abs(j - total[1]) <= 1
+        for unit in mine:
+            gained = 2 * amount * pick @ vector[unit] - amount**2 * pick @ matrix[unit] @ pick
+            gains[unit] = log_gain(gained, responses.square[unit])
+        stable[mine] = abs(i - total[0]) <= 1 and abs(j - total[1]) <= 1
     i, j, amount, gain = total
     return Found(float(edges[i]), float(edges[j + 1]), amount, gain, gains, stable)
+
+
+def _by_run(responses: Responses) -> list[np.ndarray]:
+    """Return the units of every run, which are left out together."""
+    run = responses.units.run
+    return [np.flatnonzero(run == r) for r in np.unique(run)]
 
 
 def log_gain(gained: float, square: float) -> float:
@@ -179,13 +190,14 @@ def _best(matrix: np.ndarray, vector: np.ndarray, allowed: np.ndarray) -> tuple[
 
 
 def linear_curve(responses: Responses, what: str, basis: np.ndarray, spread: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients [B] of a basis [R, J, B] and honest gains per run, with a prior of width spread."""
+    """Return the coefficients [B] of a basis [R, J, B] and honest gains per unit, with a prior of width spread."""
     matrix, vector = responses.design(what, basis)
     ridge = np.eye(vector.shape[1]) / spread**2
     gains = np.zeros(len(vector))
-    for run in range(len(vector)):
-        c = np.linalg.solve(matrix.sum(0) - matrix[run] + ridge, vector.sum(0) - vector[run])
-        gains[run] = log_gain(float(2 * c @ vector[run] - c @ matrix[run] @ c), responses.square[run])
+    for mine in _by_run(responses):
+        c = np.linalg.solve(matrix.sum(0) - matrix[mine].sum(0) + ridge, vector.sum(0) - vector[mine].sum(0))
+        for unit in mine:
+            gains[unit] = log_gain(float(2 * c @ vector[unit] - c @ matrix[unit] @ c), responses.square[unit])
     return np.linalg.solve(matrix.sum(0) + ridge, vector.sum(0)), gains
 
 
@@ -212,29 +224,29 @@ def hats(values: np.ndarray, first: float, distance: float, count: int, period: 
 def best_period(
     responses: Responses, what: str, shortest: float = 6.0, longest: float = 90.0
 ) -> tuple[float, np.ndarray]:
-    """Return the period (s) of the clock at which a sine of ``what`` explains most, and honest gains per run."""
+    """Return the period (s) of the clock at which a sine of ``what`` explains most, and honest gains per unit."""
     time = responses.coordinates["time"]
     periods = np.geomspace(shortest, longest, 60)
     designs = []
     for period in periods:
         phase = 2 * np.pi * time / period
         designs.append(responses.design(what, np.stack([np.cos(phase), np.sin(phase)], axis=-1)))
-    runs = len(designs[0][1])
+    none = np.zeros(0, int)
 
-    def best(skip: int | None) -> tuple[int, np.ndarray]:
+    def best(skip: np.ndarray) -> tuple[int, np.ndarray]:
         top, found = -np.inf, (0, np.zeros(2))
         for k, (matrix, vector) in enumerate(designs):
             a, g = matrix.sum(0), vector.sum(0)
-            if skip is not None:
-                a, g = a - matrix[skip], g - vector[skip]
+            a, g = a - matrix[skip].sum(0), g - vector[skip].sum(0)
             c = np.linalg.solve(a + 1e-6 * np.trace(a) * np.eye(2) + 1e-12 * np.eye(2), g)
             if c @ g > top:
                 top, found = c @ g, (k, c)
         return found
 
-    gains = np.zeros(runs)
-    for run in range(runs):
-        k, c = best(run)
-        matrix, vector = designs[k][0][run], designs[k][1][run]
-        gains[run] = log_gain(float(2 * c @ vector - c @ matrix @ c), responses.square[run])
-    return float(periods[best(None)[0]]), gains
+    gains = np.zeros(len(designs[0][1]))
+    for mine in _by_run(responses):
+        k, c = best(mine)
+        for unit in mine:
+            matrix, vector = designs[k][0][unit], designs[k][1][unit]
+            gains[unit] = log_gain(float(2 * c @ vector - c @ matrix @ c), responses.square[unit])
+    return float(periods[best(none)[0]]), gains

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from idm_env.discovery.solve import BOUNDS, Solution, Task, cost_of, equations, prior_of, projected
+from idm_env.discovery.units import rho, signs, units
+from idm_env.parameters import Parameter
 
-FLIPS = 4096
+ALPHA = 0.05
+FREE_SHARE = 0.2
+"""Share of the level that goes to candidates in free simulation, the rest to the same in windows (Bonferroni)."""
+POWER = 0.8
 FAINT = 0.003
 """Gain in log RMSE of a run that is hardly worth the name."""
 SYSTEMATIC = 0.01
@@ -17,7 +24,7 @@ SYSTEMATIC = 0.01
 
 
 def held_out(task: Task, solution: Solution) -> np.ndarray:
-    """Return the held-out squared residual of every run [runs], in units of noise.
+    """Return the held-out squared residual of every unit of the test [units], in units of noise.
 
     φ for a run comes from all other runs (one Newton step from the common optimum, on the normal equations without
     that run), and the run's drivers follow with their own θ, as they do in the null. Both models have the same θ,
@@ -28,14 +35,13 @@ def held_out(task: Task, solution: Solution) -> np.ndarray:
     rows = task.rows
     model = solution.model
     linear = solution.linear
-    change = _without_own_run(task, solution)
+    change = without_own_run(task, solution)
     shifted = linear.residual + np.einsum("rmq,rq->rm", linear.by_phi, change[rows.run])
-    total = np.zeros(len(rows.records.runs))
+    counted = units(rows.records)
     if _spans_runs(task):
         # Drivers of several runs share θ, which then stays that of all runs: to first order.
         moved = linear.residual + np.einsum("rmq,rq->rm", projected(solution), change[rows.run])
-        np.add.at(total, rows.run, (moved**2).sum(-1) * task.counts)
-        return total
+        return counted.sums(rows.record, (moved**2).sum(-1) * task.counts)
     part = Task(rows, task.noise, solution.prior, task.counts, task.sigma)
     moved_linear = type(linear)(shifted, linear.by_theta, linear.by_phi)
     gradient, matrix, *_ = equations(part, model, solution.theta, solution.values, moved_linear)
@@ -48,8 +54,7 @@ def held_out(task: Task, solution: Solution) -> np.ndarray:
     residual = task.residual(task.errors(both, model, values))
     better = cost_of(part, both, residual).argmin(0)[rows.group]
     square = (residual**2).sum(-1) * task.counts
-    np.add.at(total, rows.run, np.where(better == 0, square[0], square[1]))
-    return total
+    return counted.sums(rows.record, np.where(better == 0, square[0], square[1]))
 
 
 def _spans_runs(task: Task) -> bool:
@@ -69,7 +74,7 @@ def per_run(task: Task, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     return gradient, matrix
 
 
-def _without_own_run(task: Task, solution: Solution) -> np.ndarray:
+def without_own_run(task: Task, solution: Solution) -> np.ndarray:
     """Return by how much φ changes for every run [runs, Q] when that run is left out."""
     runs, count = len(task.rows.records.runs), len(solution.values)
     change = np.zeros((runs, count))
@@ -87,6 +92,13 @@ def _without_own_run(task: Task, solution: Solution) -> np.ndarray:
     return change
 
 
+def log_gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the gains in log RMSE of units from their squares before and after; 0 where a unit has nothing to tell."""
+    told = (before > 0.0) & (after > 0.0)
+    gains: np.ndarray = 0.5 * np.log(np.where(told, before, 1.0) / np.where(told, after, 1.0))
+    return gains
+
+
 @dataclass(frozen=True)
 class Tested:
     """Of every candidate: p-value corrected for the whole list, mean gain in log RMSE, and its 95 % interval."""
@@ -96,39 +108,55 @@ class Tested:
     interval: np.ndarray
 
 
-def westfall_young(gains: np.ndarray, seed: int = 0) -> Tested:
-    """Test candidates [K, runs] by sign flips of runs, with the maximum over all candidates (Westfall, Young 1993).
+def westfall_young(gains: np.ndarray, seed: int = 0, run: np.ndarray | None = None) -> Tested:
+    """Test candidates [K, units] by sign flips, with the maximum over all candidates (Westfall, Young 1993).
+
+    Units are runs, or followers in runs ``run`` [units], whose signs depend on each other as ``units`` says.
 
     The statistic is the mean of signed square roots of the gains over their root mean square, to which ``FAINT`` is
     added: an effect that shows in a few runs much more than in others is not taken for chance (as Student's t does),
-    and a tiny gain that is the same in all runs does not outdo it. Under the null, a run's gain is as likely positive
-    as negative. With few runs all 2^R flips are taken, otherwise a sample; the smallest p-value is 2^−R.
+    and a tiny gain that is the same in all runs does not outdo it. Under the null, a unit's gain is as likely positive
+    as negative. With few runs all 2^R flips are taken, otherwise a sample; the smallest p-value of runs is 2^−R.
     """
-    candidates, runs = gains.shape
-    if runs <= 12:
-        flips = 1.0 - 2.0 * ((np.arange(2**runs)[:, None] >> np.arange(runs)) & 1)
-    else:
-        random = np.random.default_rng(seed)
-        flips = np.concatenate([np.ones((1, runs)), random.choice([-1.0, 1.0], (FLIPS - 1, runs))])
+    candidates, count = gains.shape
+    run = np.arange(count) if run is None else run
     roots = np.sign(gains) * np.sqrt(np.abs(gains))
-    statistic = flips @ roots.T / np.sqrt(np.abs(gains).sum(1) + FAINT * runs)
+    flips = signs(run, rho(roots, run), seed)
+    statistic = flips @ roots.T / np.sqrt(np.abs(gains).sum(1) + FAINT * count)
     highest = statistic.max(1)
     p_value = (highest[:, None] >= statistic[0] - 1e-12).mean(0)
     mean = gains.mean(1)
-    error = gains.std(1, ddof=1) / np.sqrt(runs) if runs > 1 else np.full(candidates, np.inf)
+    # Of the mean over units, robust against their dependence within runs.
+    runs = len(np.unique(run))
+    off = np.zeros((candidates, int(run.max(initial=0)) + 1))
+    np.add.at(off.T, run, (gains - mean[:, None]).T)
+    error = np.sqrt((off**2).sum(1) * runs / (runs - 1)) / count if runs > 1 else np.full(candidates, np.inf)
     width = student.ppf(0.975, max(runs - 1, 1)) * error
     return Tested(p_value, mean, np.stack([mean - width, mean + width], axis=1))
 
 
 def interval_of(solution: Solution, task: Task) -> np.ndarray:
-    """Return estimate, low and high [Q, 3] of φ: cluster-robust over runs, t with runs − 1 degrees of freedom.
+    """Return estimate, low and high [Q, 3] of φ, within its bounds; see ``half_width``."""
+    if not len(solution.values):
+        return np.zeros((0, 3))
+    width = half_width(solution, task)
+    low, high = (np.array([getattr(p, side) for p in solution.model.parameters]) for side in ("low", "high"))
+    return np.stack(
+        [solution.values, np.maximum(solution.values - width, low), np.minimum(solution.values + width, high)], axis=1
+    )
+
+
+def at_level(tested: Tested, share: float) -> Tested:
+    """Return a test whose p-values are those of the whole family, of whose level this part has a share."""
+    return replace(tested, p_value=np.minimum(tested.p_value / share, 1.0))
+
+
+def half_width(solution: Solution, task: Task) -> np.ndarray:
+    """Return half the 95 % interval [Q] of φ: cluster-robust over runs, t with runs − 1 degrees of freedom.
 
     Where the runs' spread is smaller than the noise allows, the noise decides. ``SYSTEMATIC`` of the strength is added
     in squares: what smoothing and steps of 0.1 s do, alike in every run, so that no spread shows it.
     """
-    count = len(solution.values)
-    if not count:
-        return np.zeros((0, 3))
     runs = len(task.rows.records.runs)
     gradient, matrix = per_run(task, solution)
     big = matrix.sum(0) + np.diag(prior_of(solution.model))
@@ -144,8 +172,49 @@ def interval_of(solution: Solution, task: Task) -> np.ndarray:
     )
     null = np.array([p.null or 0.0 if p.role == "strength" else 0.0 for p in solution.model.parameters])
     own = np.array([p.role != "place" for p in solution.model.parameters])
-    width = np.sqrt(width**2 + (1.96 * SYSTEMATIC * own * (solution.values - null)) ** 2)
-    low, high = (np.array([getattr(p, side) for p in solution.model.parameters]) for side in ("low", "high"))
-    return np.stack(
-        [solution.values, np.maximum(solution.values - width, low), np.minimum(solution.values + width, high)], axis=1
-    )
+    result: np.ndarray = np.sqrt(width**2 + (1.96 * SYSTEMATIC * own * (solution.values - null)) ** 2)
+    return result
+
+
+@dataclass(frozen=True)
+class Strength:
+    """What data say of an absent effect's strength: estimate, its 95 % interval, and what would have been found.
+
+    ``seen`` is the smallest distance from the null that the test over the whole list finds four times in five, from the
+    interval's width; ``typical`` the distance of the catalogue's default.
+    """
+
+    parameter: Parameter
+    estimate: float
+    low: float
+    high: float
+    seen: float
+    typical: float
+
+
+def strength_of(solution: Solution, task: Task, label: str, tests: int) -> Strength | None:
+    """Return the strength of a term that has just one, or None; ``tests`` is how many candidates were tested."""
+    where = solution.model.where(label)
+    parameters = solution.model.parameters[where]
+    strengths = [i for i, p in enumerate(parameters) if p.null is not None and p.role == "strength"]
+    if len(strengths) != 1:
+        return None
+    p, at = parameters[strengths[0]], where.start + strengths[0]
+    width, estimate = float(half_width(solution, task)[at]), float(solution.values[at])
+    seen = width / 1.96 * float(normal.ppf(1.0 - ALPHA / max(tests, 1)) + normal.ppf(POWER))
+    assert p.null is not None
+    return Strength(p, estimate, estimate - width, estimate + width, seen, abs(p.default - p.null))
+
+
+PROMISING = 0.02
+"""Mean gain in log RMSE on held-out units that is no sign of nothing, significant or not."""
+
+
+def powerful(strengths: Sequence[Strength], tested: Tested, smallest: float) -> bool:
+    """Tell whether most effects of the catalogue would have been found at their typical strengths.
+
+    Not where units are so few that their ``smallest`` p-value leaves no room, or a gain is large without being beyond
+    chance.
+    """
+    seen = bool(strengths) and float(np.mean([s.seen <= s.typical for s in strengths])) >= 0.5
+    return seen and smallest <= 0.4 * ALPHA and bool(tested.gain.max(initial=0.0) < PROMISING)

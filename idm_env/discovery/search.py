@@ -13,8 +13,9 @@ from idm_env.discovery import noise as noises
 from idm_env.discovery import places
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
-from idm_env.discovery.score import held_out
+from idm_env.discovery.score import held_out, log_gain
 from idm_env.discovery.solve import NAMES, Prior, Solution, Task, centred, finish, linearise, solve, with_noise
+from idm_env.discovery.units import Units, units
 from idm_env.effects import IDM, Effect
 from idm_env.effects.base import Sought
 from idm_env.keep import Store
@@ -29,7 +30,7 @@ WORTH = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A candidate: its best solution, or None where only its linear response was scored, and gains [runs]."""
+    """A candidate: its best solution, or None where only its linear response was scored, and gains [units]."""
 
     term: Term
     solution: Solution | None
@@ -47,6 +48,11 @@ class Search:
     saved: Store
     on_progress: OnProgress
     base: Model = field(default_factory=Model)
+
+    @property
+    def units(self) -> Units:
+        """What a test counts."""
+        return units(self.task.rows.records)
 
     def null(self, model: Model, theta: np.ndarray, values: np.ndarray | None = None) -> Solution:
         """Fit a null and its noise in turn until both stand, from log θ [G, 5] and φ [Q]; updates ``task``."""
@@ -68,7 +74,7 @@ class Search:
         return replace(task, prior=replace(population(solution.theta, task.rows), alike_s=task.prior.alike_s))
 
     def round(self, solution: Solution, number: int) -> tuple[list[Scored], np.ndarray]:
-        """Score every candidate on top of ``solution``; return them and the null's held-out squares [runs]."""
+        """Score every candidate on top of ``solution``; return them and the null's held-out squares [units]."""
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
         wanted = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
@@ -95,7 +101,7 @@ class Search:
                 result.append(s)
                 continue
             fresh = solve(self.task, s.solution.model, s.solution.theta, s.solution.values, iterations=10)
-            gains = 0.5 * np.log(before / held_out(self.task, fresh))
+            gains = log_gain(before, held_out(self.task, fresh))
             result.append(Scored(s.term, fresh, gains if s.honest is None else np.where(s.honest, gains, s.gains)))
         return null, result
 
@@ -131,7 +137,7 @@ class Search:
             best = solve(self.task, model, best.theta, best.values, iterations=iterations)
             arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
             self.saved.put(key, {**arrays, "cost": float(best.cost)})
-        gains = 0.5 * np.log(before / held_out(self.task, best))
+        gains = log_gain(before, held_out(self.task, best))
         return Scored(term, best, gains)
 
     def _sought(self, what: Sought) -> list[Effect]:

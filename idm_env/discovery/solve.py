@@ -32,7 +32,7 @@ LONGEST = 0.5
 class Prior:
     """Log-normal prior of θ: centre [5] and width [5] of log θ; ``free`` lets the centre follow the drivers.
 
-    ``alike_s`` is its weight in free simulation, where errors of so many seconds count as one (``weight.chosen``).
+    ``alike_s`` is its weight in free simulation, where errors of so many seconds count as one (``free.stand``).
     """
 
     centre: np.ndarray

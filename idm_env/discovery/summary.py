@@ -11,12 +11,12 @@ import numpy as np
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import judge, words
 from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
-from idm_env.discovery.decide import ALPHA, LEAST_GAIN
 from idm_env.discovery.model import Term
 from idm_env.discovery.records import Records
-from idm_env.discovery.score import interval_of
+from idm_env.discovery.score import Strength, interval_of, powerful, strength_of
 from idm_env.discovery.solve import BOUNDS, NAMES, Solution, Task
-from idm_env.discovery.verdict import Refusal, conclude
+from idm_env.discovery.units import MANY_RUNS, smallest_p, units
+from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude
 from idm_env.effects import ALL
 from idm_env.report import versions
 
@@ -37,6 +37,8 @@ class Judgement:
     before: judge.Judged | None
     after: judge.Judged | None
     seed: int
+    intervals: np.ndarray | None = None
+    """Estimates of φ with their intervals [Q, 3], where they are not those of predictions in windows."""
 
     @cached_property
     def errors(self) -> dict[str, Comparison]:
@@ -85,20 +87,29 @@ def report(
     null, compared, before, after = judged.null, judged.compared, judged.before, judged.after
     base = len(null.model.terms)
     final = compared if compared is not None and judged.added else null
-    entries = [] if compared is None else _found(compared, rounds, interval_of(compared, task), base)
+    entries: list[dict[str, Any]] = []
+    if compared is not None:
+        known = judged.intervals if judged.intervals is not None else interval_of(compared, task)
+        entries = _found(compared, rounds, known, base)
     found = entries if judged.added else []
     first = rounds[0]
-    structured = bool(((first.tested.p_value < ALPHA) & (first.tested.gain >= LEAST_GAIN)).any())
-    verdict = conclude(bool(found), any(f["effect"] for f in found), judged.refusal, structured, first.left)
-    lockbox = prepared.of_runs(kept_runs) if kept_runs else prepared
+    structured = any(r.significant for r in (first, *(r for r in rounds if r.free)))
+    strengths = _strengths(first, task)
+    smallest = smallest_p(units(task.rows.records).run)
+    power = len(fit_runs) >= MANY_RUNS or powerful(list(strengths.values()), first.tested, smallest)
+    refusal = judged.refusal
+    verdict = conclude(bool(found), any(f["effect"] for f in found), refusal, structured, first.left, power)
+    if verdict is Verdict.CANNOT_TELL and not power and (refusal is None or refusal.reason is Reason.NO_GAIN):
+        refusal = Refusal(Reason.NO_POWER, len(fit_runs))
     errors = judged.errors
     left = 1.0 - np.exp(-max(float(first.left.mean()), 0.0))
     content = {
         "schema": SCHEMA,
         "verdict": verdict.value,
-        "reason": None if judged.refusal is None else judged.refusal.reason.value,
-        "sentence": words.headline(verdict, [f["clause"] for f in found], judged.refusal, judged.tried, errors),
-        "details": words.details(verdict, found, [] if judged.added else entries, left),
+        "reason": None if refusal is None else refusal.reason.value,
+        "sentence": words.headline(verdict, [f["clause"] for f in found], refusal, judged.tried, errors),
+        "details": [*words.details(verdict, found, [] if judged.added else entries, left),
+                    *words.excluded(verdict, strengths)],
         "found": found,
         "known": _known(final, interval_of(final, task), base),
         "helps": {
@@ -113,16 +124,31 @@ def report(
             "held_out_drivers": _drivers(before, after if judged.added else before),
             "before": None if before is None else before.summary(),
             "after": None if after is None or before is None else (after if judged.added else before).summary(),
-            "floor": judge.floor(lockbox),
         },
         "partial": None if judged.added or compared is None else _partial(judged, entries, first),
         "candidates": _candidates(rounds, refused),
+        "excluded": [
+            {"effect": name, "parameter": s.parameter.name, "unit": s.parameter.unit, "estimate": s.estimate,
+             "low": s.low, "high": s.high, "would_be_found": s.seen, "typical": s.typical}
+            for name, s in strengths.items()
+        ],
         "parameters": _parameters(thetas, prepared),
         "data": _data(trajectories, prepared, fit_runs, task, null, by, rounds),
         "seed": judged.seed,
         "versions": versions(),
     }  # fmt: skip
     return _plain(content)
+
+
+def _strengths(first: Any, task: Task) -> dict[str, Strength]:
+    """Return by name what the first round says of the strengths of effects that have one."""
+    found = {}
+    for s in first.scored:
+        if s.solution is not None and s.term.effect is not None and s.term.effect in ALL:
+            one = strength_of(s.solution, task, s.term.label, len(first.scored))
+            if one is not None:
+                found[s.term.effect] = one
+    return found
 
 
 def _how(before: judge.Judged) -> str:
@@ -244,6 +270,7 @@ def _candidates(rounds: list[Any], refused: dict[str, str]) -> list[dict[str, An
             rows.append(
                 {
                     "round": number,
+                    "errors": "free simulation" if this.free else "windows",
                     "effect": s.term.effect or s.term.label,
                     "named": s.term.effect is not None,
                     "p_value": this.tested.p_value[i],
@@ -256,7 +283,7 @@ def _candidates(rounds: list[Any], refused: dict[str, str]) -> list[dict[str, An
                 }
             )
     for name, reason in refused.items():
-        rows.append({"round": 0, "effect": name, "named": True, "p_value": None, "held_out_gain": None,
+        rows.append({"round": 0, "errors": None, "effect": name, "named": True, "p_value": None, "held_out_gain": None,
                      "interval": [None, None], "absorbed_share": None, "parameters": {}, "units": {},
                      "note": reason})  # fmt: skip
     return rows
@@ -327,7 +354,7 @@ def _data(
         "drivers": len(np.unique(prepared.group)),
         "records": len(prepared),
         "runs_to_choose_on": len(fit_runs),
-        "smallest_p_value": 2.0 ** -len(fit_runs),
+        "smallest_p_value": smallest_p(units(task.rows.records).run),
         "windows": len(task.rows),
         "gap_noise_m": float(np.median([noise_sigma(e.gap_m) for e in prepared.episodes])),
         "residual_autocorrelation": lag,

@@ -31,6 +31,7 @@ class Reason(str, Enum):
     """Why nothing (more) was added."""
 
     FEW_RUNS = "few_runs"
+    NO_POWER = "no_power"
     NO_GAIN = "no_gain"
     SMALL_SHARE = "small_share"
     FREE_SIMULATION = "free_simulation"
@@ -46,14 +47,29 @@ class Refusal:
     figure: float = float("nan")
 
 
+HOLDS = 1.05
+"""Ratio of the gap's error in free simulation, after / before, up to which an addition holds there.
+
+Beyond chance it may not rise at all; drivers' own noise alone moves it by some percent.
+"""
+
+
 def improves(errors: Mapping[str, Comparison]) -> bool:
-    """Tell whether a model may be called better: not if every error rises, or one is worse and none better."""
-    lights = {c.light for c in errors.values()}
+    """Tell whether a model may be called better: an error falls, none is worse, and free simulation holds."""
     falls = any(c.ratio < 1.0 for c in errors.values())
-    return falls and (Light.WORSE not in lights or Light.BETTER in lights)
+    worse = any(c.light is Light.WORSE for c in errors.values())
+    return falls and not worse and holds(errors)
 
 
-def conclude(added: bool, named: bool, refusal: Refusal | None, structured: bool, left: np.ndarray) -> Verdict:
+def holds(errors: Mapping[str, Comparison]) -> bool:
+    """Tell whether the gap in free simulation holds, where it was compared."""
+    gap = errors.get("gap_rmse_m")
+    return gap is None or not gap.ratio > HOLDS
+
+
+def conclude(
+    added: bool, named: bool, refusal: Refusal | None, structured: bool, left: np.ndarray, power: bool = True
+) -> Verdict:
     """Return the verdict.
 
     Args:
@@ -61,11 +77,14 @@ def conclude(added: bool, named: bool, refusal: Refusal | None, structured: bool
         named: Whether any of it is an effect of the catalogue.
         refusal: Why nothing was added.
         structured: Whether a candidate was significant at all.
-        left: Gains [runs] of any smooth function of the state over the null.
+        left: Gains [units] of any smooth function of the state over the null.
+        power: Whether what is in the catalogue would have been found, were it there.
     """
     if added:
         return Verdict.NAMED if named else Verdict.LOCATED
     if refusal is not None and refusal.reason is Reason.FEW_RUNS:
         return Verdict.CANNOT_TELL
     error = left.std(ddof=1) / np.sqrt(len(left)) if len(left) > 1 else np.inf
-    return Verdict.UNEXPLAINED if structured or left.mean() > max(LEFT, 3.0 * error) else Verdict.NONE
+    if structured or left.mean() > max(LEFT, 3.0 * error):
+        return Verdict.UNEXPLAINED
+    return Verdict.NONE if power else Verdict.CANNOT_TELL

@@ -7,6 +7,7 @@ from typing import Any
 
 from idm_env.discovery.compare import Comparison, Light
 from idm_env.discovery.model import Term
+from idm_env.discovery.score import Strength
 from idm_env.discovery.verdict import Reason, Refusal, Verdict
 from idm_env.effects import ALL
 from idm_env.parameters import Parameter
@@ -111,9 +112,9 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
         return ""
     figure = refusal.figure
     return {
-        Reason.FEW_RUNS: f"only {figure:.0f} run{' is' if figure == 1 else 's are'} left to choose on: "
-        f"the smallest p-value is {2.0**-figure:.2g}"
-        if figure == figure else "",
+        Reason.FEW_RUNS: f"only {figure:.0f} run{' is' if figure == 1 else 's are'} left to choose on",
+        Reason.NO_POWER: f"most effects would not have been found at their usual strengths in the {figure:.0f} runs "
+        "left to choose on",
         Reason.NO_GAIN: "no candidate gains enough on held-out runs",
         Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",
         Reason.FREE_SIMULATION: f"{tried} makes free simulation worse",
@@ -145,16 +146,25 @@ def headline(
         )
     if verdict is Verdict.CANNOT_TELL:
         return (
-            f"These data cannot tell: {reason(refusal, tried)}; seven runs are needed (a quarter is kept for the "
-            "final check), ten or more are better."
+            f"These data cannot tell: {reason(refusal, tried)}; four runs of three followers or seven runs are needed "
+            "(a quarter is kept for the final check), ten or more are better."
         )
     if refusal is not None and refusal.reason is Reason.HELD_OUT:
-        falls = any(c.ratio < 1.0 for c in errors.values())
         return (
             f"Something is missing, but no model tried predicts better: with {tried}, found on the runs that chose, "
-            f"{'an error gets worse and none better' if falls else 'no error falls'} on the runs kept back."
+            f"{_rises(errors)} on the runs kept back."
         )
     return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
+
+
+def _rises(errors: Mapping[str, Comparison]) -> str:
+    """Say what the errors on runs kept back have against an addition."""
+    worse = [ERRORS[k][0] for k, c in errors.items() if c.light is Light.WORSE]
+    if not any(c.ratio < 1.0 for c in errors.values()):
+        return "no error falls"
+    if worse:
+        return f"the error of the {' and the '.join(worse)} gets worse"
+    return f"the error of the gap in free simulation rises by {percent(errors['gap_rmse_m'].ratio)}"
 
 
 def _but(errors: Mapping[str, Comparison]) -> str:
@@ -198,6 +208,23 @@ def details(
     return parts
 
 
+def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:
+    """Say which strengths of absent effects the data exclude, and which they would not have shown."""
+    if verdict not in (Verdict.NONE, Verdict.CANNOT_TELL) or not strengths:
+        return []
+    told = [
+        f"{plain(name)} beyond {number(s.low, 2)} … {amount(float(f'{s.high:.2g}'), s.parameter.unit)}"
+        for name, s in strengths.items()
+    ]
+    unseen = [
+        f"{plain(name)} below {amount(float(f'{s.seen:.2g}'), s.parameter.unit)}" for name, s in strengths.items()
+    ]
+    return [
+        f"Excluded (95 %): {'; '.join(told)}.",
+        f"Would have been missed one time in five or more: {'; '.join(unseen)}, from what is without the effect.",
+    ]
+
+
 def cautions(at_bounds: Mapping[str, int], groups: int, converged: int) -> list[str]:
     """Say what else speaks against the figures: parameters at their bounds, and calibrations without an end."""
     parts = [
@@ -220,6 +247,22 @@ def weight(prior: Mapping[str, Any]) -> str:
         f"of stretches that his parameters had not seen, on the runs that choose: errors of "
         f"{number(prior['alike_s'])} s count as one ({tried})."
     )
+
+
+def ceilings(told: Mapping[str, float | None], before_m: float | None) -> str:
+    """Say how much of the error could be explained at all, as far as these data tell."""
+    share, halves, refit = (told[k] for k in ("repeats_share", "time_gap_between_halves", "refitted_gap_rmse_m"))
+    parts = []
+    if share is not None:
+        parts.append(f"{100 * share:.0f} % of the gap's squared error repeats in matched situations of other runs")
+    if halves is not None:
+        parts.append(f"drivers' time gaps in the two halves of their time correlate by {number(halves, 2)}")
+    if refit is not None and before_m is not None:
+        parts.append(
+            f"drivers refitted to the very stretches that are scored leave {number(refit)} m of {number(before_m)} m"
+        )
+    text = "; ".join(parts)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
 def spoken(item: str) -> str:

@@ -75,10 +75,18 @@ def test_drivers_of_many_runs_may_share_parameters() -> None:
 
 
 def test_few_runs_cannot_tell() -> None:
-    found = discover(data("leader_acceleration", runs=4), effects=FEW)
+    found = discover(data("leader_acceleration", runs=3), effects=FEW)
     assert found.verdict == "cannot_tell"
-    assert "3 runs" in found.report["sentence"]
+    assert "2 runs" in found.report["sentence"]
     assert found.report["found"] == []
+
+
+def test_followers_are_counted_where_runs_are_few() -> None:
+    found = discover(data("leader_acceleration", runs=5, followers=3), effects=FEW)
+    assert [f["effect"] for f in found.report["found"]] == ["leader_acceleration"]
+    assert found.report["found"][0]["p_value"] < 2.0**-4
+    faint = discover(data("leader_acceleration", runs=4, ou=0.3), effects=FEW).report
+    assert faint["verdict"] != "none"
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

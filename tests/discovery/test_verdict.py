@@ -21,7 +21,7 @@ from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improv
 from idm_env.effects import ALL, CANDIDATES
 
 BETTER, SAME, WORSE = (Comparison(1.0, ratio, ratio, ratio - 0.05, ratio + 0.05) for ratio in (0.9, 0.99, 1.1))
-UP = Comparison(1.0, 1.01, 1.01, 0.96, 1.06)
+UP, FAR_UP = (Comparison(1.0, ratio, ratio, 0.9, 1.2) for ratio in (1.01, 1.08))
 
 
 def errors(*three: Comparison) -> dict[str, Comparison]:
@@ -32,7 +32,10 @@ def errors(*three: Comparison) -> dict[str, Comparison]:
     ("three", "may"),
     [
         ((BETTER, BETTER, BETTER), True),
-        ((WORSE, BETTER, SAME), True),
+        ((WORSE, BETTER, SAME), False),
+        ((BETTER, WORSE, SAME), False),
+        ((UP, BETTER, SAME), True),
+        ((FAR_UP, BETTER, SAME), False),
         ((UP, UP, UP), False),
         ((UP, UP, SAME), True),
         ((WORSE, SAME, SAME), False),

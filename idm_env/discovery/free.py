@@ -1,0 +1,173 @@
+"""What candidates do for free simulation, on stretches of time that the drivers' own parameters have not seen.
+
+Predictions over five seconds, whitened, do not see a slow set-point that is wrong: a driver's noise looks the same
+there. In free simulation it shows. θ of every driver comes from every other block of time, φ from other runs, and the
+blocks between are scored, as on runs kept back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from idm_env.discovery import judge
+from idm_env.discovery.model import Frozen, Model, Term
+from idm_env.discovery.records import Records, whole
+from idm_env.discovery.score import log_gain, without_own_run
+from idm_env.discovery.solve import Linear, Prior, Solution, Task, finish, linearise, solve
+from idm_env.discovery.units import MANY_RUNS, Units, units
+
+GRID_S = (5.0, 15.0, 50.0, 150.0, 500.0)
+"""Times (s) over which errors of free simulation may be taken to be alike: the longer, the more the prior weighs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """A model in free simulation: ``task`` over all time, θ from the part that is not ``scored``, and errors (m) there.
+
+    ``rmse_m`` are the gap's errors on the scored time with every weight of ``GRID_S``, of which ``task.prior.alike_s``
+    is the best. ``absorb`` [G, 5, 5] is the inverse curvature of that calibration, ``weight`` [R] what a row's squares
+    count: one over its own mean square plus the usual one, so that a few hopeless followers do not decide.
+    """
+
+    task: Task
+    scored: np.ndarray
+    model: Model
+    values: np.ndarray
+    theta: np.ndarray
+    linear: Linear
+    absorb: np.ndarray
+    weight: np.ndarray
+    units: Units
+    rmse_m: tuple[float, ...]
+
+    def across(self, response: np.ndarray) -> np.ndarray:
+        """Return a response [R, m, Q] on the scored time, after θ has followed it on the rest."""
+        rows = self.task.rows
+        part = (rows.valid & ~self.scored)[..., None]
+        pull = self.task.per_group(np.einsum("rmi,rmq->riq", self.linear.by_theta * part, response))
+        follow = np.einsum("gij,gjq->giq", self.absorb, pull / self.task.sigma**2)
+        moved = response - np.einsum("rmi,riq->rmq", self.linear.by_theta, follow[rows.group])
+        result: np.ndarray = moved * self.scored[..., None]
+        return result
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Return the weighted sums over units of values [R, ...]."""
+        rows = self.task.rows
+        return self.units.sums(rows.record, values * self.weight.reshape(-1, *[1] * (values.ndim - 1)))
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Errors of the gap (m) on the scored time [R, m]."""
+        result: np.ndarray = self.linear.residual * self.scored
+        return result
+
+
+def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, theta: np.ndarray) -> Stand:
+    """Calibrate a model on every other block of time in free simulation, from log θ [G, 5], and see how it stands.
+
+    The weight of the prior decides more on short or noisy records than any effect does: with too light a one drivers
+    are over-fitted, and an effect that only regularises them looks like a finding. So every model has the weight with
+    which it predicts best what its drivers' parameters have not seen, on the runs that choose.
+    """
+    rows, frozen = whole(records), Frozen(model, values)
+    scored = judge.halves(rows)
+    part = replace(rows, valid=rows.valid & ~scored)
+    task = Task(part, None, replace(prior, free=False), np.ones(len(rows)))
+    near = solve(task, frozen, theta, np.zeros(0), iterations=15, tolerance=1e-4).theta
+    tasks: list[Task] = []
+    fits: list[Solution] = []
+    for seconds in GRID_S:
+        heavier = replace(task, prior=replace(task.prior, alike_s=seconds))
+        tasks.append(judge.scaled(heavier, model, values, near))
+        start = fits[-1].theta if fits else near
+        fits.append(solve(tasks[-1], frozen, start, np.zeros(0), iterations=10, tolerance=1e-4))
+    errors = replace(task, rows=replace(rows, valid=scored)).errors(
+        np.stack([f.theta for f in fits]), frozen, np.zeros((len(fits), 0))
+    )
+    squares = (errors**2).sum((1, 2)) / max(int(scored.sum()), 1)
+    task, fitted = tasks[int(squares.argmin())], fits[int(squares.argmin())]
+    matrix = task.per_group(np.einsum("rmi,rmj->rij", fitted.linear.by_theta, fitted.linear.by_theta))
+    matrix += np.diag(prior.width**-2.0)
+    meters = linearise(replace(task, rows=rows, sigma=1.0), frozen, fitted.theta, np.zeros(0))
+    square = (meters.residual**2 * scored).sum(1) / np.maximum(scored.sum(1), 1)
+    usual = max(float(np.median(square)), 1e-6)
+    return Stand(
+        replace(task, rows=rows), scored, model, values, fitted.theta, meters,
+        np.linalg.inv(matrix + 1e-9 * np.eye(5)), 1.0 / (square + usual), units(records, MANY_RUNS),
+        tuple(np.sqrt(squares).tolist()),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A candidate's first look: gains of units [units], and the value of its parameters that all runs speak for."""
+
+    term: Term
+    gains: np.ndarray
+    start: np.ndarray
+
+
+def look(at: Stand, term: Term) -> Line:
+    """Score a candidate by its responses at its starts, each scaled by one number from other runs.
+
+    Finite responses rather than derivatives at the null: what acts beyond a threshold shows, too.
+    """
+    model, meters = at.model.adding(term), replace(at.task, sigma=1.0)
+    starts = np.array(term.starts)
+    null = np.array([p.default if p.null is None else p.null for p in term.parameters])
+    strengths = np.array([p.role == "strength" or p.null is not None for p in term.parameters])
+    values = np.concatenate([np.repeat(at.values[None], len(starts), axis=0), starts], axis=1)
+    errors = meters.errors(np.repeat(at.theta[None], len(starts), axis=0), model, values)
+    response = at.across(np.moveaxis(errors - at.linear.residual, 0, -1))
+    square = at.sums((response**2).sum(1))
+    push = at.sums((response * at.errors[..., None]).sum(1))
+    own = at.sums((at.errors**2).sum(1))
+
+    def amount(square: np.ndarray, push: np.ndarray) -> np.ndarray:
+        # A ridge, for what hardly anybody shows; no more than four times the start, for it is a line.
+        return np.clip(-push / (1.02 * square + 1e-9), -4.0, 4.0)
+
+    others, pushed = at.units.others(square), at.units.others(push)
+    best = (pushed**2 / (others + 1e-9)).argmax(1)
+    unit = np.arange(len(at.units))
+    scale = amount(others, pushed)[unit, best]
+    left = own + 2 * scale * push[unit, best] + scale**2 * square[unit, best]
+    total, pull = square.sum(0), push.sum(0)
+    which = int((pull**2 / (total + 1e-9)).argmax())
+    first = np.where(strengths, null + float(amount(total, pull)[which]) * (starts[which] - null), starts[which])
+    low, high = (np.array([getattr(p, side) for p in term.parameters]) for side in ("low", "high"))
+    return Line(term, log_gain(own, np.maximum(left, 0.05 * own)), np.clip(first, low, high))
+
+
+def nested(at: Stand, term: Term, start: np.ndarray) -> Solution:
+    """Fit the model with one term more in free simulation over all time, every driver's θ following."""
+    return joint(at, at.model.adding(term), np.append(at.values, start))
+
+
+def joint(at: Stand, model: Model, values: np.ndarray) -> Solution:
+    """Fit all terms of a model at once in free simulation over all time, from φ ``values``."""
+    return solve(at.task, model, at.theta, values, iterations=8, tolerance=1e-3)
+
+
+def gains(before: Stand, solution: Solution) -> np.ndarray:
+    """Return the gain of every unit [units] by a model fitted in free simulation, with φ from the other runs.
+
+    φ moves by one Newton step where a run is left out, and the errors with it to first order.
+    """
+    after = stand(before.task.rows.records, solution.model, solution.values, before.task.prior, solution.theta)
+    change = without_own_run(before.task, solution)
+    rows = before.task.rows
+    by_phi = linearise(replace(after.task, sigma=1.0), solution.model, after.theta, solution.values).by_phi
+    moved = after.errors + np.einsum("rmq,rq->rm", after.across(by_phi), change[rows.run])
+    squares = [before.sums((e**2).sum(1)) for e in (before.errors, moved)]
+    return log_gain(*squares)
+
+
+def in_windows(task: Task, solution: Solution) -> Solution:
+    """Return a model that was fitted in free simulation as one of windows: φ stands, θ follows."""
+    frozen = Frozen(solution.model, solution.values)
+    theta = solve(task, frozen, solution.theta, np.zeros(0)).theta
+    linear = linearise(task, solution.model, theta, solution.values)
+    return finish(task, solution.model, theta, solution.values, linear, solution.cost)

@@ -1,0 +1,135 @@
+"""Terms that show in free simulation: added one by one by held-out score, all fitted at once, and taken back again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from idm_env.discovery import free
+from idm_env.discovery import model as terms
+from idm_env.discovery.free import Line, Stand
+from idm_env.discovery.score import ALPHA, FREE_SHARE, Tested, at_level, interval_of, westfall_young
+from idm_env.discovery.search import Scored, Search
+from idm_env.discovery.solve import Solution
+from idm_env.effects import ALL
+
+LEAST_GAIN = 0.01
+"""Least gain in the logarithm of the gap's error in free simulation, on stretches and runs that nothing has seen."""
+MOST_TERMS = 5
+TRIED = 2
+"""How many of the best candidates of a step are fitted, until one holds."""
+SAME = 0.15
+
+
+@dataclass(eq=False)
+class Step:
+    """One step forward: every candidate, its test, and which was added; ``equivalent`` did about as well."""
+
+    scored: list[Scored]
+    tested: Tested
+    winner: int | None
+    equivalent: list[int]
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Terms fitted at once in free simulation: their solution, estimates with intervals [Q, 3], and gains [units]."""
+
+    solution: Solution
+    intervals: np.ndarray
+    gains: np.ndarray
+
+
+def looks(searching: Search, at: Stand) -> list[Line]:
+    """Return a first look at every candidate without a place that the model has not."""
+    have = {t.effect for t in at.model.terms}
+    late = any(ALL[name].latency for name in have if name is not None)
+    effects = [searching.base.catalogue.by_name[n] for n in searching.names if n not in have]
+    simple = [e for e in effects if e.sought == "anywhere" and not (late and ALL[e.name].latency)]
+    return [free.look(at, terms.simple(e)) for e in simple]
+
+
+def grow(searching: Search, start: Stand, base: int, seed: int) -> tuple[Joined | None, list[Step]]:
+    """Return the terms beyond the first ``base`` that hold together in free simulation, or None, and every step.
+
+    Args:
+        searching: Candidates and units of the test.
+        start: The model so far.
+        base: Number of terms that belong to the null.
+        seed: Of the signs.
+    """
+    at, solution = start, None
+    steps: list[Step] = []
+    while len(at.model.terms) - base < MOST_TERMS:
+        step, found = _forward(searching, at, seed)
+        steps.append(step)
+        if found is None:
+            break
+        solution = found
+        at = free.stand(at.task.rows.records, found.model, found.values, at.task.prior, found.theta)
+    if solution is None:
+        return None, steps
+    solution = _backward(start, solution, base)
+    if len(solution.model.terms) == base:
+        return None, steps
+    return Joined(solution, interval_of(solution, start.task), free.gains(start, solution)), steps
+
+
+def _forward(searching: Search, at: Stand, seed: int) -> tuple[Step, Solution | None]:
+    lines = looks(searching, at)
+    if not lines:
+        nothing = np.zeros(0)
+        return Step([], Tested(nothing, nothing, np.zeros((0, 2))), None, []), None
+    scored = [Scored(line.term, None, line.gains) for line in lines]
+
+    def test() -> Tested:
+        return at_level(westfall_young(np.array([s.gains for s in scored]), seed, at.units.run), FREE_SHARE)
+
+    tested = test()
+    first = tested
+    for i in [i for i in np.argsort(-first.gain) if first.p_value[i] < ALPHA and first.gain[i] >= LEAST_GAIN][:TRIED]:
+        found = free.nested(at, scored[i].term, lines[i].start)
+        scored[i] = Scored(scored[i].term, found, free.gains(at, found))
+        tested = test()
+        if tested.p_value[i] < ALPHA and tested.gain[i] >= LEAST_GAIN:
+            same = [
+                int(j) for j in range(len(scored))
+                if j != i and first.p_value[j] < ALPHA and first.gain[j] >= (1.0 - SAME) * first.gain[i]
+            ]  # fmt: skip
+            return Step(scored, tested, int(i), same), found
+    return Step(scored, tested, None, []), None
+
+
+def _backward(start: Stand, solution: Solution, base: int) -> Solution:
+    """Take back terms whose interval contains their null once all are in, or that the held-out score does not miss."""
+    while len(solution.model.terms) > base:
+        intervals, gain = interval_of(solution, start.task), float(free.gains(start, solution).mean())
+        added = range(base, len(solution.model.terms))
+        losses = {index: 0.0 for index in added if contains_null(solution, intervals, index)}
+        if not losses:
+            losses = {i: gain - float(free.gains(start, _without(start, solution, i)).mean()) for i in added}
+        index = min(losses, key=lambda i: losses[i])
+        if losses[index] >= 0.5 * LEAST_GAIN:
+            break
+        solution = _without(start, solution, index)
+    return solution
+
+
+def _without(start: Stand, solution: Solution, index: int) -> Solution:
+    begin = sum(t.size for t in solution.model.terms[:index])
+    gone = np.arange(begin, begin + solution.model.terms[index].size)
+    at = replace(start, theta=solution.theta)
+    return free.joint(at, solution.model.without(index), np.delete(solution.values, gone))
+
+
+def contains_null(solution: Solution, intervals: np.ndarray, index: int) -> bool:
+    """Tell whether the interval of a term's strength contains its null; a curve has no one strength."""
+    term = solution.model.terms[index]
+    begin = sum(t.size for t in solution.model.terms[:index])
+    strengths = [(p, i) for i, p in enumerate(term.parameters) if p.role == "strength" and p.null is not None]
+    if len(strengths) != 1:
+        return False
+    parameter, at = strengths[0]
+    _, low, high = intervals[begin + at]
+    return bool(low <= parameter.null <= high)
