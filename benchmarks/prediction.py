@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from idm_env.data.womd import Scenario, scenarios
+from idm_env.data.scenario import Scenario
+from idm_env.data.womd import scenarios
 from idm_env.prediction.files import OURS, case_of
 from idm_env.prediction.metrics import Score, score, summary
 from idm_env.prediction.predict import METHODS, Mixture, Prediction, chosen, mixture

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from idm_env.data import synthetic
-from idm_env.data.womd import Agent, Control, Lane, Scenario
+from idm_env.data.scenario import Agent, Control, Lane, Scenario
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import predict
 from idm_env.prediction.scene import Scene

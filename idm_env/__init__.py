@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from idm_env import instead
+
 __version__ = "0.1.0"
 
 _LAZY = {
@@ -95,6 +97,7 @@ def _register() -> None:
 
 _end_quietly()
 _register()
+instead.enter("idm_env.kernels.dispatch:rollout")
 
 
 def __getattr__(name: str) -> Any:

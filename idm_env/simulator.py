@@ -1,17 +1,18 @@
-"""A simulator: one pure step (``step.py``), and that step repeated, by compiled kernels wherever these know it."""
+"""A simulator: one pure step (``step.py``), and that step repeated, or what may run instead of it (``instead.py``)."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from idm_env import parameters
-from idm_env.kernels import dispatch
+from idm_env import instead, parameters
 from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead, normals
 from idm_env.types import Inputs, Params, State
 
@@ -42,8 +43,6 @@ class Simulator(Stepping):
 
     def compile(self, *, backend: str = "inductor", dynamic: bool | None = False) -> Simulator:
         """Return this simulator with a compiled step; where nothing can compile it, with one warning, as it is."""
-        from idm_env.compiled import Compiled
-
         return Compiled(self.road, self.effects, self.dt, self.integration, backend, dynamic)
 
     def _covered(self, inputs: Inputs, steps: int) -> None:
@@ -92,7 +91,7 @@ class Simulator(Stepping):
 
         ``keep`` None keeps nothing, and None is returned in its place. Where a compiled kernel knows this simulator it
         runs instead of ``step`` (``kernels.dispatch`` says when). Second derivatives of a
-        kernel's rollout are recomputed on the torch path; inside ``kernels.dispatch.off()`` everything is.
+        kernel's rollout are recomputed on the torch path; inside ``instead.off()`` everything is.
 
         ``inputs`` carry a leading time dimension of at least ``steps``. ``checkpoint_every`` k > 0 saves the graph's
         tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps
@@ -103,7 +102,7 @@ class Simulator(Stepping):
             inputs = self.drawn(state.speed, inputs, steps, seed)
         if steps > 0 and keep in (_kept, None):
             self._covered(inputs, steps)
-            fast = dispatch.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)
+            fast = instead.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)
             if fast is not None:
                 last, kept_of_all = fast
                 return last, None if kept_of_all is None else Trajectory(*kept_of_all)
@@ -133,6 +132,56 @@ class Simulator(Stepping):
         first = kept[0]
         return state, type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
 
+    def advance(self, state: State, inputs: Inputs, params: Params) -> State:
+        """Return the state Δt later, as ``step`` does, by what may run in place of it: a rollout of one step."""
+        return self.rollout(state, {n: stacked([x]) for n, x in inputs.items()}, params, 1, keep=None)[0]
+
+
+@dataclass(frozen=True)
+class Compiled(Simulator):
+    """As ``Simulator``, for any effects, with gradients, on the CPU and on a GPU; ``step`` is compiled by inductor.
+
+    It is compiled when it is first called, once per shape, dtype and device. The step, not the rollout: a rollout's
+    graph grows with its length, and so would the time to compile it. The first call of a shape takes 17 s forward and
+    9 s backward where nothing is cached, 8 s and 1 s where inductor's cache on disk is warm (2 cores, AMD EPYC,
+    November 2026). Where no compiler is found the step runs as it is, after one warning.
+
+    ``backend`` is that of ``torch.compile``; ``dynamic`` True compiles once for all batch sizes, a little slower each.
+    Rollouts repeat the compiled step and use no other kernel.
+    """
+
+    kernels: ClassVar[bool] = False
+
+    backend: str = "inductor"
+    dynamic: bool | None = False
+
+    @cached_property
+    def _compiled(self) -> Callable[[State, Inputs, Params], State]:
+        plain = Simulator(self.road, self.effects, self.dt, self.integration)
+        # Filled here, because the tracer does not enter the lock of a cached property.
+        _ = plain.by_name, plain._following, plain._hooks, plain._needs, plain._unspoken
+        made: Callable[[State, Inputs, Params], State] = torch.compile(
+            plain.step, backend=self.backend, dynamic=self.dynamic, fullgraph=True
+        )
+        return made
+
+    def step(self, state: State, inputs: Inputs, params: Params) -> State:
+        """Return the state Δt later, as ``Simulator.step`` to rounding."""
+        if "failed" in self.__dict__:
+            return super().step(state, inputs, params)
+        try:
+            return self._compiled(state, inputs, params)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            self.__dict__["failed"] = True
+            first = str(error).strip().splitlines()[0]
+            warnings.warn(
+                f"the step runs uncompiled, because torch.compile failed: {first} If no C++ compiler is "
+                "installed, g++, clang or MSVC cures it (triton for a GPU).",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+            return super().step(state, inputs, params)
+
 
 def _leaves(value: Any) -> Iterable[Any]:
     return (value,) if isinstance(value, Tensor) else value
@@ -155,4 +204,14 @@ def _unbind(value: Any) -> list[Any]:
     return [type(value)(*row) for row in zip(*columns, strict=True)]
 
 
-__all__ = ["INTEGRATORS", "Integration", "Simulator", "Trajectory", "ballistic", "euler", "half_ahead", "stacked"]
+__all__ = [
+    "INTEGRATORS",
+    "Compiled",
+    "Integration",
+    "Simulator",
+    "Trajectory",
+    "ballistic",
+    "euler",
+    "half_ahead",
+    "stacked",
+]

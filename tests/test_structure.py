@@ -16,15 +16,16 @@ ALLOWED = {
     "types": set(),
     "checks": set(),
     "keep": set(),
+    "instead": set(),
+    "modules": set(),
     "parameters": {"types", "checks"},
-    "effects": {"types", "parameters", "checks"},
+    "effects": {"types", "parameters", "checks", "modules"},
     "roads": {"types"},
     "history": {"types"},
     "step": {"types", "parameters", "effects", "roads", "history"},
-    "scalar": {"types", "effects", "roads", "history", "step"},
-    "kernels": {"types", "effects", "roads", "history", "step", "scalar"},
-    "simulator": {"types", "parameters", "step", "kernels", "compiled"},
-    "compiled": {"types", "simulator"},
+    "simulator": {"types", "parameters", "step", "instead"},
+    "scalar": {"types", "effects", "roads", "history", "step", "modules"},
+    "kernels": {"types", "effects", "roads", "history", "step", "simulator", "instead", "scalar"},
     "fonts": set(),
     "report": {"fonts", "keep"},
     "progress": set(),
@@ -47,7 +48,10 @@ OUTSIDE = {"gymnasium": {"envs", "wrappers", "__init__"}, "pettingzoo": {"envs"}
 
 
 def imports(path: Path) -> set[str]:
-    """Return the modules that a file imports, wherever in it, save for those that only a type checker reads."""
+    """Return the modules that a file imports, wherever in it, save for those that only a type checker reads.
+
+    Of ``from package import module`` that is the module, since whoever imports a module runs its packages anyway.
+    """
     names = set()
     tree = ast.parse(path.read_text())
     typing = {
@@ -61,11 +65,14 @@ def imports(path: Path) -> set[str]:
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            full = {f"{node.module}.{alias.name}" for alias in node.names}
+            names |= full & MODULES.keys()
+            names |= {node.module} if full - MODULES.keys() else set()
     return names
 
 
-FILES = [p for p in PACKAGE.rglob("*.py") if p.name != "__pycache__"]
+FILES = sorted(PACKAGE.rglob("*.py"))
+MODULES = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in FILES}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
@@ -81,6 +88,14 @@ def test_imports_point_one_way(path: Path) -> None:
     for library, allowed in OUTSIDE.items():
         if any(name.split(".")[0] == library for name in found):
             assert mine in allowed, f"{library} belongs to {allowed}"
+
+
+def test_no_file_imports_itself_by_way_of_others() -> None:
+    """Imports within functions count: whoever reads one file of a circle has to read all of it."""
+    below = {name: (imports(path) & MODULES.keys()) - {name} for name, path in MODULES.items()}
+    while free := {name for name, needs in below.items() if not needs & below.keys()}:
+        below = {name: needs for name, needs in below.items() if name not in free}
+    assert not below, f"in or above a circle: {sorted(below)}"
 
 
 @pytest.mark.parametrize("name", ["simulator.py", "step.py", "history.py"])

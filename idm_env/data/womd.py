@@ -9,85 +9,18 @@ from __future__ import annotations
 import gzip
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from idm_env.data import womd_record
 from idm_env.data.errors import DataError
+from idm_env.data.scenario import PRESENT, SHOWN, Agent, Control, Lane, Scenario, check_scenario
 
-STEP_S = 0.1
-PRESENT = 10
-"""Step of the present where a file does not say: 11 steps of history, then the future."""
-KINDS = ("vehicle", "pedestrian", "cyclist")
-
-
-@dataclass(frozen=True, eq=False)
-class Agent:
-    """One agent; arrays are [T] or [T, 2], in m, rad and m/s, and mean nothing where ``valid`` is False."""
-
-    id: int
-    kind: str
-    length: float
-    width: float
-    position: np.ndarray
-    heading: np.ndarray
-    velocity: np.ndarray
-    valid: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Lane:
-    """A lane's centre line [M, 2] in the direction of travel.
-
-    ``exits`` are identifiers of the lanes that follow, None where the file does not tell them; ``speed_limit`` in m/s,
-    NaN where unknown; ``bike`` marks lanes for bicycles.
-    """
-
-    id: int
-    line: np.ndarray
-    exits: tuple[int, ...] | None = None
-    speed_limit: float = float("nan")
-    bike: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Control:
-    """A stop sign or a signal at ``point`` [2]: what it shows at the present step, and the lanes that it is for.
-
-    ``shows`` is ``sign``, or a signal's ``stop``, ``caution``, ``go`` or ``unknown``; a flashing stop is a sign, a
-    flashing caution is go. ``lanes`` is empty where the file does not tell them (signs in JSON).
-    """
-
-    shows: str
-    point: np.ndarray
-    lanes: tuple[int, ...] = ()
-
-
-SHOWN = ("unknown", "stop", "caution", "go", "stop", "caution", "go", "sign", "go")
-"""What the states 0 to 8 of a signal in the official files mean here."""
 _STATES = (
     "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Scenario:
-    """A scene: who, where and on which lanes. ``present`` is the step up to which the past is known."""
-
-    id: str
-    agents: tuple[Agent, ...]
-    lanes: tuple[Lane, ...]
-    to_predict: tuple[int, ...]
-    present: int = PRESENT
-    controls: tuple[Control, ...] = ()
-    notes: tuple[str, ...] = field(default=())
-
-    @property
-    def steps(self) -> int:
-        """Steps of history, present and future."""
-        return len(self.agents[0].valid)
 
 
 def scenarios(path: str | Path) -> Iterator[Scenario]:
@@ -104,8 +37,6 @@ def scenarios(path: str | Path) -> Iterator[Scenario]:
     if name.endswith((".json", ".json.gz")):
         yield read_json(path)
     elif ".tfrecord" in name:
-        from idm_env.data import womd_record
-
         yield from womd_record.read(path)
     else:
         raise DataError(f"{path.name} has an unknown extension; use .json, .json.gz or .tfrecord.")
@@ -116,8 +47,6 @@ def count(path: str | Path) -> int:
     path = Path(path)
     if not path.is_file() or ".tfrecord" not in path.name.lower() or path.name.lower().endswith((".json", ".json.gz")):
         return 1
-    from idm_env.data import womd_record
-
     return max(1, womd_record.count(path))
 
 
@@ -180,15 +109,6 @@ def _signals(lights: Any) -> list[Control]:
         lanes = (int(lane),) if str(lane).lstrip("-").isdigit() else ()
         found.append(Control(shows, np.array([float(light["x"][last]), float(light["y"][last])]), lanes))
     return found
-
-
-def check_scenario(agents: tuple[Agent, ...], wanted: tuple[int, ...], present: int, source: str) -> None:
-    """Raise DataError for tracks to predict that do not exist, and for a scenario that ends before its present."""
-    wrong = [i for i in wanted if not 0 <= i < len(agents)]
-    if wrong:
-        raise DataError(f"{source}: track_index {wrong[0]} to predict is outside the {len(agents)} agents.")
-    if len(agents[0].valid) <= present:
-        raise DataError(f"{source}: {len(agents[0].valid)} steps end before the present step {present}.")
 
 
 def _agent(item: dict[str, Any], number: int) -> Agent:

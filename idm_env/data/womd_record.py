@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.data.errors import DataError
-from idm_env.data.womd import SHOWN, Agent, Control, Lane, Scenario, check_scenario
+from idm_env.data.scenario import SHOWN, Agent, Control, Lane, Scenario, check_scenario
 
 MILE_PER_HOUR = 0.44704
 _KIND = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}

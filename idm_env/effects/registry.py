@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
 
+from idm_env import modules
 from idm_env.effects.base import CarFollowing, Effect
 
 
@@ -77,15 +77,4 @@ def _module_of(path: Path) -> ModuleType:
     """Run a file once per process and text, and return it as a module."""
     full = path.resolve()
     name = _PREFIX + hashlib.sha256(str(full).encode() + full.read_bytes()).hexdigest()[:16]
-    if name in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, full)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    try:
-        spec.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
-    return module
+    return modules.run(full, name)

@@ -7,41 +7,27 @@ bits with and without a graph. It imports numba only once a kernel is to run.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from idm_env.history import PAST
+from idm_env.instead import off, switched_off
 from idm_env.kernels import available
 from idm_env.roads import Lane, Ring
 from idm_env.scalar.record import Form
+from idm_env.simulator import Simulator
+from idm_env.step import Stepping
 from idm_env.types import Inputs, Params, State
 
 if TYPE_CHECKING:
     from idm_env.kernels.printed import TileKernel
-    from idm_env.simulator import Simulator
-    from idm_env.step import Stepping
-
-_off: ContextVar[str | None] = ContextVar("idm_env_kernels_off", default=None)
-
-
-@contextmanager
-def off(reason: str = "switched off by kernels.off()") -> Iterator[None]:
-    """Run everything inside on the torch path."""
-    token = _off.set(reason)
-    try:
-        yield
-    finally:
-        _off.reset(token)
 
 
 def found(simulator: Stepping, state: State, inputs: Inputs, params: Params) -> TileKernel | str:
     """Return the kernel for this call, or why it takes the torch path."""
-    why = _off.get() or surroundings() or _unfit_tensors(state, inputs, params)
+    why = switched_off() or surroundings() or _unfit_tensors(state, inputs, params)
     if why is not None:
         return why
     if type(simulator.road) not in (Lane, Ring):
@@ -130,3 +116,6 @@ def _tensors(inputs: Inputs) -> list[Tensor]:
         parts: Any = (value,) if isinstance(value, Tensor) else value
         found += [x for x in parts if x is not None]
     return found
+
+
+__all__ = ["found", "off", "refusal", "rollout", "surroundings"]

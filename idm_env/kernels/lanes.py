@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from idm_env.history import PAST
+from idm_env.instead import off
 from idm_env.kernels import lane_adjoint, lane_loops, tiles
 from idm_env.kernels import threads as pool
 from idm_env.kernels.operands import FLAGS, OPERANDS, STATES, Strides, dense, filled, operand, reduced, table
@@ -315,8 +316,6 @@ def _timed(gradient: Array, plan: _Plan, like: Tensor) -> Tensor:
 
 def _differentiable(plan: _Plan, saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...]) -> list[Tensor | None]:
     """Return the gradients with a graph of their own, for second derivatives, from the torch path."""
-    from idm_env.kernels.dispatch import off
-
     program = plan.kernel.program
     given = dict(zip(program.moving, saved, strict=False))
     memory = dict(plan.state.memory)

@@ -13,7 +13,8 @@ import polars as pl
 from idm_env import keep
 from idm_env import report as page
 from idm_env.data import DataError
-from idm_env.data.womd import Scenario, count, scenarios
+from idm_env.data.scenario import Scenario
+from idm_env.data.womd import count, scenarios
 from idm_env.parts import Parts
 from idm_env.prediction import report as written
 from idm_env.prediction.metrics import Case, Score, intervals, score, shape_of, summary

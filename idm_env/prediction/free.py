@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.stats import norm, qmc
 
-from idm_env.data.womd import Agent
+from idm_env.data.scenario import Agent
 
 DRAWS = 128
 KEEPING, KEEPING_SPEED, KEEPING_ANGLE = 32, 0.1, 0.1

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from idm_env.data.womd import Lane
+from idm_env.data.scenario import Lane
 
 JOIN_M = 1.5
 """A lane that begins this near to another's end follows it, where the file does not say what follows (m)."""

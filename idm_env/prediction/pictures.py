@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from idm_env.data.womd import Agent, Scenario
+from idm_env.data.scenario import Agent, Scenario
 from idm_env.prediction.predict import Prediction
 
 STOP, CAUTION = "#c1121f", "#e09f3e"

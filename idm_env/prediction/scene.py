@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from idm_env.data.womd import Agent, Scenario
+from idm_env.data.scenario import Agent, Scenario
 from idm_env.prediction.drivers import Second, middle, passing
 from idm_env.prediction.free import motion_now
 from idm_env.prediction.lanes import LaneGraph, Route, turn

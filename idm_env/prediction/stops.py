@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from idm_env.data.womd import Control
+from idm_env.data.scenario import Control
 from idm_env.prediction.lanes import LaneGraph, Route
 
 POST_RIGHT_M = (1.2, 8.0)

@@ -11,7 +11,8 @@ import pytest
 
 from benchmarks import prediction as benchmark
 from idm_env.data import DataError
-from idm_env.data.womd import Control, Scenario, read_json, scenarios
+from idm_env.data.scenario import Control, Scenario
+from idm_env.data.womd import read_json, scenarios
 from idm_env.keep import UNFINISHED
 from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
 from idm_env.prediction.files import OURS, case_of, predict_files

@@ -1,0 +1,62 @@
+"""What may run in place of a simulator's repeated step: entered by its name, looked up when a rollout begins.
+
+A simulator is built below the compiled loops and does not know them. ``idm_env`` enters those that it has, as it
+registers its environments: by text, so that nothing heavy is imported before it is used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+_entered: list[str] = []
+_off: ContextVar[str | None] = ContextVar("idm_env_kernels_off", default=None)
+
+
+def enter(place: str) -> None:
+    """Enter a function by its place, ``package.module:function``; see ``rollout`` for what it is called with."""
+    if place not in _entered:
+        _entered.append(place)
+
+
+@contextmanager
+def off(reason: str = "switched off by kernels.off()") -> Iterator[None]:
+    """Repeat the step itself in everything inside."""
+    token = _off.set(reason)
+    try:
+        yield
+    finally:
+        _off.reset(token)
+
+
+def switched_off() -> str | None:
+    """Return why the step itself is repeated here, or None."""
+    return _off.get()
+
+
+def rollout(*call: Any) -> Any:
+    """Return what the first function that knows this call gives; None where the step itself is to be repeated.
+
+    The call is ``(simulator, state, inputs, params, steps, checkpoint_every, keep)``, as in ``Simulator.rollout``, and
+    the result the last state with what is kept of all, or None.
+    """
+    if _off.get() is not None:
+        return None
+    for place in _entered:
+        found = _function(place)(*call)
+        if found is not None:
+            return found
+    return None
+
+
+_functions: dict[str, Callable[..., Any]] = {}
+
+
+def _function(place: str) -> Callable[..., Any]:
+    if place not in _functions:
+        module, _, name = place.partition(":")
+        _functions[place] = getattr(importlib.import_module(module), name)
+    return _functions[place]
