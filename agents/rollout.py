@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from agents.environments import task_of
-from idm_env.envs.advance import advance_of
 from idm_env.tasks import Draw, Task, World
 from idm_env.types import Params
 
@@ -54,7 +53,6 @@ def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> D
     """Roll a policy out from given worlds; ``act`` None leaves everybody to the human drivers."""
     task, world, draw, params = start
     like = world.state.speed
-    advance = advance_of(task.simulator, "numpy", like.device)
     none = like.new_zeros(len(like), len(task.agents))
     kept: list[tuple[Tensor, ...]] = []
     with torch.inference_mode():
@@ -64,7 +62,7 @@ def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> D
             action = None if act is None else act(task.observe(world).flatten(1))
             command = None if action is None else task.command(action)
             now = {name: x[t % BLOCK] for name, x in normals.items()}
-            after = task.step(world, command, now, params, advance=advance)
+            after = task.step(world, command, now, params, advance=task.simulator.advance)
             reward = task.reward(world, none if command is None else command, after) if rewards else none
             world = after
             kept.append(

@@ -167,28 +167,25 @@ def discovery() -> dict[str, Any]:
 
 def rings(seconds: float = 0.5) -> dict[str, float]:
     """Return bare steps of rings of 22 (IDM and brakes): env-steps per CPU second at 8192, µs for a single one."""
-    from idm_env.kernels.stepper import Stepper
-
     simulator = Simulator(Ring(230.0), (IDM(), Brakes()))
     params = simulator.defaults()
 
     def each(rows: int, steps: int) -> float:
         position = (-torch.arange(22.0) * 230.0 / 22).expand(rows, 22).clone()
-        stepper = Stepper(simulator)
-        state = stepper.run(simulator.state(position, torch.full((rows, 22), 3.0), params), {}, params, steps)
+        state = simulator.state(position, torch.full((rows, 22), 3.0), params)
+        state, _ = simulator.rollout(state, {}, params, steps, keep=None)
         count, begin = 0, time.process_time()
         while time.process_time() - begin < seconds:
-            state = stepper.run(state, {}, params, steps)
+            state, _ = simulator.rollout(state, {}, params, steps, keep=None)
             count += steps
         return (time.process_time() - begin) / count
 
     alone = Simulator(Lane(), simulator.effects)
     line = alone.state(-30.0 * torch.arange(1000.0)[None], torch.full((1, 1000), 10.0), params)
-    stepper = Stepper(alone)
-    line = stepper.run(line, {}, params, 10)
+    line, _ = alone.rollout(line, {}, params, 10, keep=None)
     begin = time.process_time()
     for _ in range(1000):
-        line = stepper.run(line, {}, params, 10)
+        line, _ = alone.rollout(line, {}, params, 10, keep=None)
     lane = (time.process_time() - begin) / 10_000
     return {
         "env_steps_per_s_at_8192": 8192 / each(8192, 1),

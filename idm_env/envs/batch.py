@@ -7,6 +7,7 @@ truncated back-propagation.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -14,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.envs.advance import advance_of
 from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Untraceable
@@ -71,7 +71,6 @@ class Batch:
         self.task = made.task
         self.count = count
         self.params: Params = self.task.params(made.dtype, made.device)
-        self.advance = advance_of(self.task.simulator, made.output, made.device)
         self.limit = made.limit
         self.seeds = np.zeros(count, dtype=np.int64)
         self.episodes = np.full(count, -1, dtype=np.int64)
@@ -83,8 +82,8 @@ class Batch:
         self._pool: World | None = None
         self._block: dict[str, Tensor] | None = None
         self._drawn: dict[str, np.ndarray] = {}
-        self._ahead = 0
         self._used = 0
+        self._ahead = max(1, _NORMALS_AT_ONCE // (count * self.task.vehicles))
 
     def _compiled(self) -> Values | None:
         """Return what steps without a graph, where that can be."""
@@ -193,7 +192,6 @@ class Batch:
             return None
         if self._block is None or self._used >= self._ahead:
             assert self._draw is not None
-            self._ahead = max(1, _NORMALS_AT_ONCE // (self.count * self.task.vehicles))
             self._block = self.task.normals(self._draw, clock(), self._ahead, self.settings.dtype)
             self._used = 0
             if self._values is not None:
@@ -208,10 +206,14 @@ class Batch:
 
         ``live`` (bool, ``(n, agents)``) leaves only single agents' vehicles to their drivers, and drops their commands.
         """
-        if self._values is not None and live is None:
-            told = self._step_values(action)
+        if self._values is not None:
+            told = self._step_values(action, live)
             if told is not None:
                 return Outcome.of(told)
+        with torch.no_grad() if self.settings.output == "numpy" else contextlib.nullcontext():
+            return Outcome.of(self._step_torch(action, live))
+
+    def _step_torch(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> dict[str, Any]:
         if isinstance(action, np.ndarray):
             action = torch.as_tensor(action, device=self.settings.device)
         before, task = self.world, self.task
@@ -219,19 +221,18 @@ class Batch:
         block = self._normals(lambda: before.state.step)
         normals = None if block is None else {name: x[self._used - 1] for name, x in block.items()}
         command, given, inputs = self._commanded(before, action, normals, live)
-        state = self.advance(before.state, inputs, self.params)
+        # With torch output always the step itself, so that values are the same bits with and without a graph.
+        simulator = task.simulator
+        advance = simulator.step if self.settings.output == "torch" else simulator.advance
+        state = advance(before.state, inputs, self.params)
         after = before._replace(state=state)
         if command is None:
             command = state.speed.new_zeros(self.count, len(task.agents))
-        elif live is not None:
-            command = torch.where(live, command, 0.0)
         self.world = after
         told = self._told(before, command, given, after, action is not None)
-        if self.settings.output == "numpy":
-            told = {name: x.detach().cpu().numpy() for name, x in told.items()}
-        return Outcome.of(told)
+        return {n: x.cpu().numpy() for n, x in told.items()} if self.settings.output == "numpy" else told
 
-    def _step_values(self, action: Tensor | np.ndarray | None) -> dict[str, Any] | None:
+    def _step_values(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> dict[str, Any] | None:
         """Return what is told of a step by compiled loops; None, with nothing changed, where there are none."""
         values, world = self._values, self._world
         assert values is not None
@@ -241,7 +242,9 @@ class Batch:
         used, block = self._used, self._block
         try:
             normals = self._normals(values.clock)
-            told = values.step(given, None if normals is None else self._drawn, max(self._used - 1, 0), self.params)
+            noise = None if normals is None else self._drawn
+            who = None if live is None else live.numpy().reshape(-1)
+            told = values.step(given, who, noise, max(self._used - 1, 0), self.params)
         except Untraceable:
             # Said once, as a warning, where an effect is why (``kernels.printed``).
             self._values, self._used, self._block = None, used, block
@@ -260,7 +263,10 @@ class Batch:
         task = self.task
         command = None if action is None else task.command(action)
         given = None if command is None else task.limit(world, command)
-        return command, given, task.inputs(world, given, normals, live)
+        inputs = task.inputs(world, given, normals, live)
+        if command is not None and live is not None:
+            command = torch.where(live, command, 0.0)
+        return command, given, inputs
 
     def _told(
         self, before: World, command: Tensor, given: Tensor | None, after: World, commanded: bool

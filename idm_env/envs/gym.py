@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import inspect
 from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium.envs.registration import EnvSpec
 from torch import Tensor
 
@@ -114,8 +112,7 @@ class DiffIDMEnv(TrueSpec, gymnasium.Env):
         if not self.batch.begun:
             raise RuntimeError("step was called before reset. Call reset() first.")
         given = None if action is None else action_of(action, self._shape, self.settings)[None]
-        with torch.no_grad() if self._numpy else contextlib.nullcontext():
-            outcome = self.batch.step(given)
+        outcome = self.batch.step(given)
         if self.render_mode == "human":
             self.render()
         reward, terminated, truncated = outcome.whole

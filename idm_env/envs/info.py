@@ -42,17 +42,14 @@ def begun(batch: Batch) -> dict[str, Any]:
 
 def single(batch: Batch, outcome: Outcome) -> dict[str, Any]:
     """Return the info of a step of a single environment."""
-    info: dict[str, Any] = {}
-    for name, value in outcome.details.items():
-        if name == "crash":
-            info["crash"] = bool(value.any())
-        else:
-            info[name] = _out(batch, value)[0]
+    info: dict[str, Any] = {name: value[0] for name, value in outcome.details.items()}
+    if "crash" in info:
+        crash = info["crash"]
+        info["crash"] = crash.item() if len(batch.task.agents) == 1 else bool(crash.any())
     if info.get("crash"):
         assert batch.world is not None
         info["crash_reason"] = batch.task.crash_reason(batch.world, 0)
-    info.update(begun(batch))
-    return info
+    return info | begun(batch) if batch.task.vehicle_ids else info
 
 
 def _out(batch: Batch, value: Any) -> Any:

@@ -9,7 +9,7 @@ of views. Whatever does not depend on the inputs is a constant.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ def smaller(x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def run(rows, c, {arguments}):
-    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
+{flat}    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
     for r in range(rows):
 '''
 
@@ -124,14 +124,15 @@ class RowFunction:
         text = "\n".join(self._lines)
         self.needs = [name for name in inputs if f"in_{name}[" in text]
         arguments = [f"in_{n}" for n in self.needs] + [f"t{k}" for k in range(len(self._tables))]
-        arguments += [f"out_{n}" for n in moving]
+        arguments += [f"to_{n}" for n in moving]
+        flat = "".join(f"    out_{n} = to_{n}.reshape(-1)\n" for n in moving)
         room = {kind: max(1, size) for kind, size in self._room.items()}
-        header = HEADER.format(kind=real.name, arguments=", ".join(arguments), **room)
+        header = HEADER.format(kind=real.name, arguments=", ".join(arguments), flat=flat, **room)
         self._c = np.array(list(self._constants) or [0.0], real)
         self._run = library.load("rows", header + body(self._lines)).run
 
-    def run(self, rows: int, needed: Sequence[np.ndarray], outs: Sequence[np.ndarray]) -> None:
-        """Fill ``outs``; all arrays are flat and dense, row by row."""
+    def run(self, rows: int, needed: Iterable[np.ndarray], outs: Iterable[np.ndarray]) -> None:
+        """Fill ``outs``, dense in any shape; what is ``needed`` is flat. All arrays hold row after row."""
         self._run(rows, self._c, *needed, *self._tables, *outs)
 
     def _twice(self, found: Mapping[str, Tensor]) -> dict[str, tuple[str, tuple[int, ...]]]:

@@ -6,9 +6,12 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401
+from idm_env.envs.batch import Batch
+from idm_env.envs.settings import settings
 from idm_env.envs.values import Values
 from idm_env.kernels.rows import RowFunction
 from idm_env.scalar.record import Untraceable
+from idm_env.simulator import Simulator
 
 pytest.importorskip("numba")
 
@@ -63,6 +66,53 @@ def test_a_single_environment_is_a_row_of_a_vector_and_the_torch_path(task, keyw
     assert single[0].unwrapped.batch._values is not None, "the torch path ran"
     _same(single[0].unwrapped.state.gap, single[1].unwrapped.state.gap)
     _same(vector.unwrapped.state.speed[:1], single[1].unwrapped.state.speed)
+
+
+@pytest.mark.parametrize(("task", "keywords"), [CASES[1], CASES[5]])
+def test_vehicles_whose_agents_left_go_back_to_their_drivers(task, keywords):
+    made = settings(task=task, dtype="float64", **keywords)
+    ours, theirs = Batch(made, 2), Batch(made, 2)
+    theirs._values = None
+    for batch in (ours, theirs):
+        batch.seed([0, 1], [5, 6])
+        batch.reset()
+    draw = np.random.default_rng(0)
+    for _ in range(12):
+        shape = (2, len(made.task.agents))
+        action, live = draw.uniform(-1.3, 1.3, shape), torch.as_tensor(draw.random(shape) < 0.6)
+        mine, torchs = (batch.step(action, live) for batch in (ours, theirs))
+        for a, b in zip((*mine[:4], *mine.whole), (*torchs[:4], *torchs.whole), strict=True):
+            _same(a, b)
+        assert set(mine.details) == set(torchs.details) and not mine.details["command"][~live.numpy()].any()
+        for name, value in torchs.details.items():
+            _same(mine.details[name], value)
+    assert ours._values is not None, "the torch path ran"
+
+
+def steps_of_torch(monkeypatch, **keywords):
+    """Return how often an environment calls ``Simulator.step`` in five steps."""
+    env = gym.make("DiffIDM-v0", warmup=0, **keywords)
+    env.reset(seed=0)
+    count, step = [0], Simulator.step
+
+    def counted(self, *arguments):
+        count[0] += 1
+        return step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulator, "step", counted)
+        for _ in range(5):
+            env.step(None)
+    return count[0]
+
+
+def test_environments_step_by_their_kernel_where_nothing_prevents_it(monkeypatch):
+    assert steps_of_torch(monkeypatch) == 0
+    for effects in (["delay"], [{"effect": "idm", "exponent": 3.0}], [{"effect": "brakes", "sharpness": 1.0}]):
+        assert steps_of_torch(monkeypatch, effects=effects) == 0
+    assert steps_of_torch(monkeypatch, output="torch") == 5
+    monkeypatch.setenv("IDM_ENV_KERNELS", "0")
+    assert steps_of_torch(monkeypatch) == 5
 
 
 def test_what_was_told_and_shown_before_does_not_change_with_the_next_step():
