@@ -28,7 +28,7 @@ from idm_env.discovery.slots import SETS, TARGETS, Push
 from idm_env.discovery.slots import Slot as Changed
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.effects.free import FEATURES
-from idm_env.kernels import functions
+from idm_env.kernels import functions, staged
 from idm_env.roads import Lane
 from idm_env.scalar import library
 from idm_env.scalar.graph import Slot, TimeStep
@@ -159,7 +159,7 @@ class Loop:
     @cached_property
     def march(self) -> Any:
         """The compiled function of ``march_loops``."""
-        return library.load("march", self.text, (Path(functions.__file__),)).march
+        return library.load("march", self.text, (Path(functions.__file__), Path(staged.__file__))).march
 
 
 def why_not_recorded(effect: Effect, dt: float = 0.1) -> str | None:
@@ -205,7 +205,7 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
         if number not in read_tables:
             raise ValueError(f"effect '{name}' is sought as a profile and does not read it by effects.places.curve.")
     memories = list(made.begin)
-    driver = {f"idm.{p.name}": f"th{i}" for i, p in enumerate(IDM.declared)}
+    driver = {f"idm.{p.name}": f"th[{i}]" for i, p in enumerate(IDM.declared)}
     inputs = {slot_name(e.name, ""): "pulse_now" for e in _slots(PULSE)}
     for effect in catalogue.effects:
         inputs |= {slot_name(effect.name, part): text for part, text in _BESIDE.items()}
@@ -215,7 +215,7 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
         if slot in _SEEN:
             return _SEEN[slot]
         if slot.shift == 0 and name.startswith("on "):
-            return f"flags[{catalogue.flags[name[3:]]}] != 0"
+            return f"flags[{catalogue.flags[name[3:]]}]"
         if slot.shift == 0 and name.startswith("memory of "):
             return f"memory[{memories.index(name[10:])}]"
         if slot.shift == 0 and name in inputs:
@@ -231,16 +231,14 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     moved = [("displacement", after["displacement"]), ("speed_after", after["speed"]), ("accel_after", after["accel"])]
     remembered = [(f"moved[{j}]", after[f"memory of {m}"]) for j, m in enumerate(memories)]
     blocks = {
-        "sense": straight.lines([(f"h[now, {j}]", node) for j, node in enumerate(made.sense)], "s"),
-        "begin": straight.lines([(f"memory[{j}]", made.begin[m]) for j, m in enumerate(memories)], "b"),
-        "wind": straight.lines(remembered, "w"),
-        "respond": straight.lines([*moved, *remembered], calls=False),
+        "sense": straight.lines([(f"h[now, {j}]", node) for j, node in enumerate(made.sense)]),
+        "beginning": straight.lines([(f"memory[{j}]", made.begin[m]) for j, m in enumerate(memories)]),
+        "wind": straight.lines(remembered),
+        "respond": straight.lines([*moved, *remembered]),
     }
-    constants = straight.constants()
-    loads = [f"th{i} = th[{i}]" for i in range(len(driver))] + straight.loads()
-    blocks["constants"] = [*loads, *constants]
+    blocks["constants"] = straight.constants()
     text = Path(march_loops.__file__).read_text(encoding="utf-8")
-    counts = f"SIGNALS, MEMORIES = {max(len(made.sense), 1)}, {len(memories)}\n"
+    counts = f"SIGNALS, MEMORIES, CONSTANTS = {max(len(made.sense), 1)}, {len(memories)}, {straight.kept}\n"
     text = text.replace("compiled = ", f"{counts}compiled = ", 1)
     for name, lines in blocks.items():
         text = _pasted(text, name, lines)

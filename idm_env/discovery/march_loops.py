@@ -1,27 +1,36 @@
 """Loop over rows and time of discovery's rollout, without an equation: lines between marks are printed.
 
-This file is a template (``march``): what is printed works on the local names of ``march`` below, so the compiler sees
-one loop.
+This file is a template (``march``). What is printed is staged: Python runs it once, when numba compiles the loop.
 """
 
-# ruff: noqa: F401, F821, F841
+# ruff: noqa: F401, F821
 # mypy: ignore-errors
 from __future__ import annotations
 
 import numba
 import numpy as np
 
-from idm_env.kernels.functions import exp_float64 as exp
-from idm_env.kernels.functions import sigmoid_float64 as sigmoid
+from idm_env.kernels.staged import (
+    Merged,
+    choose,
+    cos,
+    exp,
+    expm1,
+    floor,
+    log,
+    log1p,
+    looked_up,
+    negated,
+    sigmoid,
+    sin,
+    sqrt,
+    staged,
+    tanh,
+    when,
+)
 
 ROOM = 68
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-
-@compiled
-def choose(condition, a, b):
-    """Return a where the condition holds, else b."""
-    return a if condition else b
 
 
 @compiled
@@ -49,6 +58,59 @@ def curve(p, number, tables, x):
     return (1.0 - share) * p[at + 4 + low] + share * p[at + 5 + low]
 
 
+def value_of_curve(p, number, tables, x):
+    """Return ``curve``; numba compiles plain functions into what is staged."""
+    return curve(p, number, tables, x)
+
+
+@staged()
+def constants(p, th, k, c, flags):
+    """Fill ``c`` with what depends on parameters alone."""
+    # <constants>
+    # </constants>
+
+
+@staged()
+def sense(
+    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
+    lead_accel, time, per_dt, place, pulse_now,
+):  # fmt: skip
+    """Fill the past with what drivers could see now."""
+    # <sense>
+    # </sense>
+
+
+@staged()
+def beginning(
+    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
+    lead_accel, time, per_dt, place, pulse_now,
+):  # fmt: skip
+    """Fill memories at the beginning."""
+    # <beginning>
+    # </beginning>
+
+
+@staged()
+def wind(
+    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
+    lead_accel, time, per_dt, place, pulse_now,
+):  # fmt: skip
+    """Fill ``moved`` with memories Δt later, on the record."""
+    # <wind>
+    # </wind>
+
+
+@staged(3)
+def respond(
+    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed, accel, lead_speed,
+    lead_accel, time, per_dt, place, pulse_now,
+):  # fmt: skip
+    """Fill ``moved`` with memories Δt later; return displacement, speed and acceleration of the step."""
+    # <respond>
+    # </respond>
+    return displacement, speed_after, accel_after
+
+
 @compiled
 def march(
     signals, bounds, record, start, steps, group, length, theta, phi, on, tables, back, whole, lead, every, dt, k,
@@ -69,17 +131,17 @@ def march(
     for r in range(len(bounds) - 1):
         longest = max(longest, bounds[r + 1] - bounds[r])
     h = np.empty((longest + 1 if back > 0 else 1, SIGNALS))
+    c = np.empty(CONSTANTS)
     memory, kept_memory, moved = np.zeros(MEMORIES), np.zeros(MEMORIES), np.zeros(MEMORIES)
-    for c in range(theta.shape[0]):
-        flags = on[c]
+    for copy in range(theta.shape[0]):
+        flags = on[copy]
         last, kept_at = -1, 0
         for row in range(rows):
             r = record[row]
-            th, p = theta[c, group[row]], phi[c, group[row]]
+            th, p = theta[copy, group[row]], phi[copy, group[row]]
             begin, end, origin, own_length = bounds[r], bounds[r + 1], start[row], length[r]
             offset = signals[origin, 18] - signals[origin, 14]
-            # <constants>
-            # </constants>
+            constants(p, th, k, c, flags)
             # Up to ``settle`` only memories are wound up, and from there to the origin the whole step, on the record.
             settle = max(begin, origin - lead)
             going_on = whole and r == last and kept_at <= settle
@@ -93,7 +155,7 @@ def march(
             while i < origin + steps:
                 if i + 1 >= end:
                     for j in range((i - origin) // every, steps // every):
-                        gap_out[c, row, j], speed_out[c, row, j] = signals[end - 1, 0] - position, speed
+                        gap_out[copy, row, j], speed_out[copy, row, j] = signals[end - 1, 0] - position, speed
                     break
                 if i <= origin:
                     position, speed = signals[i, 14], signals[i, 15]
@@ -104,24 +166,29 @@ def march(
                 gap = signals[i, 0] - position
                 time = signals[i, 17]
                 place = position + offset
-                pulse_now = pulse[c, 2] if i - origin >= pulse[c, 0] and i - origin < pulse[c, 1] else 0.0
+                pulse_now = pulse[copy, 2] if i - origin >= pulse[copy, 0] and i - origin < pulse[copy, 1] else 0.0
                 if back > 0:
                     carried = accel
                     if i < origin:
                         accel = signals[i, 16]
-                    # <sense>
-                    # </sense>
+                    sense(
+                        signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap,
+                        speed, accel, lead_speed, lead_accel, time, per_dt, place, pulse_now,
+                    )  # fmt: skip
                     accel = carried
                 if i < first:
                     i += 1
                     continue
                 if i == first and not going_on:
-                    # <begin>
-                    # </begin>
-                    pass  # where nothing is remembered
+                    beginning(
+                        signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap,
+                        speed, accel, lead_speed, lead_accel, time, per_dt, place, pulse_now,
+                    )  # fmt: skip
                 if i < settle:
-                    # <wind>
-                    # </wind>
+                    wind(
+                        signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap,
+                        speed, accel, lead_speed, lead_accel, time, per_dt, place, pulse_now,
+                    )  # fmt: skip
                     for j in range(MEMORIES):
                         memory[j] = moved[j]
                     i += 1
@@ -130,8 +197,10 @@ def march(
                     kept_at = i
                     for j in range(MEMORIES):
                         kept_memory[j] = memory[j]
-                # <respond>
-                # </respond>
+                displacement, speed_after, accel_after = respond(
+                    signals, h, p, th, k, c, flags, tables, memory, moved, i, now, position, own_length, gap, speed,
+                    accel, lead_speed, lead_accel, time, per_dt, place, pulse_now,
+                )  # fmt: skip
                 for j in range(MEMORIES):
                     memory[j] = moved[j]
                 accel = accel_after
@@ -142,5 +211,5 @@ def march(
                 position += displacement
                 k_step = i - origin
                 if k_step % every == 0:
-                    gap_out[c, row, k_step // every - 1] = signals[i, 0] - position
-                    speed_out[c, row, k_step // every - 1] = speed
+                    gap_out[copy, row, k_step // every - 1] = signals[i, 0] - position
+                    speed_out[copy, row, k_step // every - 1] = speed

@@ -1,6 +1,6 @@
-"""A graph with regions printed as straight-line Python over local names, for a loop over one vehicle.
+"""A graph with regions printed as straight-line Python for a loop over one vehicle, to be ``staged`` (``kernels``).
 
-What depends on parameters alone is printed apart (``constants``), to stand before the loop over time.
+What depends on parameters alone is printed apart (``constants``), into an array ``c``, before the loop over time.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from idm_env.scalar.graph import DYNAMIC, Node, Slot, TimeStep
 from idm_env.scalar.regions import Regions
 from idm_env.scalar.source import _FORMS, Constants
 
-_CHOICES = {
+_STAGED = _FORMS | {
     "relu": "choose({0} < 0.0, 0.0, {0})", "clamp_min": "choose({0} < {1}, {1}, {0})",
     "clamp_max": "choose({0} > {1}, {1}, {0})", "maximum": "choose({0} > {1}, {0}, {1})",
     "minimum": "choose({0} < {1}, {0}, {1})", "select": "choose({0}, {1}, {2})",
     "sign": "choose({0} > 0.0, 1.0, choose({0} < 0.0, -1.0, 0.0))",
+    "and": "{0} & {1}", "or": "{0} | {1}", "not": "negated({0})",
+    **{name: f"{name}({{0}})" for name in ("sqrt", "expm1", "log", "log1p", "tanh", "sin", "cos", "floor")},
 }  # fmt: skip
-"""Choices as calls of ``choose(condition, a, b)``: branches would cost numba seconds to compile."""
+"""Operation → text for ``kernels.staged``: functions where Python itself would ask for truth."""
 
 Read = Callable[[Slot], str]
 """How an input is read: an expression."""
@@ -29,20 +31,19 @@ class Straight:
     def __init__(self, graph: Regions, read: Read) -> None:
         self._graph, self._read = graph, read
         self.varying = Constants()
-        self._prefix, self._calls = "t", True
         self._kept: dict[Node, str] = {}
 
-    def lines(self, writes: Sequence[tuple[str, Node]], prefix: str = "t", *, calls: bool = True) -> list[str]:
-        """Return lines that compute and write what changes with every step.
+    @property
+    def kept(self) -> int:
+        """Numbers in ``c``."""
+        return len(self._kept)
 
-        Names begin with ``prefix``: a name that is set once in a function costs its compiler much less. ``calls``
-        writes choices as calls, which compile quicker and run slower than branches.
-        """
-        self._prefix, self._calls = prefix, calls
+    def lines(self, writes: Sequence[tuple[str, Node]]) -> list[str]:
+        """Return lines that compute and write what changes with every step."""
         live = self._live([node for _, node in writes], stop=True)
         for node in live:
             if self._is_kept(node) and node not in self._kept:
-                self._kept[node] = f"c{self._graph.serial[node]}"
+                self._kept[node] = f"c[{len(self._kept)}]"
         names: dict[Node, str] = dict(self._kept)
         made = self._print([n for n in live if n not in self._kept], names)
         return [*made, *(f"{place} = {self._name(node, names)}" for place, node in writes)]
@@ -51,12 +52,7 @@ class Straight:
         """Return lines that compute what the printed lines need of parameters alone; call it last."""
         wanted = list(self._kept)
         names: dict[Node, str] = {}
-        self._prefix, self._calls = "u", True
         return self._print(self._live(wanted, stop=False), names, self._kept)
-
-    def loads(self) -> list[str]:
-        """Return lines that name what depends on the time step, from an array ``k``; call it last."""
-        return [f"k{i} = k[{i}]" for i in range(len(self.varying.values))]
 
     @staticmethod
     def _is_kept(node: Node) -> bool:
@@ -90,13 +86,15 @@ class Straight:
                 if region in done:
                     continue
                 done.add(region)
-                same = merges[region]
-                for m in same:
-                    names[m] = (fixed or {}).get(m, f"{self._prefix}{graph.serial[m]}")
-                lines += [f"{names[m]} = {self._name(m.args[2], names)}" for m in same]
                 block = inside.get(region, [])
-                block = [*block, *(f"{names[m]} = {self._name(m.args[1], names)}" for m in same)]
-                lines += [f"if {self._name(node.args[0], names)}:  # {block_note(node)}", *(f"    {x}" for x in block)]
+                for m in merges[region]:
+                    outside, within = (self._name(m.args[k], names) for k in (2, 1))
+                    names[m] = name = (fixed or {}).get(m, f"t{graph.serial[m]}")
+                    kept = name.startswith("c[")
+                    lines.append(f"{name} = {outside}" if kept else f"{name} = Merged({outside})")
+                    block = [*block, f"{name} = {within}" if kept else f"{name}.become({within})"]
+                guard = self._name(node.args[0], names)
+                lines += [f"with when({guard}):  # {block_note(node)}", *(f"    {x}" for x in block)]
                 continue
             if node.op in ("constant", "input") or node.boolean:
                 continue
@@ -105,12 +103,12 @@ class Straight:
                 note = node.note
                 lines.append(f"# {note or 'motion'}")
             text = self._text(node, names)
-            names[node] = (fixed or {}).get(node, f"{self._prefix}{graph.serial[node]}")
+            names[node] = (fixed or {}).get(node, f"t{graph.serial[node]}")
             target.append(f"{names[node]} = {text}")
         # Of a region that only fixes constants nothing is merged.
         for region, block in inside.items():
             if region not in done:
-                lines += [f"if {self._name(graph.guards[region], names)}:", *(f"    {x}" for x in block)]
+                lines += [f"with when({self._name(graph.guards[region], names)}):", *(f"    {x}" for x in block)]
         return lines
 
     def _name(self, node: Node, names: dict[Node, str]) -> str:
@@ -119,7 +117,7 @@ class Straight:
         if node.op == "constant":
             assert isinstance(node.label, float)
             if isinstance(node.label, TimeStep):
-                return f"k{self.varying.index(node.label)}"
+                return f"k[{self.varying.index(node.label)}]"
             return repr(float(node.label)) if node.label >= 0 else f"({float(node.label)!r})"
         if node.op == "input":
             assert isinstance(node.label, Slot)
@@ -130,11 +128,10 @@ class Straight:
     def _text(self, node: Node, names: dict[Node, str]) -> str:
         arguments = [self._name(a, names) for a in node.args]
         if node.op == "past":
-            return f"h[max(now - int({arguments[0]}), 0), {node.label}]"
+            return f"h[now.before({arguments[0]}), {node.label}]"
         if node.op == "table":
-            return f"curve(p, {node.label}, tables, {arguments[0]})"
-        form = (_CHOICES.get(node.op) if self._calls else None) or _FORMS[node.op]
-        return form.format(*arguments, zero="0.0", one="1.0")
+            return f"looked_up(value_of_curve, p, {node.label}, tables, {arguments[0]})"
+        return _STAGED[node.op].format(*arguments)
 
 
 def block_note(node: Node) -> str:
