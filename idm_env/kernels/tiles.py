@@ -37,7 +37,10 @@ def _cache_of_loops() -> str:
     """
     sources = sorted(Path(__file__).parent.glob("*.py"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
-    return str(Path(_settings.CACHE_DIR or library.folder()) / f"loops_{digest}")
+    place = Path(_settings.CACHE_DIR or library.folder()) / f"loops_{digest}"
+    if not place.exists():
+        library.announce()
+    return str(place)
 
 
 def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:

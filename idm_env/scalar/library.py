@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import sys
 import tempfile
@@ -12,9 +13,6 @@ from pathlib import Path
 from types import ModuleType
 
 from idm_env import modules
-
-BEGIN, END = "# <printed>", "# </printed>"
-"""Lines of a template between which the printed half goes."""
 
 
 @lru_cache(maxsize=1)
@@ -34,11 +32,13 @@ def folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="idm_env_"))
 
 
-def filled(template: Path, printed: str) -> str:
-    """Return a template with its marked part replaced."""
-    text = template.read_text(encoding="utf-8")
-    begin, end = text.index(BEGIN), text.index(END) + len(END)
-    return text[:begin] + printed + text[end:]
+@lru_cache(maxsize=1)
+def announce() -> None:
+    """Say, once per process, that something is compiled that was not met before."""
+    logging.getLogger("idm_env").warning(
+        "idm_env compiles what it has not met before: some seconds for each set of effects, once. It is kept in %s.",
+        folder(),
+    )
 
 
 def load(name: str, text: str, relies_on: Sequence[Path] = ()) -> ModuleType:
@@ -55,6 +55,7 @@ def load(name: str, text: str, relies_on: Sequence[Path] = ()) -> ModuleType:
         return sys.modules[module_name]
     path = folder() / f"{module_name}.py"
     if not path.exists():
+        announce()
         # Beside and then renamed: another process never sees half a file.
         handle, fresh = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
