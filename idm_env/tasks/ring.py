@@ -16,10 +16,10 @@ from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Ring, Road
 from idm_env.tasks.base import Features, Pay, Task, World
-from idm_env.tasks.checks import at_least, span
+from idm_env.tasks.checks import at_least, span, whole
 from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
-from idm_env.types import Params
+from idm_env.types import Command, Inputs, Params
 
 STARTS = ("uniform", "wave")
 SCALES = (5.0, 1.0, 10.0)
@@ -55,6 +55,12 @@ class RingTask(Task):
         tailgating: Weight of the tailgating term; 0 leaves it out.
         tailgating_below: Time gap below which it counts (s). An agent holds about that gap: leave a margin.
         fuel: Weight of the fuel term (s/mL); 0 leaves it out.
+        shock: Deceleration (m/s²) with which one human driver brakes once in an episode, whatever is ahead: as hard as
+            the brakes allow, by a command in place of the driver's acceleration; 0 is no shock.
+        shock_after: Time from the beginning of the episode to the shock (s).
+        shock_seconds: How long it lasts (s), in whole steps.
+        shock_vehicle: Who brakes; None is the human opposite the first agent, half the ring away (or the next one
+            behind, where that is an agent too).
     """
 
     name: ClassVar[str] = "ring"
@@ -71,6 +77,10 @@ class RingTask(Task):
     tailgating: float = 0.0
     tailgating_below: float = 0.8
     fuel: float = 0.0
+    shock: float = 0.0
+    shock_after: float = 120.0
+    shock_seconds: float = 2.0
+    shock_vehicle: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -84,6 +94,36 @@ class RingTask(Task):
         at_least("tailgating", self.tailgating, 0.0)
         at_least("tailgating_below", self.tailgating_below, 0.1, "s")
         at_least("fuel", self.fuel, 0.0)
+        at_least("shock", self.shock, 0.0, "m/s²")
+        at_least("shock_after", self.shock_after, 0.0, "s")
+        at_least("shock_seconds", self.shock_seconds, self.simulator.dt, "s")
+        if self.shock or self.shock_vehicle is not None:
+            self._check_shocked()
+
+    def _check_shocked(self) -> None:
+        """Check that a human driver brakes."""
+        if len(self.agents) == self.vehicles:
+            raise ValueError(
+                f"shock = {self.shock:g} m/s² needs a human driver, and agents control all {self.vehicles} vehicles. "
+                "Control fewer, or leave shock out."
+            )
+        vehicle = self.shock_vehicle
+        if vehicle is None:
+            return
+        if whole("shock_vehicle", vehicle, 0) >= self.vehicles or vehicle in self.agents:
+            raise ValueError(
+                f"shock_vehicle = {vehicle} must be a human driver of vehicles 0 … {self.vehicles - 1}; agents control "
+                f"{', '.join(map(str, self.agents))}."
+            )
+
+    @cached_property
+    def shocked(self) -> int:
+        """The vehicle that brakes where there is a shock."""
+        if self.shock_vehicle is not None:
+            return self.shock_vehicle
+        opposite = self.agents[0] + self.vehicles // 2
+        behind = ((opposite + i) % self.vehicles for i in range(self.vehicles))
+        return next(i for i in behind if i not in self.agents)
 
     @property
     def features(self) -> Features:
@@ -142,6 +182,23 @@ class RingTask(Task):
         if len(self._leaders) == 1:
             return x[..., self._leaders[0] : self._leaders[0] + 1]
         return x.index_select(-1, self.constant("leaders", self._leaders, x.device, torch.int64))
+
+    def inputs(
+        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+    ) -> Inputs:
+        """Return the inputs of one step: those of every task, and the command of the human who brakes."""
+        inputs = super().inputs(world, command, normals, live)
+        if not self.shock:
+            return inputs
+        step, dt = world.state.step.unsqueeze(-1), self.simulator.dt
+        first = round(self.shock_after / dt)
+        now = (step >= first) & (step < first + round(self.shock_seconds / dt))
+        who = self.constant("shocked", self._is_shocked, step.device, torch.bool)
+        given, brakes = inputs["control"], now & who
+        return {**inputs, "control": Command(torch.where(brakes, -self.shock, given.accel), given.active | brakes)}
+
+    def _is_shocked(self) -> list[bool]:
+        return [i == self.shocked for i in range(self.vehicles)]
 
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``4 mean(v)/20 − 4 mean|u|``, less the terms that have a weight."""

@@ -18,6 +18,7 @@ pytest.importorskip("numba")
 CASES = [
     ("ring", {"start": "wave", "warmup": 20}),
     ("ring", {"warmup": 5, "fuel": 0.1, "tailgating": 1.0, "controlled": 3, "failsafe": 3.0, "integration": "euler"}),
+    ("ring", {"warmup": 5, "controlled": 2, "shock": 4.0, "shock_after": 0.5, "shock_seconds": 1.2}),
     ("ring", {"warmup": 5, "effects": ["delay", "memory"], "parameters": {"idm.time_gap": 1.3}}),
     ("follow", {"max_episode_steps": 25}),
     ("platoon", {"controlled": 2, "noise": 0.1}),
@@ -35,7 +36,7 @@ def _same(ours, theirs):
         assert np.array_equal(ours, theirs)
 
 
-INFOS = [*((*case, "all") for case in CASES), *((*CASES[i], "none") for i in (0, 3, 5))]
+INFOS = [*((*case, "all") for case in CASES), *((*CASES[i], "none") for i in (0, 4, 6))]
 """All cases with infos; one of each kind without: every pair is compiled anew."""
 
 

@@ -98,6 +98,64 @@ def test_a_policy_of_constant_speed_calms_the_traffic():
     assert float(world.state.speed.mean()) > 1.03 * waves
 
 
+def shocked_speeds(shock_after=1.0):
+    """The speeds of all vehicles after every step, and what they could depend on; a human brakes for a second."""
+    task = make_task(
+        "ring", warmup=300, noise=0.0, length=260.0, shock=4.0, shock_after=shock_after, shock_seconds=1.0
+    )
+    with torch.no_grad():
+        world, params = start(task, count=2)
+    world = world._replace(state=world.state._replace(step=torch.tensor([0, -5])))
+    push = torch.zeros(2, 1, dtype=torch.float64, requires_grad=True)
+    params["idm"]["time_gap"].requires_grad_()
+    speeds = [world.state.speed]
+    for _ in range(40):
+        world = task.step(world, push, None, params)
+        speeds.append(world.state.speed)
+    return torch.stack(speeds), push, params["idm"]["time_gap"]
+
+
+def test_in_a_shock_one_human_brakes_for_its_time_whatever_is_ahead():
+    speeds, _, _ = shocked_speeds()
+    change = (speeds[1:] - speeds[:-1]).detach()
+    for row, first in ((0, 10), (1, 15)):
+        braked = change[:, row, 11] < -0.39
+        assert braked.nonzero().flatten().tolist() == list(range(first, first + 10))
+        torch.testing.assert_close(change[first : first + 10, row, 11], torch.full((10,), -0.4, dtype=torch.float64))
+    # Who drives ahead does not feel it, who follows does.
+    felt = (shocked_speeds(shock_after=60.0)[0] - speeds).detach()[:, 0]
+    assert float(felt[:, :11].abs().max()) == 0.0
+    assert float(felt[-1, 12]) > 0.5
+
+
+def test_gradients_flow_past_a_shock_and_not_into_it():
+    speeds, push, time_gap = shocked_speeds()
+    one = speeds[:, 0]
+    assert float(torch.autograd.grad(one[-1, 0], push, retain_graph=True)[0][0]) == pytest.approx(4.0)
+
+    def slope(later, earlier):
+        change = one[later, 11] - one[earlier, 11]
+        return float(torch.autograd.grad(change, time_gap, retain_graph=True)[0])
+
+    assert slope(10, 0) != 0.0
+    assert slope(20, 10) == 0.0
+    assert slope(30, 20) != 0.0
+
+
+def test_the_driver_opposite_is_no_agent_and_a_wrong_one_is_told():
+    assert make_task("ring", shock=4.0, controlled=2).shocked == 12
+    assert make_task("ring", shock=4.0, controlled=[5]).shocked == 16
+    for keywords, message in (
+        ({"shock": -1.0}, "shock = -1"),
+        ({"shock": 4.0, "shock_seconds": 0.0}, "shock_seconds = 0"),
+        ({"shock": 4.0, "controlled": "all"}, "needs a human driver"),
+        ({"shock": 4.0, "shock_vehicle": 0}, "shock_vehicle = 0 must be a human driver"),
+        ({"shock": 4.0, "shock_vehicle": 22}, "shock_vehicle = 22 must be a human driver"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_task("ring", **keywords)
+
+
 @pytest.mark.parametrize("below", [0.8, 1.1])
 def test_tailgating_and_fuel_cost(below):
     plain = make_task("ring", warmup=30)
