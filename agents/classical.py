@@ -24,6 +24,7 @@ from agents.common import load_agent, one_line
 from agents.environments import task_of
 from agents.evaluate import evaluate_ring
 from agents.rollout import FRESH, LENGTHS, UNSEEN, Act, ring_start, uniform_speed
+from idm_env.tasks import Task
 
 
 class Seen(NamedTuple):
@@ -44,15 +45,12 @@ def seen(observation: Tensor, vehicle_length: float, scales: Sequence[float]) ->
 class Controller:
     """A commanded speed, turned into actions in [−1, 1]; one object drives one batch of rings once."""
 
-    dt: float
-    max_command: float
-    vehicle_length: float
-    scales: Sequence[float]
+    task: Task
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Return actions ``(n, 1)``."""
-        view = seen(observation, self.vehicle_length, self.scales)
-        return ((self.wanted(view) - view.speed) / (self.dt * self.max_command)).clamp(-1.0, 1.0)
+        view = seen(observation, self.task.vehicle_length, self.task.scales)
+        return self.task.action((self.wanted(view) - view.speed) / self.task.simulator.dt)
 
     def wanted(self, view: Seen) -> Tensor:
         """Return the commanded speed (m/s)."""
@@ -97,7 +95,7 @@ class PISaturation(Controller):
     seconds: float = 38.0
 
     def __post_init__(self) -> None:
-        self._past: deque[Tensor] = deque(maxlen=round(self.seconds / self.dt))
+        self._past: deque[Tensor] = deque(maxlen=round(self.seconds / self.task.simulator.dt))
         self._command: Tensor | None = None
 
     def wanted(self, view: Seen) -> Tensor:
@@ -118,9 +116,9 @@ def no_command(observation: Tensor) -> Tensor:
     return observation.new_zeros(len(observation), 1)
 
 
-def constant(accel: float, max_command: float) -> Act:
+def constant(accel: float, task: Task) -> Act:
     """Return a controller that always commands this acceleration (m/s²): with a failsafe, that drives."""
-    return lambda observation: observation.new_full((len(observation), 1), accel / max_command)
+    return lambda observation: task.action(observation.new_full((len(observation), 1), accel))
 
 
 def controllers(
@@ -128,18 +126,16 @@ def controllers(
 ) -> dict[str, Callable[[], Act | None]]:
     """Return what makes each controller for rings of these lengths and draws, by the name of its row."""
     task = task_of(environment)
-    vehicle: dict[str, Any] = {"dt": task.simulator.dt, "max_command": task.max_command}
-    vehicle |= {"vehicle_length": task.vehicle_length, "scales": task.scales}
     uniform = uniform_speed(ring_start(environment, lengths, draws=draws)).unsqueeze(-1)
     middle = float(uniform.median())
     return {
         "IDM for all": lambda: None,
         "no command": lambda: no_command,
-        "0.025 m/s² for ever": lambda: constant(0.025, task.max_command),
-        "0.05 m/s² for ever": lambda: constant(0.05, task.max_command),
-        "FollowerStopper, one speed for all rings": lambda: FollowerStopper(**vehicle, desired=middle),
-        "FollowerStopper, told each ring's uniform speed": lambda: FollowerStopper(**vehicle, desired=uniform),
-        "PI with saturation": lambda: PISaturation(**vehicle),
+        "0.025 m/s² for ever": lambda: constant(0.025, task),
+        "0.05 m/s² for ever": lambda: constant(0.05, task),
+        "FollowerStopper, one speed for all rings": lambda: FollowerStopper(task, desired=middle),
+        "FollowerStopper, told each ring's uniform speed": lambda: FollowerStopper(task, desired=uniform),
+        "PI with saturation": lambda: PISaturation(task),
     }
 
 

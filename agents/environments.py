@@ -79,7 +79,7 @@ def human_driving(
 ) -> tuple[Tensor, Tensor]:
     """Return what agents observe while human drivers keep the wheel, and the actions that would do what they do.
 
-    Shapes ``(samples, features)`` and ``(samples,)``; actions are accelerations over ``max_command``, clipped.
+    Shapes ``(samples, features)`` and ``(samples,)``; actions would command what drivers do, clipped.
     """
     env = make_env(environment, count, output="numpy")
     seen, done = [env.reset(seed=seed)[0]], []
@@ -90,6 +90,6 @@ def human_driving(
         over = torch.as_tensor(terminated | truncated).unsqueeze(-1)
         done.append(torch.where(over, torch.nan, env.task.pick(env.state.accel)))
     observations = torch.as_tensor(np.stack(seen[:-1])).float().reshape(-1, len(env.task.bounds.names))
-    actions = (torch.stack(done).float() / env.task.max_command).clamp(-1.0, 1.0).flatten()
+    actions = env.task.action(torch.stack(done).float()).flatten()
     known = actions.isfinite()
     return observations[known], actions[known]

@@ -30,6 +30,7 @@ from tqdm import tqdm
 
 from agents import common
 from agents.common import Policy
+from agents.environments import task_of
 from agents.monitor import make_logger
 from idm_env.data import Episode, Trajectories, episodes, load
 from idm_env.effects import Control
@@ -37,6 +38,7 @@ from idm_env.fitting.batch import Batch, windows
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import base_simulator, fit
 from idm_env.fitting.problem import group_of
+from idm_env.tasks import Task
 from idm_env.tasks.follow import SEEN
 from idm_env.types import Command
 
@@ -78,10 +80,11 @@ def observe(speed: Tensor, lead_speed: Tensor, gap: Tensor) -> Tensor:
     return torch.stack((speed / SCALES[0], lead_speed / SCALES[1], gap.clamp(-10.0, 1000.0) / SCALES[2]), dim=-1)
 
 
-def simulate(policy: Policy, batch: Batch, max_command: float) -> tuple[Tensor, Tensor]:
+def simulate(policy: Policy, batch: Batch, task: Task) -> tuple[Tensor, Tensor]:
     """Return gap and speed of every driver at the samples after the first, ``(T − 1, rows)``, driven by the policy.
 
-    Leaders are replayed as measured; the driver starts on its measured state. Needs a batch without substeps.
+    Leaders are replayed as measured; the driver starts on its measured state; actions mean what they do in ``task``.
+    Needs a batch without substeps.
     """
     plain = base_simulator(batch.dt)
     simulator = plain.adding(Control())
@@ -92,7 +95,7 @@ def simulate(policy: Policy, batch: Batch, max_command: float) -> tuple[Tensor, 
     gaps, speeds = [], []
     for record in slices:
         seen = observe(state.speed[..., 1], state.speed[..., 0], state.gap[..., 1])
-        command = Command(policy(seen) * max_command, driver)
+        command = Command(task.command(policy(seen)), driver)
         state = simulator.step(state, {**record, "control": command}, params)
         gaps.append(state.gap[..., 1])
         speeds.append(state.speed[..., 1])
@@ -107,11 +110,11 @@ def spacing_error(gap: Tensor, batch: Batch) -> Tensor:
     return (squares / (weight.sum(0) + 1.0) + 1e-12).sqrt()
 
 
-def judge(policy: Policy, items: Sequence[Episode], max_command: float) -> dict[str, float]:
+def judge(policy: Policy, items: Sequence[Episode], task: Task) -> dict[str, float]:
     """Return the errors of a policy on episodes, as ``idm_env.fitting.evaluate`` has them."""
     batch = Batch.of(items, dtype=torch.float32, substeps=1)
     with torch.no_grad():
-        gap, speed = simulate(policy, batch, max_command)
+        gap, speed = simulate(policy, batch, task)
     weight = batch.valid[1:]
     error = spacing_error(gap, batch)
     speed_error = ((((speed - batch.speed[1:]) * weight).square().sum(0)) / (weight.sum(0) + 1.0)).sqrt()
@@ -158,7 +161,7 @@ def cloned(a: Arguments, training: Sequence[Episode]) -> Policy:
     policy = Policy(len(SCALES), a.hidden)
     policy.mean.copy_(seen.mean(0))
     policy.scale.copy_(seen.std(0))
-    common.clone(policy, seen, (accel / a.environment["max_command"]).clamp(-1.0, 1.0), a.cloning_steps)
+    common.clone(policy, seen, task_of(a.environment).action(accel), a.cloning_steps)
     return policy
 
 
@@ -166,10 +169,10 @@ def train(a: Arguments) -> list[dict[str, Any]]:
     """Return one row per model: IDM, behaviour cloning, cloning through the simulator; the last policy is saved."""
     torch.manual_seed(a.seed)
     training, test = split(a)
-    top = float(a.environment["max_command"])
+    task = task_of(a.environment)
     rows: list[dict[str, Any]] = [{"model": "IDM, calibrated on spacing", **calibrated(training, test)}]
     policy = cloned(a, training)
-    rows.append({"model": "behaviour cloning", **judge(policy, test, top)})
+    rows.append({"model": "behaviour cloning", **judge(policy, test, task)})
     last, first, before = a.out / "last.pt", 0, 0.0
     optimiser = torch.optim.Adam(policy.parameters(), lr=a.learning_rate)
     if a.resume:
@@ -183,7 +186,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
     with closing(make_logger(a, first)) as logger, tqdm(range(first, a.updates), "imitation", disable=None) as bar:
         for update in bar:
             optimiser.param_groups[0]["lr"] = common.fall(a.learning_rate, update, a.updates)
-            loss = spacing_error(simulate(policy, batch, top)[0], batch).mean()
+            loss = spacing_error(simulate(policy, batch, task)[0], batch).mean()
             norm = common.descend(loss, policy.parameters(), optimiser, a.clip, update, last)
             spent = time.process_time() - began
             kept = {"update": update, "cpu_seconds": spent, "optimiser": optimiser.state_dict()}
@@ -194,7 +197,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
             bar.set_postfix(rmse=f"{float(loss.detach()):.3f}", norm=f"{norm:.2g}", refresh=False)
             if 0.0 < a.cpu_seconds <= spent:
                 break
-    rows.append({"model": "cloning through the simulator", **judge(policy, test, top), "cpu_seconds": spent})
+    rows.append({"model": "cloning through the simulator", **judge(policy, test, task), "cpu_seconds": spent})
     return rows
 
 

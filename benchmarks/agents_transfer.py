@@ -28,7 +28,7 @@ from agents import apg, common  # noqa: E402
 from agents.classical import PISaturation, no_command  # noqa: E402
 from agents.evaluate import evaluate_ring  # noqa: E402
 from agents.rollout import FRESH, LENGTHS, Act  # noqa: E402
-from idm_env.tasks.ring import SCALES  # noqa: E402
+from idm_env.tasks import make_task  # noqa: E402
 
 Row = dict[str, Any]
 EFFECT, STRENGTH, DATA_SEED = "delay", 0.5, 5
@@ -98,7 +98,7 @@ def main() -> None:
     print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD))
     show("human drivers", "", judge(None, truth), None, None)
     show("no command", "", judge(no_command, truth), judge(no_command, guarded), None)
-    by_hand = (judge(PISaturation(0.1, 3.0, 5.0, SCALES), where) for where in (truth, guarded))
+    by_hand = (judge(PISaturation(make_task(**RING)), where) for where in (truth, guarded))
     show("PI with saturation", "", *by_hand, None)
     touched: dict[str, list[int]] = {}
     for name, environment in environments.items():

@@ -3,7 +3,7 @@
 ``accel``
     Executed accelerations of the agents (m/s²), shape ``(agents,)``: what drivers' brakes and the failsafe left.
 ``command``
-    Commanded accelerations (m/s²): the clipped action times ``max_command``; NaN where nobody commands.
+    Commanded accelerations (m/s²): the clipped action times its ``max_command``; NaN where nobody commands.
 ``failsafe``
     Whether the failsafe cut each command (bool).
 ``crash``, ``crash_reason``

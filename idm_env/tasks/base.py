@@ -22,7 +22,7 @@ from idm_env.effects import Control, Effect, Noise
 from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import agents_of, at_least, whole
+from idm_env.tasks.checks import agents_of, at_least, limits_of, whole
 from idm_env.tasks.crash import contact, lawful_cost
 from idm_env.tasks.nouns import Advance, Bounds, Ended, Features, Pay, World
 from idm_env.tasks.random import Draw
@@ -55,7 +55,9 @@ class Task(abc.ABC):
             none.
         warmup: Steps before an episode begins, in which nobody is controlled.
         warmup_pool: If above 0, episodes begin in one of that many warmed-up worlds, which are made once.
-        max_command: Acceleration that an action of 1 commands (m/s²).
+        max_command: Acceleration that an action of 1 commands (m/s²), and an action of −1 its negative; or
+            ``[hardest braking, strongest acceleration]``, such as ``[-4.5, 2.6]``: actions below 0 are then in parts of
+            the former, those above in parts of the latter, and an action of 0 commands 0 in any case.
         failsafe: Deceleration (m/s²) of a failsafe: commands that leave a vehicle no room to stop at it behind a leader
             who brakes as hard are cut, and may then brake beyond ``max_command``; 0 is none. Rewards are for the
             command as it was given. See ``safe_command``.
@@ -80,7 +82,7 @@ class Task(abc.ABC):
     noise: float = 0.0
     warmup: int = 0
     warmup_pool: int = 0
-    max_command: float = 1.0
+    max_command: float | Sequence[float] = 1.0
     failsafe: float = 0.0
     failsafe_time: float = 1.0
     max_episode_steps: int | None = None
@@ -105,7 +107,7 @@ class Task(abc.ABC):
         whole("warmup_pool", self.warmup_pool, 0)
         if self.warmup_pool and not self.warmup:
             raise ValueError(f"warmup_pool = {self.warmup_pool} has no use without warm-up. Give warmup=750 as well.")
-        at_least("max_command", self.max_command, 1e-3, "m/s²")
+        limits_of(self.max_command)
         at_least("failsafe", self.failsafe, 0.0, "m/s²")
         at_least("failsafe_time", self.failsafe_time, 0.0, "s")
         self._check_episode()
@@ -128,6 +130,11 @@ class Task(abc.ABC):
     def agents(self) -> tuple[int, ...]:
         """Indices of the controlled vehicles, front first."""
         return agents_of(self.controlled, self.vehicles, self.first_free)
+
+    @cached_property
+    def command_limits(self) -> tuple[float, float]:
+        """The accelerations (m/s²) that actions of −1 and 1 command."""
+        return limits_of(self.max_command)
 
     @property
     def usual_steps(self) -> int:
@@ -283,7 +290,14 @@ class Task(abc.ABC):
 
     def command(self, action: Tensor) -> Tensor:
         """Return the commanded accelerations (m/s²) of actions, which are clipped to [−1, 1] (no gradient beyond)."""
-        return action.clamp(-1.0, 1.0) * self.max_command
+        low, high = self.command_limits
+        action = action.clamp(-1.0, 1.0)
+        return action * high if low == -high else torch.where(action < 0.0, action * -low, action * high)
+
+    def action(self, accel: Tensor) -> Tensor:
+        """Return the actions in [−1, 1] that command accelerations (m/s²), as far as they can."""
+        low, high = self.command_limits
+        return torch.where(accel < 0.0, accel / -low, accel / high).clamp(-1.0, 1.0)
 
     def lead_speed(self, state: State) -> Tensor:
         """Return the speed of each agent's leader (m/s), the agent's own where there is none, shape ``(…, agents)``."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from idm_env.checks import at_least, shown, whole
+from idm_env.checks import at_least, finite, shown, whole
 
-__all__ = ["KeywordError", "agents_of", "at_least", "span", "whole"]
+__all__ = ["KeywordError", "agents_of", "at_least", "limits_of", "span", "whole"]
+
+_WEAKEST = 1e-3
 
 
 class KeywordError(TypeError, ValueError):
@@ -23,6 +25,20 @@ def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
     if first > last:
         raise ValueError(f"{name} = {shown(value)} must rise: write [{last:g}, {first:g}] ({unit}).")
     return first, last
+
+
+def limits_of(max_command: Any) -> tuple[float, float]:
+    """Return the accelerations (m/s²) that actions of −1 and 1 command, from one number or from both."""
+    if isinstance(max_command, Sequence) and not isinstance(max_command, str):
+        ends = [finite("max_command", x, "m/s²") for x in max_command]
+        if len(ends) != 2 or ends[0] > -_WEAKEST or ends[1] < _WEAKEST:
+            raise ValueError(
+                f"max_command = {shown(list(max_command))} must be one number, or [hardest braking, strongest "
+                "acceleration] with a braking below 0 and an acceleration above 0, such as [-4.5, 2.6] (m/s²)."
+            )
+        return ends[0], ends[1]
+    top = at_least("max_command", max_command, _WEAKEST, "m/s²")
+    return -top, top
 
 
 def count_of(controlled: Any, free: int) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -74,7 +74,7 @@ class FollowTask(Task):
     first_free: ClassVar[int] = 1
 
     vehicles: int = 7
-    max_command: float = 3.0
+    max_command: float | Sequence[float] = 3.0
     leader: str | None = None
 
     def __post_init__(self) -> None:

@@ -58,7 +58,7 @@ class PlatoonTask(Task):
     first_free: ClassVar[int] = 1
 
     vehicles: int = 11
-    max_command: float = 2.0
+    max_command: float | Sequence[float] = 2.0
     speed: float = 10.0
     disturbance: float = 3.0
     period: float | Sequence[float] = (40.0, 90.0)

@@ -64,7 +64,7 @@ class ReplayTask(Task):
 
     vehicles: int = 0
     controlled: Any = 1
-    max_command: float = 3.0
+    max_command: float | Sequence[float] = 3.0
     data: str | None = None
     runs: Sequence[str] | None = None
     model: str | Sequence[str] = ()

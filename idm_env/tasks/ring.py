@@ -44,7 +44,7 @@ class RingTask(Task):
     Speeds are clipped to 40 m/s, their difference to ±20 m/s, headways to −10 m … the longest ring.
     Reward, the same for all agents: ``4 mean(v)/20 − 4 mean|u|``, v of all vehicles after the step (at most 40 m/s), u
     the commands (m/s²); less ``tailgating · max(0, 1 − time gap / tailgating_below)``, each agent's own, and ``fuel ·
-    mean fuel rate (mL/s)``, which saturates from 5 to 10 mL/s. At least ``−4 max_command`` (less what has a weight) and
+    mean fuel rate (mL/s)``, which saturates from 5 to 10 mL/s. At least ``−4 max|u|`` (less what has a weight) and
     at most 8. Terminated where vehicles touch, which pays ``−crash_cost`` instead: 36 001 by default, so that a crash
     is worse than any survival (``idm_env.tasks.crash``). Flow pays 0 there, which is more than a slow ring.
 
@@ -139,7 +139,7 @@ class RingTask(Task):
 
     def _worst(self) -> float:
         """Return the reward below which the fuel's term saturates; without its weight none lies below."""
-        return -4.0 * self.max_command - self.tailgating - _FUEL * self.fuel
+        return -4.0 * max(-self.command_limits[0], self.command_limits[1]) - self.tailgating - _FUEL * self.fuel
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return rings of drawn lengths: standing at equal gaps, or in a wave."""

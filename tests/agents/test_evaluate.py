@@ -13,10 +13,10 @@ from agents.common import Policy
 from agents.evaluate import solved_at
 from agents.rollout import Driven, ring_start, uniform_speed
 from idm_env import metrics
-from idm_env.tasks.ring import SCALES
+from idm_env.tasks import make_task
 
-RING = {"task": "ring"}
-VEHICLE: dict[str, Any] = {"dt": 0.1, "max_command": 1.0, "vehicle_length": 5.0, "scales": SCALES}
+RING: dict[str, Any] = {"task": "ring"}
+TASK = make_task(**RING)
 
 
 def test_uniform_speed_is_the_equilibrium_of_equal_drivers():
@@ -80,10 +80,10 @@ def test_a_better_evaluation_has_a_higher_score():
 
 def test_humans_make_waves_and_pi_with_saturation_dissolves_young_ones():
     human = evaluate.evaluate_ring(None, RING, (230.0,), warmup=750)
-    calm = evaluate.evaluate_ring(PISaturation(**VEHICLE), RING, (230.0,), warmup=750)
+    calm = evaluate.evaluate_ring(PISaturation(TASK), RING, (230.0,), warmup=750)
     assert not human["passed"] and human["speed_ratio"] < 0.8 and human["speed_std"] > 2.0
     assert calm["passed"] and calm["time_gap"] > 0.8
-    assert calm == evaluate.evaluate_ring(PISaturation(**VEHICLE), RING, (230.0,), warmup=750)  # repeatable
+    assert calm == evaluate.evaluate_ring(PISaturation(TASK), RING, (230.0,), warmup=750)  # repeatable
 
 
 def test_observations_of_the_ring_are_unpacked():
@@ -110,12 +110,12 @@ def view_of(speed, lead_speed, gap):
     ],
 )
 def test_follower_stopper_in_its_zones(speed, lead, gap, command):
-    controller = FollowerStopper(**VEHICLE, desired=4.0)
+    controller = FollowerStopper(TASK, desired=4.0)
     assert float(controller.wanted(view_of(speed, lead, gap))) == pytest.approx(command, abs=1e-5)
 
 
 def test_pi_follows_the_mean_of_its_own_speed():
-    controller = PISaturation(**VEHICLE, seconds=1.0)
+    controller = PISaturation(TASK, seconds=1.0)
     for speed in [2.0] * 10 + [4.0] * 5:
         controller.wanted(view_of(speed, speed, 7.0))
     before = float(controller._command)

@@ -11,6 +11,9 @@ import torch
 from agents import common, environments, imitation
 from idm_env.data import episodes, synthetic
 from idm_env.fitting.batch import Batch, windows
+from idm_env.tasks import make_task
+
+FOLLOW = make_task("follow", max_command=4.0)
 
 
 @pytest.fixture
@@ -30,12 +33,11 @@ def arguments(data, tmp_path, **changes):
 
 
 def test_observations_are_those_of_task_follow():
-    task = environments.task_of({"task": "follow", "max_command": 4.0})
     env = environments.make_env({"task": "follow"}, 3, output="torch")
     observation = env.reset(seed=0)[0]
     state = env.state
     ours = imitation.observe(state.speed[:, 1], state.speed[:, 0], state.gap[:, 1])
-    assert torch.allclose(ours, observation, atol=1e-5) and len(task.bounds.names) == len(imitation.SCALES)
+    assert torch.allclose(ours, observation, atol=1e-5) and len(FOLLOW.bounds.names) == len(imitation.SCALES)
 
 
 def test_a_policy_that_does_what_idm_does_is_idm(data):
@@ -52,9 +54,9 @@ def test_a_policy_that_does_what_idm_does_is_idm(data):
         root = 2.0 * (driver["max_accel"] * driver["comfort_decel"]) ** 0.5
         wanted = driver["min_gap"] + torch.relu(speed * driver["time_gap"] + speed * (speed - lead) / root)
         accel = driver["max_accel"] * (1.0 - (speed / driver["desired_speed"]) ** 4 - (wanted / gap) ** 2)
-        return accel.unsqueeze(-1)
+        return accel.unsqueeze(-1) / 20.0
 
-    gap, _ = imitation.simulate(idm, batch, 1.0)
+    gap, _ = imitation.simulate(idm, batch, make_task("follow", max_command=20.0))
     _, kept = simulator.rollout(batch.start(simulator, params), batch.inputs(simulator), params, batch.steps)
     assert torch.allclose(gap, kept.gap[..., 1], atol=2e-2)
 
@@ -68,7 +70,7 @@ def test_the_closed_loop_lowers_the_error_that_it_follows(data, tmp_path):
     optimiser = torch.optim.Adam(policy.parameters(), lr=3e-3)
     losses = []
     for update in range(5):
-        loss = imitation.spacing_error(imitation.simulate(policy, batch, 4.0)[0], batch).mean()
+        loss = imitation.spacing_error(imitation.simulate(policy, batch, FOLLOW)[0], batch).mean()
         common.descend(loss, policy.parameters(), optimiser, 1.0, update, a.out)
         losses.append(float(loss.detach()))
     assert losses[-1] < losses[0]
@@ -101,7 +103,7 @@ def test_measured_pairs_are_split_as_published_and_can_be_driven(measured, tmp_p
     training, test = imitation.split(a)
     assert (len(training), len(test)) == (100, 20)
     torch.manual_seed(0)
-    found = imitation.judge(imitation.cloned(a, training), test, 4.0)
+    found = imitation.judge(imitation.cloned(a, training), test, FOLLOW)
     assert found["episodes"] == 20 and 1.0 < found["gap_rmse_m"] < 20.0
 
 

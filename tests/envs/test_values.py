@@ -18,7 +18,7 @@ pytest.importorskip("numba")
 CASES = [
     ("ring", {"start": "wave", "warmup": 20}),
     ("ring", {"warmup": 5, "fuel": 0.1, "tailgating": 1.0, "controlled": 3, "failsafe": 3.0, "integration": "euler"}),
-    ("ring", {"warmup": 5, "controlled": 2, "shock": 4.0, "shock_after": 0.5, "shock_seconds": 1.2}),
+    ("ring", {"warmup": 5, "controlled": 2, "shock": 4.0, "shock_after": 0.5, "max_command": [-4.5, 2.6]}),
     ("ring", {"warmup": 5, "effects": ["delay", "memory"], "parameters": {"idm.time_gap": 1.3}}),
     ("follow", {"max_episode_steps": 25}),
     ("platoon", {"controlled": 2, "noise": 0.1}),

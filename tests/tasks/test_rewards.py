@@ -10,6 +10,7 @@ CASES = {
     "ring": {"task": "ring", "warmup": 60},
     "ring, wave": {"task": "ring", "warmup": 60, "start": "wave", "controlled": 3},
     "ring, weights": {"task": "ring", "warmup": 60, "tailgating": 2.0, "fuel": 3.0, "max_command": 4.0},
+    "ring, real brakes": {"task": "ring", "warmup": 60, "max_command": [-4.5, 2.6], "shock": 4.0, "shock_after": 3.0},
     "follow": {"task": "follow"},
     "follow, hard": {"task": "follow", "max_command": 30.0, "controlled": 2},
     "platoon": {"task": "platoon", "controlled": 2},
@@ -75,7 +76,7 @@ def test_no_state_pays_beyond_the_bounds_that_the_cost_is_made_of(name):
         speed=200.0 * u[:, 0] ** 3, accel=20.0 * u[:, 1] - 10.0, gap=1e4 * u[:, 2] ** 4 + 1e-9,
         position=world.state.position + 1e5 * u[:, 0], step=world.state.step + 9,
     )  # fmt: skip
-    command = task.max_command * (2.0 * u[:, 1, : len(task.agents)] - 1.0)
+    command = task.command(2.0 * u[:, 1, : len(task.agents)] - 1.0)
     earned = task.earned(world, command, world._replace(state=state))
     assert bool(torch.isfinite(earned).all())
     assert task.pay.low <= float(earned.min()) < float(earned.max()) <= task.pay.high

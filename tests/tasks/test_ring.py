@@ -100,9 +100,7 @@ def test_a_policy_of_constant_speed_calms_the_traffic():
 
 def shocked_speeds(shock_after=1.0):
     """The speeds of all vehicles after every step, and what they could depend on; a human brakes for a second."""
-    task = make_task(
-        "ring", warmup=300, noise=0.0, length=260.0, shock=4.0, shock_after=shock_after, shock_seconds=1.0
-    )
+    task = make_task("ring", warmup=300, noise=0.0, length=260.0, shock=4.0, shock_after=shock_after, shock_seconds=1.0)
     with torch.no_grad():
         world, params = start(task, count=2)
     world = world._replace(state=world.state._replace(step=torch.tensor([0, -5])))
