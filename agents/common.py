@@ -50,6 +50,8 @@ class Arguments:
     Args:
         environment: Keywords of ``gym.make_vec("DiffIDM-v0", …)``; only in YAML. ``config`` names an environment's
             file beside that YAML file.
+        judged_in: Keywords of the environment that differ where the policy is judged (``agents.evaluate.tested``);
+            only in YAML.
         out: Folder of checkpoints and logs.
         seed: Of everything random.
         updates: Updates of the policy; the learning rate falls with their count.
@@ -64,6 +66,7 @@ class Arguments:
     """
 
     environment: Annotated[dict[str, Any], tyro.conf.Suppress] = field(default_factory=lambda: {"task": "ring"})
+    judged_in: Annotated[dict[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
     out: Path = Path("runs/agent")
     seed: int = 0
     updates: int = 60

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from agents import common
 from agents.common import Arguments, Policy
-from agents.evaluate import evaluate, score
+from agents.evaluate import evaluate, score, tested
 
 
 def make_logger(arguments: Arguments, done: int) -> Logger:
@@ -36,6 +36,7 @@ class Monitor:
 
     def __init__(self, agent: str, arguments: Arguments, began: float, saved: Mapping[str, Any] | None = None) -> None:
         self.agent, self.arguments = agent, arguments
+        self.test = tested(arguments.environment, arguments.judged_in)
         self.last, self.best = arguments.out / "last.pt", arguments.out / "best.pt"
         arguments.out.mkdir(parents=True, exist_ok=True)
         saved = saved or {}
@@ -57,7 +58,7 @@ class Monitor:
         """Evaluate and log a policy before its first update: what the test gives for nothing."""
         begin = time.process_time()
         row = {"updates": 0, "steps": self.steps, "cpu_seconds": self.cpu_seconds}
-        row |= evaluate(policy, self.arguments.environment)
+        row |= evaluate(policy, self.test)
         self.history.append(row)
         self._log(row, row)
         self._aside += time.process_time() - begin
@@ -93,7 +94,7 @@ class Monitor:
         row: dict[str, Any] = {}
         if over or since >= self.arguments.evaluate_every:
             row = {"updates": update + 1, "steps": self.steps, "cpu_seconds": spent}
-            row |= evaluate(policy, self.arguments.environment)
+            row |= evaluate(policy, self.test)
             self.history.append(row)
         kept = {**training, "update": update, "steps": self.steps, "cpu_seconds": spent, "history": self.history}
         kept["arguments"] = common.choices(self.arguments)

@@ -1,12 +1,14 @@
 """Agents side by side: equal searches, ten seeds of the best, held-out rings and drivers.
 
-    python benchmarks/agents.py run [--only ring-ppo] [--out runs/benchmark]
+    python benchmarks/agents.py reference [--rings failsafe-shock] [--out runs/benchmark]
+    python benchmarks/agents.py run [--only ring-ppo] [--trial 0] [--seeds 3] [--out runs/benchmark]
     python benchmarks/agents.py table [--out runs/benchmark]
     python benchmarks/agents.py takeover [--out runs/benchmark]
 
-Every training is one process with one thread and one file of results; what is done is skipped, what another process
-works on is left to it, so the command may be interrupted, repeated, and started several times. CPU seconds are those of
-training; evaluations every 3 s are not counted.
+``reference`` has what learns nothing, ``run`` the searches and the seeds of each best trial (or of the one that is
+given, without a search). Every training is one process with one thread and one file of results; what is done is
+skipped, what another process works on is left to it, so the command may be interrupted, repeated, and started several
+times. CPU seconds are those of training; evaluations every 3 s are not counted.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +33,8 @@ sys.path.insert(0, str(ROOT))
 BUDGET = {"ring-shac": 90.0}
 """CPU seconds of a training, 45 where nothing else is said; the three that are compared have the same."""
 EVERY = 3.0
+RINGS = ("failsafe", "failsafe-shock", "brakes", "brakes-shock")
+"""Of the reference rows (``benchmarks.agents_reference.rings``)."""
 SEARCH_SEEDS, SEEDS, FEW = (100, 101), tuple(range(10)), tuple(range(5))
 
 Options = dict[str, Any]
@@ -56,6 +61,7 @@ SEARCH: dict[str, list[Options]] = {
         {"learning_rate": 1e-3, "ent_coef": "0.002", "gradient_steps": 2, "updates": 48},
     ],
     "ring-shac": [{}],
+    "ring-drivers-apg": [{}],
     "follow-apg": [{}],
     "follow-ppo": [{}],
 }
@@ -79,7 +85,7 @@ class Job:
 
     def command(self, out: Path) -> list[str]:
         """Return the command that trains."""
-        module = MODULES[self.config.split("-")[1]]
+        module = MODULES[self.config.split("-")[-1]]
         words = [sys.executable, "-m", module, "--config", f"configs/{self.config}.yaml", "--seed", str(self.seed)]
         words += ["--out", str(out), "--cpu-seconds", str(BUDGET.get(self.config, 45.0))]
         words += ["--evaluate-every", str(EVERY)]
@@ -89,11 +95,10 @@ class Job:
         return words
 
 
-def perform(job: Job, out: Path) -> dict[str, Any] | None:
-    """Return the results of a job, trained now if they are not there; None where another process works on it."""
+def once(folder: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any] | None:
+    """Return the result of a folder, made now if it is not there; None where another process works on it."""
     from idm_env.keep import write_text
 
-    folder = out / job.name
     result = folder / "result.json"
     folder.mkdir(parents=True, exist_ok=True)
     # The lock goes with its process: whatever was interrupted is begun again.
@@ -103,20 +108,29 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
         except BlockingIOError:
             return None
         if not result.exists():
-            training = folder / "training"
-            shutil.rmtree(training, ignore_errors=True)
-            done = subprocess.run(job.command(training), cwd=ROOT, capture_output=True, text=True, check=False)
-            row = {**dataclasses.asdict(job), **outcome(training, done, unseen=job.seed in SEEDS)}
-            write_text(result, json.dumps(row, indent=1))
-            print(f"{job.name}: {json.dumps(row['summary'])}", flush=True)
+            write_text(result, json.dumps(make(), indent=1))
     content: dict[str, Any] = json.loads(result.read_text())
     return content
+
+
+def perform(job: Job, out: Path) -> dict[str, Any] | None:
+    """Return the results of a job, trained now if they are not there; None where another process works on it."""
+    training = out / job.name / "training"
+
+    def make() -> dict[str, Any]:
+        shutil.rmtree(training, ignore_errors=True)
+        done = subprocess.run(job.command(training), cwd=ROOT, capture_output=True, text=True, check=False)
+        row = {**dataclasses.asdict(job), **outcome(training, done, unseen=job.seed in SEEDS)}
+        print(f"{job.name}: {json.dumps(row['summary'])}", flush=True)
+        return row
+
+    return once(out / job.name, make)
 
 
 def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool) -> dict[str, Any]:
     """Return what a training came to: evaluations, last and best checkpoint, the last one on held-out traffic too."""
     from agents.common import load
-    from agents.evaluate import evaluate_ring, held_out, solved_at
+    from agents.evaluate import evaluate_ring, held_out, solved_at, tested
     from agents.rollout import FRESH
 
     if not (training / "last.pt").exists() or not (training / "best.pt").exists():
@@ -124,11 +138,17 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
         return {"error": done.stderr[-2000:], "history": [], "summary": summary}
     policy, content = load(training / "last.pt")
     best, at_best = load(training / "best.pt")
-    environment, history = content["environment"], content["training"]["history"]
+    environment = tested(content["environment"], content["training"]["arguments"]["judged_in"])
+    history = content["training"]["history"]
     # The first evaluation is of the policy before any update: it solves nothing, whatever it passes.
     untrained, history = history[0], history[1:]
     # What ended before its time has solved nothing.
     first = solved_at(history) if done.returncode == 0 else None
+    on_ring = content["task"] == "ring"
+    # A last policy must pass on the fresh rings too.
+    fresh = {"fresh_last": evaluate_ring(policy, environment, draws=FRESH)} if on_ring else {}
+    if not all(row["passed"] for row in fresh.values()):
+        first = None
     summary = {
         "solved": first is not None,
         "cpu_seconds": None if first is None else history[first]["cpu_seconds"],
@@ -140,12 +160,13 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
     result = {
         "error": done.stderr[-2000:] if done.returncode else "",
         "summary": summary,
+        "untrained": untrained,
         "history": history,
         "last": history[-1],
         "best": at_best["training"]["history"][-1],
+        **fresh,
     }
-    if unseen and content["task"] == "ring":
-        result["fresh_last"] = evaluate_ring(policy, environment, draws=FRESH)
+    if unseen and on_ring:
         result["fresh_best"] = evaluate_ring(best, environment, draws=FRESH)
         result["held_out"] = held_out(policy, environment)
     return result
@@ -173,10 +194,10 @@ def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
     return ranks.index(max(ranks)), rows
 
 
-def run(configs: list[str], out: Path, seeds: int) -> None:
-    """Do every search and the first ``seeds`` seeds of its best trial."""
+def run(configs: list[str], out: Path, seeds: int, given: int | None = None) -> None:
+    """Do every search and the first ``seeds`` seeds of its best trial, or those of a given one without any search."""
     for config in configs:
-        trial, _ = chosen(config, out)
+        trial = chosen(config, out)[0] if given is None else given
         if trial < 0:
             print(f"{config}: another process is still searching.")
             continue
@@ -189,8 +210,10 @@ def main() -> None:
     import argparse
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["run", "table", "takeover"])
+    parser.add_argument("what", choices=["reference", "run", "table", "takeover"])
     parser.add_argument("--only", nargs="*", default=list(SEARCH))
+    parser.add_argument("--rings", nargs="*", default=list(RINGS), choices=RINGS, help="of the reference rows")
+    parser.add_argument("--trial", type=int, help="train the seeds of this trial, without a search")
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train no more seeds than that")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
     options = parser.parse_args()
@@ -203,8 +226,12 @@ def main() -> None:
         from benchmarks.agents_tables import takeover_table
 
         takeover_table(options.out, [c for c in SEARCH if c.startswith("ring")], SEEDS[: options.seeds])
+    elif options.what == "reference":
+        from benchmarks import agents_reference
+
+        agents_reference.show(options.out.resolve(), options.rings, once)
     else:
-        run(options.only, options.out.resolve(), options.seeds)
+        run(options.only, options.out.resolve(), options.seeds, options.trial)
 
 
 if __name__ == "__main__":

@@ -24,13 +24,12 @@ from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
 from idm_env.tasks.checks import agents_of, at_least, limits_of, whole
 from idm_env.tasks.crash import contact, lawful_cost
+from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.nouns import Advance, Bounds, Ended, Features, Pay, World
 from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params, State
 
 _NORMALS_AT_ONCE = 1 << 16
-_STANDSTILL = 1.0
-"""Gap that the failsafe leaves (m)."""
 OBSERVATIONS = ("scaled", "raw")
 _TAKE_INPUTS = {"control", "replay", "imagined", "lateral"}
 
@@ -60,7 +59,7 @@ class Task(abc.ABC):
             the former, those above in parts of the latter, and an action of 0 commands 0 in any case.
         failsafe: Deceleration (m/s²) of a failsafe: commands that leave a vehicle no room to stop at it behind a leader
             who brakes as hard are cut, and may then brake beyond ``max_command``; 0 is none. Rewards are for the
-            command as it was given. See ``safe_command``.
+            command as it was given. See ``idm_env.tasks.failsafe.safe_accel``.
         failsafe_time: Time (s) that the failsafe allows for before braking begins, as SUMO's tau.
         max_episode_steps: Steps after which an episode is cut off; None is the task's own number, −1 is no limit.
         observation: ``"scaled"``: each entry over a fixed scale that the task documents, about unit size; ``"raw"``: in
@@ -310,20 +309,12 @@ class Task(abc.ABC):
     def safe_command(self, world: World) -> Tensor:
         """Return the highest acceleration (m/s²) that the failsafe allows each agent, shape ``(…, agents)``.
 
-        The safe speed of Krauß 1998 (Microscopic modeling of traffic flow), which SUMO keeps, for one step Δt: the
-        largest v' with ``(v + v')/2 Δt + v' τ + v'²/(2b) ≤ s − 1 m + v_lead²/(2b)``, b and τ being ``failsafe`` and
-        ``failsafe_time``. Where it holds at first and no leader brakes harder than b, it can be kept with b for ever:
-        no two vehicles touch, and behind a leader of the same speed the time gap is at least τ.
+        That of ``safe_accel``, with ``failsafe`` and ``failsafe_time``.
         """
-        state, decel, dt = world.state, self.failsafe, self.simulator.dt
-        speed, ahead = self.pick(state.speed), self.lead_speed(state)
-        # Euler moves by the old speed; the speed after the step then costs its half step later.
-        way = speed * dt if self.simulator.integration == "euler" else 0.5 * speed * dt
-        half = decel * (self.failsafe_time + 0.5 * dt)
-        room = 2.0 * decel * (self.pick(state.gap) - _STANDSTILL - way) + ahead * ahead
-        # Below the clamp the vehicle must stop at once, whatever the root.
-        safe = torch.sqrt((room + half * half).clamp_min(1e-6)) - half
-        return (safe - speed) / dt
+        state = world.state
+        speed, ahead, gap = self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)
+        euler = self.simulator.integration == "euler"
+        return safe_accel(speed, ahead, gap, self.failsafe, self.failsafe_time, self.simulator.dt, euler)
 
     def limit(self, world: World, command: Tensor) -> Tensor:
         """Return commands (m/s²) as far as the failsafe lets them pass."""

@@ -69,7 +69,7 @@ def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
     for config, trials in benchmark.SEARCH.items():
         assert (ROOT / "configs" / f"{config}.yaml").exists()
         for options in trials:
-            assert set(options) <= set(kinds[config.split("-")[1]].__dataclass_fields__)
+            assert set(options) <= set(kinds[config.split("-")[-1]].__dataclass_fields__)
 
 
 def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, monkeypatch, capsys):

@@ -49,12 +49,16 @@ def test_the_figures_of_the_ring_are_the_worst_of_all_lengths():
     found = evaluate.judge_ring(start, calm)
     assert found["passed"] and found["speed_ratio"] == pytest.approx(1.0, rel=1e-4) and found["speed_std"] < 1e-5
     assert found["time_gap"] == pytest.approx(4.0 / float(uniform.max()))
-    slow = calm._replace(speed=calm.speed * torch.tensor([0.94, 1.0])[None, :, None])
-    found = evaluate.judge_ring(start, slow)
-    assert not found["passed"] and found["speed_ratio"] == pytest.approx(0.94, rel=1e-4)
-    waves = calm.speed + torch.tensor([0.0, 0.6])[None, :, None] * (-1.0) ** torch.arange(22)
-    found = evaluate.judge_ring(start, calm._replace(speed=waves))
-    assert not found["passed"] and found["speed_std"] == pytest.approx(0.6, rel=1e-3)
+    for share, passed in ((0.975, True), (0.965, False)):
+        slow = calm._replace(speed=calm.speed * torch.tensor([share, 1.0])[None, :, None])
+        found = evaluate.judge_ring(start, slow)
+        assert found["passed"] == passed and found["speed_ratio"] == pytest.approx(share, rel=1e-4)
+    for height, passed in ((0.14, True), (0.16, False)):
+        waves = calm.speed + torch.tensor([0.0, height])[None, :, None] * (-1.0) ** torch.arange(22)
+        found = evaluate.judge_ring(start, calm._replace(speed=waves))
+        assert found["passed"] == passed and found["speed_std"] == pytest.approx(height, rel=1e-3)
+    close = evaluate.judge_ring(start, calm._replace(gap=calm.gap * 0.9))
+    assert not close["passed"] and close["time_gap"] < 0.8
     crash = calm.gap.clone()
     crash[0, 1, 3] = -0.1  # long before the last 100 s
     found = evaluate.judge_ring(start, calm._replace(gap=crash))
@@ -63,9 +67,9 @@ def test_the_figures_of_the_ring_are_the_worst_of_all_lengths():
 
 @pytest.mark.parametrize(
     ("passed", "first"),
-    [("", None), ("0111", 1), ("111", 0), ("0011", None), ("1110", None), ("11101111", 4), ("0000", None)],
+    [("", None), ("011111", 1), ("11111", 0), ("01111", None), ("111110", None), ("111101111111", 5), ("0000", None)],
 )
-def test_solved_means_three_in_a_row_and_kept(passed, first):
+def test_solved_means_five_in_a_row_and_kept(passed, first):
     assert solved_at([{"passed": x == "1"} for x in passed]) == first
 
 
@@ -146,7 +150,18 @@ def test_following_is_judged_against_leader_and_human():
 
 def test_a_task_without_a_test_is_told():
     with pytest.raises(ValueError, match="task 'platoon' has no test of agents"):
-        evaluate.evaluate(None, {"task": "platoon"})
+        evaluate.tested({"task": "platoon"})
+
+
+def test_agents_are_judged_with_a_shock_that_training_does_not_have():
+    guarded = {**RING, "failsafe": 3.0}
+    assert evaluate.tested(guarded) == {**guarded, "shock": 4.0}
+    assert evaluate.tested({"warmup": 5, "parameters": {"idm.max_accel": 0.8}}, {"parameters": {}}) == {
+        "warmup": 5, "parameters": {}, "shock": 4.0,
+    }  # fmt: skip
+    assert evaluate.tested({"task": "follow"}) == {"task": "follow"}
+    calm, shocked = (evaluate.evaluate_ring(no_command, {**guarded, "shock": x}, (260.0,), 750) for x in (0.0, 4.0))
+    assert calm["passed"] and not shocked["passed"]
 
 
 def test_held_out_covers_lengths_and_drivers(monkeypatch):
@@ -172,11 +187,12 @@ def test_a_later_take_over_finds_a_deeper_wave_and_a_failsafe_survives_it():
     assert touched["collisions"] == 2 and guarded["collisions"] == 0
 
 
-def test_doing_nothing_passes_in_a_young_wave_only():
+def test_doing_nothing_calms_a_young_wave_only():
     """Why agents are judged in a grown one."""
     guarded = {**RING, "failsafe": 3.0}
     young, grown = (evaluate.evaluate_ring(no_command, guarded, warmup=warmup) for warmup in (750, 3000))
-    assert young["passed"] and not grown["passed"] and grown["speed_ratio"] < 0.1
+    assert young["speed_ratio"] > 0.94 and young["speed_std"] < 0.05
+    assert not grown["passed"] and grown["speed_ratio"] < 0.1
 
 
 def test_draws_differ_and_lengths_stay_together():
