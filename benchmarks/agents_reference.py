@@ -47,7 +47,8 @@ def begun(environment: Row, folder: Path, updates: int) -> Family:
         arguments.out = folder / f"seed{seed}"
         torch.manual_seed(seed)
         if updates:
-            apg.train(arguments)
+            if not (arguments.out / "last.pt").exists():
+                apg.train(arguments)
             made.append(common.load(arguments.out / "last.pt")[0])
         else:
             made.append(common.begin(arguments, "apg")[0])
@@ -64,7 +65,7 @@ def makers(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
     # Trained on the ring without a shock, as agents are.
     training = {k: v for k, v in environment.items() if k != "shock"}
     for updates, name in ((0, "APG before any update"), (1, "APG after one update")):
-        made[name] = lambda updates=updates: tried(begun(training, folder / f"apg{updates}", updates), environment)
+        made[name] = lambda updates=updates: tried(begun(training, folder / "one_update", updates), environment)
     return made
 
 
@@ -74,7 +75,9 @@ def show(out: Path, names: Sequence[str], once: Once) -> None:
     for name in names:
         environment, folder = rings()[name], out / "reference" / name
         columns[name] = {}
-        for i, (row, make) in enumerate(makers(environment, folder).items()):
+        # With and without a shock policies are trained alike.
+        trained = out / "reference" / name.removesuffix("-shock")
+        for i, (row, make) in enumerate(makers(environment, trained).items()):
             print(f"{name}: {row}", flush=True)
             columns[name][row] = once(folder / f"row{i}", lambda make=make, row=row: {"row": row, **make()})
     rows = [[row, *(told(columns[n][row]) for n in names)] for row in next(iter(columns.values()))]

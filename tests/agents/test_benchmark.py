@@ -92,3 +92,33 @@ def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, 
     names = ("no_command", "PISaturation", "Policy")
     assert judged == [(name, b, *case) for name in names for b in (0.0, 3.0) for case in cases]
     assert "| ring-apg | 1 | none | 1 of 6 / 1.000 / 0.10 |" in capsys.readouterr().out
+
+
+def test_the_seeds_of_a_given_trial_need_no_search(benchmark, tmp_path):
+    benchmark.run(["ring-apg"], tmp_path, 2, given=3)
+    options = [c[c.index("--window") + 1] for c in benchmark.trained]
+    assert options == ["300", "300"]
+
+
+def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tmp_path, monkeypatch, capsys):
+    from benchmarks import agents_reference
+
+    made = []
+
+    def makers(environment, folder):
+        def row(name, passed):
+            made.append((name, environment.get("shock", 0.0)))
+            return {"tried": 10, "six": len(passed), "passed": passed, "best": "b", "figures": LAST}
+
+        easy = ["1", "2"] if not environment.get("shock") else []
+        return {name: lambda name=name: row(name, easy) for name in ("constants", *agents_reference.RANDOM)}
+
+    monkeypatch.setattr(agents_reference, "makers", makers)
+    for _ in range(2):
+        agents_reference.show(tmp_path, ("failsafe", "failsafe-shock"), benchmark.once)
+    assert len(made) == 6 and {shock for _, shock in made} == {0.0, 4.0}
+    printed = capsys.readouterr().out
+    assert "| constants | 2 of 10; 1.000/0.10/1.00/0 | 0 of 10; 1.000/0.10/1.00/0 |" in printed
+    assert "failsafe: 4 of 20 random policies pass, so it is no test." in printed
+    assert "failsafe-shock: 0 of 20 random policies pass, so it is a test." in printed
+    assert set(benchmark.RINGS) == set(agents_reference.rings())
