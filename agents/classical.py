@@ -22,8 +22,8 @@ from torch import Tensor
 from agents import apg
 from agents.common import load_agent, one_line
 from agents.environments import task_of
-from agents.evaluate import evaluate_ring
-from agents.rollout import FRESH, LENGTHS, UNSEEN, Act, ring_start, uniform_speed
+from agents.evaluate import evaluate_ring, tested
+from agents.rollout import FRESH, LENGTHS, Act, ring_start, uniform_speed
 from idm_env.tasks import Task
 
 
@@ -150,23 +150,15 @@ class Arguments:
     config: str = "configs/ring-apg.yaml"
 
 
-def rows(environment: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the figures of every controller, on the test's fresh draws and on unseen lengths."""
-    result: dict[str, dict[str, Any]] = {}
-    for kind, lengths, draws in (("test", LENGTHS, FRESH), ("lengths", UNSEEN, (1,))):
-        for name, make in controllers(environment, lengths, draws).items():
-            result.setdefault(name, {})[kind] = evaluate_ring(make(), environment, lengths, draws=draws)
-    return result
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per controller."""
     torch.set_num_threads(1)
     with one_line():
-        environment = load_agent(tyro.cli(Arguments, args=argv).config, apg.Arguments, "apg").environment
+        arguments = load_agent(tyro.cli(Arguments, args=argv).config, apg.Arguments, "apg")
+        environment = tested(arguments.environment, arguments.judged_in)
     print("controller | worst speed ratio | worst std (m/s) | smallest time gap (s) | collisions")
-    for name, figures in rows(environment).items():
-        r = figures["test"]
+    for name, make in controllers(environment, LENGTHS, FRESH).items():
+        r = evaluate_ring(make(), environment, draws=FRESH)
         print(
             f"{name} | {r['speed_ratio']:.3f} | {r['speed_std']:.2f} | {r['time_gap']:.2f} | {r['collisions']}"
             f" | {[round(x, 3) for x in r['ratios']]}"

@@ -93,7 +93,7 @@ def ratio_line(out: Path, ours: str, theirs: str, seeds: Sequence[int]) -> None:
 
 
 def seed_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
-    """Print every seed: last and best checkpoint, and the last one on held-out lengths and drivers."""
+    """Print every seed: before any update, last and best checkpoint; the last one on held-out lengths and drivers."""
     rows = []
     for config in configs:
         for r in results(out, config):
@@ -107,11 +107,12 @@ def seed_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
                 for k in kinds
             ]
             ends = ["/".join(ring(r[k])) for k in ("fresh_last", "fresh_best")]
-            rows.append([config, str(r["seed"]), *when, *ends, *far])
+            before = "/".join(ring(r["untrained"])[:2])
+            rows.append([config, str(r["seed"]), before, *when, *ends, *far])
     figures = "ratio/std/time gap/collisions"
     table(
-        ("agent", "seed", "CPU s", "1000 steps", f"last: {figures}", f"best: {figures}", "lengths 200–300 m",
-         "drivers ±20 %, worst", "drivers mixed"), rows,
+        ("agent", "seed", "before any update", "CPU s", "1000 steps", f"last: {figures}", f"best: {figures}",
+         "lengths 200–300 m", "drivers ±20 %, worst", "drivers mixed"), rows,
     )  # fmt: skip
 
 
@@ -191,17 +192,6 @@ def follow(r: Row) -> list[str]:
     ]  # fmt: skip
 
 
-def classical_table() -> None:
-    """Print the classical controllers on the test and on unseen lengths."""
-    from agents.classical import rows
-
-    found = rows(environment_of("ring-apg")).items()
-    table(
-        ("controller", "test: ratio/std/time gap/collisions", "lengths 200–300 m"),
-        [[name, "/".join(ring(r["test"])), "/".join(ring(r["lengths"]))] for name, r in found],
-    )
-
-
 def show(
     out: Path, search: dict[str, list[Row]], search_seeds: Sequence[int], seeds: Sequence[int], data: Path
 ) -> None:
@@ -213,5 +203,4 @@ def show(
     for other in compared[1:]:
         ratio_line(out, compared[0], other, seeds)
     seed_table(out, rings, seeds)
-    classical_table()
     follow_table(out, [c for c in search if c.startswith("follow")], data)
