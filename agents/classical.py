@@ -22,7 +22,7 @@ from torch import Tensor
 from agents import apg
 from agents.common import load_agent, one_line
 from agents.environments import task_of
-from agents.evaluate import evaluate_ring, tested
+from agents.evaluate import as_judged, evaluate_ring
 from agents.rollout import FRESH, LENGTHS, Act, ring_start, uniform_speed
 from idm_env.tasks import Task
 
@@ -155,7 +155,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     with one_line():
         arguments = load_agent(tyro.cli(Arguments, args=argv).config, apg.Arguments, "apg")
-        environment = tested(arguments.environment, arguments.judged_in)
+        environment = as_judged(arguments.environment, arguments.judged_in)
     print("controller | worst speed ratio | worst std (m/s) | smallest time gap (s) | collisions")
     for name, make in controllers(environment, LENGTHS, FRESH).items():
         r = evaluate_ring(make(), environment, draws=FRESH)

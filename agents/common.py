@@ -50,7 +50,7 @@ class Arguments:
     Args:
         environment: Keywords of ``gym.make_vec("DiffIDM-v0", …)``; only in YAML. ``config`` names an environment's
             file beside that YAML file.
-        judged_in: Keywords of the environment that differ where the policy is judged (``agents.evaluate.tested``);
+        judged_in: Keywords of the environment that differ where the policy is judged (``agents.evaluate.as_judged``);
             only in YAML.
         out: Folder of checkpoints and logs.
         seed: Of everything random.

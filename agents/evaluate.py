@@ -44,7 +44,7 @@ TEST: dict[str, dict[str, Any]] = {"ring": {"shock": 4.0}, "follow": {}}
 """Keywords of the environment in which policies of a task are judged, over those in which they are trained."""
 
 
-def tested(environment: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def as_judged(environment: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return the environment in which a policy trained in ``environment`` is judged.
 
     ``changes`` are keywords of the test besides ``TEST``: an agent's ``judged_in``. ValueError for a task without one.
@@ -159,20 +159,21 @@ def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int 
     """Return the figures of a policy behind ``count`` stretches of the recorded leaders, 100 s each.
 
     ``reward``: mean per step; ``litres`` and ``litres_behind``: fuel per 100 km of the first controlled vehicle and of
-    all vehicles from it to the last; ``energy``: at its wheels (J/kg per metre); the same of the recorded leader as
-    ``leader_…``; ``time_gap``: its smallest (s); ``collisions``: stretches with one; ``spacing``: its mean gap (m).
+    all vehicles from it to the last, by the model of Kamal et al., ``…_circles`` by that of CIRCLES; ``energy``: at its
+    wheels (J/kg per metre); the same of the recorded leader as ``leader_…``; ``time_gap``: its smallest (s);
+    ``collisions``: stretches with one; ``spacing``: its mean gap (m).
     """
     start = follow_start(environment, count)
     task = start.task
     driven = drive(start, act, task.horizon or STEPS, rewards=True)
     first = task.agents[0]
     speed, accel, gap = (x.double() for x in (driven.speed, driven.accel, driven.gap))
-    fuel = metrics.fuel(speed, accel)
+    fuel = {name: metrics.fuel(speed, accel, name) for name in metrics.FUELS}
     energy = metrics.traction_energy(speed, accel, task.simulator.dt)
     way = (speed * task.simulator.dt).sum(0)
 
-    def litres(part: slice) -> float:
-        return float(100.0 * fuel[..., part].sum() / speed[..., part].sum())
+    def litres(part: slice, model: str = "kamal") -> float:
+        return float(100.0 * fuel[model][..., part].sum() / speed[..., part].sum())
 
     crashed = gap[..., 1:].amin((0, 2)) <= 0.0
     time_gap = metrics.time_gap(task.pick(gap), task.pick(speed)).amin((0, 2))
@@ -181,6 +182,9 @@ def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int 
         "litres": litres(slice(first, first + 1)),
         "litres_behind": litres(slice(first, None)),
         "leader_litres": litres(slice(0, 1)),
+        "litres_circles": litres(slice(first, first + 1), "circles"),
+        "litres_behind_circles": litres(slice(first, None), "circles"),
+        "leader_litres_circles": litres(slice(0, 1), "circles"),
         "energy": float(energy[:, first].sum() / way[:, first].sum()),
         "leader_energy": float(energy[:, 0].sum() / way[:, 0].sum()),
         "time_gap": float(time_gap.min()),
@@ -194,7 +198,7 @@ def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int 
 
 
 def evaluate(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures of a policy in the environment of its test (``tested``); None is the human driver."""
+    """Return the figures of a policy in the environment of its test (``as_judged``); None is the human driver."""
     tests: dict[str, Callable[..., dict[str, Any]]] = {"ring": evaluate_ring, "follow": evaluate_follow}
     return tests[environment.get("task", "ring")](act, environment)
 
@@ -280,7 +284,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         if min(arguments.steps, arguments.human + 1) < 1:
             raise ValueError(f"steps = {arguments.steps} must be at least 1, human = {arguments.human} at least 0.")
         policy, content = load(arguments.checkpoint)
-        environment = tested(content["environment"], content["training"].get("arguments", {}).get("judged_in"))
+        environment = as_judged(content["environment"], content["training"].get("arguments", {}).get("judged_in"))
         for name, act in (("human", None), (content["agent"], policy)):
             print(name, json.dumps(evaluate(act, environment)))
         for path in (arguments.video, arguments.picture):

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from agents import common
 from agents.common import Arguments, Policy
-from agents.evaluate import evaluate, score, tested
+from agents.evaluate import as_judged, evaluate, score
 
 
 def make_logger(arguments: Arguments, done: int) -> Logger:
@@ -36,7 +36,7 @@ class Monitor:
 
     def __init__(self, agent: str, arguments: Arguments, began: float, saved: Mapping[str, Any] | None = None) -> None:
         self.agent, self.arguments = agent, arguments
-        self.test = tested(arguments.environment, arguments.judged_in)
+        self.test = as_judged(arguments.environment, arguments.judged_in)
         self.last, self.best = arguments.out / "last.pt", arguments.out / "best.pt"
         arguments.out.mkdir(parents=True, exist_ok=True)
         saved = saved or {}

@@ -130,7 +130,7 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
 def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool) -> dict[str, Any]:
     """Return what a training came to: evaluations, last and best checkpoint, the last one on held-out traffic too."""
     from agents.common import load
-    from agents.evaluate import evaluate_ring, held_out, solved_at, tested
+    from agents.evaluate import as_judged, evaluate_ring, held_out, solved_at
     from agents.rollout import FRESH
 
     if not (training / "last.pt").exists() or not (training / "best.pt").exists():
@@ -138,7 +138,7 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
         return {"error": done.stderr[-2000:], "history": [], "summary": summary}
     policy, content = load(training / "last.pt")
     best, at_best = load(training / "best.pt")
-    environment = tested(content["environment"], content["training"]["arguments"]["judged_in"])
+    environment = as_judged(content["environment"], content["training"]["arguments"]["judged_in"])
     history = content["training"]["history"]
     # The first evaluation is of the policy before any update: it solves nothing, whatever it passes.
     untrained, history = history[0], history[1:]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 UNARY = {
+    "reciprocal": "(F(1.0) / {0})",
     "neg": "(-{0})",
     "abs": "abs({0})",
     "sqrt": "np.sqrt({0})",

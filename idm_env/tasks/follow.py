@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
+from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Ended, Features, Pay, Task, World
@@ -53,13 +54,14 @@ class FollowTask(Task):
 
     Observation, per agent: ``v/40, v_lead/40, gap/100`` (m/s and m; raw: without the scales).
     Reward, per agent: ``1 − fuel/10 − 0.002 u² − 2 p``; fuel is the mean rate of the agent and everybody behind it (US
-    gallons per hour; the source's own energy model is not public, ``metrics.fuel`` stands in), u its command (m/s²), p
+    gallons per hour; the source's own energy model is not public, ``fuel_model`` stands in), u its command (m/s²), p
     in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap below 1 s. Below −2 it saturates towards
     −4 (``floored``). Terminated where vehicles touch, which pays ``−crash_cost`` instead: 5001 by default, so that a
     crash is worse than any survival (``idm_env.tasks.crash``); the source takes 50. Truncated at the end of the record,
     and after ``max_episode_steps``: 1000, or what the longest record has.
 
     Args:
+        fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
         leader: A trajectory file; every leader that somebody follows in it may be drawn. None is the project's own
             made-up trace.
     """
@@ -75,10 +77,12 @@ class FollowTask(Task):
 
     vehicles: int = 7
     max_command: float | Sequence[float] = 3.0
+    fuel_model: str = "kamal"
     leader: str | None = None
 
     def __post_init__(self) -> None:
         whole("vehicles", self.vehicles, 2)
+        one_of("fuel_model", self.fuel_model, metrics.FUELS)
         super().__post_init__()
         longest = self._longest
         if (self.max_episode_steps or 0) > longest:
@@ -157,7 +161,7 @@ class FollowTask(Task):
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``1 − fuel/10 − 0.002 u² − 2 p``, saturated below −2."""
         state = after.state
-        fuel = metrics.fuel(state.speed, state.accel) * _GALLONS_PER_HOUR
+        fuel = metrics.fuel(state.speed, state.accel, self.fuel_model) * _GALLONS_PER_HOUR
         # Running means from the back: of every vehicle and those behind it.
         count = self.constant("count", list(range(self.vehicles, 0, -1)), fuel.device, fuel.dtype)
         behind = fuel.flip(-1).cumsum(-1).flip(-1) / count

@@ -55,6 +55,7 @@ class RingTask(Task):
         tailgating: Weight of the tailgating term; 0 leaves it out.
         tailgating_below: Time gap below which it counts (s). An agent holds about that gap: leave a margin.
         fuel: Weight of the fuel term (s/mL); 0 leaves it out.
+        fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
         shock: Deceleration (m/s²) with which one human driver brakes once in an episode, whatever is ahead: as hard as
             the brakes allow, by a command in place of the driver's acceleration; 0 is no shock.
         shock_after: Time from the beginning of the episode to the shock (s).
@@ -77,6 +78,7 @@ class RingTask(Task):
     tailgating: float = 0.0
     tailgating_below: float = 0.8
     fuel: float = 0.0
+    fuel_model: str = "kamal"
     shock: float = 0.0
     shock_after: float = 120.0
     shock_seconds: float = 2.0
@@ -94,6 +96,7 @@ class RingTask(Task):
         at_least("tailgating", self.tailgating, 0.0)
         at_least("tailgating_below", self.tailgating_below, 0.1, "s")
         at_least("fuel", self.fuel, 0.0)
+        one_of("fuel_model", self.fuel_model, metrics.FUELS)
         at_least("shock", self.shock, 0.0, "m/s²")
         at_least("shock_after", self.shock_after, 0.0, "s")
         at_least("shock_seconds", self.shock_seconds, self.simulator.dt, "s")
@@ -208,7 +211,7 @@ class RingTask(Task):
             effort = effort.mean(-1, keepdim=True)
         reward = 0.2 * state.speed.mean(-1, keepdim=True).clamp_max(_FASTEST) - 4.0 * effort
         if self.fuel:
-            reward = reward - self.fuel * metrics.fuel(state.speed, state.accel).mean(-1, keepdim=True)
+            reward = reward - self.fuel * metrics.fuel(state.speed, state.accel, self.fuel_model).mean(-1, keepdim=True)
         if len(self.agents) > 1:
             reward = reward.expand(-1, len(self.agents))
         if self.tailgating:

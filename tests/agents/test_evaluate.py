@@ -150,16 +150,16 @@ def test_following_is_judged_against_leader_and_human():
 
 def test_a_task_without_a_test_is_told():
     with pytest.raises(ValueError, match="task 'platoon' has no test of agents"):
-        evaluate.tested({"task": "platoon"})
+        evaluate.as_judged({"task": "platoon"})
 
 
 def test_agents_are_judged_with_a_shock_that_training_does_not_have():
     guarded = {**RING, "failsafe": 3.0}
-    assert evaluate.tested(guarded) == {**guarded, "shock": 4.0}
-    assert evaluate.tested({"warmup": 5, "parameters": {"idm.max_accel": 0.8}}, {"parameters": {}}) == {
+    assert evaluate.as_judged(guarded) == {**guarded, "shock": 4.0}
+    assert evaluate.as_judged({"warmup": 5, "parameters": {"idm.max_accel": 0.8}}, {"parameters": {}}) == {
         "warmup": 5, "parameters": {}, "shock": 4.0,
     }  # fmt: skip
-    assert evaluate.tested({"task": "follow"}) == {"task": "follow"}
+    assert evaluate.as_judged({"task": "follow"}) == {"task": "follow"}
     calm, shocked = (evaluate.evaluate_ring(no_command, {**guarded, "shock": x}, (260.0,), 750) for x in (0.0, 4.0))
     assert calm["passed"] and not shocked["passed"]
 

@@ -10,11 +10,11 @@ import torch
 from agents import reference
 from agents.classical import no_command
 from agents.common import Policy
-from agents.evaluate import SPEED_RATIO, evaluate_ring, tested
+from agents.evaluate import SPEED_RATIO, as_judged, evaluate_ring
 from agents.rollout import ring_start
 
 GUARDED: dict[str, Any] = {"task": "ring", "failsafe": 3.0}
-SHOCK = tested(GUARDED)
+SHOCK = as_judged(GUARDED)
 
 
 def judged(environment, names, every=1):

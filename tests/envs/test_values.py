@@ -20,7 +20,7 @@ CASES = [
     ("ring", {"warmup": 5, "fuel": 0.1, "tailgating": 1.0, "controlled": 3, "failsafe": 3.0, "integration": "euler"}),
     ("ring", {"warmup": 5, "controlled": 2, "shock": 4.0, "shock_after": 0.5, "max_command": [-4.5, 2.6]}),
     ("ring", {"warmup": 5, "effects": ["delay", "memory"], "parameters": {"idm.time_gap": 1.3}}),
-    ("follow", {"max_episode_steps": 25}),
+    ("follow", {"max_episode_steps": 25, "fuel_model": "circles"}),
     ("platoon", {"controlled": 2, "noise": 0.1}),
     ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
     ("replay", {"reward_terms": "follow", "failsafe": 4.0}),

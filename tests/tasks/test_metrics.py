@@ -16,6 +16,36 @@ def test_fuel_is_the_published_polynomial():
     assert float(steady) == pytest.approx(100.0 * float(rate[1]) / 20.0)
 
 
+@pytest.mark.parametrize(
+    ("speed", "accel", "grams"),
+    [
+        (0.0, 0.0, 0.1271),  # idling
+        (20.0, 0.0, 0.19829 + 0.42244 + 0.222408),
+        (20.0, 1.0, 0.843138 + 0.23956 + 0.161184 + 1.10948 + 1.01112),
+        (20.0, 9.0, 0.843138 + 1.510224 * 2.393599 + 1.01112 * 2.393599**2),  # the engine gives 48.9891/v − 0.056
+        (20.0, -0.2, 0.843138 - 0.2 * 1.510224 + 0.04 * 1.01112),
+        (20.0, -0.26, 0.0),  # beyond a0 + a1 v + a3 v² = −0.25682 the fuel is cut off
+        (3.0, -2.0, 0.1271),  # not below idling up to 5.07 m/s
+        (5.0, 3.0, 0.19829 + 0.10561 + 0.003475 + 3.0 * (0.23956 + 0.040296 + 0.0693425) + 9.0 * 0.25278),
+    ],
+)
+def test_the_fuel_of_circles_is_the_published_polynomial(speed, accel, grams):
+    x = torch.tensor([speed, accel], dtype=torch.float64, requires_grad=True)
+    rate = metrics.fuel(x[0], x[1], "circles")
+    assert float(rate.detach()) * 0.745 == pytest.approx(grams, rel=1e-5)
+    if rate.requires_grad:
+        assert bool(torch.isfinite(torch.autograd.grad(rate, x)[0]).all())
+
+
+def test_braking_never_costs_more_and_an_unknown_fuel_is_told():
+    speed, accel = torch.meshgrid(torch.linspace(0.2, 35.0, 60), torch.linspace(-5.0, 5.0, 101), indexing="ij")
+    for model in metrics.FUELS:
+        rate = metrics.fuel(speed, accel, model)
+        assert bool((rate.diff(dim=-1) >= -1e-6).all()) and float(rate.min()) >= 0.0
+    with pytest.raises(ValueError, match=r"fuel_model = 'circle' is unknown\. Did you mean 'circles'"):
+        metrics.fuel(speed, accel, "circle")
+
+
 def test_energy_of_a_steady_drive_is_force_times_way():
     speed = torch.full((100,), 20.0, dtype=torch.float64)
     energy = metrics.traction_energy(speed, torch.zeros_like(speed), 0.1)

@@ -11,6 +11,7 @@ CASES = {
     "ring, wave": {"task": "ring", "warmup": 60, "start": "wave", "controlled": 3},
     "ring, weights": {"task": "ring", "warmup": 60, "tailgating": 2.0, "fuel": 3.0, "max_command": 4.0},
     "ring, real brakes": {"task": "ring", "warmup": 60, "max_command": [-4.5, 2.6], "shock": 4.0, "shock_after": 3.0},
+    "ring, the other fuel": {"task": "ring", "warmup": 60, "fuel": 3.0, "fuel_model": "circles"},
     "follow": {"task": "follow"},
     "follow, hard": {"task": "follow", "max_command": 30.0, "controlled": 2},
     "platoon": {"task": "platoon", "controlled": 2},
