@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -187,7 +187,7 @@ class RingTask(Task):
         return x.index_select(-1, self.constant("leaders", self._leaders, x.device, torch.int64))
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Tensor | None, live: Tensor | None = None
+        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step: those of every task, and the command of the human who brakes."""
         inputs = super().inputs(world, command, normals, live)
