@@ -53,15 +53,20 @@ class Job:
     strength: str
     ou: float
     seed: int
+    runs: int = 10
 
     @property
     def key(self) -> str:
         """What the set is called in the file of results."""
-        return f"{self.kind}|{self.effect}|{self.strength}|{self.ou}|{self.seed}"
+        runs = "" if self.runs == 10 else f"|{self.runs} runs"
+        return f"{self.kind}|{self.effect}|{self.strength}|{self.ou}|{self.seed}{runs}"
 
 
-def jobs(sets: int, clean: int, first: int) -> list[Job]:
-    """Return the sets to run, shuffled, so that an unfinished table is a fair one: ``clean`` without an effect each."""
+def jobs(sets: int, clean: int, first: int, few: int = 0) -> list[Job]:
+    """Return the sets to run, shuffled, so that an unfinished table is a fair one.
+
+    ``clean`` without an effect of every kind of noise, and ``few`` without one of 4 to 9 runs.
+    """
     from idm_env.data.synthetic import EFFECTS
 
     made = []
@@ -75,6 +80,7 @@ def jobs(sets: int, clean: int, first: int) -> list[Job]:
         made += [Job("two", "+".join(e), "", 0.0, seed + 500 + k) for k, e in enumerate(TWO)]
     for j, ou in enumerate((0.0, 0.1, 0.2)):
         made += [Job("none", "none", "", ou, first + 500_000 + 1000 * j + k) for k in range(clean)]
+    made += [Job("few", "none", "", (0.0, 0.1, 0.2)[k % 3], first + 600_000 + k, 4 + (k // 3) % 6) for k in range(few)]
     return [made[i] for i in np.random.default_rng(first).permutation(len(made))]
 
 
@@ -86,7 +92,9 @@ def generated(job: Job) -> tuple[Any, Any]:
         effects = {e: synthetic.EFFECTS[e].middle for e in job.effect.split("+")}
         return synthetic.generate(job.seed, effect=effects)
     if job.kind != "outside":
-        return synthetic.generate(job.seed, effect=job.effect, strength=job.strength or "middle", ou=job.ou)
+        return synthetic.generate(
+            job.seed, effect=job.effect, strength=job.strength or "middle", ou=job.ou, runs=job.runs
+        )
     original = synthetic.Platoon
     synthetic.Platoon = outside(original, job.effect)  # type: ignore[attr-defined, assignment, misc]
     try:
@@ -232,6 +240,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     for ou in (0.0, 0.1, 0.2):
         none = [bool(r["found"]) for r in rows if r["kind"] == "none" and r["ou"] == ou]
         lines.append(f"something found where nothing is, OU {ou:g} | {share(none)}")
+    few = [bool(r["found"]) or r["verdict"] == "located" for r in rows if r["kind"] == "few"]
+    lines.append(f"something found where nothing is, 4 to 9 runs, OU 0 to 0.2 | {share(few)}")
     outside_rows = [r for r in rows if r["kind"] == "outside"]
     lines.append(f"catalogue name for an effect outside it | {share([bool(r['named']) for r in outside_rows])}")
     both = [set(r["effect"].split("+")) <= set(r["named"]) for r in rows if r["kind"] == "two"]
@@ -263,7 +273,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines += ["", "hidden | found (sets)", "--- | ---"]
     confusion: dict[str, Counter[str]] = defaultdict(Counter)
     for r in rows:
-        label = r["effect"] if r["kind"] != "none" else f"none, OU {r['ou']:g}"
+        label = r["effect"] if r["kind"] not in ("none", "few") else f"none, OU {r['ou']:g}"
+        label += ", few runs" if r["kind"] == "few" else ""
         confusion[label]["+".join(r["found"]) or r["verdict"]] += 1
     for effect, counts in confusion.items():
         lines.append(f"{effect} | " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
@@ -274,6 +285,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", type=int, default=1, help="sets of every kind with an effect")
     parser.add_argument("--clean", type=int, default=6, help="sets without an effect, of every kind of noise")
+    parser.add_argument("--few", type=int, default=0, help="sets without an effect, of 4 to 9 runs")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--first-seed", type=int, default=70_000)
     parser.add_argument("--only", default="", help="part of the keys of the sets to run, such as 'one|delay'")
@@ -282,7 +294,9 @@ def main() -> None:
     done: dict[str, dict[str, Any]] = {}
     if arguments.out.exists():
         done = {r["key"]: r for r in map(json.loads, arguments.out.read_text().splitlines())}
-    wanted = [j for j in jobs(arguments.sets, arguments.clean, arguments.first_seed) if arguments.only in j.key]
+    wanted = [
+        j for j in jobs(arguments.sets, arguments.clean, arguments.first_seed, arguments.few) if arguments.only in j.key
+    ]
     missing = [j for j in wanted if j.key not in done]
     with ProcessPoolExecutor(arguments.jobs) as pool, arguments.out.open("a") as file:
         for number, future in enumerate(as_completed([pool.submit(measure, j) for j in missing]), 1):
