@@ -16,7 +16,7 @@ from idm_env.checks import nearest
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import ceilings, free, judge, places, records, search, summary, words
+from idm_env.discovery import ceilings, free, judge, places, records, search, shared, summary, words
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
@@ -240,6 +240,7 @@ def _finish(
     fit_records = prepared.of_runs(fit_runs)
     kept = prepared.of_runs(kept_runs) if kept_runs else None
     final, refusal = null, rounds[0].refusal
+    confirmed: list[Solution] = []
     if kept is not None:
         # The lockbox is looked into once for every addition, and only to end there.
         for s in decided.steps:
@@ -247,6 +248,7 @@ def _finish(
                 refusal = Refusal(Reason.LOCKBOX)
                 break
             final = s
+            confirmed.append(s)
 
     def judged(s: Solution) -> tuple[Solution, judge.Judged | None]:
         theta = judge.calibrate(prepared if adapt else fit_records, s.model, s.values, s.prior, start=s.theta)
@@ -263,6 +265,13 @@ def _finish(
     judgement = summary.Judgement(null, compared, added, refusal, before, after, seed)
     if added and judgement.errors and not improves(judgement.errors):
         judgement = replace(judgement, added=False, refusal=Refusal(Reason.HELD_OUT))
+        # What the last additions spoil does not speak against the first.
+        for s in reversed(confirmed[:-1]):
+            theta, there = judged(s)
+            fewer = replace(judgement, compared=s, added=True, refusal=None, after=there)
+            if improves(fewer.errors):
+                judgement, compared, last, after = fewer, s, theta, there
+                break
     if decided.joined is not None and before is not None:
         # What was found in free simulation takes the place of what windows found where it does better there.
         theta, there = judged(decided.joined.solution)
@@ -276,6 +285,8 @@ def _finish(
             if improves(other.errors):
                 judgement, last = other, theta
                 compared = other.compared
+    final = compared if judgement.added and compared is not None else null
+    judgement = replace(judgement, shared=shared.find(judge.everywhere(prepared, searching.task, final), seed))
     report = summary.report(
         trajectories, prepared, fit_runs, kept_runs, searching.task, judgement, rounds, refused, [first, last], by
     )

@@ -159,6 +159,17 @@ def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> 
     return float(0.5 * np.log(squares[0] / squares[1]))
 
 
+def everywhere(records: Records, task: Task, solution: Solution) -> places.Responses:
+    """Return the responses of a model in windows of all records: φ as it stands, θ fitted, the noise of ``task``."""
+    assert task.noise is not None
+    rows = windows(records)
+    there = Task(
+        rows, replace(task.noise, weight=np.ones(len(rows))), replace(task.prior, free=False), np.ones(len(rows))
+    )
+    start = np.tile(task.prior.centre, (there.groups, 1))
+    return places.respond(there, solve(there, Frozen(solution.model, solution.values), start, np.zeros(0)))
+
+
 def halves(rows: Rows) -> np.ndarray:
     """Return [R, samples] which samples lie in the blocks of time that are scored; the others fit θ."""
     records = rows.records

@@ -14,6 +14,7 @@ from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
 from idm_env.discovery.model import Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.score import Strength, interval_of, powerful, strength_of
+from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import BOUNDS, NAMES, Solution, Task
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude
@@ -39,6 +40,8 @@ class Judgement:
     seed: int
     intervals: np.ndarray | None = None
     """Estimates of φ with their intervals [Q, 3], where they are not those of predictions in windows."""
+    shared: Shared | None = None
+    """What vehicles of one run do alike, beyond the model."""
 
     @cached_property
     def errors(self) -> dict[str, Comparison]:
@@ -98,7 +101,10 @@ def report(
     smallest = smallest_p(units(task.rows.records).run)
     power = len(fit_runs) >= MANY_RUNS or powerful(list(strengths.values()), first.tested, smallest)
     refusal = judged.refusal
-    verdict = conclude(bool(found), any(f["effect"] for f in found), refusal, structured, first.left, power)
+    common = judged.shared
+    verdict = conclude(
+        bool(found), any(f["effect"] for f in found), refusal, structured, first.left, power, common is not None
+    )
     if verdict is Verdict.CANNOT_TELL and not power and (refusal is None or refusal.reason is Reason.NO_GAIN):
         refusal = Refusal(Reason.NO_POWER, len(fit_runs))
     errors = judged.errors
@@ -107,7 +113,7 @@ def report(
         "schema": SCHEMA,
         "verdict": verdict.value,
         "reason": None if refusal is None else refusal.reason.value,
-        "sentence": words.headline(verdict, [f["clause"] for f in found], refusal, judged.tried, errors),
+        "sentence": words.headline(verdict, [f["clause"] for f in found], refusal, judged.tried, errors, common),
         "details": [*words.details(verdict, found, [] if judged.added else entries, left),
                     *words.excluded(verdict, strengths)],
         "found": found,
@@ -127,6 +133,7 @@ def report(
         },
         "partial": None if judged.added or compared is None else _partial(judged, entries, first),
         "candidates": _candidates(rounds, refused),
+        "shared": None if common is None else vars(common),
         "excluded": [
             {"effect": name, "parameter": s.parameter.name, "unit": s.parameter.unit, "estimate": s.estimate,
              "low": s.low, "high": s.high, "would_be_found": s.seen, "typical": s.typical}

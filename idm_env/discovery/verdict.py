@@ -68,8 +68,9 @@ def holds(errors: Mapping[str, Comparison]) -> bool:
 
 
 def conclude(
-    added: bool, named: bool, refusal: Refusal | None, structured: bool, left: np.ndarray, power: bool = True
-) -> Verdict:
+    added: bool, named: bool, refusal: Refusal | None, structured: bool, left: np.ndarray, power: bool = True,
+    shared: bool = False,
+) -> Verdict:  # fmt: skip
     """Return the verdict.
 
     Args:
@@ -79,9 +80,12 @@ def conclude(
         structured: Whether a candidate was significant at all.
         left: Gains [units] of any smooth function of the state over the null.
         power: Whether what is in the catalogue would have been found, were it there.
+        shared: Whether vehicles of one run miss the model alike at one time.
     """
     if added:
         return Verdict.NAMED if named else Verdict.LOCATED
+    if shared:
+        return Verdict.LOCATED
     if refusal is not None and refusal.reason is Reason.FEW_RUNS:
         return Verdict.CANNOT_TELL
     error = left.std(ddof=1) / np.sqrt(len(left)) if len(left) > 1 else np.inf

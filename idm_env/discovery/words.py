@@ -8,6 +8,7 @@ from typing import Any
 from idm_env.discovery.compare import Comparison, Light
 from idm_env.discovery.model import Term
 from idm_env.discovery.score import Strength
+from idm_env.discovery.shared import Shared
 from idm_env.discovery.verdict import Reason, Refusal, Verdict
 from idm_env.effects import ALL
 from idm_env.parameters import Parameter
@@ -124,8 +125,9 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
 
 
 def headline(
-    verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison]
-) -> str:
+    verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison],
+    shared: Shared | None = None,
+) -> str:  # fmt: skip
     """Say in one sentence what is missing, or why nothing can be said.
 
     Args:
@@ -134,7 +136,10 @@ def headline(
         refusal: Why nothing was added.
         tried: Plain names of what came nearest, "" for nothing.
         errors: How errors on runs kept back changed with what was added or came nearest.
+        shared: What vehicles of one run do alike, told where nothing was added.
     """
+    if shared is not None and not clauses:
+        return common(shared)
     if verdict in (Verdict.NAMED, Verdict.LOCATED):
         text = ", and ".join(clauses)
         unnamed = "" if verdict is Verdict.NAMED else "; the catalogue has no name for it"
@@ -155,6 +160,16 @@ def headline(
             f"{_rises(errors)} on the runs kept back."
         )
     return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
+
+
+def common(shared: Shared) -> str:
+    """Say what vehicles of one run do alike."""
+    more = "more" if shared.accel_mps2 > 0 else "less"
+    return (
+        f"The {shared.vehicles} followers of run {shared.run} all accelerate {more} than the model between "
+        f"{shared.begin_s:.0f} and {shared.end_s:.0f} s, by {number(abs(shared.accel_mps2), 2)} m/s² on average: "
+        "something that they share there, and no driver's own noise; the catalogue has no name for it."
+    )
 
 
 def _rises(errors: Mapping[str, Comparison]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from benchmarks import discovery as sets
@@ -74,3 +75,26 @@ class TestSumo:
         first = found.report["found"][0]
         assert first["effect"] in ("delay", "lag")
         assert next(iter(first["parameters"].values()))["estimate"] == pytest.approx(0.5, abs=0.2)
+
+
+def test_what_vehicles_of_one_run_share_is_located_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A push of the third run between 40 and 60 s, under drivers' noise: no driver's own noise, and no effect."""
+
+    class Pushed(synthetic.Platoon):
+        def _rates(self, k: int, known: int, state: np.ndarray) -> np.ndarray:
+            rates = super()._rates(k, known, state)
+            time = self.starts + k * self.step
+            on = (np.arange(len(time)) == 2) & (time >= 40.0) & (time < 60.0)
+            rates[1] += np.where(on[:, None], -0.4, 0.0)
+            return rates
+
+    options = {"runs": 6, "followers": 3, "seconds": 100.0, "ou": 0.1}
+    clean = discover(synthetic.generate(1, **options)[0], effects=["drag"]).report  # type: ignore[arg-type]
+    assert clean["shared"] is None and clean["verdict"] in ("none", "cannot_tell")
+    monkeypatch.setattr(synthetic, "Platoon", Pushed)
+    report = discover(synthetic.generate(1, **options)[0], effects=["drag"]).report  # type: ignore[arg-type]
+    assert report["verdict"] == "located" and report["found"] == []
+    shared = report["shared"]
+    assert shared["run"] == "3" and shared["accel_mps2"] < 0.0 and shared["vehicles"] == 3
+    assert 35.0 < shared["begin_s"] < 50.0 < shared["end_s"] < 65.0
+    assert "followers of run 3" in report["sentence"] and "less than the model" in report["sentence"]

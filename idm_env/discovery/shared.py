@@ -1,0 +1,94 @@
+"""What vehicles of one run miss alike at one time: found by turning their clocks against each other, and located.
+
+A driver's own noise knows nothing of another's. Where the vehicles of a run miss the model together, the cause is
+theirs together: weather, a closed lane, a sensor's clock. (If they do so in most runs, the model lacks something, and
+no run is special.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.stats import norm as normal
+
+from idm_env.discovery.places import Responses, scan
+
+TURNS = 199
+ALPHA = 0.01
+LARGEST = 6.0
+"""A residual counts at most so much: one vehicle's emergency is nobody else's."""
+FEWEST_RUNS = 4
+USUAL = 1.0
+"""Score of the other runs, in the median and in units of chance, above which all miss the model and none is special."""
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Run, interval of its clock (s), acceleration added there (m/s²), number of vehicles, and p over all runs."""
+
+    run: str
+    begin_s: float
+    end_s: float
+    accel_mps2: float
+    vehicles: int
+    p_value: float
+
+
+def find(responses: Responses, seed: int) -> Shared | None:
+    """Return the interval of a run in which its vehicles miss the model alike, or None where chance does as much.
+
+    The score of a run is the sum, over pairs of its vehicles and windows of 5 s on one clock, of products of whitened
+    residuals. Chance: each vehicle's residuals turned by a random time, which keeps what lasts in a driver; p from the
+    scores' mean and spread, times the number of runs. The interval is the one of time in which an added acceleration
+    explains most of that run, drivers re-calibrated.
+    """
+    rows, records = responses.rows, responses.rows.records
+    number = np.round(records.signals[rows.start, 17] / (rows.steps * records.dt)).astype(int)
+    random = np.random.default_rng(seed)
+    score, vehicles = np.full(len(records.runs), np.nan), np.zeros(len(records.runs), int)
+    for run in range(len(records.runs)):
+        tables = _tables(responses, run, number)
+        vehicles[run] = len(tables)
+        if len(tables) > 1 and tables.shape[1] > 3:
+            scores = _scores(tables, random)
+            score[run] = (scores[0] - scores[1:].mean()) / (scores[1:].std() + 1e-12)
+    tested = int(np.isfinite(score).sum())
+    if tested < FEWEST_RUNS:
+        return None
+    run = int(np.nanargmax(score))
+    p_value = float(normal.sf(score[run])) * tested
+    if p_value > ALPHA or np.nanmedian(np.delete(score, run)) > USUAL:
+        return None
+    mine = rows.run == run
+    alone = replace(responses, change=responses.change * mine[:, None], residual=responses.residual * mine[:, None])
+    found = scan(alone, "acceleration", "time", 5.0)
+    if found is None:
+        return None
+    return Shared(records.runs[run], found.begin, found.end, found.amount, int(vehicles[run]), p_value)
+
+
+def _tables(responses: Responses, run: int, number: np.ndarray) -> np.ndarray:
+    """Return residuals [vehicles, windows, m] of a run on one clock, 0 where there is none."""
+    rows, episodes = responses.rows, responses.rows.records.episodes
+    mine = np.flatnonzero(rows.run == run)
+    names = [episodes[r].vehicle_id for r in rows.record[mine]]
+    if not names:
+        return np.zeros((0, 0, 0))
+    vehicles = list(dict.fromkeys(names))
+    first = int(number[mine].min())
+    table = np.zeros((len(vehicles), int(number[mine].max()) - first + 1, responses.residual.shape[1]))
+    table[[vehicles.index(n) for n in names], number[mine] - first] = responses.residual[mine]
+    return np.clip(table, -LARGEST, LARGEST)
+
+
+def _scores(table: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Return the score as it is, and with every vehicle's residuals turned by a random time [1 + TURNS]."""
+    vehicles, count, _ = table.shape
+    by = np.concatenate([np.zeros((1, vehicles), int), random.integers(0, count, (TURNS, vehicles))])
+    at = (np.arange(count) + by[..., None]) % count
+    total = np.zeros(len(by))
+    for i, j in combinations(range(vehicles), 2):
+        total += np.einsum("ntm,ntm->n", table[i][at[:, i]], table[j][at[:, j]])
+    return total
