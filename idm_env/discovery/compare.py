@@ -27,13 +27,17 @@ class Light(str, Enum):
 
 @dataclass(frozen=True)
 class Comparison:
-    """One error before and after; ``ratio`` is after / before, with its 95 % interval from ``low`` to ``high``."""
+    """One error before and after; ``ratio`` is after / before, with its 95 % interval from ``low`` to ``high``.
+
+    ``improved`` is the share of followers whose error falls.
+    """
 
     before: float
     after: float
     ratio: float
     low: float
     high: float
+    improved: float = float("nan")
 
     @property
     def light(self) -> Light:
@@ -59,7 +63,9 @@ def _compared(was: np.ndarray, now: np.ndarray, samples: float, runs: np.ndarray
     errors = [float(np.sqrt(x.sum() / samples)) if samples else float("nan") for x in (was, now)]
     change = 0.5 * np.log(now.sum() / was.sum()) if samples and was.sum() > 0 else float("nan")
     width = _width(was, now, runs, seed) if np.isfinite(change) else float("inf")
-    return Comparison(*errors, *(float(np.exp(x)) for x in (change, change - width, change + width)))
+    improved = float((now < was).mean()) if len(was) else float("nan")
+    ratio, low, high = (float(np.exp(x)) for x in (change, change - width, change + width))
+    return Comparison(errors[0], errors[1], ratio, low, high, improved)
 
 
 def _width(was: np.ndarray, now: np.ndarray, runs: np.ndarray, seed: int) -> float:

@@ -287,5 +287,5 @@ def _tried(r: dict[str, Any]) -> Iterator[Block]:
         f"gain at least {percent(LEAST_GAIN, 1)}, explain at least {percent(LEAST_SHARE)} of what any smooth function "
         "of the state explains, not make free simulation worse, and hold on the runs kept back, where it is called an "
         "improvement only if an error falls, none is worse, and the gap in free simulation rises by "
-        f"{HOLDS - 1.0:.0%} at most."
+        f"{HOLDS - 1.0:.0%} at most, or falls for most followers."
     )
