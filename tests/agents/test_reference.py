@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from agents import reference
+from agents import evaluate, reference
 from agents.classical import no_command
 from agents.common import Policy
 from agents.evaluate import SPEED_RATIO, as_judged, evaluate_ring
@@ -28,7 +28,7 @@ def judged(environment, names, every=1):
 
 
 def test_constants_and_follower_stopper_fail_the_ring_with_a_shock():
-    for _, chosen, found in judged(SHOCK, ("constants", "FollowerStopper"), every=3).values():
+    for _, chosen, found in judged(SHOCK, ("constants", "FollowerStopper"), every=4).values():
         assert len(found) == len(chosen) and not any(row["passed"] for row in found)
     constant = evaluate_ring(lambda o: o.new_full((len(o), 1), 0.025), GUARDED)
     assert constant["speed_ratio"] > 0.95, "without the shock one of them nearly dissolves the wave"
@@ -47,18 +47,20 @@ def test_an_oracle_can_pass_it():
         assert reference.judge(family, SHOCK, draws, (patient,))[0]["passed"]
 
 
-def test_policies_that_drive_together_do_what_each_does_alone():
+def test_policies_that_drive_together_do_what_each_does_alone(monkeypatch):
     """In one batch or alone, networks and rules alike."""
+    for module in (reference, evaluate):
+        monkeypatch.setattr(module, "STEPS", 1100)
     torch.manual_seed(0)
     policies = [Policy(3, (4,)) for _ in range(3)]
     for i, policy in enumerate(policies):
         with torch.no_grad():
             policy.body[-1].bias.fill_(0.01 * (i + 1))
-    both = reference.judge(reference.networks(policies, "abc"), GUARDED, (0,), (0, 2))
+    both = reference.judge(reference.networks(policies, "abc"), SHOCK, (0,), (0, 2))
     for found, policy in zip(both, (policies[0], policies[2]), strict=True):
-        assert found["ratios"] == pytest.approx(evaluate_ring(policy, GUARDED)["ratios"], abs=1e-3)
-    still = reference.judge(reference.families(GUARDED)["constants"](), GUARDED, (0,), (0,))[0]
-    assert still["ratios"] == pytest.approx(evaluate_ring(no_command, GUARDED)["ratios"], abs=1e-3)
+        assert found["ratios"] == pytest.approx(evaluate_ring(policy, SHOCK)["ratios"], abs=1e-3)
+    still = reference.judge(reference.families(SHOCK)["constants"](), SHOCK, (0,), (0,))[0]
+    assert still["ratios"] == pytest.approx(evaluate_ring(no_command, SHOCK)["ratios"], abs=1e-3)
 
 
 def test_rules_command_what_their_names_say():

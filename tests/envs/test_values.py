@@ -69,7 +69,7 @@ def test_a_single_environment_is_a_row_of_a_vector_and_the_torch_path(task, keyw
     _same(vector.unwrapped.state.speed[:1], single[1].unwrapped.state.speed)
 
 
-@pytest.mark.parametrize(("task", "keywords"), [CASES[1], CASES[5]])
+@pytest.mark.parametrize(("task", "keywords"), [CASES[1], CASES[2], CASES[6]])
 def test_vehicles_whose_agents_left_go_back_to_their_drivers(task, keywords):
     made = settings(task=task, dtype="float64", **keywords)
     ours, theirs = Batch(made, 2), Batch(made, 2)
