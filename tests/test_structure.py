@@ -36,6 +36,7 @@ ALLOWED = {
         "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "report", "metrics",
         "checks", "keep", "progress", "diagrams",
     },
+    "drift": {"types", "parameters", "simulator", "fitting", "progress"},
 }  # fmt: skip
 """What a part may import of the package; parts that are not named may import anything but what FORBIDDEN says."""
 

@@ -1,0 +1,305 @@
+"""What following a driver's drift is worth in forecasts, on runs kept back.
+
+    python -m benchmarks.drift --data ../shared/data [--draws 60]
+
+NGSIM I-80 pairs by the split of ``explain`` (a quarter of the runs kept back, seed 0). Drivers of these runs are
+calibrated on every other block of time, as ``explain`` does, with the population of the other runs as prior. Forecasts
+begin every 5 s in the blocks between, from the measured state, behind the leader as recorded. IDM and every row below
+it have the same calibrations. σ, τ and all else come from runs that are not kept back. A forecast of 10 or 30 s may end
+in a block that calibrated the driver, for all rows alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+import numpy as np  # noqa: E402 (threads are set before numpy starts)
+import torch  # noqa: E402
+
+from idm_env.data import Episode, episodes, load  # noqa: E402
+from idm_env.drift import forecast  # noqa: E402
+from idm_env.drift.estimate import Estimate, estimate  # noqa: E402
+from idm_env.drift.linear import Drivers  # noqa: E402
+from idm_env.drift.linear import Path as Record  # noqa: E402
+from idm_env.effects import IDM, AccelNoise, Brakes, Effect, Noise, Replay, Wander  # noqa: E402
+from idm_env.fitting.batch import Batch, part  # noqa: E402
+from idm_env.fitting.fit import fit  # noqa: E402
+from idm_env.fitting.prior import Prior  # noqa: E402
+from idm_env.fitting.problem import IDM_NAMES  # noqa: E402
+from idm_env.roads import Lane  # noqa: E402
+from idm_env.simulator import Simulator  # noqa: E402
+
+HORIZONS = (1.0, 5.0, 10.0, 30.0)
+EVERY_S, FIRST_S = 5.0, 5.0
+STEP_S = 0.5
+"""Records are thinned to this step: errors of a model of drivers are no noise that is new ten times a second."""
+NOISE_M = 13.0
+"""Weight of the prior: errors of 3 m that stay alike for 10 s, every half second."""
+THINNED = 3
+"""Every so manieth driver to fit tells of drift."""
+ORDER, RESIDUAL_S = 3, 0.5
+MODELS: dict[str, tuple[Effect, ...]] = {
+    "wander": (Wander(), Noise()),
+    "wander, accel_noise": (Wander(), AccelNoise(), Noise()),
+}
+CHOSEN = {"wander": (0.5, 0.3), "wander, accel_noise": (0.5, 0.3)}
+NOISES = ((0.5, 0.3), (1.0, 0.5), (2.0, 1.0))
+"""What a filter may take for noise of gap (m) and speed (m/s): what drivers do beside any model of them is among it."""
+
+
+def simulator(dt: float, *drifts: Effect) -> Simulator:
+    """Return IDM behind a record with drift."""
+    return Simulator(Lane(), (IDM(), *drifts, Replay(), Brakes()), dt=dt, integration="midpoint")
+
+
+def split(found: list[Episode]) -> tuple[list[Episode], list[Episode]]:
+    """Return the episodes of the runs to fit and of the runs kept back, as ``explain`` with seed 0 draws them."""
+    runs = list(dict.fromkeys(e.run_id for e in found))
+    order = np.random.default_rng(0).permutation(len(runs))
+    kept = {runs[i] for i in order[: round(0.25 * len(runs))]}
+    return [e for e in found if e.run_id not in kept], [e for e in found if e.run_id in kept]
+
+
+def thinned(e: Episode) -> Episode:
+    """Return an episode with fewer samples."""
+    at = slice(None, None, round(STEP_S / e.dt))
+
+    def few(x: Any) -> Any:
+        if isinstance(x, np.ndarray):
+            return x[at]
+        if isinstance(x, dict):
+            return {name: few(y) for name, y in x.items()}
+        if dataclasses.is_dataclass(x):
+            return dataclasses.replace(x, **{f.name: few(getattr(x, f.name)) for f in dataclasses.fields(x)})  # type: ignore[type-var]
+        return x
+
+    return dataclasses.replace(few(e), dt=STEP_S)
+
+
+def block_s(e: Episode) -> float:
+    """Return the length of the blocks of time, of which every other one calibrates."""
+    return float(np.clip(len(e) * e.dt / 4.0, 5.0, 30.0))
+
+
+def even(e: Episode) -> list[Episode]:
+    """Return the blocks of an episode that calibrate."""
+    size = round(block_s(e) / e.dt)
+    return [part(e, i, min(i + size + 1, len(e))) for i in range(0, len(e) - 1, 2 * size) if len(e) - i > 4]
+
+
+def calibrated(items: list[Episode], own: list[Episode], centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return log θ [rows, 5] of the drivers of ``items``, calibrated on ``own`` with a prior."""
+    groups = len({(e.run_id, e.vehicle_id) for e in own})
+    prior = Prior(torch.tensor(np.exp(centre)).expand(groups, -1), torch.tensor(spread).expand(groups, -1), NOISE_M)
+    found = fit(own, by="driver", loss="mse", starts=1, iterations=25, substeps=1, prior=prior)
+    at = {name: i for i, name in enumerate(found.problem.groups)}
+    return np.log(np.stack([found.own.numpy()[at[f"{e.run_id}/{e.vehicle_id}"]] for e in items]))
+
+
+def starts_of(items: list[Episode]) -> list[tuple[int, int]]:
+    """Return (row, sample) of every forecast: every 5 s in the blocks that calibrate nothing."""
+    found = []
+    for r, e in enumerate(items):
+        for t in np.arange(FIRST_S, (len(e) - 1) * e.dt - 5.0, EVERY_S):
+            if int(t // block_s(e)) % 2 == 1:
+                found.append((r, round(t / e.dt)))
+    return found
+
+
+class Rows:
+    """Forecasts of one sort at every horizon, scored."""
+
+    def __init__(self, items: list[Episode], starts: list[tuple[int, int]]) -> None:
+        self.items, self.starts = items, starts
+        self.lines: list[tuple[str, float, int, list[float]]] = []
+        self.base: dict[float, tuple[float, float]] = {}
+
+    def truth(self, horizon: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return which starts have a truth so far ahead, and gap and speed there."""
+        at = [t + round(horizon / self.items[r].dt) for r, t in self.starts]
+        there = np.array([t < len(self.items[r]) for (r, _), t in zip(self.starts, at, strict=True)])
+        known = [(self.items[r], t) for (r, _), t, y in zip(self.starts, at, there, strict=True) if y]
+        pairs = [(e.gap_m[t], e.speed_mps[t]) for e, t in known]
+        gap, speed = np.array(pairs).T
+        return there, gap, speed
+
+    def score(self, name: str, gap: np.ndarray, speed: np.ndarray) -> None:
+        """Score draws [steps, n, starts]; one draw is a point forecast."""
+        for horizon in HORIZONS:
+            there, true_gap, true_speed = self.truth(horizon)
+            step = round(horizon / self.items[0].dt) - 1
+            s, v = gap[step][:, there], speed[step][:, there]
+            ok = np.isfinite(s).all(0)
+            s, v, true_gap, true_speed = s[:, ok], v[:, ok], true_gap[ok], true_speed[ok]
+            rmse = float(np.sqrt(np.mean((s.mean(0) - true_gap) ** 2)))
+            score = float(forecast.crps(s, true_gap).mean())
+            base = self.base.setdefault(horizon, (score, rmse))
+            numbers = [rmse, rmse / base[1], score, score / base[0], float(forecast.crps(v, true_speed).mean())]
+            if len(s) > 1:
+                for share in (0.5, 0.9):
+                    inside, width = forecast.covers(s, true_gap, share)
+                    numbers += [100.0 * float(inside.mean()), float(width.mean())]
+                numbers += [float(forecast.log_score(x, y).mean()) for x, y in ((s, true_gap), (v, true_speed))]
+            self.lines.append((name, horizon, int(ok.sum()), numbers))
+
+    def table(self) -> str:
+        """Return the table, by horizon."""
+        lines = [
+            "ahead s | forecast | n | gap RMSE m | after/before | gap CRPS m | after/before | speed CRPS m/s | "
+            "50 % covers %, m wide | 90 % covers %, m wide | log score gap, speed",
+            "--- | --- | --- | --- | --- | --- | --- | --- | --- | --- | ---",
+        ]
+        for horizon in HORIZONS:
+            for name, at, n, x in self.lines:
+                if at == horizon:
+                    text = f"{at:g} | {name} | {n} | {x[0]:.2f} | {x[1]:.2f} | {x[2]:.2f} | {x[3]:.2f} | {x[4]:.3f} | "
+                    if len(x) > 5:
+                        text += f"{x[5]:.0f}, {x[6]:.1f} | {x[7]:.0f}, {x[8]:.1f} | {x[9]:.2f}, {x[10]:.2f}"
+                    else:
+                        text += "– | – | –"
+                    lines.append(text)
+        return "\n".join(lines)
+
+
+def residuals(drivers: Drivers, theta: np.ndarray) -> np.ndarray:
+    """Return what IDM lacks of the recorded acceleration (m/s²) [T − 1, rows]."""
+    batch = drivers.batch
+    still = np.zeros((*batch.gap.shape, 1 + len(drivers.drifts)))
+    linear = drivers.linearise(Record(batch.gap.numpy(), batch.speed.numpy(), still, theta))
+    return (batch.speed.numpy()[1:] - linear.to[..., 1]) / batch.dt
+
+
+def autoregression(drivers: Drivers, theta: np.ndarray) -> np.ndarray:
+    """Return the coefficients of AR(k) on residuals of ``RESIDUAL_S`` s, by least squares over all drivers."""
+    stride = round(RESIDUAL_S / drivers.batch.dt)
+    left, right = [], []
+    for r, x in enumerate(residuals(drivers, theta).T):
+        y = _means(x[: len(drivers.batch.episodes[r]) - 1], stride)
+        left += [y[i - ORDER : i][::-1] for i in range(ORDER, len(y))]
+        right += list(y[ORDER:])
+    return np.linalg.lstsq(np.array(left), np.array(right), rcond=None)[0]
+
+
+def _means(x: np.ndarray, stride: int) -> np.ndarray:
+    return x[: len(x) // stride * stride].reshape(-1, stride).mean(1)
+
+
+def by_residual(
+    theta: np.ndarray, items: list[Episode], starts: list[tuple[int, int]], coefficients: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return IDM's forecasts with the residual as an AR(k) goes on from the past, [steps, 1, starts]."""
+    dt = items[0].dt
+    bare = Drivers(simulator(dt), Batch.of(items, substeps=1), Batch.of(items, substeps=1), IDM_NAMES)
+    past, stride, steps = residuals(bare, theta), round(RESIDUAL_S / dt), round(HORIZONS[-1] / dt)
+    ahead = np.zeros((steps, len(starts)))
+    for i, (r, t) in enumerate(starts):
+        known = list(_means(past[t % stride : t, r], stride))
+        while len(known) < ORDER:
+            known.insert(0, 0.0)
+        for j in range(0, steps, stride):
+            known.append(float(coefficients @ known[: -ORDER - 1 : -1]))
+            ahead[j : j + stride, i] = known[-1]
+    model = simulator(dt, Noise())
+    made = Batch.of([part(items[r], t, t + steps + 1) for r, t in starts], substeps=1)
+    params = bare.params(torch.tensor(theta[[r for r, _ in starts]]), torch.zeros(len(starts), dtype=torch.float64))
+    params["noise"] = {"sigma": torch.ones((), dtype=torch.float64)}
+    inputs = dict(made.inputs(model))
+    inputs["noise"] = torch.tensor(ahead[: made.steps]).unsqueeze(-1).expand(made.steps, len(starts), 2)
+    _, kept = model.rollout(made.start(model, params), inputs, params, made.steps)
+    gap, speed = (np.full((steps, 1, len(starts)), np.nan) for _ in range(2))
+    gap[: made.steps, 0], speed[: made.steps, 0] = kept.gap[..., 1].numpy(), kept.speed[..., 1].numpy()
+    return gap, speed
+
+
+def persistent(
+    drivers: Drivers, nothing: Estimate, theta: np.ndarray, starts: list[tuple[int, int]], gap: np.ndarray,
+    speed: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return IDM's forecasts plus the error of its last forecast over the same time; without one, as they are."""
+    gap, speed = gap.copy(), speed.copy()
+    zero = still_levels(drivers)
+    for horizon in HORIZONS:
+        steps = round(horizon / drivers.batch.dt)
+        able = [i for i, (_, t) in enumerate(starts) if t >= steps]
+        earlier = [(starts[i][0], starts[i][1] - steps) for i in able]
+        s, v = forecast.drawn(drivers, nothing.settings, theta, zero, earlier, horizon, 1)
+        for n, i in enumerate(able):
+            r, t = starts[i]
+            gap[steps - 1, 0, i] += drivers.batch.episodes[r].gap_m[t] - s[-1, 0, n]
+            speed[steps - 1, 0, i] += drivers.batch.episodes[r].speed_mps[t] - v[-1, 0, n]
+    return gap, speed
+
+
+def still_levels(drivers: Drivers) -> tuple[np.ndarray, np.ndarray]:
+    """Return levels of drivers who do not drift, known for sure."""
+    k = 1 + len(drivers.drifts)
+    return np.zeros((*drivers.batch.gap.shape, k)), np.zeros((*drivers.batch.gap.shape, k, k))
+
+
+def i80(folder: Path, draws: int, choose: bool, noises: dict[str, tuple[float, float]]) -> str:
+    """Return the table of I-80; with ``choose`` of drivers to fit, for every noise, instead of those kept back."""
+    begin = time.perf_counter()
+
+    def say(text: str) -> None:
+        print(f"{time.perf_counter() - begin:6.0f} s  {text}", file=sys.stderr, flush=True)
+
+    found = list(episodes(load(folder / "ngsim_i80_pairs.parquet"), min_seconds=12.0))
+    found = [thinned(e) for e in found]
+    train, kept = split(found)
+    dt = found[0].dt
+    centre, spread = np.log([1.2, 1.5, 1.4, 2.2, 30.0]), np.full(5, 0.3)
+    if choose:
+        kept = train[1::THINNED]
+    train = train[::THINNED]
+    theta = calibrated(train, train, centre, spread)
+    centre, spread = np.median(theta, 0), np.maximum(theta.std(0), 0.1)
+    mine = calibrated(kept, [b for e in kept for b in even(e)], centre, spread)
+    say(f"population {np.exp(centre).round(2)}, spread {spread.round(2)}")
+    batch, starts = Batch.of(kept, substeps=1), starts_of(kept)
+    training = Batch.of(train, substeps=1)
+    rows = Rows(kept, starts)
+    plain = Drivers(simulator(dt), batch, batch, IDM_NAMES)
+    nothing = estimate(plain.simulator, training, IDM_NAMES, theta, rounds=1)
+    ahead = forecast.drawn(plain, nothing.settings, mine, still_levels(plain), starts, HORIZONS[-1], 1)
+    rows.score("IDM", *ahead)
+    steps = np.full((round(HORIZONS[-1] / dt), 1, 1), 1.0)
+    rows.score(
+        "gap and speed stay", *(steps * np.array([x(kept[r])[t] for r, t in starts])
+                                for x in (lambda e: e.gap_m, lambda e: e.speed_mps)),
+    )  # fmt: skip
+    rows.score("IDM + last error", *persistent(plain, nothing, mine, starts, *ahead))
+    trained = Drivers(simulator(dt), training, training, IDM_NAMES)
+    rows.score(f"IDM + AR({ORDER})", *by_residual(mine, kept, starts, autoregression(trained, theta)))
+    for name, drifts in MODELS.items():
+        for noise in NOISES if choose else (noises[name],):
+            label = f"{name}, noise {noise[0]:g} m, {noise[1]:g} m/s"
+            model = simulator(dt, *drifts)
+            estimated = estimate(model, training, IDM_NAMES, theta, noise=noise, rounds=2)
+            numbers = (f"{r['name']} {r['estimate']:.3g} ({r['low']:.3g} … {r['high']:.3g})" for r in estimated.table())
+            say(f"{label}: {', '.join(numbers)}")
+            drivers = Drivers(model, batch, batch, IDM_NAMES)
+            levels = forecast.followed(drivers, estimated.settings, mine)
+            rows.score(label, *forecast.drawn(drivers, estimated.settings, mine, levels, starts, HORIZONS[-1], draws))
+    return f"{len(kept)} drivers, {len(starts)} forecasts\n{rows.table()}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("IDM_ENV_DATA", "../shared/data")))
+    parser.add_argument("--draws", type=int, default=60)
+    parser.add_argument("--choose", action="store_true", help="score every noise on drivers to fit, to choose one")
+    arguments = parser.parse_args()
+    print(i80(arguments.data, arguments.draws, arguments.choose, CHOSEN))
+
+
+if __name__ == "__main__":
+    main()

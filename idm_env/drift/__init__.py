@@ -1,0 +1,1 @@
+"""Drivers who drift: how much and for how long, which of their numbers, and forecasts that follow it."""

@@ -1,0 +1,123 @@
+"""Forecasts of drivers who drift: how they are is followed on the past, the future is drawn, and both are scored."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from idm_env.drift.estimate import Likelihood, Settings
+from idm_env.drift.linear import Drivers, Path
+from idm_env.fitting.batch import Batch, part
+
+
+def followed(drivers: Drivers, settings: Settings, theta: np.ndarray, passes: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean [T, rows, 1 + k] and covariance of a driver's levels, each from the record up to that sample only.
+
+    Steps are linear about the record and about the levels that the pass before had found one sample earlier.
+    """
+    batch = drivers.batch
+    level = np.zeros((*batch.gap.shape, 1 + len(drivers.drifts)))
+    reach = 3.0 * np.append(settings.style, settings.sigma)
+    for _ in range(passes):
+        path = Path(batch.gap.numpy(), batch.speed.numpy(), level, theta)
+        mean, covariance, _ = Likelihood(drivers, path).filtered(settings)
+        level = np.clip(np.concatenate((mean[:1, :, 2:], mean[:-1, :, 2:])), -reach, reach)
+    return mean[..., 2:], covariance[..., 2:, 2:]
+
+
+def drawn(
+    drivers: Drivers,
+    settings: Settings,
+    theta: np.ndarray,
+    levels: tuple[np.ndarray, np.ndarray],
+    starts: list[tuple[int, int]],
+    seconds: float,
+    count: int,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` drawn futures of gap and speed [steps, count, starts], each start a (row, sample).
+
+    They begin at the measured state, with a draw of what is known of the ``levels`` (of ``followed``) then. Beyond the
+    end of a record a future means nothing.
+    """
+    steps = round(seconds / drivers.batch.dt)
+    found = [
+        _chunk(drivers, settings, theta, levels, starts[i : i + 64], steps, count, seed + i)
+        for i in range(0, len(starts), 64)
+    ]
+    gap, speed = (np.concatenate(x, -1) for x in zip(*found, strict=True))
+    return gap, speed
+
+
+def _chunk(
+    drivers: Drivers, settings: Settings, theta: np.ndarray, levels: tuple[np.ndarray, np.ndarray],
+    starts: list[tuple[int, int]], steps: int, count: int, seed: int,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    simulator, d = drivers.simulator, drivers.driver
+    batch = Batch.of([part(drivers.batch.episodes[r], t, t + steps + 1) for r, t in starts], substeps=1)
+    random = np.random.default_rng(seed)
+    rows, at = np.array([r for r, _ in starts]), np.array([t for _, t in starts])
+    values, vectors = np.linalg.eigh(levels[1][at, rows])
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    normals = random.standard_normal((count, *levels[0].shape[2:], len(starts)))
+    level = levels[0][at, rows] + np.einsum("rij,njr->nri", root, normals)
+    params = drivers.params(torch.tensor(theta[rows]), torch.tensor(level[..., 0]))
+    for j, name in enumerate(drivers.drifts):
+        one = torch.ones((), dtype=torch.float64)
+        params[name] = {**params[name], "sigma": settings.sigma[j] * one, "memory_time": settings.memory_time[j] * one}
+    state = batch.start(simulator, params)
+    for effect in simulator.effects:
+        if effect.draws and not effect.remembers:  # white: what the filter calls jitter
+            sigma = torch.tensor(settings.jitter / math.sqrt(simulator.dt), dtype=torch.float64)
+            params[effect.name] = {**params[effect.name], "sigma": sigma}
+    memory = {
+        name: torch.tensor(level[..., j + 1] / settings.sigma[j]).unsqueeze(-1).expand(state.speed.shape).contiguous()
+        for j, name in enumerate(drivers.drifts)
+    }
+    state = state._replace(memory={**state.memory, **memory}, step=state.step.expand(state.speed.shape[:-1]))
+    inputs = {n: _wider(x) for n, x in batch.inputs(simulator.without(*simulator.draws)).items()}
+    inputs = simulator.drawn(state.speed, inputs, batch.steps, seed)
+    _, kept = simulator.rollout(state, inputs, params, batch.steps)
+    made = (x[..., d].numpy() for x in (kept.gap, kept.speed))
+    gap, speed = (np.pad(x, [(0, steps - len(x)), (0, 0), (0, 0)], constant_values=np.nan) for x in made)
+    return gap, speed
+
+
+def _wider(value: Any) -> Any:
+    """Return an input with a dimension for draws after time."""
+    return type(value)(*(None if x is None else x.unsqueeze(1) for x in value))
+
+
+def crps(drawn: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the continuous ranked probability score of draws [n, …], without the bias of few draws.
+
+    ``E|X − y| − ½ E|X − X'|`` (Gneiting, Raftery 2007, JASA 102); of a single draw the absolute error.
+    """
+    n = len(drawn)
+    first = np.abs(drawn - truth).mean(0)
+    if n == 1:
+        return np.asarray(first)
+    ranked = np.sort(drawn, 0)
+    weight = (2.0 * np.arange(1, n + 1) - n - 1.0).reshape(-1, *(1,) * truth.ndim)
+    return np.asarray(first - (weight * ranked).sum(0) / (n * (n - 1.0)))
+
+
+def log_score(drawn: np.ndarray, truth: np.ndarray, least: float = 0.1) -> np.ndarray:
+    """Return minus the log density of the truth under a normal of the draws' mean and variance: small is good.
+
+    ``least`` is added as a standard deviation, since all draws may agree that a car stands.
+    """
+    variance = drawn.var(0, ddof=1) + least**2
+    return np.asarray(0.5 * (math.log(2.0 * math.pi) + np.log(variance) + (truth - drawn.mean(0)) ** 2 / variance))
+
+
+def covers(drawn: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return whether the central band of ``share`` of the draws holds the truth, and the band's width."""
+    low, high = np.quantile(drawn, [0.5 - 0.5 * share, 0.5 + 0.5 * share], axis=0)
+    return (truth >= low) & (truth <= high), high - low
+
+
+__all__ = ["covers", "crps", "drawn", "followed", "log_score"]

@@ -1,0 +1,108 @@
+"""Known drift is found again, and forecasts of drivers who drift are honest about it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+
+pytest.importorskip("numba")
+
+from idm_env.data import Episode, Trajectories, episodes
+from idm_env.drift import forecast
+from idm_env.drift.estimate import Estimate, estimate
+from idm_env.effects import IDM, AccelNoise, Brakes, Delay, Effect, Replay, Wander
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.problem import IDM_NAMES
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
+from idm_env.types import Record
+
+DRIVERS, SECONDS, DT = 30, 90.0, 0.2
+TRUE = {
+    "idm.max_accel": 1.4,
+    "idm.comfort_decel": 2.0,
+    "idm.time_gap": 1.3,
+    "idm.min_gap": 2.0,
+    "idm.desired_speed": 30.0,
+}
+GAP_NOISE, SPEED_NOISE = 0.05, 0.05
+
+
+def behind_a_record(*drifts: Effect) -> Simulator:
+    return Simulator(Lane(), (IDM(), *drifts, Replay(), Brakes()), dt=DT, integration="midpoint")
+
+
+def driven(drift: Effect, sigma: float, memory_time: float) -> list[Episode]:
+    """Return drivers of one kind behind leaders who never stop changing their speed, gap and speed with noise."""
+    simulator, random = behind_a_record(drift), np.random.default_rng(1)
+    params = simulator.defaults(dtype=torch.float64)
+    params["idm"] |= {n.removeprefix("idm."): torch.tensor(x, dtype=torch.float64) for n, x in TRUE.items()}
+    params[drift.name] = {"sigma": torch.tensor(sigma).double(), "memory_time": torch.tensor(memory_time).double()}
+    steps = round(SECONDS / DT)
+    time, phase = DT * np.arange(steps + 1)[:, None], random.uniform(0.0, 6.0, (2, DRIVERS))
+    lead_speed = 12.0 + 3.0 * np.sin(time / 7.0 + phase[0]) + 2.0 * np.sin(time / 3.1 + phase[1])
+    lead_accel = 3.0 / 7.0 * np.cos(time / 7.0 + phase[0]) + 2.0 / 3.1 * np.cos(time / 3.1 + phase[1])
+    lead = np.cumsum(DT * (lead_speed - 0.5 * DT * lead_accel), 0)
+    both = (torch.tensor(np.stack((x, np.zeros_like(x)), -1)) for x in (lead, lead_speed, lead_accel))
+    record = Record(*(x[1:] for x in both), torch.tensor([True, False]).expand(steps, DRIVERS, 2))
+    position = torch.tensor(np.stack((lead[0], lead[0] - 25.0), -1))
+    speed = torch.tensor(np.stack((lead_speed[0],) * 2, -1))
+    accel = torch.tensor(np.stack((lead_accel[0], 0.0 * lead_accel[0]), -1))
+    start = simulator.state(position, speed, params, accel=accel, seed=2)
+    _, kept = simulator.rollout(start, {"replay": record}, params, steps, seed=3)
+    tables = []
+    for i in range(DRIVERS):
+        for vehicle in (0, 1):
+            noisy = vehicle * random.normal(size=(2, steps))
+            own = kept.speed[:, i, vehicle].numpy() + SPEED_NOISE * noisy[1]
+            columns = {"time_s": time[1:, 0], "position_m": kept.position[:, i, vehicle].numpy(), "speed_mps": own}
+            gap = kept.gap[:, i, 1].numpy() + GAP_NOISE * noisy[0]
+            columns["gap_m"] = gap if vehicle else np.full(steps, np.nan)
+            ids = {"run_id": f"{i:02d}", "vehicle_id": vehicle, "leader_id": 0 if vehicle else -1, "length_m": 5.0}
+            tables.append(pl.DataFrame(columns).with_columns(pl.lit(x).alias(n) for n, x in ids.items()))
+    table = pl.concat(tables).with_columns(
+        pl.col("leader_id").replace(-1, None), pl.col("gap_m").fill_nan(None)
+    )  # fmt: skip
+    found = Trajectories.from_frame(table, source="made up")
+    return list(episodes(found, smooth=True)), list(episodes(found))  # type: ignore[return-value]
+
+
+def estimated(drift: Effect, sigma: float, memory_time: float) -> Estimate:
+    smooth, raw = (Batch.of(x, substeps=1) for x in driven(drift, sigma, memory_time))
+    theta = np.tile(np.log([TRUE[n] for n in IDM_NAMES]), (DRIVERS, 1))
+    return estimate(behind_a_record(drift), smooth, IDM_NAMES, theta, measured=raw)
+
+
+@pytest.mark.parametrize(("drift", "sigma", "memory_time"), [(Wander(), 0.2, 8.0), (AccelNoise(), 0.3, 3.0)], ids=str)
+def test_drift_of_calibrated_drivers_is_found_again(drift: Effect, sigma: float, memory_time: float) -> None:
+    """σ, τ and the noise of measurement, within four of their standard errors, which are small."""
+    found = estimated(drift, sigma, memory_time)
+    true = (sigma, memory_time, GAP_NOISE, SPEED_NOISE)
+    for row, error, value in zip(found.table(), found.log_error, true, strict=False):
+        assert abs(math.log(row["estimate"] / value)) < 4.0 * error + 0.03, row
+        assert error < 0.25, row
+
+
+def test_scores_of_a_known_normal() -> None:
+    """CRPS of N(0, 1) at 0 is (√2 − 1)/√π; bands hold their share; one draw is a point forecast."""
+    draws = np.random.default_rng(0).normal(size=(4000, 50))
+    zero = np.zeros(50)
+    assert forecast.crps(draws, zero).mean() == pytest.approx((math.sqrt(2.0) - 1.0) / math.sqrt(math.pi), rel=0.01)
+    assert forecast.crps(draws[:1], zero) == pytest.approx(np.abs(draws[0]))
+    assert forecast.log_score(draws, zero, 0.0).mean() == pytest.approx(0.5 * math.log(2.0 * math.pi), rel=0.01)
+    truth = np.random.default_rng(1).normal(size=50_000)
+    inside, width = forecast.covers(np.random.default_rng(2).normal(size=(300, 50_000)), truth, 0.9)
+    assert inside.mean() == pytest.approx(0.9, abs=0.01)
+    assert width.mean() == pytest.approx(2.0 * 1.6449, rel=0.02)
+
+
+def test_a_driver_who_looks_back_is_refused() -> None:
+    """A step about a path has no past."""
+    smooth, _ = driven(Wander(), 0.1, 5.0)
+    batch = Batch.of(smooth[:1], substeps=1)
+    with pytest.raises(ValueError, match="'delay' looks back"):
+        estimate(behind_a_record(Delay()), batch, IDM_NAMES, np.zeros((1, 5)))
