@@ -84,7 +84,7 @@ def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws
         states.append(one.reset(draw, params).state)
         keys.append(draw.key)
     memory = {name: torch.cat([s.memory[name] for s in states]) for name in states[0].memory}
-    columns = {
+    columns: Any = {
         k: torch.cat([getattr(s, k) for s in states]) for k in ("position", "speed", "accel", "gap", "length", "step")
     }
     world = World(states[0]._replace(**columns, memory=memory), {})

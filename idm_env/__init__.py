@@ -22,6 +22,7 @@ _LAZY = {
     "Simulator": "idm_env.simulator",
     "Trajectory": "idm_env.simulator",
     "Lane": "idm_env.roads",
+    "Lanes": "idm_env.roads",
     "Ring": "idm_env.roads",
     "State": "idm_env.types",
     "Command": "idm_env.types",
@@ -41,6 +42,7 @@ __all__ = [
     "Control",
     "Effect",
     "Lane",
+    "Lanes",
     "Parameter",
     "Record",
     "Replay",
@@ -54,7 +56,7 @@ __all__ = [
 if TYPE_CHECKING:
     from idm_env.effects import IDM, Brakes, Control, Effect, Replay
     from idm_env.parameters import Parameter
-    from idm_env.roads import Lane, Ring
+    from idm_env.roads import Lane, Lanes, Ring
     from idm_env.simulator import Simulator, Trajectory
     from idm_env.types import Command, Record, State
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from idm_env.diagrams import COLOURS, space_time
+from idm_env.roads import Lanes
 from idm_env.types import State
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ __all__ = ["SIZE", "Viewer", "colour", "space_time"]
 SIZE = 600
 """Width, and on a ring also height, of a picture (pixels)."""
 _LANE_HEIGHT = 200
+_NEAR = 150.0
+"""How far from the agent one sees on a long ring (m)."""
 _MOST_LANES = 8
 """Lanes beyond these are drawn over the first ones again."""
 _ASPHALT, _GROUND, _INK, _MARK = (70, 74, 82), (244, 243, 238), (30, 32, 36), (30, 90, 220)
@@ -42,6 +45,14 @@ def _pygame() -> Any:
     return pygame
 
 
+def _around(task: Task, values: dict[str, np.ndarray], ring: float) -> None:
+    """Leave only what is near the first agent, at places beside it: all of a ring would be too small to see."""
+    first = values["position"][task.agents[0]]
+    away = (values["position"] - first + 0.5 * ring) % ring - 0.5 * ring
+    values["position"] = first + away
+    values["present"] = values["present"] * (np.abs(away) <= _NEAR)
+
+
 class Viewer:
     """Draws one environment: vehicles coloured by speed, controlled ones outlined in blue with a dot.
 
@@ -61,7 +72,10 @@ class Viewer:
     def show(self, task: Task, state: State, row: int = 0) -> np.ndarray | None:
         """Return the picture of one row of a state as ``(height, width, 3)`` uint8, or show it in the window."""
         ring = task.name == "ring"
-        lanes = min(max(task.lanes) + 1, _MOST_LANES)
+        lane, lanes = np.array(task.lanes), min(max(task.lanes) + 1, _MOST_LANES)
+        if isinstance(task.road, Lanes) and state.links is not None:
+            # The left lane is on top, as seen by drivers who go to the right.
+            lane, lanes = task.road.count - 1 - state.links.lane[row].cpu().numpy(), task.road.count
         canvas = self._pygame.Surface((SIZE, SIZE if ring else _LANE_HEIGHT + 40 * (lanes - 1)))
         canvas.fill(_GROUND)
         values = {
@@ -70,6 +84,9 @@ class Viewer:
         }
         everybody = np.ones(task.vehicles)
         values["present"] = everybody if state.present is None else state.present[row].detach().cpu().numpy()
+        values["lane"] = lane
+        if isinstance(task.road, Lanes) and task.road.ring is not None:
+            _around(task, values, task.road.ring)
         fastest = 10.0 if ring else 30.0
         (self._ring if ring else self._lane)(canvas, task, values, fastest)
         self._legend(canvas, task, state, row, values, fastest)
@@ -90,7 +107,7 @@ class Viewer:
 
     def _lane(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float) -> None:
         there = values["present"] > 0
-        lanes = min(max(task.lanes) + 1, _MOST_LANES)
+        lanes = (canvas.get_height() - _LANE_HEIGHT) // 40 + 1
         top = 0.55 * _LANE_HEIGHT
         for lane in range(lanes):
             self._pygame.draw.rect(canvas, _ASPHALT, (0, top + 40 * lane - 13, SIZE, 26))
@@ -107,7 +124,7 @@ class Viewer:
         for i in np.flatnonzero(there):
             length = values["length"][i]
             x = 0.97 * SIZE - (front - values["position"][i] + 0.5 * length) * scale
-            y = top + 40 * (task.lanes[i] % _MOST_LANES)
+            y = top + 40 * (int(values["lane"][i]) % lanes)
             self._vehicle(canvas, (x, y), 0.0, length * scale, values["speed"][i], fastest, i in task.agents)
 
     def _vehicle(

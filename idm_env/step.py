@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from idm_env import parameters
-from idm_env.effects.base import CarFollowing, Effect, Hook
+from idm_env.changes import decided
+from idm_env.effects.base import HOOKS, CarFollowing, Effect, Hook
 from idm_env.effects.limits import unspoken
 from idm_env.history import PAST, History
 from idm_env.roads.base import Road
@@ -31,7 +32,8 @@ S = TypeVar("S", bound="Stepping")
 class Stepping:
     """A road, a tuple of effects and a time step (s): all of a simulator that is one step.
 
-    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps.
+    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps. Where lanes are
+    changed, that comes first (``changes.py``).
 
     ``integration`` is ``"ballistic"`` (``x += v Δt + a Δt²/2``, and a car that would reverse stops inside the step) or
     ``"euler"`` (the paper's: ``x += v Δt`` with the old speed). ``"midpoint"`` is ballistic with speeds and gaps of the
@@ -99,12 +101,21 @@ class Stepping:
     @cached_property
     def _hooks(self) -> dict[Hook, tuple[Effect, ...]]:
         hooks: dict[Hook, tuple[Effect, ...]] = {
-            hook: tuple(e for e in self.effects if e.hook == hook)
-            for hook in ("perceive", "adapt", "accelerate", "limit", "place")
+            hook: tuple(e for e in self.effects if e.hook == hook) for hook in HOOKS
         }
         hooks["perceive"] = tuple(sorted(hooks["perceive"], key=lambda e: e.rank))
         hooks["limit"] = tuple(sorted((*hooks["limit"], *unspoken(self.effects)), key=lambda e: e.rank))
         return hooks
+
+    @cached_property
+    def changes(self) -> tuple[Effect, ...]:
+        """Effects that change lanes."""
+        return self._hooks["change"]
+
+    @cached_property
+    def decides_after(self) -> int:
+        """Steps between two decisions about lanes."""
+        return max(1, round(min((e.decides_every for e in self.changes), default=1.0) / self.dt))
 
     @cached_property
     def _unspoken(self) -> dict[str, dict[str, float]]:
@@ -159,11 +170,13 @@ class Stepping:
         step: Tensor | int = 0,
         circumference: Tensor | float | None = None,
         seed: int | None = None,
+        lane: Tensor | int | None = None,
     ) -> State:
         """Return the state at the start, with gaps built from positions (differentiably) and memories filled.
 
         ``position`` and ``speed`` have shape ``(..., vehicles)``, front first; ``length`` (m) broadcasts; ``step`` sets
-        the clock; ``circumference`` (m) is a ring's, one per batch row. ``seed`` draws how drivers who drift are at the
+        the clock; ``circumference`` (m) is a ring's, one per batch row; ``lane`` (whole numbers, 0 on the right) is
+        needed on a road of several, where slots may be in any order. ``seed`` draws how drivers who drift are at the
         start, from how they are in the long run; without it they begin at their mean. ValueError for shapes that do
         not fit.
         """
@@ -172,21 +185,27 @@ class Stepping:
                 f"position {tuple(position.shape)} and speed {tuple(speed.shape)} must have one shape (…, vehicles)."
             )
         length = torch.as_tensor(length, dtype=position.dtype, device=position.device).expand_as(position)
-        gap = self.road.gaps(position, length, circumference)
+        if present is None and self.road.leaving:
+            present = torch.ones_like(position.detach())
         if present is not None:
             present = present.to(position.dtype).expand_as(position)
-            gap = torch.where(self.road.leader_present(present, position) > 0, gap, FAR)
         start = State(
             position=position,
             speed=speed,
             accel=torch.zeros_like(speed) if accel is None else accel,
-            gap=gap,
+            gap=position,  # until the road is seen
             length=length,
             step=torch.as_tensor(step, device=position.device),
             present=present,
             memory={},
+            links=self.road.links(position, length, lane, present),
         )
-        scene = self._scene(start, {})
+        road = self.road.view(start)
+        gap = road.gaps(position, length, circumference)
+        if present is not None:
+            gap = torch.where(road.leader_present(present, position) > 0, gap, FAR)
+        start = start._replace(gap=gap)
+        scene = self.scene(start, {})
         driver = self._following.driver(dict(params[self._following.name]))
         memory: dict[str, Tensor] = {}
         for effect in self.effects:
@@ -198,8 +217,9 @@ class Stepping:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
         return start._replace(memory=memory)
 
-    def _scene(self, state: State, inputs: Inputs) -> Scene:
-        road = self.road
+    def scene(self, state: State, inputs: Inputs) -> Scene:
+        """Return what this step looks like to every vehicle."""
+        road = self.road.view(state)
         there = road.leader_present(state.present, state.speed)
         leader = road.leader(state.gap, state.speed, state.accel, there)
         scene = Scene(
@@ -228,8 +248,8 @@ class Stepping:
         time = state.step.to(state.position.dtype) * self.dt
         return time if time.dim() == 0 else time.unsqueeze(-1)
 
-    def _respond(self, state: State, inputs: Inputs, params: Params) -> tuple[Tensor, Scene, Driver]:
-        scene = self._scene(state, inputs)
+    def wanted(self, scene: Scene, params: Params) -> tuple[Tensor, Scene, Driver]:
+        """Return what drivers want in a scene (m/s²), the scene as they see it, and their parameters in force."""
         seen = scene
         for effect in self._hooks["perceive"]:
             seen = effect.perceive(seen, params[effect.name])  # type: ignore[arg-type]
@@ -243,6 +263,11 @@ class Stepping:
             part = effect.accelerate(view, driver, params[effect.name])  # type: ignore[arg-type]
             accel = part if accel is None else accel + part
         assert accel is not None  # the car-following effect accelerates
+        return accel, seen, driver
+
+    def _respond(self, state: State, inputs: Inputs, params: Params) -> tuple[Tensor, Scene, Driver]:
+        scene = self.scene(state, inputs)
+        accel, seen, driver = self.wanted(scene, params)
         for effect in self._hooks["limit"]:
             view = scene if effect.sees_truth else seen
             given = self._unspoken.get(effect.name) or params[effect.name]
@@ -259,11 +284,15 @@ class Stepping:
         ``inputs`` maps effect names to what they take at this step; ``params`` maps effect and parameter names to
         tensors that broadcast against ``(..., vehicles)``.
         """
+        if state.links is not None and self.changes:
+            state = decided(self, state, inputs, params)
         accel, scene, driver = self._respond(state, inputs, params)
         displacement, speed, accel = INTEGRATORS[self.integration](state.speed, accel, self.dt)
         motion = Motion(displacement, state.position + displacement, speed, accel, state.present)
         for effect in self._hooks["place"]:
             motion = effect.place(motion, scene, params[effect.name])  # type: ignore[arg-type]
+        if self.road.leaving:
+            motion = motion._replace(present=self.road.view(state).remaining(motion.present, motion.position))
         memory = {
             e.name: e.remember(scene, driver, params[e.name])  # type: ignore[arg-type]
             for e in self.effects
@@ -282,13 +311,14 @@ class Stepping:
         )
 
     def _gaps(self, state: State, motion: Motion) -> Tensor:
-        gap = self.road.advance(state.gap, motion.displacement)
+        road = self.road.view(state)
+        gap = road.advance(state.gap, motion.displacement)
         if motion.present is None:
             return gap
-        now = self.road.leader_present(motion.present, motion.position) > 0
+        now = road.leader_present(motion.present, motion.position) > 0
         if motion.present is not state.present:
-            before = self.road.leader_present(state.present, state.position) > 0
-            gap = torch.where(now & ~before, self.road.gaps(motion.position, state.length), gap)
+            before = road.leader_present(state.present, state.position) > 0
+            gap = torch.where(now & ~before, road.gaps(motion.position, state.length), gap)
         return torch.where(now, gap, FAR)
 
 

@@ -32,12 +32,32 @@ Memory = Mapping[str, Tensor]
 """Effect name → state of its own that the effect carries from step to step."""
 
 
+class Links(NamedTuple):
+    """Who drives where on a road of several lanes: integer tensors of shape ``(..., vehicles)``.
+
+    ``lane`` counts from the right, which is 0. ``leader`` and ``follower`` are slots in the last dimension, a vehicle's
+    own slot where there is nobody (on a ring: nobody but itself), so that a leader's follower is oneself. ``changed``,
+    ``refused`` and ``blocked`` count what became of each vehicle's wishes for another lane: done; lost to a better
+    claim on the same gap; not possible, because there was no lane or no room that is safe. ``unjudged`` are changes in
+    front of another follower than the one who was judged, because he changed himself at the same time.
+    """
+
+    lane: Tensor
+    leader: Tensor
+    follower: Tensor
+    changed: Tensor
+    refused: Tensor
+    blocked: Tensor
+    unjudged: Tensor
+
+
 class State(NamedTuple):
     """Everything that a step carries over.
 
     ``gap`` is state although positions imply it: in float32 the difference of two positions cancels, and the
     gradients with it. A step adds ``displacement[leader] - displacement`` instead. ``step`` is an integer
-    tensor (scalar or one per batch row), so that time never forces a device to synchronise.
+    tensor (scalar or one per batch row), so that time never forces a device to synchronise. ``links`` is None on roads
+    whose order never changes; where lanes change, vehicles keep their slots and links say who leads whom.
     """
 
     position: Tensor
@@ -48,6 +68,7 @@ class State(NamedTuple):
     step: Tensor
     present: Tensor | None
     memory: Memory
+    links: Links | None = None
 
 
 class Motion(NamedTuple):
@@ -75,6 +96,37 @@ class Neighbour(NamedTuple):
     present: Tensor
 
 
+class Beside(NamedTuple):
+    """A lane as a place to be: a driver's own (``scene.here``), or the one on his ``left`` or ``right``.
+
+    ``exists`` is 1 where there is such a lane and it may be entered here. ``leader`` and ``follower`` are those that he
+    has or would have; the follower's ``gap`` is the one behind him. ``wanted`` is what the driver wants there (m/s²),
+    ``with_me`` and ``without_me`` what that follower wants behind him and if he is not there (m/s²; 0 where there is
+    nobody). ``ends`` is how far the lane goes on (m).
+    """
+
+    exists: Tensor
+    leader: Neighbour
+    follower: Neighbour
+    wanted: Tensor
+    with_me: Tensor
+    without_me: Tensor
+    ends: Tensor
+
+
+class Wish(NamedTuple):
+    """What an effect of the hook ``change`` says of a change to the left and to the right.
+
+    Utility (m/s²): a change is wished where the sum over effects is above 0. Margin (m/s²): it is safe where the least
+    of all effects is at least 0.
+    """
+
+    left: Tensor
+    right: Tensor
+    left_margin: Tensor
+    right_margin: Tensor
+
+
 class Past(Protocol):
     """What a simulator keeps of the steps before where an effect looks back."""
 
@@ -88,8 +140,9 @@ class Past(Protocol):
 class Scene(NamedTuple):
     """What one step looks like to every vehicle; effects read this and know no topology.
 
-    ``second_leader`` and ``behind`` are filled only where an effect of the simulator needs them, ``inputs``
-    and ``memory`` are keyed by effect name, ``time`` is in seconds, ``euler`` tells how speeds will be integrated.
+    ``second_leader`` and ``behind`` are filled only where an effect of the simulator needs them, ``here``, ``left`` and
+    ``right`` only for the hook ``change``; ``inputs`` and ``memory`` are keyed by effect name, ``time`` is in seconds,
+    ``euler`` tells how speeds will be integrated.
     """
 
     position: Tensor
@@ -104,6 +157,9 @@ class Scene(NamedTuple):
     inputs: Inputs
     memory: Memory
     history: Past | None = None
+    here: Beside | None = None
+    left: Beside | None = None
+    right: Beside | None = None
 
     def past(self, seconds: Tensor) -> Scene:
         """Return the scene of some seconds ago, interpolated between steps; ``seconds`` broadcasts over vehicles.

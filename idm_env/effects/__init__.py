@@ -14,6 +14,7 @@ from idm_env.effects.actions import Control, Replay
 from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
 from idm_env.effects.base import CarFollowing, Effect
 from idm_env.effects.bases import FVDM, IIDM, ConstantTimeGap, Gipps, IDMPlus
+from idm_env.effects.changes import LaneCommand, MandatoryChange, Mobil
 from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
 from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
@@ -65,6 +66,9 @@ ALL: dict[str, type[Effect]] = {
         PerceptionNoise,
         Curve,
         DriverCurve,
+        Mobil,
+        MandatoryChange,
+        LaneCommand,
     )
 }
 
@@ -204,9 +208,12 @@ __all__ = [
     "IDMPlus",
     "ImaginedLeader",
     "Lag",
+    "LaneCommand",
     "Lateral",
     "LeaderAcceleration",
     "LongMemory",
+    "MandatoryChange",
+    "Mobil",
     "Noise",
     "PerceptionNoise",
     "PowerLimit",

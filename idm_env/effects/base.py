@@ -1,4 +1,4 @@
-"""What an effect is: one hook of five, parameters of its own, and static choices that are never tensors."""
+"""What an effect is: one hook of six, parameters of its own, and static choices that are never tensors."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import torch
 from torch import Tensor
 
 from idm_env.parameters import Parameter
-from idm_env.types import Driver, Motion, Scene
+from idm_env.types import Driver, Motion, Scene, Wish
 
-Hook = Literal["perceive", "adapt", "accelerate", "limit", "place"]
-HOOKS: tuple[Hook, ...] = ("perceive", "adapt", "accelerate", "limit", "place")
+Hook = Literal["perceive", "adapt", "accelerate", "limit", "place", "change"]
+HOOKS: tuple[Hook, ...] = ("perceive", "adapt", "accelerate", "limit", "place", "change")
 
 Sought = Literal["anywhere", "profile", "interval", "step"]
 """What a search has to find beside a strength: nothing, a curve over places, an interval of places, a moment."""
@@ -25,7 +26,7 @@ P = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Effect:
-    """Base of all effects. A subclass overrides exactly one of the five hooks, and `remember` if it needs memory.
+    """Base of all effects. A subclass overrides exactly one of the six hooks, and `remember` if it needs memory.
 
     ==============  =================================  ===========================  =======================
     hook            meaning                            composition                  example
@@ -35,6 +36,8 @@ class Effect:
     ``accelerate``  what the driver wants, in m/s²     summed                       IDM, Grade, Noise
     ``limit``       what the vehicle can               chained by ``rank``          Control, Lag, Brakes
     ``place``       put where a record says            chained, after integration   Replay
+    ``change``      wishes for the lanes beside        utilities summed, least      Mobil
+                                                       margin; the road executes
     ==============  =================================  ===========================  =======================
 
     Class attributes: ``kind`` is the name in ``effects.ALL`` and in YAML; ``needs`` names the optional neighbours
@@ -119,6 +122,11 @@ class Effect:
         """Seconds of the past that this effect may ask the scene for (``scene.past``); 0 for none."""
         return 0.0
 
+    @property
+    def decides_every(self) -> float:
+        """Seconds between two decisions of an effect that changes lanes; the least of a simulator's effects holds."""
+        return 1.0
+
     @classmethod
     def strength_of(cls, change: float) -> float:
         """Return the strength that changes what it ``changes`` by ``change``, to first order, from its null on.
@@ -146,6 +154,11 @@ class Effect:
     def place(self, motion: Motion, scene: Scene, p: P) -> Motion:
         """Return the motion after integration, overridden where a record says so."""
         return motion
+
+    def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
+        """Return what speaks for a change to either side; ``scene.here``, ``left`` and ``right`` are there."""
+        none = torch.zeros_like(scene.speed)
+        return Wish(none, none, none, none)
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:
         """Return the memory before the first step, or None for an effect without one."""

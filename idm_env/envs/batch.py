@@ -263,7 +263,7 @@ class Batch:
         task = self.task
         command = None if action is None else task.command(action)
         given = None if command is None else task.limit(world, command)
-        inputs = task.inputs(world, given, normals, live)
+        inputs = task.wishes(task.inputs(world, given, normals, live), action, live)
         if command is not None and live is not None:
             command = torch.where(live, command, 0.0)
         return command, given, inputs

@@ -90,8 +90,8 @@ class DiffIDMEnv(TrueSpec, gymnasium.Env):
         agents = len(self.task.agents)
         self.metadata = {**type(self).metadata, "render_fps": round(1.0 / self.task.simulator.dt)}
         self.observation_space = observation_box(self.task, made.dtype, agents)
-        self.action_space = action_box(agents)
-        self._shape = (agents,)
+        self._shape = (agents * len(self.task.commands),)
+        self.action_space = action_box(self._shape[0])
         self._numpy = made.output == "numpy"
         self._viewer: Any = None
 

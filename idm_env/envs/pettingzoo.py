@@ -58,7 +58,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         self.possible_agents = [f"vehicle_{i}" for i in self.task.agents]
         self.agents: list[str] = []
         self.observation_spaces = {a: observation_box(self.task, made.dtype, 1) for a in self.possible_agents}
-        self.action_spaces = {a: action_box(1) for a in self.possible_agents}
+        self.action_spaces = {a: action_box(len(self.task.commands)) for a in self.possible_agents}
         kind, n = numpy_dtype(made.dtype), self.task.vehicles
         low = np.repeat(np.array([0.0, -1.0], kind), n)
         high = np.repeat(np.array([10.0, _FARTHEST / _GAP_SCALE], kind), n)
@@ -97,15 +97,15 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         if not self.agents:
             return {}, {}, {}, {}, {}
         live = [agent in self.agents for agent in self.possible_agents]
-        commands = np.zeros((1, len(live)))
+        commands = np.zeros((1, len(self.task.commands), len(live)))
         for i, agent in enumerate(self.possible_agents):
             if live[i]:
-                commands[0, i] = self._action(agent, actions)
+                commands[0, :, i] = self._action(agent, actions)
         made = self.settings
         with torch.no_grad():
             everybody = all(live)
             outcome = self.batch.step(
-                torch.as_tensor(commands, dtype=made.dtype, device=made.device),
+                torch.as_tensor(commands.reshape(1, -1), dtype=made.dtype, device=made.device),
                 None if everybody else torch.tensor([live], device=made.device),
             )
         seen = self._by_agent(np.asarray(outcome.observation[0]))
@@ -130,15 +130,17 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
             info["crash_reason"] = self.task.crash_reason(self.batch.world, 0, alone)
         return info | self._begun(agent)
 
-    def _action(self, agent: str, actions: dict[str, np.ndarray]) -> float:
+    def _action(self, agent: str, actions: dict[str, np.ndarray]) -> np.ndarray:
         if agent not in actions:
             raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
         action = np.asarray(actions[agent])
-        if action.shape != (1,) or action.dtype.kind not in "fiu" or not np.isfinite(action).all():
+        size = len(self.task.commands)
+        if action.shape != (size,) or action.dtype.kind not in "fiu" or not np.isfinite(action).all():
+            several = "one finite number" if size == 1 else f"{size} finite numbers"
             raise ValueError(
-                f"action of '{agent}' = {shown(actions[agent])} must be one finite number, as an array of shape (1,)."
+                f"action of '{agent}' = {shown(actions[agent])} must be {several}, as an array of shape ({size},)."
             )
-        return float(action[0])
+        return action
 
     def _by_agent(self, values: Any) -> dict[str, Any]:
         return {agent: values[i] for i, agent in enumerate(self.possible_agents) if agent in self.agents}

@@ -230,6 +230,8 @@ def _record(
     task: Task, before: Before, after: After, world: World, kind: tuple[bool, bool], draws: tuple[str, ...]
 ) -> Recorded:
     """Record a step with or without actions, and with or without saying whose count (``kind`` as in ``Plan``)."""
+    if world.state.links is not None:
+        raise Untraceable("vehicles change lanes: the torch path steps several lanes")
     idle, every = kind
     size, count = world.state.speed.shape[-1], len(task.agents)
     # A number of rows that is no other dimension tells rows apart from everything else.

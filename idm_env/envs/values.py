@@ -80,7 +80,7 @@ class Values:
         memory = {name: leaves.get(f"memory_{name}", x) for name, x in state.memory.items()}
         if PAST in memory:
             memory[PAST] = past_tensor(held["past"], state.memory[PAST].shape[-2], tuple(state.speed.shape))
-        fields = {n.removeprefix("state_"): x for n, x in leaves.items() if n.startswith("state_")}
+        fields: Any = {n.removeprefix("state_"): x for n, x in leaves.items() if n.startswith("state_")}
         episode = {n.removeprefix("episode_"): x for n, x in leaves.items() if n.startswith("episode_")}
         return World(state._replace(**fields, memory=memory), episode)
 

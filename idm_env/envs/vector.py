@@ -61,12 +61,12 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
         }
         agents = len(self.task.agents)
         self.single_observation_space = observation_box(self.task, made.dtype, agents)
-        self.single_action_space = action_box(agents)
+        self.single_action_space = action_box(agents * len(self.task.commands))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.batch = Batch(made, num_envs)
         self._rows = Rows(self.batch)
-        self._shape = (num_envs, agents)
+        self._shape = (num_envs, agents * len(self.task.commands))
         self._numpy = made.output == "numpy"
         self._ended = np.zeros(num_envs, dtype=bool)
         self._viewers: list[Any] = []

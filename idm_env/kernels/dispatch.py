@@ -15,7 +15,7 @@ from torch import Tensor
 from idm_env.history import PAST
 from idm_env.instead import off, switched_off
 from idm_env.kernels import available
-from idm_env.roads import Lane, Ring
+from idm_env.roads import Lanes
 from idm_env.scalar.record import Form
 from idm_env.simulator import Simulator
 from idm_env.step import Stepping
@@ -30,8 +30,10 @@ def found(simulator: Stepping, state: State, inputs: Inputs, params: Params) -> 
     why = switched_off() or surroundings() or _unfit_tensors(state, inputs, params)
     if why is not None:
         return why
-    if type(simulator.road) not in (Lane, Ring):
-        return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
+    if isinstance(simulator.road, Lanes):
+        from idm_env.kernels.several import kernel_of
+
+        return kernel_of(simulator, state, inputs)  # type: ignore[arg-type]
     from idm_env.kernels.printed import tile_kernel
 
     return tile_kernel(simulator, Form.of(state, inputs))
@@ -59,6 +61,10 @@ def rollout(
     kernel = found(simulator, state, inputs, params)
     if isinstance(kernel, str):
         return None
+    if isinstance(simulator.road, Lanes):
+        from idm_env.kernels import several
+
+        return several.rollout(kernel, simulator, state, inputs, params, steps, keep)
     from idm_env.kernels import lanes
 
     block = min(every or lanes.BLOCK, 4 * lanes.BLOCK)

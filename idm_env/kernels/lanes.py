@@ -124,9 +124,11 @@ class _Plan:
 def static_of(simulator: Stepping, state: State, params: Params, name: str) -> Tensor:
     """Return what a static slot stands for, as a tensor."""
     if name == "led":
-        return simulator.road.led(state.speed)
+        return simulator.road.view(state).led(state.speed)
     if name == "leads":
-        return simulator.road.leads(state.speed)
+        return simulator.road.view(state).leads(state.speed)
+    if name == "ends":
+        return state.links.ends  # type: ignore[union-attr]
     if name in ("length", "present"):
         value = getattr(state, name)
         assert value is not None
@@ -322,7 +324,7 @@ def _differentiable(plan: _Plan, saved: tuple[Tensor, ...], seeds: tuple[Tensor 
     memory.update({n.removeprefix("memory of "): x for n, x in given.items() if n in program.memories})
     if plan.slots:
         memory[PAST] = saved[len(program.moving)]
-    plain = {n: x for n, x in given.items() if n not in program.memories}
+    plain: Any = {n: x for n, x in given.items() if n not in program.memories}
     with off("second derivatives"):
         last, kept = plan.simulator.rollout(  # type: ignore[attr-defined]
             plan.state._replace(**plain, memory=memory), plan.inputs, plan.params, plan.steps

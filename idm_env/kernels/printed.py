@@ -14,7 +14,8 @@ import numpy as np
 
 from idm_env.effects.base import Effect
 from idm_env.kernels.tiles import ROW, Array
-from idm_env.roads import Ring, Road
+from idm_env.roads import Lane, Ring, Road
+from idm_env.roads.chains import Chains
 from idm_env.scalar import library
 from idm_env.scalar.program import PHASES, Program
 from idm_env.scalar.record import Form, Untraceable, record
@@ -157,6 +158,8 @@ def _flat(moves: dict[str, list[tuple[int, int, int]]], order: tuple[str, ...]) 
 
 def tile_kernel(simulator: Stepping, form: Form) -> TileKernel | str:
     """Return the kernel of a simulator, or why there is none (said once, as a warning, where an effect is why)."""
+    if type(simulator.road) not in (Lane, Ring, Chains):
+        return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
     try:
         return _tile_kernel(simulator.road, simulator.effects, simulator.dt, simulator.integration, form)
     except TypeError as error:  # an effect with a choice that cannot be hashed

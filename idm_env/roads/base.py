@@ -8,15 +8,40 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from idm_env.types import FAR, Neighbour
+from idm_env.types import FAR, Links, Neighbour, State
 
 
 @dataclass(frozen=True)
 class Road(abc.ABC):
     """A topology over the last tensor dimension, vehicles sorted front first.
 
-    Written with shifted views instead of index gathers, because compilers fuse those.
+    Written with shifted views instead of index gathers, because compilers fuse those. A road on which the order changes
+    (``Lanes``) answers through ``view(state)``, which is bound to the links of that state.
     """
+
+    def view(self, state: State) -> Road:
+        """Return this road as it is in a state: itself, where the order never changes."""
+        return self
+
+    def links(
+        self, position: Tensor, length: Tensor, lane: Tensor | int | None, present: Tensor | None
+    ) -> Links | None:
+        """Return the links of vehicles of these positions, lengths (m) and lanes: None where the order never changes.
+
+        ValueError for lanes on a road that has one only.
+        """
+        if lane is not None:
+            raise ValueError(f"a {type(self).__name__} has one lane, and lane = … was given. Use Lanes(count).")
+        return None
+
+    @property
+    def leaving(self) -> bool:
+        """Whether vehicles leave this road by themselves."""
+        return False
+
+    def remaining(self, present: Tensor | None, position: Tensor) -> Tensor | None:
+        """Return who is still on the road at these positions (m)."""
+        return present
 
     @abc.abstractmethod
     def ahead(self, x: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from idm_env.scalar.derive import adjoint
 from idm_env.scalar.graph import STATIC, Graph, Node, Slot, hoisted, inputs_of, ordered, replaced
 from idm_env.scalar.record import Recording
 
-STATICS = ("led", "leads", "length", "present")
+STATICS = ("led", "leads", "ends", "length", "present")
 """What holds for a whole rollout and is no parameter; ``present`` only where no record changes it."""
 
 PHASES = ("sense", "recall", "respond", "close")

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from idm_env import history
 from idm_env.roads.base import Road
+from idm_env.roads.chains import Chains
+from idm_env.roads.ends import Ending
 from idm_env.roads.ring import Ring
 from idm_env.scalar.graph import Graph, Node, TimeStep
 from idm_env.scalar.scalar import Scalar, Untraceable, static, value_of
@@ -78,7 +80,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class _SeenRoad(Road):
+class _SeenRoad(Ending):
     """A road on which ``ahead`` of an expression is the same expression of the leader."""
 
     road: Road
@@ -99,6 +101,12 @@ class _SeenRoad(Road):
         if isinstance(self.road, Ring):
             return Scalar(self.graph, self.graph.constant(1.0))
         return Scalar(self.graph, self.graph.input("leads"))
+
+    def room(self) -> Any:
+        if not (isinstance(self.road, Chains) and self.road.closed):
+            return None
+        ends: Any = Scalar(self.graph, self.graph.input("ends"))
+        return ends - Scalar(self.graph, self.graph.input("position"))
 
     def gaps(self, position: Any, length: Any, circumference: Any = None) -> Any:
         if isinstance(self.road, Ring):
@@ -206,7 +214,7 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
     given = _Parameters(recorder, graph)
     try:
         after = recorder.step(state, _inputs(form, graph), given)  # type: ignore[arg-type]
-        scene, driver = recorder._scene(state, {}), recorder._following.driver(given[recorder._following.name])  # type: ignore[arg-type]
+        scene, driver = recorder.scene(state, {}), recorder._following.driver(given[recorder._following.name])  # type: ignore[arg-type]
         for effect in simulator.effects:
             if effect.name in form.memories:
                 held = effect.initial_memory(scene, driver, given[effect.name])  # type: ignore[arg-type]

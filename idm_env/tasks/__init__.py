@@ -10,12 +10,15 @@ from idm_env.checks import nearest, shown
 from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.follow import FollowTask
+from idm_env.tasks.highway import HighwayTask
 from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.replay import ReplayTask
 from idm_env.tasks.ring import RingTask
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (RingTask, FollowTask, PlatoonTask, ReplayTask)}
+TASKS: dict[str, type[Task]] = {
+    task.name: task for task in (RingTask, FollowTask, PlatoonTask, ReplayTask, HighwayTask)
+}
 
 
 def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any) -> Task:
@@ -43,6 +46,7 @@ __all__ = [
     "Ended",
     "Features",
     "FollowTask",
+    "HighwayTask",
     "KeywordError",
     "Pay",
     "PlatoonTask",

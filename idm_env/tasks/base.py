@@ -31,7 +31,7 @@ from idm_env.types import Command, Inputs, Params, State
 
 _NORMALS_AT_ONCE = 1 << 16
 OBSERVATIONS = ("scaled", "raw")
-_TAKE_INPUTS = {"control", "replay", "imagined", "lateral"}
+_TAKE_INPUTS = {"control", "replay", "imagined", "lateral", "lane_command"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -163,6 +163,11 @@ class Task(abc.ABC):
     def shares(self) -> int:
         """Agents among whose rewards the mean spreads the cost of a crash: 1 where all crash together."""
         return 1
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """What an agent commands: an action holds the first of all agents, then the second of all, and so on."""
+        return ("accel",)
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -300,9 +305,10 @@ class Task(abc.ABC):
 
     def lead_speed(self, state: State) -> Tensor:
         """Return the speed of each agent's leader (m/s), the agent's own where there is none, shape ``(…, agents)``."""
-        ahead = self.road.ahead(state.speed)
+        road = self.road.view(state)
+        ahead = road.ahead(state.speed)
         if state.present is not None:
-            there = self.road.leader_present(state.present, state.speed) > 0
+            there = road.leader_present(state.present, state.speed) > 0
             ahead = torch.where(there, ahead, state.speed)
         return self.pick(ahead)
 
@@ -340,6 +346,10 @@ class Task(abc.ABC):
             active = active if live is None else active & live
             inputs = {"control": Command(command, active)}
         return {**inputs, **(normals or {})}
+
+    def wishes(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
+        """Return the inputs of a step with what agents command beside accelerations, where they do."""
+        return inputs
 
     def step(
         self,
@@ -403,7 +413,9 @@ class Task(abc.ABC):
         vehicle = int(gap.argmin()) if agent is None else self.agents[agent]
         ids = self.vehicle_ids or tuple(str(i) for i in range(self.vehicles))
         seconds = float(world.state.step[row]) * self.simulator.dt
-        return contact(ids, self.agents, vehicle, float(gap[vehicle]), seconds)
+        links = world.state.links
+        leader = None if links is None else int(links.leader[row, vehicle])
+        return contact(ids, self.agents, vehicle, float(gap[vehicle]), seconds, leader)
 
     def clip(self, features: list[Tensor]) -> Tensor:
         """Stack features of shape ``(…, agents)`` in SI units, over their ``scales`` and clipped to ``bounds``."""

@@ -33,9 +33,12 @@ def floored(reward: Tensor, knee: float, low: float) -> Tensor:
     return reward.clamp_min(knee) - below / (1.0 + below / (knee - low))
 
 
-def contact(ids: Sequence[str], agents: Sequence[int], vehicle: int, gap: float, seconds: float) -> str:
-    """Return in words that a vehicle touched the one before it."""
-    leader = vehicle - 1 if vehicle else len(ids) - 1
+def contact(
+    ids: Sequence[str], agents: Sequence[int], vehicle: int, gap: float, seconds: float, leader: int | None = None
+) -> str:
+    """Return in words that a vehicle touched its leader, the one before it where nobody is named."""
+    if leader is None:
+        leader = vehicle - 1 if vehicle else len(ids) - 1
     names = [
         ("its leader" if ids[i] == NOBODY else f"vehicle {ids[i]}") + (" (an agent)" if i in agents else "")
         for i in (vehicle, leader)

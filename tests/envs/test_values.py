@@ -24,6 +24,7 @@ CASES = [
     ("platoon", {"controlled": 2, "noise": 0.1}),
     ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
     ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
+    ("highway", {"vehicles": 12, "length": 200.0, "controlled": 2, "noise": 0.1, "failsafe": 3.0}),
 ]
 
 

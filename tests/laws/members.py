@@ -69,6 +69,7 @@ def inputs_for(simulator: Simulator, steps: int, like: Tensor) -> dict[str, obje
             (320.0 + 8.0 * simulator.dt * time + 0 * draw()).to(like.dtype), 8.0 + 0 * draw(), 0 * draw(), first
         ),
         "imagined": lambda: Imagined(10.0 + 5.0 * draw(), draw() - 0.5),
+        "lane_command": lambda: draw().round(),
         "lateral": lambda: Adjacent(20.0 * (draw() - 0.5), 6.0 + draw(), torch.ones_like(draw())),
     }
     given = {name: make() for name, make in every.items() if name in simulator.by_name}

@@ -130,7 +130,9 @@ def test_gradcheck_in_parameters_positions_and_speeds(effect: Effect) -> None:
     assert torch.autograd.gradcheck(run, [x.clone().requires_grad_() for x in leaves], eps=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("effect", [e for e in MEMBERS if e.parameters and e.kind != "action_point"], ids=label)
+@pytest.mark.parametrize(
+    "effect", [e for e in MEMBERS if e.parameters and e.kind != "action_point" and e.hook != "change"], ids=label
+)
 def test_forward_mode_equals_reverse_mode(effect: Effect) -> None:
     """Jacobian-vector products, on which fitting and discovery stand, agree with back-propagation."""
     simulator = around(effect)
@@ -201,6 +203,19 @@ def test_without_neighbours_an_effect_of_neighbours_is_exactly_absent(name: str)
     _, one = simulator.rollout(simulator.state(*alone, params), {}, params, 50)
     _, other = bare.rollout(bare.state(*alone, params), {}, params, 50)
     assert torch.equal(one.position, other.position)
+
+
+@pytest.mark.parametrize("effect", [e for e in MEMBERS if e.hook == "change"], ids=label)
+@pytest.mark.parametrize("road", [Lane(), Ring()], ids=["lane", "ring"])
+def test_on_one_lane_effects_that_change_lanes_leave_no_trace(effect: Effect, road: Lane | Ring) -> None:
+    """There is nowhere to go."""
+    simulator = around(effect, road)
+    params = simulator.defaults(dtype=DTYPE)
+    inputs = inputs_for(simulator, 30, torch.zeros(N, dtype=DTYPE))
+    bare = simulator.without(effect.name)
+    _, one = simulator.rollout(start(simulator, params), inputs, params, 30)
+    _, other = bare.rollout(start(bare, params), {}, params, 30)
+    assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 def test_absent_vehicles_leave_no_trace() -> None:

@@ -16,6 +16,7 @@ CASES = {
     "follow, hard": {"task": "follow", "max_command": 30.0, "controlled": 2},
     "platoon": {"task": "platoon", "controlled": 2},
     "replay": {"task": "replay"},
+    "highway": {"task": "highway", "vehicles": 30, "length": 300.0, "max_command": 4.0, "controlled": 3},
     "replay, follow": {"task": "replay", "controlled": 3, "reward_terms": "follow"},
 }
 STEPS, COUNT = 150, 24

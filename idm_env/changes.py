@@ -1,0 +1,146 @@
+"""Lane changes, the first part of a step: what drivers would want beside, what they wish, and what the road does.
+
+Effects see a scene with ``here``, ``left`` and ``right`` and know no topology; the road chooses, resolves conflicts and
+executes. Hypothetical pairs are answered by the simulator's own effects, perception and adaptation included, up to what
+limits the vehicle: it is the driver who decides. He judges by what he sees now, whatever his delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from idm_env.roads.lanes import Linked, Side
+from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish
+
+if TYPE_CHECKING:
+    from idm_env.step import Stepping
+
+
+class _Now:
+    """The past of a pair that has none: what is seen now."""
+
+    def at(self, scene: Scene, seconds: Tensor) -> Scene:
+        return scene
+
+    def pushed(self, scene: Scene) -> Tensor:
+        raise NotImplementedError
+
+
+def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) -> State:
+    """Return the state after the decisions that are due at this step, with gaps of those concerned measured anew.
+
+    Choices are frozen: gradients flow through the gaps, not through who chose what.
+    """
+    due = state.step.remainder(stepping.decides_after) == 0
+    if not bool(due.any()):
+        return state
+    view = stepping.road.view(state)
+    assert isinstance(view, Linked)
+    with torch.no_grad():
+        order = view.order(state.present)
+        sides = view.side(order, 1, state), view.side(order, -1, state)
+        scene = beside(stepping, view, sides, state, inputs, params)
+        wish = wished(stepping, scene, params)
+        claim = view.chosen(sides, wish, due if due.dim() == 0 else due.unsqueeze(-1))
+    return view.changed(state, claim)
+
+
+def wished(stepping: Stepping, scene: Scene, params: Params) -> Wish:
+    """Return the sum of all utilities and the least of all margins."""
+    driver = stepping.wanted(scene, params)[2]
+    total: Wish | None = None
+    for effect in stepping.changes:
+        wish = effect.change(scene, driver, dict(params[effect.name]))
+        if total is not None:
+            wish = Wish(
+                total.left + wish.left,
+                total.right + wish.right,
+                torch.minimum(total.left_margin, wish.left_margin),
+                torch.minimum(total.right_margin, wish.right_margin),
+            )
+        total = wish
+    assert total is not None
+    return total
+
+
+def beside(
+    stepping: Stepping, view: Linked, sides: tuple[Side, Side], state: State, inputs: Inputs, params: Params
+) -> Scene:
+    """Return the scene with the driver's own lane, and those on his left and right."""
+    scene = stepping.scene(state, inputs)._replace(history=_Now())
+    second = view.second_leader(scene.leader, state.length, scene.speed)
+    third = view.follow(state, scene.leader, view.ahead(view.links_now.leader), second.gap, second.present)[1]
+    now = stepping.wanted(scene, params)[0]
+    skipped = scene._replace(leader=second, second_leader=scene.second_leader and third)
+    without = stepping.wanted(skipped, params)[0]
+    follower = view.behind(scene.leader, scene.speed, scene.accel)
+    here = Beside(
+        exists=torch.ones_like(scene.speed),
+        leader=scene.leader,
+        follower=follower,
+        wanted=now,
+        with_me=view.back(now) * follower.present,
+        without_me=view.back(without) * follower.present,
+        ends=view.goes_on(view.links_now.lane),
+    )
+    left, right = (_one_side(stepping, view, side, state, scene, now, params) for side in sides)
+    return scene._replace(here=here, left=left, right=right)
+
+
+def _one_side(
+    stepping: Stepping, view: Linked, side: Side, state: State, scene: Scene, now: Tensor, params: Params
+) -> Beside:
+    """Return a lane beside: the driver behind its leader, and its follower behind the driver, in each driver's slot."""
+    there = side.led.to(scene.speed.dtype)
+    leader, second = view.follow(state, scene.leader, side.leader, side.gap, there)
+    # What is nearer: the leader there or the end of that lane; behind an end there is nobody.
+    nearest = view.before_end(leader, side.lane)
+    second = second._replace(present=second.present * (nearest.gap == leader.gap).to(there.dtype))
+    n = side.follower
+    behind = Neighbour(
+        side.back_gap,
+        scene.speed.gather(-1, n),
+        scene.accel.gather(-1, n),
+        side.followed.to(scene.speed.dtype),
+    )
+    own = scene._replace(leader=nearest, second_leader=scene.second_leader and second, behind=scene.behind and behind)
+    wanted = stepping.wanted(own, params)[0]
+    me = Neighbour(side.back_gap, scene.speed, scene.accel, torch.ones_like(scene.speed))
+    mine = Neighbour(
+        torch.where(nearest.present > 0, side.back_gap + state.length + nearest.gap, FAR),
+        nearest.speed,
+        nearest.accel,
+        nearest.present,
+    )
+    width = scene.speed.shape
+    follower = _of(scene, n, width)._replace(leader=me, second_leader=scene.second_leader and mine)
+    with_me = stepping.wanted(follower, _of(dict(params), n, width))[0]
+    return Beside(
+        exists=side.exists.to(scene.speed.dtype),
+        leader=nearest,
+        follower=behind,
+        wanted=wanted,
+        with_me=with_me * behind.present,
+        without_me=now.gather(-1, n) * behind.present,
+        ends=view.goes_on(side.lane),
+    )
+
+
+def _of(tree: Any, slots: Tensor, shape: torch.Size) -> Any:
+    """Return, in every slot, what belongs to another slot; what is the same for all vehicles stays."""
+    if isinstance(tree, Tensor):
+        if tree.dim() == 0 or tree.shape[-1] != shape[-1] or shape[-1] == 1 or tree.dim() > len(shape):
+            return tree
+        return tree.expand(shape).gather(-1, slots)
+    if isinstance(tree, Mapping):
+        return {name: _of(x, slots, shape) for name, x in tree.items()}
+    if isinstance(tree, tuple) and hasattr(tree, "_fields"):
+        return type(tree)(*(_of(x, slots, shape) for x in tree))  # type: ignore[call-arg]
+    return tree
+
+
+__all__ = ["beside", "decided", "wished"]

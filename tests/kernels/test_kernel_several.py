@@ -1,0 +1,98 @@
+"""Several lanes on the kernels of one: values, links, counts and gradients are those of the torch path."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from idm_env.effects import IDM, Brakes, Effect, MandatoryChange, Mobil, make
+from idm_env.kernels import dispatch
+from idm_env.roads import Lanes, lane_drop
+from idm_env.simulator import Simulator, Trajectory
+from idm_env.types import State
+
+pytest.importorskip("numba")
+
+N, STEPS = 24, 47
+CASES: dict[str, tuple[Lanes, tuple[Effect, ...]]] = {
+    "ring": (Lanes(3, ring=500.0), (IDM(), make("memory"), make("noise"), Mobil(), Brakes())),
+    "one lane empty": (Lanes(5, ring=500.0), (IDM(), make("memory"), make("noise"), Mobil(), Brakes())),
+    "drop": (
+        Lanes(3, ends=(lane_drop(2, at=460.0),)),
+        (IDM(), make("second_leader"), make("follower"), Mobil(every=0.5), MandatoryChange(), Brakes()),
+    ),
+}
+
+
+def rolled(
+    road: Lanes, effects: tuple[Effect, ...], dtype: torch.dtype, graph: bool
+) -> tuple[State, Trajectory, list[Tensor]]:
+    """Return a rollout of shuffled vehicles, and the gradients of all that is kept."""
+    generator = torch.Generator().manual_seed(5)
+    simulator = Simulator(road, effects)
+    params = simulator.defaults(dtype=dtype)
+    place = torch.stack([torch.randperm(N, generator=generator) for _ in range(2)])
+    position = (place * (480.0 / N)).to(dtype).requires_grad_(graph)
+    lane = torch.randint(3, (2, N), generator=generator)
+    desired = (15.0 + 20.0 * torch.rand((2, N), generator=generator)).to(dtype).requires_grad_(graph)
+    params["idm"]["desired_speed"] = desired
+    noise = torch.randn((STEPS, 2, N), generator=generator).to(dtype)
+    inputs = {"noise": noise} if "noise" in simulator.by_name else {}
+    speed = torch.full_like(position, 8.0, requires_grad=False)
+    state = simulator.state(position, speed, params, lane=lane, step=3)
+    end, kept = simulator.rollout(state, inputs, params, STEPS)
+    if not graph:
+        return end, kept, []
+    weights = [torch.randn(x.shape, generator=generator).to(dtype) for x in kept]
+    loss = sum((x.clamp_max(500.0) * w).sum() for x, w in zip(kept, weights, strict=True))
+    return end, kept, list(torch.autograd.grad(loss, [position, desired]))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_several_lanes_run_on_compiled_steps(case: str) -> None:
+    """And the same bits come out with and without a graph."""
+    with dispatch.off():
+        end, kept, gradients = rolled(*CASES[case], torch.float64, graph=True)
+    road, effects = CASES[case]
+    simulator = Simulator(road, effects)
+    params = simulator.defaults(dtype=torch.float64)
+    state = simulator.state(torch.tensor([50.0, 0.0]).double(), torch.ones(2).double(), params, lane=0)
+    inputs = {"noise": torch.zeros(1, 2).double()} if "noise" in simulator.by_name else {}
+    assert dispatch.refusal(simulator, state, inputs, params) is None
+    fast, quick, fast_gradients = rolled(road, effects, torch.float64, graph=True)
+    assert end.links is not None and fast.links is not None and end.links.changed.sum() > 3
+    for one, other in zip(end.links, fast.links, strict=True):
+        assert torch.equal(one, other)
+    for a, b in zip([*kept, *gradients], [*quick, *fast_gradients], strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+    for name, held in end.memory.items():
+        torch.testing.assert_close(held, fast.memory[name], rtol=1e-9, atol=1e-9)
+    assert torch.equal(end.step, fast.step)
+    plain, same, _ = rolled(road, effects, torch.float64, graph=False)
+    assert all(torch.equal(a, b) for a, b in zip(quick, same, strict=True))
+    assert torch.equal(plain.gap, fast.gap)
+
+
+def test_the_past_goes_with_its_vehicle() -> None:
+    """Delayed drivers on several lanes, values alone: a graph would compile for half a minute."""
+    road, effects = Lanes(3, ring=500.0), (IDM(), make("delay"), Mobil(), Brakes())
+    with dispatch.off():
+        end, kept, _ = rolled(road, effects, torch.float64, graph=False)
+    fast, quick, _ = rolled(road, effects, torch.float64, graph=False)
+    assert end.links is not None and fast.links is not None and torch.equal(end.links.lane, fast.links.lane)
+    for a, b in zip([*kept, end.memory["past"]], [*quick, fast.memory["past"]], strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_vehicles_that_have_passed_through_each_other_take_the_torch_path() -> None:
+    """Their links are no order of positions, and are not guessed at."""
+    simulator = Simulator(Lanes(2, ring=300.0), (IDM(), Brakes()))
+    params = simulator.defaults(dtype=torch.float64)
+    position = torch.tensor([100.0, 50.0, 0.0], dtype=torch.float64)
+    state = simulator.state(position, torch.full_like(position, 5.0), params, lane=0)
+    crossed = state._replace(position=torch.tensor([40.0, 50.0, 0.0], dtype=torch.float64))
+    with dispatch.off():
+        expected, _ = simulator.rollout(crossed, {}, params, 5)
+    found, _ = simulator.rollout(crossed, {}, params, 5)
+    assert torch.equal(found.gap, expected.gap)

@@ -1,0 +1,245 @@
+"""Laws of lane changes: nobody overlaps, mirrored roads give mirrored changes, and hypothetical pairs are real ones."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from idm_env.changes import beside
+from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
+from idm_env.roads import Lane, Lanes, lane_drop, off_ramp, on_ramp
+from idm_env.simulator import Simulator
+from idm_env.types import State
+
+DTYPE = torch.float64
+
+
+def mixed(
+    road: Lanes, n: int, span: float, *, batch: int = 3, seed: int = 0, effects: tuple[Effect, ...] = (Mobil(),)
+) -> tuple[Simulator, State, dict[str, dict[str, Tensor]]]:
+    """Return drivers of different desired speeds anywhere on the lanes of a road, nobody in another's body."""
+    generator = torch.Generator().manual_seed(seed)
+    simulator = Simulator(road, (IDM(), *effects, Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    params["idm"]["desired_speed"] = 15.0 + 20.0 * torch.rand((batch, n), generator=generator, dtype=DTYPE)
+    place = torch.stack([torch.randperm(n, generator=generator) for _ in range(batch)])
+    lane = torch.randint(road.count, (batch, n), generator=generator)
+    position = place * (span / n) + 0.5 * torch.rand((batch, n), generator=generator, dtype=DTYPE)
+    # Side by side in the same lane there is room only if a place is longer than a vehicle.
+    lane = torch.where(torch.tensor(span / n < 8.0), place % road.count, lane)
+    return simulator, simulator.state(position, torch.full_like(position, 8.0), params, lane=lane), params
+
+
+ROADS = {
+    "ring": lambda count: Lanes(count, ring=600.0),
+    "open": lambda count: Lanes(count),
+    "drop": lambda count: Lanes(count, ends=(lane_drop(count - 1, at=900.0),)),
+    "ramps": lambda count: Lanes(
+        count, length=1500.0, ends=(on_ramp(0, begin=300.0, end=800.0), off_ramp(count - 1, 200.0, 700.0, leaves=900.0))
+    ),
+}
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    road=st.sampled_from(sorted(ROADS)),
+    count=st.integers(2, 5),
+    n=st.integers(5, 60),
+    seed=st.integers(0, 10_000),
+    politeness=st.floats(-0.5, 1.0),
+    safe=st.floats(0.5, 6.0),
+)
+def test_nobody_overlaps_and_nobody_is_lost(
+    road: str, count: int, n: int, seed: int, politeness: float, safe: float
+) -> None:
+    """At every step of random traffic: gaps are positive and what positions say, links are inverse, all are counted."""
+    simulator, state, params = mixed(ROADS[road](count), n, 580.0, seed=seed, effects=(Mobil(), MandatoryChange()))
+    for name, value in (("politeness", politeness), ("safe_decel", safe)):
+        params["mobil"][name] = torch.tensor(value, dtype=DTYPE)
+    params["mandatory_change"]["safe_decel"] = params["mobil"]["safe_decel"]
+    own = torch.arange(n).expand_as(state.speed)
+    gone = torch.zeros_like(state.speed)
+    for _ in range(150):
+        before = state
+        state = simulator.step(state, {}, params)
+        links = state.links
+        assert links is not None
+        assert (state.gap > 0).all()
+        fresh = simulator.road.view(state).gaps(state.position, state.length)
+        there = state.gap < 5e3
+        torch.testing.assert_close(state.gap[there], fresh[there], rtol=0, atol=1e-8)
+        back = links.follower.gather(-1, links.leader)
+        assert ((back == own) | (links.leader == own)).all()
+        if state.present is not None and before.present is not None:
+            gone += before.present - state.present
+            assert torch.equal(state.present + gone, torch.ones_like(gone))
+    assert (links.changed + links.refused + links.blocked).sum() >= 0
+
+
+@pytest.mark.parametrize("road", sorted(ROADS))
+def test_traffic_changes_lanes_on_every_road(road: str) -> None:
+    """Otherwise the laws above would hold of nothing."""
+    simulator, state, params = mixed(ROADS[road](3), 40, 580.0, seed=4, effects=(Mobil(), MandatoryChange()))
+    end, _ = simulator.rollout(state, {}, params, 200)
+    assert end.links is not None
+    assert end.links.changed.sum() >= 20 and end.links.refused.sum() > 0
+    lanes = end.links.lane if end.present is None else end.links.lane[end.present > 0]
+    assert len(lanes.unique()) >= 2
+
+
+@pytest.mark.parametrize("ring", [None, 600.0])
+def test_mirrored_roads_give_mirrored_changes(ring: float | None) -> None:
+    """With the hand that settles equal claims mirrored as well, to the last bit."""
+    ends = () if ring else (lane_drop(0, at=900.0),)
+    other = () if ring else (lane_drop(3, at=900.0),)
+    simulator, state, params = mixed(Lanes(4, ring=ring, ends=ends), 50, 580.0, effects=(Mobil(), MandatoryChange()))
+    params["mobil"]["keep_right"] = torch.tensor(0.1, dtype=DTYPE)
+    params["idm"]["desired_speed"] = params["idm"]["desired_speed"].round(decimals=-1)  # so that claims are equal
+    mirror = Simulator(Lanes(4, ring=ring, ends=other, handed="right"), simulator.effects)
+    turned = {**params, "mobil": {**params["mobil"], "keep_right": -params["mobil"]["keep_right"]}}
+    assert state.links is not None
+    start = mirror.state(state.position, state.speed, turned, lane=3 - state.links.lane)
+    one, kept = simulator.rollout(state, {}, params, 200)
+    two, same = mirror.rollout(start, {}, turned, 200)
+    assert one.links is not None and two.links is not None and one.links.changed.sum() > 20
+    assert torch.equal(one.links.lane, 3 - two.links.lane)
+    assert all(torch.equal(a, b) for a, b in zip(kept, same, strict=True))
+
+
+def test_claims_of_equal_utility_go_to_the_hand_of_the_road() -> None:
+    """Two drivers beside one gap, alike in all: who goes to the road's hand is granted, the other is counted."""
+    for handed, winner in (("left", 0), ("right", 1)):
+        simulator = Simulator(Lanes(3, handed=handed), (IDM(), Mobil(), Brakes()))  # type: ignore[arg-type]
+        params = simulator.defaults(dtype=DTYPE)
+        position = torch.tensor([0.0, 0.0, 25.0, 25.0, -200.0], dtype=DTYPE)
+        speed = torch.tensor([20.0, 20.0, 5.0, 5.0, 20.0], dtype=DTYPE)
+        state = simulator.state(position, speed, params, lane=torch.tensor([0, 2, 0, 2, 1]))
+        links = simulator.step(state, {}, params).links
+        assert links is not None
+        assert links.lane.tolist()[winner] == 1 and links.lane.tolist()[1 - winner] == 2 * (1 - winner)
+        assert links.changed.tolist()[:2] == [1 - winner, winner]
+        assert links.refused.tolist()[:2] == [winner, 1 - winner]
+
+
+def test_drivers_who_never_wish_drive_as_without_lane_changes() -> None:
+    """A threshold that nothing exceeds leaves no trace, to the last bit; and rows do not see each other."""
+    simulator, state, params = mixed(Lanes(3, ring=600.0), 30, 580.0)
+    never = {**params, "mobil": {**params["mobil"], "threshold": torch.tensor(1e3, dtype=DTYPE)}}
+    _, kept = simulator.rollout(state, {}, never, 60)
+    _, plain = simulator.without("mobil").rollout(state, {}, params, 60)
+    assert all(torch.equal(a, b) for a, b in zip(kept, plain, strict=True))
+    _, together = simulator.rollout(state, {}, params, 60)
+    for row in range(3):
+        mine = {**params, "idm": {n: v[row] if v.dim() else v for n, v in params["idm"].items()}}
+        assert state.links is not None
+        alone = simulator.state(state.position[row], state.speed[row], mine, lane=state.links.lane[row])
+        _, single = simulator.rollout(alone, {}, mine, 60)
+        assert all(torch.equal(a[:, row], b) for a, b in zip(together, single, strict=True))
+
+
+FOLLOWING = (
+    IDM(),
+    make("second_leader"),
+    make("speed_dependent_gap"),
+    make("gap_bias"),
+    make("grade"),
+    make("follower"),
+)
+
+
+def test_hypothetical_pairs_are_answered_by_the_simulators_own_effects() -> None:
+    """What drivers would want beside is what a lane of these very vehicles says, followers' drivers included."""
+    road = Lanes(3)
+    simulator, state, params = mixed(road, 14, 300.0, batch=1, seed=8, effects=(*FOLLOWING[1:], Mobil()))
+    params["idm"]["time_gap"] = 1.0 + torch.rand((1, 14), generator=torch.Generator().manual_seed(2), dtype=DTYPE)
+    lane = Simulator(Lane(), FOLLOWING)
+    view = simulator.road.view(state)
+    sides = view.side(view.order(None), 1, state), view.side(view.order(None), -1, state)  # type: ignore[attr-defined]
+    scene = beside(simulator, view, sides, state, {}, params)  # type: ignore[arg-type]
+    place, which = state.position[0], state.links.lane[0]  # type: ignore[union-attr]
+
+    def lone(slots: list[int], who: int) -> Tensor:
+        """Return what one of these vehicles wants where they alone are on a lane."""
+        slots = sorted(slots, key=lambda i: -float(place[i]))
+        mine = {
+            e: {n: v[0, slots] if v.dim() else v for n, v in p.items()} for e, p in params.items() if e in lane.by_name
+        }
+        alone = lane.state(place[slots], state.speed[0, slots], mine)
+        return lane.acceleration(alone, {}, mine)[slots.index(who)]
+
+    checked = 0
+    for i in range(14):
+        for name, to in (("left", int(which[i]) + 1), ("here", int(which[i])), ("right", int(which[i]) - 1)):
+            if not 0 <= to < 3:
+                continue
+            seen = getattr(scene, name)
+            there = [j for j in range(14) if which[j] == to and j != i]
+            behind = [j for j in there if place[j] <= place[i]]
+            torch.testing.assert_close(seen.wanted[0, i], lone([*there, i], i))
+            if behind:
+                n = max(behind, key=lambda j: float(place[j]))
+                torch.testing.assert_close(seen.with_me[0, i], lone([*there, i], n))
+                # A follower behind a gap that one leaves has the same vehicle behind, as everybody else.
+                torch.testing.assert_close(seen.without_me[0, i], lone(there, n))
+                checked += 1
+    assert checked > 20
+
+
+def test_mobils_rule_is_the_published_one() -> None:
+    """Utility and margin of a scene, from the accelerations that the paper names."""
+    simulator, state, params = mixed(Lanes(2), 10, 250.0, batch=1, seed=3)
+    view = simulator.road.view(state)
+    sides = view.side(view.order(None), 1, state), view.side(view.order(None), -1, state)  # type: ignore[attr-defined]
+    scene = beside(simulator, view, sides, state, {}, params)  # type: ignore[arg-type]
+    values = {"politeness": 0.5, "threshold": 0.2, "safe_decel": 3.0, "keep_right": 0.3}
+    p = {name: torch.tensor(value, dtype=DTYPE) for name, value in values.items()}
+    wish = Mobil().change(scene, None, p)  # type: ignore[arg-type]
+    here, left, right = scene.here, scene.left, scene.right
+    assert here is not None and left is not None and right is not None
+    for side, utility, margin, bias in (
+        (left, wish.left, wish.left_margin, -0.3),
+        (right, wish.right, wish.right_margin, 0.3),
+    ):
+        others = side.with_me - side.without_me + here.without_me - here.with_me
+        there = side.exists > 0
+        expected = side.wanted - here.wanted + 0.5 * others - 0.2 + bias
+        torch.testing.assert_close(utility[there], expected[there])
+        assert (utility[~there] <= 0).all()
+        safe = (side.with_me >= -3.0) & ((side.wanted >= -3.0) | (side.wanted >= here.wanted))
+        assert torch.equal(margin >= 0, safe)
+
+
+def test_commands_are_done_at_the_next_decision_or_counted() -> None:
+    """To the left, off the road, into another vehicle, and left to the driver."""
+    simulator = Simulator(Lanes(2), (IDM(), Mobil(), LaneCommand(), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    position = torch.tensor([0.0, 300.0, 600.0, 602.0, 900.0, 1200.0], dtype=DTYPE)
+    lane = torch.tensor([0, 0, 0, 1, 1, 1])
+    state = simulator.state(position, torch.full_like(position, 20.0), params, lane=lane)
+    nan = float("nan")
+    command = torch.tensor([1.0, -1.0, 1.0, nan, 0.0, -1.0], dtype=DTYPE)
+    after = simulator.step(state, {"lane_command": command}, params).links
+    assert after is not None
+    assert after.lane.tolist() == [1, 0, 0, 1, 1, 0]
+    assert after.changed.tolist() == [1, 0, 0, 0, 0, 1]
+    assert after.blocked.tolist() == [0, 1, 1, 0, 0, 0]
+
+
+def test_gradients_with_choices_frozen_are_exact() -> None:
+    """Finite differences that flip no choice agree with back-propagation through changes, ends of lanes included."""
+    road = Lanes(3, ends=(lane_drop(2, at=330.0),))
+    simulator, state, params = mixed(road, 8, 200.0, batch=1, seed=5, effects=(Mobil(), MandatoryChange()))
+    assert state.links is not None
+    lane = state.links.lane
+
+    def run(position: Tensor, speed: Tensor, time_gap: Tensor) -> tuple[Tensor, Tensor]:
+        p = {**params, "idm": {**params["idm"], "time_gap": time_gap}}
+        end, _ = simulator.rollout(simulator.state(position, speed, p, lane=lane), {}, p, 22)
+        assert end.links is not None and end.links.changed.sum() >= 3
+        return end.position, end.gap.clamp_max(1e3)
+
+    leaves = state.position, state.speed, torch.full((1, 8), 1.4, dtype=DTYPE)
+    assert torch.autograd.gradcheck(run, [x.clone().requires_grad_() for x in leaves], eps=1e-6, atol=1e-5)

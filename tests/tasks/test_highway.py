@@ -1,0 +1,75 @@
+"""Task ``highway``: faces, lane commands, gradients."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import idm_env  # noqa: F401
+from idm_env.envs.pettingzoo import parallel_env
+from idm_env.tasks import make_task
+
+EMPTY = {"task": "highway", "vehicles": 2, "length": 2000.0, "controlled": [1], "lanes_count": 3}
+
+
+def lanes_of(env: gym.Env, action: np.ndarray, steps: int) -> list[int]:
+    """Return the lane of vehicle 1 after every step."""
+    env.reset(seed=1)
+    seen = []
+    for _ in range(steps):
+        env.step(action)
+        seen.append(int(env.unwrapped.state.links.lane[0, 1]))
+    return seen
+
+
+def test_agents_command_lanes_where_that_is_asked_for() -> None:
+    """One lane a second to the left until there is none, and back; in every face alike."""
+    env = gym.make("DiffIDM-v0", lane_commands=True, **EMPTY)
+    assert env.action_space.shape == (2,)
+    left = lanes_of(env, np.array([0.0, 1.0], np.float32), 25)
+    assert left[0] == left[9] == 2 and left[10] == left[24] == 2
+    blocked = int(env.unwrapped.state.links.blocked[0, 1])
+    assert blocked == 2
+    right = lanes_of(env, np.array([0.0, -1.0], np.float32), 25)
+    assert right[0] == right[24] == 0
+    assert set(lanes_of(env, np.array([0.0, 0.2], np.float32), 25)) == {1}
+    vector = gym.make_vec("DiffIDM-v0", num_envs=2, lane_commands=True, **EMPTY)
+    vector.reset(seed=1)
+    vector.step(np.array([[0.0, 1.0], [0.0, -1.0]], np.float32))
+    assert vector.state.links.lane[:, 1].tolist() == [2, 0]
+    each = parallel_env(lane_commands=True, **EMPTY)
+    each.reset(seed=1)
+    (agent,) = each.agents
+    assert each.action_space(agent).shape == (2,)
+    each.step({agent: np.array([0.0, 1.0], np.float32)})
+    assert each.batch.world.state.links.lane[0, 1] == 2
+
+
+def test_gradients_flow_through_steps_and_changes() -> None:
+    """Of a later reward by an earlier action, which finite differences confirm."""
+    env = gym.make("DiffIDM-v0", task="highway", vehicles=16, length=300.0, output="torch", dtype="float64")
+
+    def total(push: torch.Tensor) -> torch.Tensor:
+        env.reset(seed=3)
+        rewards = [env.step(push if t == 0 else torch.zeros(1, dtype=torch.float64))[1] for t in range(25)]
+        return torch.stack(rewards).sum()
+
+    push = torch.tensor([0.2], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(total(push), push)
+    h = 1e-5
+    expected = (total(push.detach() + h) - total(push.detach() - h)) / (2 * h)
+    torch.testing.assert_close(slope[0], expected, rtol=1e-5, atol=1e-8)
+
+
+def test_desired_speeds_are_spread_and_bad_roads_are_refused() -> None:
+    """In one line each."""
+    speeds = make_task("highway", spread=0.2).params(torch.float64, "cpu")["idm"]["desired_speed"]
+    assert 24.0 <= speeds.min() < 25.0 and 35.0 < speeds.max() <= 36.0
+    with pytest.raises(ValueError, match="do not fit 4 lanes of 100 m"):
+        make_task("highway", length=100.0, vehicles=80)
+    with pytest.raises(ValueError, match="spread = 1 must be below 1"):
+        make_task("highway", spread=1.0)
+    with pytest.raises(ValueError, match="takes an input that task 'highway' does not give"):
+        make_task("highway", effects=["lane_command"])
