@@ -65,7 +65,8 @@ def test_a_single_environment_is_a_row_of_a_vector_and_the_torch_path(task, keyw
         if ours[2] or ours[3]:
             _same(single[0].reset()[0], rows[0])
             single[1].reset()
-    assert single[0].unwrapped.batch._values is not None, "the torch path ran"
+    compiled = single[0].unwrapped.batch._values is not None
+    assert compiled == (task != "highway"), "the torch path ran, which is for several lanes alone"
     _same(single[0].unwrapped.state.gap, single[1].unwrapped.state.gap)
     _same(vector.unwrapped.state.speed[:1], single[1].unwrapped.state.speed)
 
