@@ -162,7 +162,7 @@ def repeated(start: Start, times: int) -> Start:
         return x.repeat(times, *(1 for _ in x.shape[1:]))
 
     state = start.world.state
-    fields = {k: many(x) for k, x in state._asdict().items() if isinstance(x, Tensor)}
+    fields: Any = {k: many(x) for k, x in state._asdict().items() if isinstance(x, Tensor)}
     memory = {name: many(x) for name, x in state.memory.items()}
     world = World(state._replace(**fields, memory=memory), {k: many(x) for k, x in start.world.episode.items()})
     return start._replace(world=world, draw=start.draw._replace(key=many(start.draw.key)))

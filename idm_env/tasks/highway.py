@@ -197,4 +197,5 @@ class HighwayTask(Task):
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``v/40 − 0.1 (u/u_max)²``."""
         speed = self.pick(after.state.speed).clamp_max(_FASTEST) / _FASTEST
-        return speed - 0.1 * (command / self.max_command).square().clamp_max(1.0)
+        hardest = max(abs(limit) for limit in self.command_limits)
+        return speed - 0.1 * (command / hardest).square().clamp_max(1.0)
