@@ -1,0 +1,56 @@
+"""Terms that show in free simulation: scored on what nothing has seen, fitted at once, and taken back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from idm_env.data import episodes, synthetic
+from idm_env.discovery import free, search, together
+from idm_env.discovery import model as terms
+from idm_env.discovery.model import Model
+from idm_env.discovery.records import gather, windows
+from idm_env.discovery.search import Search
+from idm_env.discovery.solve import Task, solve
+from idm_env.keep import Store
+
+
+@pytest.fixture(scope="module")
+def searching() -> Search:
+    made, _ = synthetic.generate(31, runs=6, followers=3, seconds=120.0, effect="speed_time_gap")
+    records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
+    rows = windows(records)
+    task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
+    return Search(task, ("speed_time_gap", "drag"), False, Store(None, "", False), lambda *_: None)
+
+
+@pytest.fixture(scope="module")
+def start(searching: Search) -> free.Stand:
+    task = searching.task
+    null = solve(task, Model(), np.tile(task.prior.centre, (task.groups, 1)), np.zeros(0))
+    return free.stand(task.rows.records, null.model, null.values, null.prior, null.theta)
+
+
+def test_what_is_there_is_added_in_free_simulation_and_nothing_else(searching: Search, start: free.Stand) -> None:
+    joined, steps = together.grow(searching, start, 0, seed=0)
+    assert joined is not None
+    assert [t.label for t in joined.solution.model.terms] == ["speed_time_gap"]
+    estimate, low, high = joined.intervals[0]
+    assert estimate == pytest.approx(-0.4, rel=0.3) and low < estimate < high
+    assert joined.gains.mean() > 0.1 and steps[0].tested.p_value[steps[0].winner] < 0.05
+    assert len(start.units) == 18 and len(start.rmse_m) == len(free.GRID_S)
+
+
+def test_a_term_that_is_not_there_is_taken_back(start: free.Stand) -> None:
+    model = Model((terms.simple("speed_time_gap"), terms.simple("drag")))
+    both = free.joint(start, model, np.array([-0.3, 1e-4]))
+    kept = together._backward(start, both, 0)
+    assert [t.label for t in kept.model.terms] == ["speed_time_gap"]
+
+
+def test_theta_follows_on_time_that_is_not_scored(start: free.Stand) -> None:
+    """A response that θ can make up for leaves next to nothing."""
+    by_theta = start.linear.by_theta[..., [2]]
+    left = start.across(by_theta)
+    assert (left**2).sum() < 0.1 * ((by_theta * start.scored[..., None]) ** 2).sum()
+    assert not left[~start.scored].any()
