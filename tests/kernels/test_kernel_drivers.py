@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Effect, Grade, Noise, Replay, make
+from idm_env.effects import IDM, AccelNoise, Brakes, Effect, Grade, Replay, make
 from idm_env.effects.base import CarFollowing, P
 from idm_env.kernels import dispatch, drivers
 from idm_env.parameters import Parameter
@@ -297,9 +297,9 @@ def test_neighbours_must_be_records() -> None:
 
 
 def test_noise_and_grades_are_inputs_and_places() -> None:
-    """Correlated noise has a memory; a grade reads the driver's own position, which then is a state."""
+    """Drifting acceleration has a memory; a grade reads the driver's own position, which then is a state."""
     grade = Grade(profile=(0.0, 0.02, -0.03, 0.01, 0.0))
-    measured = Measured((IDM(), Brakes(), Noise(correlated=True), grade), "ballistic")
+    measured = Measured((IDM(), Brakes(), AccelNoise(), grade), "ballistic")
     assert "position" in measured.behind.kernel.program.states
     assert "position" not in Measured((IDM(), Brakes()), "ballistic").behind.kernel.program.states
     np.testing.assert_allclose(
