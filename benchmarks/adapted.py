@@ -30,7 +30,7 @@ EFFECTS = ("asymmetry", "delay", "lag", "leader_acceleration", "speed_dependent_
 def fitted(training: records.Records) -> list[Solution]:
     """Return IDM and IDM with every effect on the training pairs: population, and the effect's strength."""
     rows = records.windows(training)
-    task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
+    task = Task(rows, search.first_noise(rows), search.first_prior())
     theta = np.tile(task.prior.centre, (task.groups, 1))
     found = []
     for name in (None, *EFFECTS):
@@ -55,7 +55,7 @@ def errors(test: records.Records, s: Solution) -> np.ndarray:
     late = dataclasses.replace(
         rows, start=middle, steps=count * rows.every, valid=ahead < test.bounds[rows.record + 1][:, None]
     )
-    task = Task(late, None, s.prior, np.ones(len(late)))
+    task = Task(late, None, s.prior)
     off = task.errors(theta[None], Frozen(s.model, s.values), np.zeros((1, 0)))[0]
     return np.asarray(np.sqrt((off**2).sum(1) / late.valid.sum(1)))
 

@@ -148,7 +148,7 @@ def discovery() -> dict[str, Any]:
 
     trajectories, _ = synthetic.generate(0)
     rows = records.windows(prepare(trajectories, "driver"))
-    task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
+    task = Task(rows, search.first_noise(rows), search.first_prior())
     theta = np.tile(task.prior.centre, (task.groups, 1))
 
     def jacobian(name: str) -> Case:

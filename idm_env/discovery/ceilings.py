@@ -95,7 +95,7 @@ def refitted(records: Records, null: Solution) -> float:
     own = replace(rows, valid=scored)
     task, theta = judge.unweighed(records, null.model, null.values, null.prior, own, null.theta)
     empty = np.zeros((1, 0))
-    errors = Task(own, None, task.prior, task.counts).errors(theta[None], Frozen(null.model, null.values), empty)[0]
+    errors = Task(own, None, task.prior).errors(theta[None], Frozen(null.model, null.values), empty)[0]
     return float(np.sqrt((errors**2).sum() / scored.sum()))
 
 

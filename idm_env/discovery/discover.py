@@ -106,7 +106,7 @@ def discover(
     options = (list(map(repr, tried)), tuple(known), seed, located, lockbox)
     mark = keep.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
     saved = keep.Store(None if out is None else out / keep.UNFINISHED / "explain", mark, resume)
-    task = Task(rows, search.first_noise(rows), search.first_prior(), np.ones(len(rows)))
+    task = Task(rows, search.first_noise(rows), search.first_prior())
     told = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
     base = Model(told, twin.Catalogue.of([*own, *(terms.known_effect(term) for term in told)], prepared.period))

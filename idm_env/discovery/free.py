@@ -74,7 +74,7 @@ def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, thet
     rows, frozen = whole(records), Frozen(model, values)
     scored = judge.halves(rows)
     part = replace(rows, valid=rows.valid & ~scored)
-    task = Task(part, None, replace(prior, free=False), np.ones(len(rows)))
+    task = Task(part, None, replace(prior, free=False))
     near = solve(task, frozen, theta, np.zeros(0), iterations=15, tolerance=1e-4).theta
     tasks: list[Task] = []
     fits: list[Solution] = []

@@ -107,7 +107,7 @@ def unweighed(
     """
     rows = whole(records) if rows is None else rows
     frozen, empty = Frozen(model, values), np.zeros(0)
-    task = Task(rows, None, replace(prior, free=False), np.ones(len(rows)))
+    task = Task(rows, None, replace(prior, free=False))
     centre = np.tile(prior.centre, (task.groups, 1))
     fits = [
         solve(task, frozen, x, empty, iterations=25, tolerance=1e-5)
@@ -137,7 +137,7 @@ def free_run_squares(records: Records, s: Solution) -> np.ndarray:
     model, values, prior = s.model, s.values, s.prior
     fitted = calibrate(records, model, values, prior, start=s.theta)
     rows = whole(records)
-    task = Task(rows, None, prior, np.ones(len(rows)))
+    task = Task(rows, None, prior)
     errors = task.errors(fitted.theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
     return units(records).sums(rows.record, (np.clip(errors, -30.0, 30.0) ** 2).sum(1))
 
@@ -150,7 +150,7 @@ def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> 
     """
     rows = windows(records)
     assert task.noise is not None
-    there = Task(rows, replace(task.noise, weight=np.ones(len(rows))), task.prior, np.ones(len(rows)))
+    there = Task(rows, replace(task.noise, weight=np.ones(len(rows))), task.prior)
     squares = []
     for s in (null, final):
         start = np.tile(s.prior.centre, (there.groups, 1))
@@ -163,9 +163,7 @@ def everywhere(records: Records, task: Task, solution: Solution) -> places.Respo
     """Return the responses of a model in windows of all records: φ as it stands, θ fitted, the noise of ``task``."""
     assert task.noise is not None
     rows = windows(records)
-    there = Task(
-        rows, replace(task.noise, weight=np.ones(len(rows))), replace(task.prior, free=False), np.ones(len(rows))
-    )
+    there = Task(rows, replace(task.noise, weight=np.ones(len(rows))), replace(task.prior, free=False))
     start = np.tile(task.prior.centre, (there.groups, 1))
     return places.respond(there, solve(there, Frozen(solution.model, solution.values), start, np.zeros(0)))
 
@@ -200,10 +198,10 @@ def judge(
     assert theta is not None
     frozen = Frozen(model, values)
     empty = np.zeros((1, 0))
-    task = Task(rows, None, prior, np.ones(len(rows)))
+    task = Task(rows, None, prior)
     gap, speed = (x[0] for x in task.predict(theta[None], frozen, empty))
     short = windows(records)
-    near = Task(short, None, prior, np.ones(len(short)))
+    near = Task(short, None, prior)
     ahead = near.errors(theta[None], frozen, empty)[0][:, -1]
     odd = short.block % 2 == 1 if adapt else np.ones(len(short), bool)
     return Judged(rows, theta, gap, speed, scored, ahead[odd], short.record[odd])

@@ -70,8 +70,7 @@ def respond(task: Task, solution: Solution) -> Responses:
     theta = np.repeat(solution.theta[None], copies, axis=0)
     values = np.repeat(solution.values[None], copies, axis=0)
     residual = task.residual(task.errors(theta, solution.model, values, pulses))
-    counts = task.counts[:, None]
-    change = (residual[1:] - residual[0]).reshape(len(WHATS), pieces, len(rows), -1) / PULSE * counts
+    change = (residual[1:] - residual[0]).reshape(len(WHATS), pieces, len(rows), -1) / PULSE
     at = rows.start[:, None] + seconds * np.arange(pieces) + seconds // 2
     signals = records.signals
     place = signals[at, 18]
@@ -82,11 +81,11 @@ def respond(task: Task, solution: Solution) -> Responses:
         "gap": signals[at, 0] - signals[at, 14],
     }
     linear = solution.linear
-    matrix = equations(task, solution.model, solution.theta, solution.values, linear)[1]
+    matrix = equations(task, solution.theta, linear)[1][:, :5, :5]
     counted = units(records)
-    square = counted.sums(rows.record, (linear.residual**2).sum(-1) * task.counts)
+    square = counted.sums(rows.record, (linear.residual**2).sum(-1))
     return Responses(
-        rows, counted, change, linear.residual * counts, linear.by_theta * counts[:, :, None],
+        rows, counted, change, linear.residual, linear.by_theta,
         np.linalg.inv(matrix + 1e-9 * np.eye(5)), coordinates, square,
     )  # fmt: skip
 

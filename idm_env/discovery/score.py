@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
-from idm_env.discovery.solve import BOUNDS, Solution, Task, cost_of, equations, prior_of, projected
+from idm_env.discovery.solve import BOUNDS, Linear, Solution, Task, cost_of, equations, prior_of, projected
 from idm_env.discovery.units import rho, signs, units
 from idm_env.parameters import Parameter
 
@@ -41,10 +41,9 @@ def held_out(task: Task, solution: Solution) -> np.ndarray:
     if _spans_runs(task):
         # Drivers of several runs share θ, which then stays that of all runs: to first order.
         moved = linear.residual + np.einsum("rmq,rq->rm", projected(solution), change[rows.run])
-        return counted.sums(rows.record, (moved**2).sum(-1) * task.counts)
-    part = Task(rows, task.noise, solution.prior, task.counts, task.sigma)
-    moved_linear = type(linear)(shifted, linear.by_theta, linear.by_phi)
-    gradient, matrix, *_ = equations(part, model, solution.theta, solution.values, moved_linear)
+        return counted.sums(rows.record, (moved**2).sum(-1))
+    part = replace(task, prior=solution.prior)
+    gradient, matrix = equations(part, solution.theta, Linear(shifted, linear.jacobian[:5]))
     step = -np.linalg.solve(matrix + 1e-9 * np.eye(5), gradient[..., None])[..., 0]
     theta = np.clip(solution.theta + np.clip(step, -0.5, 0.5), BOUNDS[:, 0], BOUNDS[:, 1])
     by_group = np.zeros((task.groups, len(solution.values)))
@@ -53,7 +52,7 @@ def held_out(task: Task, solution: Solution) -> np.ndarray:
     both = np.stack([theta, solution.theta])
     residual = task.residual(task.errors(both, model, values))
     better = cost_of(part, both, residual).argmin(0)[rows.group]
-    square = (residual**2).sum(-1) * task.counts
+    square = (residual**2).sum(-1)
     return counted.sums(rows.record, np.where(better == 0, square[0], square[1]))
 
 
@@ -66,7 +65,7 @@ def _spans_runs(task: Task) -> bool:
 def per_run(task: Task, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     """Return φ's gradient [runs, Q] and matrix [runs, Q, Q] of every run, the drivers' own parameters eliminated."""
     rows = task.rows
-    across = projected(solution) * task.counts[:, None, None]
+    across = projected(solution)
     runs, count = len(rows.records.runs), len(solution.values)
     gradient, matrix = np.zeros((runs, count)), np.zeros((runs, count, count))
     np.add.at(gradient, rows.run, np.einsum("rmq,rm->rq", across, solution.linear.residual))

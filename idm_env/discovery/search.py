@@ -14,7 +14,7 @@ from idm_env.discovery import places
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out, log_gain
-from idm_env.discovery.solve import NAMES, Prior, Solution, Task, centred, finish, linearise, solve, with_noise
+from idm_env.discovery.solve import NAMES, Prior, Solution, Task, finish, linearise, solve
 from idm_env.discovery.units import Units, units
 from idm_env.effects import IDM, Effect
 from idm_env.effects.base import Sought
@@ -70,8 +70,9 @@ class Search:
 
     def _renoised(self, solution: Solution) -> Task:
         errors = self.task.errors(solution.theta[None], solution.model, solution.values[None])[0]
-        task = with_noise(self.task, noises.estimate(errors, self.task.rows.joined))
-        return replace(task, prior=replace(population(solution.theta, task.rows), alike_s=task.prior.alike_s))
+        noise = noises.estimate(errors, self.task.rows.joined)
+        prior = replace(population(solution.theta, self.task.rows), alike_s=self.task.prior.alike_s)
+        return replace(self.task, noise=noise, prior=prior)
 
     def round(self, solution: Solution, number: int) -> tuple[list[Scored], np.ndarray]:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [units]."""
@@ -127,9 +128,8 @@ class Search:
         kept = self.saved.get(key)
         if kept is not None:
             theta, values = kept["theta"].numpy(), kept["values"].numpy()
-            task = centred(self.task, theta)
-            linear = linearise(task, model, theta, values)
-            best = finish(task, model, theta, values, linear, kept["cost"])
+            linear = linearise(self.task, model, theta, values)
+            best = finish(self.task, model, theta, values, linear, kept["cost"])
         else:
             starts = starts or [np.append(solution.values, s) for s in term.starts]
             first = [solve(self.task, model, solution.theta, s, iterations=5) for s in starts]

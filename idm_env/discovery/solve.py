@@ -1,23 +1,24 @@
-"""Nested least squares: every trial of a candidate's parameters φ lets every driver's own parameters θ follow.
+"""What discovery solves: every trial of a candidate's parameters φ lets every driver's own parameters θ follow.
 
-Predictions come from the compiled loop, derivatives from its differences (one extra copy of the rows per parameter).
-Each iteration solves the normal equations of all drivers at once and eliminates their θ (Schur complement), so a step
-of φ already knows how θ will follow: variable projection (Golub and Pereyra 1973).
+Predictions come from the compiled loop, derivatives from its differences (one extra copy of the rows per parameter);
+the solver is that of fits, ``idm_env.fitting.solver``, with log θ as own parameters and φ as shared ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from idm_env.discovery import march as twin
 from idm_env.discovery.model import Model
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Rows
 from idm_env.effects import IDM
+from idm_env.fitting.solver import Box, Normal, Progress, minimise
 from idm_env.parameters import Parameter
 
 NAMES = tuple(p.name for p in IDM.declared)
@@ -33,26 +34,37 @@ class Prior:
     """Log-normal prior of θ: centre [5] and width [5] of log θ; ``free`` lets the centre follow the drivers.
 
     ``alike_s`` is its weight in free simulation, where errors of so many seconds count as one (``free.stand``).
+    ``seen`` are the groups that have data: their mean is the centre, so that a shift of all of them costs nothing.
     """
 
     centre: np.ndarray
     width: np.ndarray
     free: bool = True
     alike_s: float = 5.0
+    seen: tuple[int, ...] = ()
+
+    def equations(self, own: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the prior adds to cost [..., G], gradient [..., G, 5] and matrix [5, 5]; own is log θ."""
+        off, weight = own - torch.from_numpy(self.centre), torch.from_numpy(self.width**-2.0)
+        return (weight * off.square()).sum(-1), weight * off, torch.diag(weight)
+
+    def following(self, own: Tensor) -> Prior:
+        """Return the prior centred at the mean of the drivers [1, G, 5], if there are enough of them."""
+        if not self.free or len(self.seen) < 5:
+            return self
+        return replace(self, centre=own[0, list(self.seen)].mean(0).numpy())
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
     """Rows, how their errors are judged, and the prior: everything that is common to the null and all candidates.
 
-    ``noise`` None means free simulation: plain gap errors in units of ``sigma`` (m). ``counts`` [R] is 1 for rows
-    that are fitted.
+    ``noise`` None means free simulation: plain gap errors in units of ``sigma`` (m).
     """
 
     rows: Rows
     noise: Noise | None
     prior: Prior
-    counts: np.ndarray
     sigma: float = 0.3
 
     @property
@@ -102,32 +114,48 @@ class Task:
             return errors / self.sigma
         return self.noise.whiten(errors, self.rows.joined)
 
+    @cached_property
+    def known(self) -> Prior:
+        """The prior, which knows what groups have data."""
+        return replace(self.prior, seen=tuple(np.unique(self.rows.group)))
+
+    @cached_property
+    def of_group(self) -> list[np.ndarray]:
+        """Rows of every group."""
+        return [np.flatnonzero(self.rows.group == g) for g in range(self.groups)]
+
     def per_group(self, x: np.ndarray) -> np.ndarray:
         """Sum [R, ...] over the rows of every group."""
-        total = np.zeros((self.groups, *x.shape[1:]))
-        np.add.at(total, self.rows.group, x)
-        return total
+        return np.stack([x[rows].sum(0) for rows in self.of_group])
 
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Residual [R, m] and its derivatives by log θ [R, m, 5] and φ [R, m, Q] at one point."""
+    """Residual [R, m] and its derivatives by log θ and φ [5 + Q, R, m] at one point."""
 
     residual: np.ndarray
-    by_theta: np.ndarray
-    by_phi: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def by_theta(self) -> np.ndarray:
+        """Derivatives by log θ [R, m, 5]."""
+        return np.moveaxis(self.jacobian[:5], 0, -1)
+
+    @property
+    def by_phi(self) -> np.ndarray:
+        """Derivatives by φ [R, m, Q]."""
+        return np.moveaxis(self.jacobian[5:], 0, -1)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """log θ [G, 5], values [Q], cost, and the linearisation there."""
+    """log θ [G, 5], values [Q], cost, the linearisation there, and how θ follows φ [G, 5, Q] (times −1)."""
 
     model: Model
     theta: np.ndarray
     values: np.ndarray
     cost: float
     linear: Linear
-    reduced_gradient: np.ndarray
     reduced_hessian: np.ndarray
     prior: Prior
     row_group: np.ndarray
@@ -152,19 +180,15 @@ def differences(parameters: tuple[Parameter, ...], values: np.ndarray) -> np.nda
 def linearise(task: Task, model: Model, theta: np.ndarray, values: np.ndarray) -> Linear:
     """Return the residual and its derivatives by forward differences."""
     count = model.entries.size
-    step = differences(model.parameters, values)
+    step = np.append(np.full(5, STEP), differences(model.parameters, values))
     many = np.repeat(theta[None], 6 + count, axis=0)
     shared = np.repeat(values[None], 6 + count, axis=0)
     for i in range(5):
         many[1 + i, :, i] += STEP
     for i in range(count):
-        shared[6 + i, i] += step[i]
+        shared[6 + i, i] += step[5 + i]
     residual = task.residual(task.errors(many, model, shared))
-    change = residual[1:] - residual[0]
-    change[:5] /= STEP
-    change[5:] /= step[:, None, None]
-    moved = np.moveaxis(change, 0, -1)
-    return Linear(residual[0], moved[..., :5], moved[..., 5:])
+    return Linear(residual[0], (residual[1:] - residual[0]) / step[:, None, None])
 
 
 def prior_of(model: Model) -> np.ndarray:
@@ -174,135 +198,93 @@ def prior_of(model: Model) -> np.ndarray:
     return np.concatenate([np.full(t.size, t.smoothness**-2.0 if t.smoothness else 0.0) for t in model.terms])
 
 
-def equations(task: Task, model: Model, theta: np.ndarray, values: np.ndarray, linear: Linear) -> tuple[Any, ...]:
-    """Return per group gradient [G, 5], matrix [G, 5, 5], cross [G, 5, Q], and of φ gradient [G, Q], matrix."""
-    w = task.counts[:, None, None]
-    jt, jp, r = linear.by_theta * w, linear.by_phi, linear.residual
-    gradient = task.per_group(np.einsum("rmi,rm->ri", jt, r))
-    matrix = task.per_group(np.einsum("rmi,rmj->rij", jt, linear.by_theta))
-    cross = task.per_group(np.einsum("rmi,rmq->riq", jt, jp))
+def equations(task: Task, theta: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
+    """Return every group's gradient [G, 5 + Q] and matrix [G, 5 + Q, 5 + Q], with the prior of θ in them."""
+    gradient, matrix = _sums(task, linear)
     weight = task.prior.width**-2.0
-    gradient += weight * (theta - task.prior.centre)
-    matrix += np.diag(weight)
-    phi_gradient = task.per_group(np.einsum("rmq,rm->rq", jp * w, r))
-    phi_matrix = task.per_group(np.einsum("rmq,rms->rqs", jp * w, jp))
-    return gradient, matrix, cross, phi_gradient, phi_matrix
+    gradient[:, :5] += weight * (theta - task.prior.centre)
+    matrix[:, :5, :5] += np.diag(weight)
+    return gradient, matrix
+
+
+def _sums(task: Task, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
+    """Return Jᵀr [G, N] and JᵀJ [G, N, N] over the rows of every group."""
+    count = len(linear.jacobian)
+    gradient, matrix = np.zeros((task.groups, count)), np.zeros((task.groups, count, count))
+    for group, rows in enumerate(task.of_group):
+        j = linear.jacobian[:, rows].reshape(count, -1)
+        gradient[group], matrix[group] = j @ linear.residual[rows].reshape(-1), j @ j.T
+    return gradient, matrix
 
 
 def cost_of(task: Task, theta: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return the cost of every copy and group [C, G]: squared residuals and the prior."""
-    square = (residual**2).sum(-1) * task.counts
-    total = np.stack([task.per_group(x) for x in square])
-    return total + (((theta - task.prior.centre) / task.prior.width) ** 2).sum(-1)
+    known = (((theta - task.prior.centre) / task.prior.width) ** 2).sum(-1)
+    return np.asarray(task.per_group((residual**2).sum(-1).T).T + known)
+
+
+class _Nested:
+    """A task and a model as the solver sees them: log θ of every group is its own, φ is shared."""
+
+    def __init__(self, task: Task, model: Model) -> None:
+        self.task, self.model = task, model
+        self.prior = task.known
+        self.stiffness = torch.from_numpy(prior_of(model))
+        of_phi = np.array([(p.low, p.high, _longest(p)) for p in model.parameters]).reshape(-1, 3)
+        of_theta = np.column_stack((BOUNDS, np.full(5, LONGEST)))
+        self.boxes = Box(*torch.from_numpy(of_theta.T)), Box(*torch.from_numpy(of_phi.T))
+        self.at: tuple[Tensor, Tensor, Linear] | None = None
+
+    def costs(self, own: Tensor, shared: Tensor) -> Tensor:
+        """Return the sums of squared residuals [C, G]."""
+        residual = self.task.residual(self.task.errors(own.numpy(), self.model, shared.numpy()))
+        return torch.from_numpy(self.task.per_group((residual**2).sum(-1).T)).T
+
+    def normal(self, own: Tensor, shared: Tensor) -> Normal:
+        """Return the normal equations of one copy."""
+        linear = self.linear(own, shared)
+        gradient, matrix = _sums(self.task, linear)
+        cost = self.task.per_group((linear.residual**2).sum(-1))
+        return Normal(*(torch.from_numpy(x[None]) for x in (cost, gradient, matrix)))
+
+    def linear(self, own: Tensor, shared: Tensor) -> Linear:
+        """Return the linearisation of one copy; the last one is kept."""
+        if self.at is None or not (torch.equal(self.at[0], own) and torch.equal(self.at[1], shared)):
+            self.at = own, shared, linearise(self.task, self.model, own[0].numpy(), shared[0].numpy())
+        return self.at[2]
+
+
+def _longest(p: Parameter) -> float:
+    """Return the longest step of an entry of φ in one iteration."""
+    if p.role == "place":
+        return 200.0 if p.unit == "m" else 20.0
+    return 0.5 * (p.high - p.low)
 
 
 def solve(
-    task: Task, model: Model, theta: np.ndarray, values: np.ndarray, *, iterations: int = 12, tolerance: float = 2e-4,
-    on_step: Callable[[], None] | None = None,
-) -> Solution:  # fmt: skip
+    task: Task, model: Model, theta: np.ndarray, values: np.ndarray, *, iterations: int = 12, tolerance: float = 2e-4
+) -> Solution:
     """Minimise over θ of every group and φ, from log θ [G, 5] and values [Q]."""
-    low, high = (np.array([getattr(p, side) for p in model.parameters]) for side in ("low", "high"))
-    ridge = prior_of(model)
-    task = centred(task, theta)
-    linear = linearise(task, model, theta, values)
-    now = cost_of(task, theta[None], linear.residual[None])[0]
-    total = now.sum() + (ridge * values**2).sum()
-    # Every group has a damping of its own, or one that refuses its step would wait for ever while others improve.
-    damping = np.full(task.groups, 1e-3)
-    shared_damping = 1e-3
-    seen = np.isin(np.arange(task.groups), task.rows.group)
-    for _ in range(iterations):
-        if on_step is not None:
-            on_step()
-        step_theta, step_phi, alone = _step(
-            task, model, theta, values, linear, damping, shared_damping, low, high, ridge
-        )  # fmt: skip
-        sizes = np.array([1.0, 0.4, 0.1]) if len(values) else np.zeros(0)
-        trial_values = np.clip(values + sizes[:, None] * step_phi, low, high)
-        trial_theta = theta + sizes[:, None, None] * step_theta
-        # The last trial leaves φ where it is, and every group decides for itself.
-        trial_theta = np.clip(np.concatenate([trial_theta, (theta + alone)[None]]), BOUNDS[:, 0], BOUNDS[:, 1])
-        trial_values = np.concatenate([trial_values, values[None]])
-        residual = task.residual(task.errors(trial_theta, model, trial_values))
-        costs = cost_of(task, trial_theta, residual)
-        sums = costs.sum(1) + (ridge * trial_values**2).sum(1)
-        keep = costs[-1] < now
-        sums[-1] = np.where(keep, costs[-1], now).sum() + (ridge * values**2).sum()
-        best = int(sums.argmin())
-        gain = float(total - sums[best])
-        damping = np.where(keep, 0.3 * damping, np.minimum(10.0 * damping, 1e6))
-        if best == len(sums) - 1:
-            theta = np.where(keep[:, None], trial_theta[-1], theta)
-            shared_damping *= 10.0
-        elif gain > 0:
-            theta, values = trial_theta[best], trial_values[best]
-            shared_damping *= 0.3 if best == 0 else 1.0
-        if gain > 0:
-            task = centred(task, theta)
-            linear = linearise(task, model, theta, values)
-            now = cost_of(task, theta[None], linear.residual[None])[0]
-            total = now.sum() + (ridge * values**2).sum()
-        # Candidates start where every driver of the null has arrived: they need not wait for each.
-        waiting = not len(values) and (~keep & seen & (damping < 1.0)).any()
-        if gain <= tolerance * total and not waiting and (not len(values) or shared_damping > 1e-2 or gain > 0):
-            break
-    return finish(task, model, theta, values, linear, float(total))
-
-
-def _step(
-    task: Task, model: Model, theta: np.ndarray, values: np.ndarray, linear: Linear, damping: np.ndarray,
-    shared_damping: float, low: np.ndarray, high: np.ndarray, ridge: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    gradient, matrix, cross, phi_gradient, phi_matrix = equations(task, model, theta, values, linear)
-    out = ((theta <= BOUNDS[:, 0] + 1e-9) & (gradient > 0)) | ((theta >= BOUNDS[:, 1] - 1e-9) & (gradient < 0))
-    free = ~out
-    matrix = matrix * free[:, :, None] * free[:, None, :]
-    diagonal = np.einsum("gii->gi", matrix)
-    matrix = matrix + np.einsum("gi,ij->gij", np.where(free, damping[:, None] * diagonal + 1e-9, 1.0), np.eye(5))
-    gradient, cross = gradient * free, cross * free[:, :, None]
-    alone = -np.linalg.solve(matrix, gradient[..., None])[..., 0]
-    if not len(values):
-        alone = np.clip(alone, -LONGEST, LONGEST)
-        return alone, np.zeros(0), alone
-    follow = np.linalg.solve(matrix, cross)
-    s = phi_gradient.sum(0) + ridge * values - np.einsum("giq,gi->q", follow, gradient)
-    big = (phi_matrix - np.einsum("giq,gis->gqs", cross, follow)).sum(0) + np.diag(ridge)
-    active = ~(((values <= low) & (s > 0)) | ((values >= high) & (s < 0)))
-    scale = np.maximum(np.diag(big), 1e-12)
-    big = big * active[:, None] * active[None, :] + np.diag(np.where(active, shared_damping * scale, 1.0) + 1e-12)
-    step = -np.linalg.solve(big, s * active)
-    most = np.array([
-        200.0 if p.role == "place" and p.unit == "m" else 20.0 if p.role == "place" else 0.5 * (h - lo)
-        for p, lo, h in zip(model.parameters, low, high, strict=True)
-    ])  # fmt: skip
-    step = np.clip(step, -most, most)
-    following = alone - np.einsum("giq,q->gi", follow, step)
-    return np.clip(following, -LONGEST, LONGEST), step, np.clip(alone, -LONGEST, LONGEST)
+    nested = _Nested(task, model)
+    begin = Progress.begin(torch.tensor(theta[None]), torch.tensor(values[None]), damping=1e-3)
+    found, now = minimise(nested, begin, iterations, tolerance=tolerance)
+    linear = nested.linear(found.own, found.shared)
+    own, shared = found.own[0].numpy(), found.shared[0].numpy()
+    cost = float(now.cost.sum()) + float((prior_of(model) * shared**2).sum())
+    return finish(task, model, own, shared, linear, cost)
 
 
 def finish(task: Task, model: Model, theta: np.ndarray, values: np.ndarray, linear: Linear, cost: float) -> Solution:
-    """Return the solution with φ's normal equations per group, θ eliminated."""
-    gradient, matrix, cross, phi_gradient, phi_matrix = equations(task, model, theta, values, linear)
-    follow = np.linalg.solve(matrix + 1e-9 * np.eye(5), cross)
-    s = phi_gradient - np.einsum("giq,gi->gq", follow, gradient)
-    big = phi_matrix - np.einsum("giq,gis->gqs", cross, follow)
-    return Solution(model, theta, values, cost, linear, s, big, task.prior, task.rows.group, follow)
-
-
-def centred(task: Task, theta: np.ndarray) -> Task:
-    """Return the task with the prior's centre at the drivers' mean, so that a shift of all of them costs nothing."""
-    seen = np.unique(task.rows.group)
-    if not task.prior.free or len(seen) < 5:
-        return task
-    return replace(task, prior=replace(task.prior, centre=theta[seen].mean(0)))
+    """Return the solution at a point: φ's matrix per group with θ eliminated, and the prior centred there."""
+    prior = task.known.following(torch.from_numpy(theta[None]))
+    _, matrix = equations(replace(task, prior=prior), theta, linear)
+    cross = matrix[:, :5, 5:]
+    follow = np.linalg.solve(matrix[:, :5, :5] + 1e-9 * np.eye(5), cross)
+    big = matrix[:, 5:, 5:] - np.einsum("giq,gis->gqs", cross, follow)
+    return Solution(model, theta, values, cost, linear, big, prior, task.rows.group, follow)
 
 
 def projected(solution: Solution) -> np.ndarray:
     """Return the response to φ [R, m, Q] after the drivers' own parameters have followed."""
     linear = solution.linear
     return linear.by_phi - np.einsum("rmi,riq->rmq", linear.by_theta, solution.follow[solution.row_group])
-
-
-def with_noise(task: Task, noise: Noise) -> Task:
-    """Return the task judged by another model of noise."""
-    return replace(task, noise=noise)

@@ -17,9 +17,9 @@ from idm_env.data import Episode
 from idm_env.effects import IDM, Brakes, CarFollowing, Replay
 from idm_env.fitting.adam import adam
 from idm_env.fitting.batch import Batch
-from idm_env.fitting.levenberg import Normal, Progress, minimise, normal
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.problem import Loss, Objective, Problem, group_of
+from idm_env.fitting.solver import Normal, Progress, minimise, normal
 from idm_env.fitting.uncertainty import Uncertainty, uncertainty
 from idm_env.progress import OnProgress
 from idm_env.roads import Lane
@@ -221,11 +221,7 @@ def _phase(
     on_progress: OnProgress | None,
 ) -> tuple[Progress, Normal]:  # fmt: skip
     found = saved.get(name)
-    if found is not None:
-        progress = Progress(**found)
-    else:
-        size = (own.shape[0], len(problem.groups))
-        progress = Progress(own, shared, torch.full(size, 1e-2, dtype=own.dtype), torch.zeros(size, dtype=torch.bool))
+    progress = Progress.begin(own, shared) if found is None else Progress(**found)
 
     def on_step(now: Progress, equations: Normal) -> None:
         saved.put(name, dataclasses.asdict(now))

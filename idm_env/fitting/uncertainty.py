@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from idm_env.fitting.batch import Batch
-from idm_env.fitting.levenberg import normal, row_equations, sum_groups
 from idm_env.fitting.problem import Problem
+from idm_env.fitting.solver import normal
 
 ENOUGH_ROWS = 10
 """From this many episodes in a group on, their spread itself gives the variance of the group's gradient."""
@@ -56,7 +56,7 @@ def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
     are of the interior: at a bound they say how flat the loss is, not how far the truth may lie. With a prior the
     covariance is that of the posterior around its mode, ``noise² H⁻¹`` with the prior in H.
     """
-    rows, row_weight = row_equations(problem, own[None], shared[None])
+    rows, row_weight = problem.row_normal(own[None], shared[None])
     with torch.no_grad():
         residual = problem.residual(problem.simulate(problem.rows(own, shared)))
     sample_weight = problem.weight.repeat(2, 1) if problem.objective == "both" else problem.weight
@@ -71,11 +71,11 @@ def uncertainty(problem: Problem, own: Tensor, shared: Tensor) -> Uncertainty:
     by_row = rows.hessian[0] * (row_weight[0] * variance * inflation)[:, None, None]
     spread = rows.gradient[0][:, :, None] * rows.gradient[0][:, None, :]
     many = per_group >= ENOUGH_ROWS
-    meat = torch.where(many[:, None, None], sum_groups(problem, spread[None])[0], sum_groups(problem, by_row[None])[0])
+    meat = torch.where(many[:, None, None], problem.sum_groups(spread[None])[0], problem.sum_groups(by_row[None])[0])
     if problem.prior is not None:
         covariance = problem.prior.noise**2 * _inverse(normal(problem, own[None], shared[None]).hessian[0])
     else:
-        bread = _inverse(sum_groups(problem, rows.hessian)[0])
+        bread = _inverse(problem.sum_groups(rows.hessian)[0])
         drift = integration_error(problem, own, shared)
         covariance = bread @ meat @ bread + drift[:, :, None] * drift[:, None, :]
     if problem.shared and groups > 1:

@@ -19,8 +19,8 @@ from scipy.stats import norm, qmc
 from idm_env.data import Episode
 from idm_env.data import Record as Recorded
 from idm_env.fitting.fit import fit
-from idm_env.fitting.levenberg import normal
 from idm_env.fitting.prior import Prior
+from idm_env.fitting.solver import normal
 from idm_env.prediction.lanes import Route
 from idm_env.prediction.rollout import DT, Ahead, Drivers, bend_speed
 from idm_env.prediction.shares import STANDING_MPS

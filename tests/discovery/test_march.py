@@ -65,7 +65,7 @@ def simulated(records: Records, model: Model, values: np.ndarray) -> np.ndarray:
 
 def twin(records: Records, model: Model, values: np.ndarray) -> np.ndarray:
     rows = whole(records)
-    task = Task(rows, None, first_prior(), np.ones(len(rows)))
+    task = Task(rows, None, first_prior())
     theta = np.tile(THETA, (1, task.groups, 1))
     return task.predict(theta, Frozen(model, values), np.zeros((1, 0)))[0][0]
 
@@ -124,7 +124,7 @@ def test_windows_share_their_winding_up(platoon: Records) -> None:
     model, values = Model((terms.simple("memory"), terms.simple("delay"))), np.array([[0.7, 40.0, 0.46]])
 
     def ends(some: Rows) -> np.ndarray:
-        task = Task(some, None, first_prior(), np.ones(len(some)))
+        task = Task(some, None, first_prior())
         return task.predict(np.tile(THETA, (1, task.groups, 1)), model, values)[0][0]
 
     together = ends(rows)

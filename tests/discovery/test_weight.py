@@ -18,7 +18,7 @@ def fitted(seconds: float, ou: float, spread: float, seed: int = 5) -> tuple[Rec
     made, _ = synthetic.generate(seed, runs=10, followers=2, seconds=seconds, ou=ou, spread=spread)
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
-    task = Task(rows, first_noise(rows), first_prior(), np.ones(len(rows)))
+    task = Task(rows, first_noise(rows), first_prior())
     null = solve(task, Model(), np.tile(first_prior().centre, (task.groups, 1)), np.zeros(0))
     seen = null.theta[np.unique(records.group)]
     return records, replace(null, prior=replace(first_prior(), centre=np.median(seen, axis=0), width=np.full(5, 0.3)))

@@ -16,8 +16,8 @@ from idm_env.effects import IDM, Brakes, Replay, make
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import fit
-from idm_env.fitting.levenberg import normal
 from idm_env.fitting.problem import IDM_NAMES, Problem, group_of
+from idm_env.fitting.solver import normal
 from idm_env.fitting.uncertainty import effective_samples
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
@@ -63,6 +63,20 @@ def test_a_shared_effect_is_found_with_every_driver_of_its_own() -> None:
     after, _ = errors(found.problem, found.own, found.shared)
     assert after.gap_rmse.mean() < 0.5 * before.gap_rmse.mean()
     assert bool(found.converged.all())
+
+
+def test_shared_parameters_are_not_called_found_before_they_are() -> None:
+    """Two effects for the fleet, of which one is there, from far off: no stop on the way along a valley."""
+    trajectories, truth = synthetic.generate(
+        9, runs=6, followers=3, seconds=90.0, effect="leader_acceleration", strength="middle", noise=0.02
+    )
+    items = episodes(trajectories, max_gap=None, smooth=True)
+    simulator = Simulator(Lane(), (IDM(), Replay(), Brakes(), make("leader_acceleration"), make("asymmetry")))
+    shared = ("leader_acceleration.gain", "asymmetry.strength")
+    found = fit(items, loss="mse", simulator=simulator, shared=shared, substeps=1)
+    assert found.shared.tolist() == pytest.approx([truth.effects["leader_acceleration"], 0.0], abs=0.02)
+    assert bool(found.converged.all())
+    assert errors(found.problem, found.own, found.shared)[0].gap_rmse.mean() < 0.05
 
 
 def test_what_has_converged_cannot_be_improved_by_starting_there_again() -> None:

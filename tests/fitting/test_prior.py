@@ -9,8 +9,8 @@ from idm_env.data import Episodes
 from idm_env.data.synthetic import Truth
 from idm_env.fitting.batch import part
 from idm_env.fitting.fit import fit
-from idm_env.fitting.levenberg import normal
 from idm_env.fitting.prior import Prior
+from idm_env.fitting.solver import normal
 
 CENTRE = (1.6, 2.0, 1.3, 2.0, 30.0)
 
