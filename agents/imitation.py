@@ -33,8 +33,9 @@ from agents.common import Policy
 from agents.environments import task_of
 from agents.monitor import make_logger
 from idm_env.data import Episode, Trajectories, episodes, load
+from idm_env.data.episode import windows
 from idm_env.effects import Control
-from idm_env.fitting.batch import Batch, windows
+from idm_env.fitting.batch import Batch
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import base_simulator, fit
 from idm_env.fitting.problem import group_of

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import overload
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, overload
 
 import numpy as np
 
-from idm_env.data.errors import Repair
+from idm_env.data.errors import DataError, Repair
 from idm_env.data.records import Record
 
 
@@ -57,6 +57,25 @@ class Episode:
         """Duration in s."""
         return len(self) * self.dt
 
+    @property
+    def driver(self) -> Record:
+        """The driver's own record."""
+        accel = np.gradient(self.speed_mps, self.dt)
+        return Record(self.position_m, self.speed_mps, accel, self.length_m, np.ones(len(self), dtype=bool))
+
+    def part(self, begin: int, end: int) -> Episode:
+        """Return the samples [begin, end), under the same key."""
+
+        def cut(value: Any) -> Any:
+            if isinstance(value, np.ndarray):
+                return value[begin:end]
+            if isinstance(value, Record):
+                return replace(value, **{f.name: cut(getattr(value, f.name)) for f in fields(value)})
+            return value
+
+        columns = {name: cut(column) for name, column in self.columns.items()}
+        return replace(self, **{f.name: cut(getattr(self, f.name)) for f in fields(self)} | {"columns": columns})
+
 
 @dataclass(frozen=True, eq=False)
 class Episodes(Sequence[Episode]):
@@ -79,3 +98,27 @@ class Episodes(Sequence[Episode]):
         if isinstance(index, slice):
             return Episodes(self.items[index], self.left_out)
         return self.items[index]
+
+
+def windows(episodes: Iterable[Episode], seconds: float, shortest: float = 20.0) -> list[Episode]:
+    """Cut long episodes into windows of ``seconds``; each starts from its own measured state.
+
+    A rest shorter than ``shortest`` (s) stays with the window before it.
+    """
+    cut = []
+    for episode in episodes:
+        size = round(seconds / episode.dt)
+        begins = list(range(0, max(len(episode) - round(shortest / episode.dt), 1), size))
+        cut += [episode.part(*ends) for ends in zip(begins, [*begins[1:], len(episode)], strict=True)]
+    return cut
+
+
+def time_step(episodes: Sequence[Episode]) -> float:
+    """Return the time step (s) of all episodes. DataError if there is none, or if they differ in it."""
+    if not episodes:
+        raise DataError("no episode of a driver behind a leader is left. Loosen the split or the shortest length.")
+    first = episodes[0]
+    odd = next((e for e in episodes if abs(e.dt - first.dt) > 1e-3 * first.dt), None)
+    if odd is not None:
+        raise DataError(f"episodes {first.key} and {odd.key} have steps of {first.dt:g} and {odd.dt:g} s. Give one dt.")
+    return first.dt

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from idm_env.data.episode import windows
 from idm_env.discovery.records import Records
 from idm_env.discovery.solve import BOUNDS, NAMES
-from idm_env.fitting.batch import windows
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import fit
 from idm_env.progress import OnProgress, silent

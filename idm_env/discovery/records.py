@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from idm_env.data import DataError, Episode, Trajectories
+from idm_env.data.episode import time_step
 from idm_env.data.records import Record
 from idm_env.discovery import march as twin
+from idm_env.fitting.problem import group_of
 
 WINDOW_S = 5.0
 """Horizon of a prediction: long enough for every effect to show, short enough for drivers' noise not to add up."""
@@ -73,20 +75,6 @@ class Records:
         )
 
 
-def labels(episodes: Sequence[Episode], by: str) -> list[str]:
-    """Return each episode's group: its driver, ``all``, or a column that is constant over an episode."""
-    if by == "driver":
-        return [f"{e.run_id}/{e.vehicle_id}" for e in episodes]
-    if by == "all":
-        return ["all"] * len(episodes)
-    if by in ("run_id", "vehicle_id", "leader_id"):
-        return [str(getattr(e, by)) for e in episodes]
-    known = sorted(set.intersection(*(set(e.labels) for e in episodes)))
-    if by not in known:
-        raise DataError(f"by = {by!r} is no column that is constant for a driver; use driver, all or one of {known}.")
-    return [e.labels[by] for e in episodes]
-
-
 def gather(
     episodes: Sequence[Episode], by: str = "driver", period: float = 0.0, trajectories: Trajectories | None = None
 ) -> Records:
@@ -94,14 +82,8 @@ def gather(
 
     ``trajectories`` tell how fast drivers went before their episodes began.
     """
-    if not episodes:
-        raise DataError("no episode of a driver behind a leader is left; loosen the split or give longer tracks.")
-    dt = episodes[0].dt
-    odd = next((e for e in episodes if abs(e.dt - dt) > 1e-3 * dt), None)
-    if odd is not None:
-        raise DataError(f"episodes {episodes[0].key} and {odd.key} have steps of {dt:g} and {odd.dt:g} s; give one dt.")
-    names = labels(episodes, by)
-    groups = tuple(dict.fromkeys(names))
+    dt = time_step(episodes)
+    group, groups = group_of(episodes, by)
     runs = tuple(dict.fromkeys(e.run_id for e in episodes))
     before = _histories(episodes, trajectories)
     pieces = [_with_history(_signals(e, period), h, dt) for e, h in zip(episodes, before, strict=True)]
@@ -113,7 +95,7 @@ def gather(
         bounds=bounds,
         first=bounds[:-1] + np.array([len(h) for h in before]),
         length=np.array([e.length_m for e in episodes]),
-        group=np.array([groups.index(n) for n in names]),
+        group=group.numpy(),
         groups=groups,
         run=np.array([runs.index(e.run_id) for e in episodes]),
         runs=runs,
@@ -128,13 +110,12 @@ def _signals(e: Episode, period: float) -> np.ndarray:
     place = e.place_m
     if period > 0.0:
         place = np.unwrap(place, period=period)
-    accel = np.gradient(e.speed_mps, e.dt)
     columns = [
         rear(e.leader), e.leader.speed_mps, e.leader.accel_mps2,
         rear(e.second_leader), e.second_leader.speed_mps, e.second_leader.accel_mps2, e.second_leader.present,
         e.behind.position_m, e.behind.speed_mps, e.behind.accel_mps2, e.behind.present,
         e.adjacent.position_m - e.position_m, e.adjacent.speed_mps, e.adjacent.present,
-        e.position_m, e.speed_mps, accel, e.time_s, place,
+        e.position_m, e.speed_mps, e.driver.accel_mps2, e.time_s, place,
     ]  # fmt: skip
     assert len(columns) == len(twin.COLUMNS)
     return np.stack([np.asarray(c, float) for c in columns], axis=1)

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.data import DataError, Episode, Record
+from idm_env.data import DataError, Episode
+from idm_env.data.episode import time_step
 from idm_env.simulator import Simulator
 from idm_env.types import Adjacent, Inputs, Params, State
 from idm_env.types import Record as Replayed
@@ -58,14 +59,7 @@ class Batch:
         ``substeps`` None takes as many as ``INTEGRATION_STEP_S`` asks for.
         """
         items = tuple(episodes)
-        if not items:
-            raise DataError("no episode of a driver behind a leader is left. Loosen the split or the shortest length.")
-        dt = items[0].dt
-        odd = next((e for e in items if abs(e.dt - dt) > 1e-3 * dt), None)
-        if odd is not None:
-            raise DataError(
-                f"episodes {items[0].key} and {odd.key} have steps of {dt:g} and {odd.dt:g} s. Give one dt."
-            )
+        dt = time_step(items)
         steps = max(len(e) for e in items)
 
         def stack(columns: Sequence[np.ndarray]) -> Tensor:
@@ -74,10 +68,14 @@ class Batch:
 
         fine = substeps or max(1, math.ceil(dt / INTEGRATION_STEP_S - 1e-6))
 
-        def four(field: str) -> Tensor:
-            return torch.stack([stack([_column(e, name, field) for e in items]) for name in COLUMNS], dim=-1)
+        records = [[getattr(e, name) for name in COLUMNS] for e in items]
 
-        position, speed = four("position_m"), four("speed_mps")
+        def four(field: str) -> Tensor:
+            return torch.stack([stack([getattr(r[i], field) for r in records]) for i in range(4)], dim=-1)
+
+        # Everything is moved along with the driver, so that places are those of its own track at the start.
+        moved = torch.as_tensor([float(e.place_m[0] - e.position_m[0]) for e in items], dtype=dtype)
+        position, speed = four("position_m") + moved[:, None], four("speed_mps")
 
         return cls(
             episodes=items,
@@ -89,7 +87,7 @@ class Batch:
             all_speed=_between(speed, fine),
             accel=_between(four("accel_mps2"), fine),
             present=_held(four("present"), fine),
-            length=torch.as_tensor([[_length(e, name) for name in COLUMNS] for e in items], dtype=dtype),
+            length=torch.as_tensor([[r.length_m for r in four] for four in records], dtype=dtype),
             first_step=torch.as_tensor([round(float(e.time_s[0]) / dt * fine) for e in items]),
             beside=(
                 _between(stack([e.adjacent.position_m - e.position_m for e in items]), fine),
@@ -212,66 +210,3 @@ def _between_positions(position: Tensor, speed: Tensor, dt: float, substeps: int
     plain = a + s * (b - a)
     fine = torch.where((b - a - 0.5 * (u + v)).abs() < 0.5, cubic, plain)
     return torch.cat((fine.flatten(0, 1), position[-1:]))
-
-
-def _record(episode: Episode, name: str) -> Record | None:
-    return None if name == "driver" else getattr(episode, name)
-
-
-def _column(episode: Episode, name: str, field: str) -> np.ndarray:
-    record = _record(episode, name)
-    if field == "position_m":
-        # Everything is moved along with the driver, so that places are those of its own track at the start.
-        moved = float(episode.place_m[0] - episode.position_m[0])
-        return (episode.position_m if record is None else record.position_m) + moved
-    if record is not None:
-        return np.asarray(getattr(record, field), dtype=float)
-    if field == "speed_mps":
-        return episode.speed_mps
-    if field == "accel_mps2":
-        return np.gradient(episode.speed_mps, episode.dt)
-    return np.ones(len(episode))
-
-
-def _length(episode: Episode, name: str) -> float:
-    record = _record(episode, name)
-    return episode.length_m if record is None else record.length_m
-
-
-def windows(episodes: Iterable[Episode], seconds: float, shortest: float = 20.0) -> list[Episode]:
-    """Cut long episodes into windows of ``seconds``; each starts from its own measured state.
-
-    A rest shorter than ``shortest`` (s) stays with the window before it.
-    """
-    cut = []
-    for episode in episodes:
-        size = round(seconds / episode.dt)
-        begins = list(range(0, max(len(episode) - round(shortest / episode.dt), 1), size))
-        for number, begin in enumerate(begins):
-            end = len(episode) if number == len(begins) - 1 else begin + size
-            cut.append(part(episode, begin, end))
-    return cut
-
-
-def part(episode: Episode, begin: int, end: int) -> Episode:
-    """Return the samples [begin, end) of an episode, under the same key."""
-    at = slice(begin, end)
-
-    def cut(record: Record) -> Record:
-        return Record(
-            record.position_m[at], record.speed_mps[at], record.accel_mps2[at], record.length_m, record.present[at]
-        )
-
-    return dataclasses.replace(
-        episode,
-        time_s=episode.time_s[at],
-        position_m=episode.position_m[at],
-        speed_mps=episode.speed_mps[at],
-        gap_m=episode.gap_m[at],
-        place_m=episode.place_m[at],
-        columns={name: column[at] for name, column in episode.columns.items()},
-        leader=cut(episode.leader),
-        second_leader=cut(episode.second_leader),
-        behind=cut(episode.behind),
-        adjacent=cut(episode.adjacent),
-    )

@@ -15,10 +15,11 @@ from idm_env import keep
 from idm_env import report as page
 from idm_env.config import Model, Numbers, load_model, save_model
 from idm_env.data import LEADER_LOST_GAP_M, DataError, Episodes, Repair, Trajectories, episodes, load
+from idm_env.data.episode import windows
 from idm_env.data.fingerprint import fingerprints, fitted_on
 from idm_env.effects import Brakes, Effect, Replay, base_named
 from idm_env.fitting import drivers, pictures
-from idm_env.fitting.batch import Batch, windows
+from idm_env.fitting.batch import Batch
 from idm_env.fitting.evaluate import Errors, errors, own_for
 from idm_env.fitting.fit import Fit, Method, base_simulator, fit
 from idm_env.fitting.problem import Loss, Objective, Problem, Simulated, group_of

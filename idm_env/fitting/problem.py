@@ -320,6 +320,5 @@ def group_of(episodes: Sequence[Episode], by: str) -> tuple[Tensor, tuple[str, .
                 f"cannot group by '{by}': no such column that is constant for a driver.{nearest(by, known)}"
             )
         labels = [e.labels[by] for e in episodes]
-    names = tuple(dict.fromkeys(labels))
-    index = {name: i for i, name in enumerate(names)}
-    return torch.tensor([index[label] for label in labels]), names
+    number = {name: i for i, name in enumerate(dict.fromkeys(labels))}
+    return torch.tensor([number[label] for label in labels]), tuple(number)

@@ -10,7 +10,8 @@ import torch
 
 from agents import common, environments, imitation
 from idm_env.data import episodes, synthetic
-from idm_env.fitting.batch import Batch, windows
+from idm_env.data.episode import windows
+from idm_env.fitting.batch import Batch
 from idm_env.tasks import make_task
 
 FOLLOW = make_task("follow", max_command=4.0)

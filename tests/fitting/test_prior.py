@@ -7,7 +7,6 @@ import torch
 
 from idm_env.data import Episodes
 from idm_env.data.synthetic import Truth
-from idm_env.fitting.batch import part
 from idm_env.fitting.fit import fit
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.solver import normal
@@ -21,7 +20,7 @@ def prior_of(groups: int, noise: float, deviation: float = 0.3) -> Prior:
 
 
 def test_little_data_leave_the_prior_and_many_overrule_it(platoon: tuple[Episodes, Truth]) -> None:
-    short, long = [part(platoon[0][0], 0, 11)], [platoon[0][0]]
+    short, long = [platoon[0][0].part(0, 11)], [platoon[0][0]]
     given = prior_of(1, 1.0)
     second = fit(short, loss="mse", prior=given)
     assert torch.allclose(second.own, given.centre, rtol=0.05)
@@ -33,7 +32,7 @@ def test_little_data_leave_the_prior_and_many_overrule_it(platoon: tuple[Episode
 
 
 def test_the_mode_is_stationary_and_no_other_point_near_it_costs_less(platoon: tuple[Episodes, Truth]) -> None:
-    found = fit([part(platoon[0][1], 0, 300)], loss="mse", prior=prior_of(1, 0.5))
+    found = fit([platoon[0][1].part(0, 300)], loss="mse", prior=prior_of(1, 0.5))
     now = normal(found.problem, found.own[None], found.shared[None])
     scale = now.hessian[0].diagonal(dim1=-2, dim2=-1) * found.own
     assert (now.gradient[0].abs() < 1e-2 * scale).all()
@@ -47,12 +46,12 @@ def test_the_mode_is_stationary_and_no_other_point_near_it_costs_less(platoon: t
 def test_groups_have_priors_of_their_own(platoon: tuple[Episodes, Truth]) -> None:
     given = prior_of(2, 1.0)
     given.centre[1, 4] = 20.0
-    found = fit([part(e, 0, 5) for e in platoon[0][:2]], loss="mse", prior=given)
+    found = fit([e.part(0, 5) for e in platoon[0][:2]], loss="mse", prior=given)
     assert found.own[0, 4] > 25.0 > 21.0 > found.own[1, 4]
 
 
 def test_what_a_prior_cannot_be_is_named(platoon: tuple[Episodes, Truth]) -> None:
-    items = [part(platoon[0][0], 0, 20)]
+    items = [platoon[0][0].part(0, 20)]
     with pytest.raises(ValueError, match="loss = 'rmse' has none"):
         fit(items, loss="rmse", prior=prior_of(1, 1.0))
     with pytest.raises(ValueError, match="knows no prior"):

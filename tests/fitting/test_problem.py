@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from idm_env.data import DataError, Episodes
+from idm_env.data.episode import windows
 from idm_env.data.synthetic import Truth
 from idm_env.effects import IDM, Brakes, Replay, make
-from idm_env.fitting.batch import Batch, part, windows
+from idm_env.fitting.batch import Batch
 from idm_env.fitting.problem import IDM_NAMES, Problem, group_of
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
@@ -53,7 +54,7 @@ def test_jacobians_are_those_of_finite_differences(
     substeps: int
 ) -> None:  # fmt: skip
     """For IDM and for effects with memory, neighbours and lags, over 20 s."""
-    items = Episodes(tuple(part(e, 0, 200) for e in platoon[0][:2]), ())
+    items = Episodes(tuple(e.part(0, 200) for e in platoon[0][:2]), ())
     problem = problem_of(items, *effects, shared=shared, substeps=substeps, kernels=False, objective="both")
     own, common = start(problem)[None], torch.tensor([values], dtype=torch.float64)
     residual, jacobian = problem.linearise(own, common)
@@ -110,7 +111,7 @@ def test_a_corrected_model_is_compiled(
 ) -> None:
     """Normal equations of both paths, own and shared parameters, at two starts at once; memories start from both."""
     pytest.importorskip("numba")
-    items = Episodes(tuple(part(e, 0, 200) for e in platoon[0][:3]), ())
+    items = Episodes(tuple(e.part(0, 200) for e in platoon[0][:3]), ())
     slow = problem_of(items, *effects, shared=shared, substeps=2, objective="both", kernels=False)
     quick = dataclasses.replace(slow, kernels=True)
     assert quick._compiled is not None
@@ -124,7 +125,7 @@ def test_a_corrected_model_is_compiled(
 
 def test_a_batch_starts_measured_and_counts_only_what_was_measured(platoon: tuple[Episodes, Truth]) -> None:
     """Rows of different length: padding has no weight, and the record is met at every sample."""
-    items = Episodes((part(platoon[0][0], 0, 300), platoon[0][1]), ())
+    items = Episodes((platoon[0][0].part(0, 300), platoon[0][1]), ())
     batch = Batch.of(items, substeps=4)
     assert batch.valid.sum(0).tolist() == [300.0, float(len(items[1]))]
     assert batch.steps == (len(items[1]) - 1) * 4
