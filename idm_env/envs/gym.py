@@ -36,10 +36,11 @@ def asked_of_make() -> int | None:
     return getattr(frame.f_locals.get("env_spec"), LIMIT, None) if given is None else given
 
 
-class TrueSpec:
-    """Mixin: an environment whose ``spec`` says after how many steps its episodes are cut off."""
+class Face:
+    """Mixin: a ``spec`` that says after how many steps episodes are cut off, and what gradients go through."""
 
     task: Task
+    batch: Batch
     _spec: EnvSpec | None = None
 
     @property
@@ -51,8 +52,29 @@ class TrueSpec:
     def spec(self, spec: EnvSpec | None) -> None:
         self._spec = None if spec is None else dataclasses.replace(spec, max_episode_steps=self.task.horizon)
 
+    @property
+    def state(self) -> State:
+        """The state of the traffic, one row per environment."""
+        world = self.batch.world
+        if world is None:
+            raise RuntimeError("there is no state before reset. Call reset() first.")
+        return world.state
 
-class DiffIDMEnv(TrueSpec, gymnasium.Env):
+    @property
+    def params(self) -> Params:
+        """The parameters in force; assign tensors that require grad to differentiate with respect to them."""
+        return self.batch.params
+
+    @params.setter
+    def params(self, params: Params) -> None:
+        self.batch.set_params(params)
+
+    def detach(self) -> None:
+        """Cut the graph behind the present states, for truncated back-propagation."""
+        self.batch.detach()
+
+
+class DiffIDMEnv(Face, gymnasium.Env):
     """One environment: ``gym.make("DiffIDM-v0", task="ring", …)``.
 
     ``task`` is one of ``idm_env.tasks.TASKS``; its docstring defines the task, and its fields are further keywords,
@@ -123,29 +145,6 @@ class DiffIDMEnv(TrueSpec, gymnasium.Env):
     def _out(self, observation: Any) -> Any:
         flat = observation.reshape(-1)
         return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
-
-    # -- gradients -----------------------------------------------------------------------------------------------
-
-    @property
-    def state(self) -> State:
-        """The state of the traffic, a batch of one."""
-        world = self.batch.world
-        if world is None:
-            raise RuntimeError("there is no state before reset. Call reset() first.")
-        return world.state
-
-    @property
-    def params(self) -> Params:
-        """The parameters in force; assign tensors that require grad to differentiate with respect to them."""
-        return self.batch.params
-
-    @params.setter
-    def params(self, params: Params) -> None:
-        self.batch.set_params(params)
-
-    def detach(self) -> None:
-        """Cut the graph behind the present state, for truncated back-propagation."""
-        self.batch.detach()
 
     # -- pictures ------------------------------------------------------------------------------------------------
 

@@ -15,14 +15,13 @@ from torch import Tensor
 
 from idm_env.checks import shown, whole
 from idm_env.envs.batch import Batch, Outcome
-from idm_env.envs.gym import TrueSpec
+from idm_env.envs.gym import Face
 from idm_env.envs.info import Rows
 from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
 from idm_env.envs.spaces import action_box, action_of, observation_box
-from idm_env.types import Params, State
 
 
-class DiffIDMVectorEnv(TrueSpec, VectorEnv):
+class DiffIDMVectorEnv(Face, VectorEnv):
     """``num_envs`` environments in one batch; keywords as for ``DiffIDMEnv``.
 
     Environment i equals a single environment seeded with ``seed + i``. ``autoreset_mode`` is ``"SameStep"`` (the
@@ -182,29 +181,6 @@ class DiffIDMVectorEnv(TrueSpec, VectorEnv):
     def _out(self, observation: Any) -> Any:
         flat = observation.reshape(self.num_envs, -1)
         return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
-
-    # -- gradients -----------------------------------------------------------------------------------------------
-
-    @property
-    def state(self) -> State:
-        """The state of the traffic, one row per environment."""
-        world = self.batch.world
-        if world is None:
-            raise RuntimeError("there is no state before reset. Call reset() first.")
-        return world.state
-
-    @property
-    def params(self) -> Params:
-        """The parameters in force; assign tensors that require grad to differentiate with respect to them."""
-        return self.batch.params
-
-    @params.setter
-    def params(self, params: Params) -> None:
-        self.batch.set_params(params)
-
-    def detach(self) -> None:
-        """Cut the graph behind the present states, for truncated back-propagation."""
-        self.batch.detach()
 
     # -- pictures ------------------------------------------------------------------------------------------------
 
