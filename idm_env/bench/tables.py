@@ -9,8 +9,6 @@ from typing import Any
 from idm_env import report as page
 
 Rows = list[dict[str, Any]]
-BYTES = 4 * (3 + 6 + 4)
-"""What one step of one vehicle has to read (state, parameters) and write (state, acceleration) in float32."""
 RINGS = {
     "env_steps_per_s_at_8192": ("8192 rings at once", "environment steps per CPU second"),
     "env_steps_per_s_at_8192_ten_per_call": ("8192 rings, ten steps a call", "environment steps per CPU second"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,11 +107,3 @@ class Tally:
             row["speed_rmse_mps"] = (self.speed_square / self.compared) ** 0.5
             row["accel_rmse_mps2"] = (self.accel_error_square / self.compared) ** 0.5
         return row
-
-
-def tallied(motions: Sequence[Motion], data: Sequence[tuple[np.ndarray, np.ndarray]]) -> Tally:
-    """Return the tally of motions and their data (times, positions)."""
-    tally = Tally()
-    for motion, (time_s, position_m) in zip(motions, data, strict=True):
-        tally.add(motion, time_s, position_m)
-    return tally
