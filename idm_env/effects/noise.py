@@ -151,7 +151,7 @@ class PerceptionNoise(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         """σ, relative for the gap and in 1/s for the closing speed, and τ."""
         sigma = (
-            Parameter("sigma", "σ", "1", 0.05, 0.0, 1.0, null=0.0)
+            Parameter("sigma", "σ", "1", 0.05, 0.0, 0.5, null=0.0)
             if self.signal == "gap"
             else Parameter("sigma", "σ", "1/s", 0.01, 0.0, 0.5, null=0.0)
         )

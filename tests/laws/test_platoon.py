@@ -37,13 +37,12 @@ def quiet(simulator: Simulator, params: Params, steps: int = STEPS) -> Trajector
             all_rows + sway * often * torch.cos(often * time),
             first,
         ),
-        "noise": torch.randn(all_rows.shape, generator=torch.Generator().manual_seed(1), dtype=DTYPE),
         "control": Command(all_rows, first),
         "imagined": Imagined(all_rows + EQUILIBRIUM_GAP, all_rows),
         "lateral": Adjacent(all_rows + 5.0, all_rows + SPEED - 0.5, all_rows + 1.0),
     }
     inputs = {name: value for name, value in every.items() if name in simulator.by_name}
-    kept: Trajectory = simulator.rollout(begin, inputs, params, steps)[1]
+    kept: Trajectory = simulator.rollout(begin, inputs, params, steps, seed=1)[1]
     return kept
 
 
