@@ -35,7 +35,7 @@ def problem(simulator, dtype=torch.float64):
     every = {
         "control": Command(-ones, active),
         "replay": Record(position + 1.0, 10.0 * ones, 0.0 * ones, active),
-        "noise": 0.5 * ones,
+        **dict.fromkeys(simulator.draws, 0.5 * ones),
         "imagined": Imagined(20.0 * ones, 1.0 * ones),
         "lateral": Adjacent(8.0 * ones, 9.0 * ones, ones),
     }
