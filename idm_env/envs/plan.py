@@ -87,7 +87,7 @@ class Plan:
         self._slots = slots = world.state.memory[PAST].shape[-2] if kernel.signals else 0
         for held in arrays:
             held.setdefault("past", np.zeros((1, 1), self._real))
-        wide = tiles.NARROW if slots and size <= tiles.NARROW else tiles.width(size, 1)
+        wide = tiles.width(size, slots)
         around = tiles.halo(1, kernel.program.reach)
         self._small = rows * size < 2 * pool.GRAIN
         self._tiles = tiles.tiles(rows, size, wide, around)

@@ -6,8 +6,6 @@ The states within a block live only in the workspace of a tile, so that the tape
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-import numpy as np
-
 from idm_env.kernels.lane_loops import (
     CLOSE,
     FLAGS,
@@ -34,6 +32,7 @@ from idm_env.kernels.lane_loops import (
     STATE_ROWS,
     STATICS,
     fetch_next,
+    fetch_states,
     load_inputs,
     load_past,
     load_static,
@@ -42,19 +41,18 @@ from idm_env.kernels.lane_loops import (
     step,
     store_past,
 )  # fmt: skip
+from idm_env.kernels.memory import add, copy, fill, number
 from idm_env.kernels.phases import call
 from idm_env.kernels.tiles import (
     ROW,
-    add,
-    clear,
     exact,
     load,
     padded,
     place,
     send_ahead,
     send_back,
-    store,
     uniform,
+    workspace,
 )  # fmt: skip
 
 
@@ -70,7 +68,7 @@ def send(w, n, size, measures, sends, phase):
             last = hop == abs(shift) - 1
             target = sends[i, 3] if last else measures[SCRATCH] + (hop % 2) * ROW
             if not last:
-                clear(w, target, padded(n))
+                fill(w, target, 0, padded(n))
             if shift > 0:
                 send_ahead(w, target, source, n, size, ring)
             else:
@@ -87,7 +85,8 @@ def give_back(w, ah, n, signals, recalls, now):
             add(ah, ((now - int(w[ago])) * signals + signal) * ROW, w, on, n)
         else:
             for j in range(n):
-                ah[((now - int(w[ago + j])) * signals + signal) * ROW + j] += w[on + j]
+                back = int(number(w, ago + j, w))
+                ah[((now - back) * signals + signal) * ROW + j] += number(w, on + j, w)
 
 
 @exact
@@ -103,62 +102,55 @@ def step_back(w, h, ah, n, size, measures, phases, back, looks, recalls, sends, 
     if phases[SENSE]:
         give_back(w, ah, n, signals, recalls, now)
         for i in range(signals):
-            store(w, measures[ON_SIGNAL_ROWS] + i * ROW, ah, (now * signals + i) * ROW, n)
+            copy(w, measures[ON_SIGNAL_ROWS] + i * ROW, ah, (now * signals + i) * ROW, n)
         call(back[SENSE], w, m, k)  # type: ignore[call-arg]
         send(w, n, size, measures, sends, SENSE)
 
 
 @exact
 def recompute(
-    w, h, tape, taped, operands, flags, strides, k, begin_step, steps, slots, row, first, n, size, measures, phases,
-    looks, recalls,
+    w, h, tape, taped, operands, strides, k, begin_step, steps, slots, row, first, n, size, measures, phases, looks,
+    recalls,
 ):  # fmt: skip
     """Run a block once more and put what the adjoint reads on the tape of the tile."""
     for t in range(steps):
         for i in range(len(taped)):
-            store(tape, (t * len(taped) + i) * ROW, w, measures[STATE_ROWS] + taped[i] * ROW, n)
+            copy(tape, (t * len(taped) + i) * ROW, w, measures[STATE_ROWS] + taped[i] * ROW, n)
         # The last step's result is not needed, but what it senses is.
         if t + 1 < steps or phases[SENSE]:
             if measures[NUMBERS] + measures[FLAGS]:
-                load_inputs(w, operands, flags, strides, begin_step + t, row, first, n, size, measures)
+                load_inputs(w, operands, strides, begin_step + t, row, first, n, size, measures)
             step(w, h, n, size, measures, phases, looks, recalls, k, slots + t)
 
 
 @exact
-def seed(w, to, source, dense, row, first, n, size):
-    """Load an adjoint; an array of one element stands for zeros."""
-    if source.size == 1:
-        clear(w, to, n)
-        w[to] = source[0]
-    else:
-        load(w, to, source, 0, dense, row, first, n, size)
-
-
-@exact
-def add_seeds(w, seeds, t, dense, row, first, n, size, measures):
+def add_seeds(w, seeds, every, t, strides, row, first, n, size, measures, count):
     """Add the adjoints of what was kept of one step."""
     for i, target in enumerate((ON_POSITION, ON_SPEED, ON_ACCEL, ON_GAP)):
-        load(w, measures[SEEDED], seeds[i, t], 0, dense, row, first, n, size)
+        source = seeds + (i * every + t) * count * w.itemsize
+        load(w, measures[SEEDED], source, strides, len(strides) - 1, 0, row, first, n, size, False)
         add(w, measures[target], w, measures[SEEDED], n)
 
 
 @exact
 def backward(
-    start, past, slots, seeds, on_end, on_begin, on_past_end, on_past, on_parameters, fresh, on_inputs,
-    measures, phases, looks, recalls, back, sends, taped, again, operands, flags, strides, k,
+    start, past, alike, slots, seeds, every, on_end, on_strides, on_begin, on_past_end, on_past, on_parameters, fresh,
+    on_inputs, over, measures, phases, looks, recalls, back, sends, taped, again, operands, strides, k,
     begin_step, steps, rows, size, wide, around, begin, end,
 ):  # fmt: skip
     """Carry adjoints at the end of a block to its begin; store (``fresh``) or add what falls on the parameters.
 
-    ``seeds`` (4, time, vehicles; or no time) are the adjoints of position, speed, acceleration and gap of every step;
-    ``on_end`` and ``on_begin`` one array per moving state; ``on_inputs`` (inputs, time, vehicles; or no time).
+    Addresses as in ``forward``: ``seeds`` (4, ``every`` steps, vehicles) are the adjoints of position, speed,
+    acceleration and gap of every step, nothing where ``every`` is 0; ``on_end`` with its strides and ``on_begin`` are
+    those of moving states, 0 for zeros and for what is not wanted; ``on_parameters`` (parameters, vehicles);
+    ``on_inputs`` (inputs, ``over`` steps, vehicles).
     """
     signals = measures[SIGNALS]
-    w = np.zeros(measures[N_ROWS] * ROW + 64, k.dtype)
-    h = np.zeros(((slots + steps) * signals + 1) * ROW, k.dtype)
-    ah = np.zeros(((slots + steps) * signals + 1) * ROW, k.dtype)
-    tape = np.empty(len(taped) * steps * ROW, k.dtype)
-    dense, count, is_ring = strides[len(strides) - 1], rows * size, measures[IS_RING] != 0
+    w = workspace(measures[N_ROWS] * ROW, k)
+    h = workspace(((slots + steps) * signals + 1) * ROW, k)
+    ah = workspace(((slots + steps) * signals + 1) * ROW, k)
+    tape = workspace(len(taped) * steps * ROW, k)
+    dense, count, is_ring = len(strides) - 1, rows * size, measures[IS_RING] != 0
     many, has_inputs = measures[STATICS] + measures[PARAMETERS], measures[NUMBERS] + measures[FLAGS] > 0
     filled = 0
     for tile in range(begin, end):
@@ -166,43 +158,47 @@ def backward(
         at = row * size + first + skip
         if tile + 1 < end:
             following = place(tile + 1, rows, size, wide, around, is_ring)
-            fetch_next(start, operands, many, strides, following, size)
-            fetch_next(on_end, operands, 0, strides, following, size)
+            fetch_states(start, again, following, size, k)
+            fetch_next(operands, strides[:many], following, size, k)
+            fetch_next(on_end, on_strides, following, size, k)
         for i in again:
-            load(w, measures[STATE_ROWS] + i * ROW, start[i], 0, dense, row, first, n, size)
+            load(w, measures[STATE_ROWS] + i * ROW, start[i], strides, dense, 0, row, first, n, size, False)
         load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
         filled = max(filled, n)
-        load_past(h, past, 0, slots, signals, dense, row, first, n, size)
+        load_past(h, past, alike, 0, slots, signals, strides, row, first, n, size, count)
         if signals:
-            clear(ah, 0, len(ah))
-            load_past(ah, on_past_end, steps, slots, signals, dense, row, first, n, size)
+            fill(ah, 0, 0, len(ah))
+            load_past(ah, on_past_end, False, steps, slots, signals, strides, row, first, n, size, count)
         recompute(
-            w, h, tape, taped, operands, flags, strides, k, begin_step, steps, slots, row, first, n, size, measures,
-            phases, looks, recalls,
+            w, h, tape, taped, operands, strides, k, begin_step, steps, slots, row, first, n, size, measures, phases,
+            looks, recalls,
         )  # fmt: skip
         for i in range(measures[MOVING]):
-            seed(w, measures[ON_ROWS] + i * ROW, on_end[i], dense, row, first, n, size)
-        clear(w, measures[GRADIENT_ROWS], (measures[PARAMETERS] + measures[HOISTS]) * ROW)
+            if on_end[i]:
+                load(w, measures[ON_ROWS] + i * ROW, on_end[i], on_strides, i, 0, row, first, n, size, False)
+            else:
+                fill(w, measures[ON_ROWS] + i * ROW, 0, n)
+        fill(w, measures[GRADIENT_ROWS], 0, (measures[PARAMETERS] + measures[HOISTS]) * ROW)
         for t in range(steps - 1, -1, -1):
             now = begin_step + t
-            if seeds.shape[1]:
-                add_seeds(w, seeds, now, dense, row, first, n, size, measures)
+            if every:
+                add_seeds(w, seeds, every, now, strides, row, first, n, size, measures, count)
             for i in range(len(taped)):
-                store(w, measures[STATE_ROWS] + taped[i] * ROW, tape, (t * len(taped) + i) * ROW, n)
+                copy(w, measures[STATE_ROWS] + taped[i] * ROW, tape, (t * len(taped) + i) * ROW, n)
             if has_inputs:
-                load_inputs(w, operands, flags, strides, now, row, first, n, size, measures)
+                load_inputs(w, operands, strides, now, row, first, n, size, measures)
             step_back(w, h, ah, n, size, measures, phases, back, looks, recalls, sends, k, slots + t)
-            if on_inputs.shape[1]:
+            if over:
                 for i in range(measures[NUMBERS]):
-                    store(on_inputs[i, now], at, w, measures[ON_INPUT_ROWS] + i * ROW + skip, own)
+                    copy(on_inputs, (i * over + now) * count + at, w, measures[ON_INPUT_ROWS] + i * ROW + skip, own)
         if back[HOIST]:
             call(back[HOIST], w, padded(n), k)  # type: ignore[call-arg]
         for i in range(measures[MOVING]):
-            if on_begin[i].size == count:
-                store(on_begin[i], at, w, measures[ON_ROWS] + i * ROW + skip, own)
-        store_past(ah, on_past, slots - 1, slots, signals, at, skip, own)
+            if on_begin[i]:
+                copy(on_begin[i], at, w, measures[ON_ROWS] + i * ROW + skip, own)
+        store_past(ah, on_past, slots - 1, slots, signals, at, skip, own, count)
         for i in range(measures[PARAMETERS]):
             if fresh:
-                store(on_parameters[i], at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)
+                copy(on_parameters, i * count + at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)
             else:
-                add(on_parameters[i], at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)
+                add(on_parameters, i * count + at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)

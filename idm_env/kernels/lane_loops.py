@@ -8,10 +8,8 @@ states within a block live only in the workspace of a tile, so that the tape is 
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-import numpy as np
-
+from idm_env.kernels.memory import copy, number, prefetch
 from idm_env.kernels.phases import call
-from idm_env.kernels.prefetch import prefetch
 from idm_env.kernels.tiles import (
     ROW,
     exact,
@@ -21,8 +19,8 @@ from idm_env.kernels.tiles import (
     padded,
     place,
     repeats,
-    store,
     uniform,
+    workspace,
 )
 
 (
@@ -43,23 +41,20 @@ BEFORE = 0
 def load_static(w, operands, strides, row, first, n, size, again, measures, phases, looks, k):
     """Load what holds for the rollout; ``again`` says that a tile of at least this size filled this workspace."""
     for i in range(measures[STATICS] + measures[PARAMETERS]):
-        if not (again and repeats(strides[i], n, size)):
-            load(w, measures[STATIC_ROWS] + i * ROW, operands[i], 0, strides[i], row, first, n, size)
+        if not (again and repeats(strides, i, n, size)):
+            load(w, measures[STATIC_ROWS] + i * ROW, operands[i], strides, i, 0, row, first, n, size, False)
     if phases[HOIST]:
         call(phases[HOIST], w, padded(n), k)  # type: ignore[call-arg]
     look(w, n, size, measures, looks, BEFORE)
 
 
 @exact
-def load_inputs(w, operands, flags, strides, t, row, first, n, size, measures):
+def load_inputs(w, operands, strides, t, row, first, n, size, measures):
     """Load the inputs of step ``t``: numbers, then truth values."""
-    o = measures[STATICS] + measures[PARAMETERS]
-    numbers = measures[NUMBERS]
-    for i in range(numbers):
-        load(w, measures[INPUT_ROWS] + i * ROW, operands[o + i], t, strides[o + i], row, first, n, size)
-    for i in range(measures[FLAGS]):
-        at = numbers + i
-        load(w, measures[INPUT_ROWS] + at * ROW, flags[i], t, strides[o + at], row, first, n, size)
+    o, numbers = measures[STATICS] + measures[PARAMETERS], measures[NUMBERS]
+    for i in range(numbers + measures[FLAGS]):
+        to = measures[INPUT_ROWS] + i * ROW
+        load(w, to, operands[o + i], strides, o + i, t, row, first, n, size, i >= numbers)
 
 
 @exact
@@ -79,17 +74,18 @@ def fetch(w, h, n, signals, recalls, now):
     for i in range(recalls.shape[0]):
         ago, signal, to = recalls[i, 0], recalls[i, 1], recalls[i, 2]
         if uniform(w, ago, n):
-            store(w, to, h, ((now - int(w[ago])) * signals + signal) * ROW, n)
+            copy(w, to, h, ((now - int(w[ago])) * signals + signal) * ROW, n)
         else:
             for j in range(n):
-                w[to + j] = h[((now - int(w[ago + j])) * signals + signal) * ROW + j]
+                back = int(number(w, ago + j, w))
+                w[to + j] = number(h, ((now - back) * signals + signal) * ROW + j, w)
 
 
 @exact
 def remember(w, h, n, signals, signal_rows, now):
     """Put the signals of this step into the past."""
     for i in range(signals):
-        store(h, (now * signals + i) * ROW, w, signal_rows + i * ROW, n)
+        copy(h, (now * signals + i) * ROW, w, signal_rows + i * ROW, n)
 
 
 @exact
@@ -117,70 +113,85 @@ def step(w, h, n, size, measures, phases, looks, recalls, k, now):
 
 
 @exact
-def load_past(h, past, begin, slots, signals, dense, row, first, n, size):
-    """Fill the past of a tile; slot 0 is the newest, at place ``begin + slots − 1``. One slot may stand for all."""
+def load_past(h, past, alike, begin, slots, signals, strides, row, first, n, size, count):
+    """Fill the past of a tile from an address; slot 0 is the newest, at place ``begin + slots − 1``.
+
+    ``alike`` says that one slot stands for all.
+    """
+    dense = len(strides) - 1
     for s in range(slots):
         for i in range(signals):
-            to = ((begin + slots - 1 - s) * signals + i) * ROW
-            load(h, to, past[(s * signals + i) % past.shape[0]], 0, dense, row, first, n, size)
+            source = past + (i if alike else s * signals + i) * count * h.itemsize
+            load(
+                h, ((begin + slots - 1 - s) * signals + i) * ROW, source, strides, dense, 0, row, first, n, size, False
+            )
 
 
 @exact
-def store_past(h, past, newest, slots, signals, at, skip, own):
+def store_past(h, past, newest, slots, signals, at, skip, own, count):
     """Store the last steps of a tile's past; ``newest`` is the place of slot 0."""
     for s in range(slots):
         for i in range(signals):
-            store(past[s * signals + i], at, h, ((newest - s) * signals + i) * ROW + skip, own)
+            copy(past, (s * signals + i) * count + at, h, ((newest - s) * signals + i) * ROW + skip, own)
 
 
 @exact
-def fetch_next(arrays, operands, many, strides, placed, size):
-    """Start fetching the state and the dense parameters of the next tile."""
+def fetch_next(sources, strides, placed, size, like):
+    """Start fetching the dense ones of some arrays, as many as there are strides, for the next tile."""
     row, first, n, _, _ = placed
-    begin = row * size + first
-    for i in range(len(arrays)):
-        prefetch(arrays[i], begin, n)
-    for i in range(many):
-        if strides[i][2] == 1 and strides[i][1] == size:
-            prefetch(operands[i], begin, n)
+    for i in range(len(strides)):
+        if sources[i] and strides[i, 2] == 1 and strides[i, 1] == size:
+            prefetch(sources[i], row * size + first, n, like)
+
+
+@exact
+def fetch_states(states, which, placed, size, like):
+    """Start fetching some of the states for the next tile."""
+    row, first, n, _, _ = placed
+    for i in which:
+        prefetch(states[i], row * size + first, n, like)
 
 
 @exact
 def forward(
-    start, ends, past, past_end, slots, kept, measures, phases, looks, recalls, read, operands, flags, strides, k,
-    begin_step, steps, rows, size, wide, around, begin, end,
+    start, ends, past, alike, past_end, slots, kept, every, measures, phases, looks, recalls, read, operands, strides,
+    k, begin_step, steps, rows, size, wide, around, begin, end,
 ):  # fmt: skip
     """Run tiles ``begin`` to ``end`` through a block of steps.
 
-    ``start`` and ``ends`` are the states, one array each (of one element where it is not wanted); ``past`` (slots ·
-    signals, vehicles); ``kept`` (4, time, vehicles) may have no time at all.
+    What belongs to the caller are addresses (``memory``): ``start`` and ``ends`` of the states, 0 for one that is not
+    wanted; ``past`` (slots · signals, vehicles; of one slot where all are ``alike``) and ``past_end``; ``kept``
+    (4, ``every`` steps, vehicles), nothing where ``every`` is 0; ``operands`` with their ``strides``, of which the last
+    are those of a dense array: statics, parameters, inputs, truth values among these.
     """
-    w = np.zeros(measures[N_ROWS] * ROW + 64, k.dtype)
+    w = workspace(measures[N_ROWS] * ROW, k)
     signals = measures[SIGNALS]
-    h = np.zeros(((slots + steps) * signals + 1) * ROW, k.dtype)
-    dense, count, is_ring = strides[len(strides) - 1], rows * size, measures[IS_RING] != 0
+    h = workspace(((slots + steps) * signals + 1) * ROW, k)
+    dense, count, is_ring = len(strides) - 1, rows * size, measures[IS_RING] != 0
     many, has_inputs = measures[STATICS] + measures[PARAMETERS], measures[NUMBERS] + measures[FLAGS] > 0
     filled = 0
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
         if tile + 1 < end:
-            fetch_next(start, operands, many, strides, place(tile + 1, rows, size, wide, around, is_ring), size)
+            following = place(tile + 1, rows, size, wide, around, is_ring)
+            fetch_states(start, read, following, size, k)
+            fetch_next(operands, strides[:many], following, size, k)
         for i in read:
-            load(w, measures[STATE_ROWS] + i * ROW, start[i], 0, dense, row, first, n, size)
-        load_past(h, past, 0, slots, signals, dense, row, first, n, size)
+            load(w, measures[STATE_ROWS] + i * ROW, start[i], strides, dense, 0, row, first, n, size, False)
+        load_past(h, past, alike, 0, slots, signals, strides, row, first, n, size, count)
         load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
         filled = max(filled, n)
         at = row * size + first + skip
         for t in range(begin_step, begin_step + steps):
             if has_inputs:
-                load_inputs(w, operands, flags, strides, t, row, first, n, size, measures)
+                load_inputs(w, operands, strides, t, row, first, n, size, measures)
             step(w, h, n, size, measures, phases, looks, recalls, k, slots + t - begin_step)
-            if kept.shape[1]:
-                store(kept[0, t], at, w, measures[POSITION] + skip, own)
-                store(kept[1, t], at, w, measures[SPEED] + skip, own)
-                store(kept[2, t], at, w, measures[ACCEL] + skip, own)
-                store(kept[3, t], at, w, measures[GAP] + skip, own)
+            if every:
+                copy(kept, t * count + at, w, measures[POSITION] + skip, own)
+                copy(kept, (every + t) * count + at, w, measures[SPEED] + skip, own)
+                copy(kept, (2 * every + t) * count + at, w, measures[ACCEL] + skip, own)
+                copy(kept, (3 * every + t) * count + at, w, measures[GAP] + skip, own)
         for i in range(measures[STATES]):
-            if ends[i].size == count:
-                store(ends[i], at, w, measures[STATE_ROWS] + i * ROW + skip, own)
-        store_past(h, past_end, slots + steps - 1, slots, signals, at, skip, own)
+            if ends[i]:
+                copy(ends[i], at, w, measures[STATE_ROWS] + i * ROW + skip, own)
+        store_past(h, past_end, slots + steps - 1, slots, signals, at, skip, own, count)

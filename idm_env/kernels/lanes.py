@@ -20,7 +20,8 @@ from idm_env.history import PAST
 from idm_env.instead import off
 from idm_env.kernels import lane_adjoint, lane_loops, tiles
 from idm_env.kernels import threads as pool
-from idm_env.kernels.operands import FLAGS, OPERANDS, STATES, Strides, dense, filled, operand, reduced, table
+from idm_env.kernels.memory import addresses
+from idm_env.kernels.operands import dense, operand, reduced, table
 from idm_env.kernels.printed import TileKernel
 from idm_env.kernels.tiles import Array
 from idm_env.kernels.workspace import take
@@ -49,7 +50,6 @@ class _Plan:
     keep: bool
     tape: bool
     operands: tuple[Array, ...]
-    flags: tuple[Array, ...]
     strides: Array
     threads: int | None
 
@@ -70,9 +70,9 @@ class _Plan:
         return np.dtype(np.float32 if self.state.speed.dtype == torch.float32 else np.float64)
 
     @cached_property
-    def nothing(self) -> Array:
-        """An array that stands for one that is not wanted."""
-        return np.zeros(1, self.kind)
+    def places(self) -> Array:
+        """Addresses of the operands."""
+        return addresses(self.operands)
 
     @cached_property
     def slots(self) -> int:
@@ -86,10 +86,10 @@ class _Plan:
     def run(self, loop: Any, first: int, steps: int, *arguments: Any) -> None:
         """Call a compiled loop over all tiles, on one thread or several."""
         size = self.shape[-1]
-        wide = tiles.NARROW if self.kernel.signals and size <= tiles.NARROW else tiles.width(size, steps)
+        wide = tiles.width(size, self.slots)
         around = tiles.halo(steps, self.kernel.program.reach)
         given = (
-            *arguments, self.operands, self.flags, self.strides, self.kernel.constants[self.kind.name],
+            *arguments, self.places, self.strides, self.kernel.constants[self.kind.name],
             first, steps, self.rows, size, wide, around,
         )  # fmt: skip
         pool.split(
@@ -116,8 +116,6 @@ class _Plan:
     def past(self, filled: bool = False) -> Array:
         """Return an array for the past: (slots · signals, vehicles)."""
         shape = (self.slots * self.kernel.signals, self.count)
-        if not shape[0]:
-            return np.zeros((1, 1), self.kind)
         return np.zeros(shape, self.kind) if filled else take(shape, self.kind)
 
 
@@ -160,10 +158,13 @@ def starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
     return found
 
 
-def past_rows(past: Tensor, shape: tuple[int, ...]) -> Array:
-    """Return the past as (slots · signals, vehicles), newest first; (signals, vehicles) where all slots are one."""
+def past_rows(past: Tensor, shape: tuple[int, ...], *, every: bool = False) -> Array:
+    """Return the past as (slots · signals, vehicles), newest first.
+
+    Where all slots are one and not ``every`` is asked for, it is (signals, vehicles).
+    """
     full = past.detach().expand(*shape, *past.shape[-2:]).movedim((-2, -1), (0, 1))
-    if full.stride(0) == 0:
+    if full.stride(0) == 0 and not every:
         full = full[:1]
     return full.reshape(full.shape[0] * full.shape[1], -1).contiguous().numpy()
 
@@ -183,16 +184,13 @@ def _plan(
     numbers = [part_of(inputs, n) for n in kernel.numbers]
     kind = state.speed.dtype
     made = [operand(x.to(kind), batch, size) for x in given]
-    made += [operand(x, batch, size, steps) for x in numbers]
-    flags = [operand(part_of(inputs, n), batch, size, steps) for n in kernel.flags]
-    nothing: tuple[Array, Strides] = (np.zeros(1, np.float32 if kind == torch.float32 else np.float64), (0, 0, 0))
-    strides = table([*(s for _, s in made), *(s for _, s in flags), (0, size, 1)])
+    made += [operand(x, batch, size, steps) for x in (*numbers, *(part_of(inputs, n) for n in kernel.flags))]
+    strides = table([*(s for _, s in made), (0, size, 1)])
     differentiated = _differentiated(program.moving, state, given[len(program.statics) :], numbers, kernel.signals)
     tape = torch.is_grad_enabled() and any(x.requires_grad for x in differentiated)
     plan = _Plan(
         kernel, simulator, state, inputs, params, steps, min(block, steps), keep, tape,
-        filled([a for a, _ in made] or [nothing[0]], OPERANDS), filled([a for a, _ in flags], FLAGS), strides,
-        threads,
+        tuple(a for a, _ in made), strides, threads,
     )  # fmt: skip
     return plan, differentiated
 
@@ -204,27 +202,33 @@ def _differentiated(
     return [*starts(state, moving), *([state.memory[PAST]] if signals else []), *parameters, *numbers]
 
 
-def _forward(plan: _Plan, start: list[Array], past: Array) -> tuple[list[Array], Array, Array, list[Any]]:
+def _forward(
+    plan: _Plan, start: list[Array], past: Array
+) -> tuple[list[Array | None], Array, Array, list[tuple[list[Array | None], Array]]]:
     """Return the last states, the last past, what is kept of every step, and the tape: states at every block."""
-    program = plan.kernel.program
+    states = range(len(plan.kernel.program.states))
     kept = take((4, plan.steps if plan.keep else 0, plan.count), plan.kind)
     blocks = plan.blocks()
-    tape: list[Any] = []
+    tape: list[tuple[list[Array | None], Array]] = []
     again, read = set(plan.kernel.again), set(plan.kernel.read)
-    now, before = start, past
-    spare: list[list[Array]] = []
+    now: list[Array | None] = [*start]
+    before = past
+    spare: list[list[Array | None]] = []
     for number, (first, steps) in enumerate(blocks):
         last = number == len(blocks) - 1
         if plan.tape:
-            tape.append(([x if i in again else plan.nothing for i, x in enumerate(now)], before))
+            tape.append(([x if i in again else None for i, x in enumerate(now)], before))
         if len(spare) > 1 and not plan.tape and not last:
             ends = spare[number % 2]
         else:
-            wanted = range(len(program.states)) if last else read
-            ends = [take((plan.count,), plan.kind) if i in wanted else plan.nothing for i in range(len(program.states))]
+            ends = [take((plan.count,), plan.kind) if last or i in read else None for i in states]
             spare.append(ends)
         after = plan.past()
-        plan.forward(first, steps, filled(now, STATES), filled(ends, STATES), before, after, plan.slots, kept)
+        alike = len(before) == plan.kernel.signals
+        plan.forward(
+            first, steps, addresses(now), addresses(ends), before.ctypes.data, alike, after.ctypes.data, plan.slots,
+            kept.ctypes.data, plan.steps if plan.keep else 0,
+        )  # fmt: skip
         now, before = ends, after
     return now, before, kept, tape
 
@@ -239,7 +243,7 @@ class _Rollout(torch.autograd.Function):
         ctx.plan, ctx.tape = plan, tape
         ctx.save_for_backward(*sources)
         ctx.set_materialize_grads(False)
-        out = [torch.from_numpy(x).view(plan.shape) for x in ends]
+        out = [torch.from_numpy(x).view(plan.shape) for x in ends if x is not None]
         if plan.slots:
             out.append(past_tensor(after, plan.slots, plan.shape))
         if plan.keep:
@@ -265,35 +269,37 @@ def _backward(
     states, moving = len(program.states), len(program.moving)
     begin_of = moving + bool(plan.slots)
     parameters = len(program.parameters)
-    on: list[Array] = [plan.nothing if s is None else dense(s, plan.shape) for s in seeds[:moving]]
+    *batch, size = plan.shape
+    given = [(None, (0, 0, 0)) if s is None else operand(s, batch, size) for s in seeds[:moving]]
+    on: list[Array | None] = [array for array, _ in given]
+    strides = table([s for _, s in given])
     on_past = plan.past(filled=True)
     if plan.slots and seeds[states] is not None:
-        on_past = past_rows(seeds[states], plan.shape)  # type: ignore[arg-type]
+        on_past = past_rows(seeds[states], plan.shape, every=True)  # type: ignore[arg-type]
     every = seeds[states + bool(plan.slots) :]
-    seeded = any(s is not None for s in every)
-    along = take((4, plan.steps if seeded else 0, plan.count), plan.kind)
+    seeded = plan.steps if any(s is not None for s in every) else 0
+    along = take((4, seeded, plan.count), plan.kind)
     for j, seed in enumerate(every if seeded else ()):
         along[j] = 0 if seed is None else dense(seed, (plan.steps, *plan.shape)).reshape(plan.steps, plan.count)
-    wants_inputs = any(needed[begin_of + parameters :])
-    on_inputs = take((len(kernel.numbers), plan.steps if wants_inputs else 0, plan.count), plan.kind)
+    over = plan.steps if any(needed[begin_of + parameters :]) else 0
+    on_inputs = take((len(kernel.numbers), over, plan.count), plan.kind)
     on_parameters = take((parameters, plan.count), plan.kind)
     blocks = plan.blocks()
     for number in range(len(blocks) - 1, -1, -1):
         first, steps = blocks[number]
         start, past = tape[number]
         # What nobody asks for is not written: half the time of a short rollout goes to memory.
-        begin = [
-            take((plan.count,), plan.kind) if number or wanted else plan.nothing for wanted in needed[:moving]
-        ]  # fmt: skip
+        begin = [take((plan.count,), plan.kind) if number or wanted else None for wanted in needed[:moving]]
         before = plan.past()
         plan.backward(
-            first, steps, filled(start, STATES), past, plan.slots, along, filled(on, STATES), filled(begin, STATES),
-            on_past, before, on_parameters, number == len(blocks) - 1, on_inputs,
+            first, steps, addresses(start), past.ctypes.data, len(past) == kernel.signals, plan.slots,
+            along.ctypes.data, seeded, addresses(on), strides, addresses(begin), on_past.ctypes.data,
+            before.ctypes.data, on_parameters.ctypes.data, number == len(blocks) - 1, on_inputs.ctypes.data, over,
         )  # fmt: skip
-        on, on_past = begin, before
+        on, on_past, strides = begin, before, table([(0, size, 1)] * moving)
     full = [*on, *([on_past] if plan.slots else []), *on_parameters, *on_inputs]
     return [
-        _gradient(plan, i, gradient, like, begin_of, parameters) if wanted else None
+        _gradient(plan, i, gradient, like, begin_of, parameters) if wanted and gradient is not None else None
         for i, (gradient, like, wanted) in enumerate(zip(full, saved, needed, strict=True))
     ]
 

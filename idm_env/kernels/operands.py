@@ -70,19 +70,6 @@ def reduced(gradient: Array, full: Sequence[int], like: Tensor) -> Tensor:
     return torch.from_numpy(gradient).view(*full).sum_to_size(like.shape)
 
 
-def filled(arrays: Sequence[Array], multiple: int) -> tuple[Array, ...]:
-    """Return arrays as a tuple of a length that is a multiple, filled up with an array of one element.
-
-    A compiled loop is compiled again for every length of a tuple: so there are few.
-    """
-    missing = -len(arrays) % multiple or (0 if arrays else multiple)
-    return (*arrays, *([np.zeros(1, arrays[0].dtype if arrays else np.uint8)] * missing))
-
-
-STATES, OPERANDS, FLAGS = 8, 32, 4
-"""Multiples to which the tuples of states, of operands and of truth values are filled up."""
-
-
 def table(strides: Sequence[Strides]) -> np.ndarray[Any, np.dtype[np.int64]]:
     """Return strides as the array that compiled loops read."""
-    return np.array(strides, dtype=np.int64)
+    return np.array(strides, np.int64).reshape(-1, 3)

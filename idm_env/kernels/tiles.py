@@ -19,8 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 from numpy.typing import NDArray
 
+from idm_env.kernels.memory import LINE, add, copy, copy_truth, fill, number
 from idm_env.scalar import library
 
 Array = NDArray[Any]
@@ -63,15 +65,15 @@ TILE = 1024
 """Most vehicles per tile: some forty rows of 4 kB and the states of a time block stay in the second-level cache."""
 
 NARROW = 256
-"""Vehicles per tile where a block has few steps: then the rows in use should stay in the first-level cache."""
+"""Vehicles per tile where a past is kept, which has hundreds of rows: they should stay in the second-level cache."""
 
 ROW = TILE + 16
 """Distance of two rows: not a power of two, or all rows would compete for the same cache sets."""
 
 
-def width(size: int, steps: int) -> int:
-    """Return how many vehicles a tile should hold."""
-    return NARROW if steps <= 2 and (size <= NARROW or size > TILE) else TILE
+def width(size: int, slots: int) -> int:
+    """Return how many vehicles a tile should hold, where batch rows have ``size`` and the past ``slots`` steps."""
+    return NARROW if slots and size <= NARROW else TILE
 
 
 def halo(steps: int, reach: int) -> int:
@@ -111,7 +113,7 @@ def place(tile, rows, size, wide, around, is_ring):
 def look_ahead(w, to, source, n, size, is_ring):
     """Fill row ``to`` with each leader's value; whoever has no leader gets what he will not read."""
     w[to] = w[source]
-    _copy(w[to + 1 :], w[source:], padded(n) - 1)
+    copy(w, to + 1, w, source, n - 1)
     if is_ring and n >= size:
         for j in range(0, n, size):
             w[to + j] = w[source + j + size - 1]
@@ -120,7 +122,7 @@ def look_ahead(w, to, source, n, size, is_ring):
 @exact
 def look_back(w, to, source, n, size, is_ring):
     """Fill row ``to`` with each follower's value; whoever has no follower gets what he will not read."""
-    _copy(w[to:], w[source + 1 :], padded(n))
+    copy(w, to, w, source + 1, n - 1)
     w[to + n - 1] = w[source + n - 1]
     if is_ring and n >= size:
         for j in range(0, n, size):
@@ -128,19 +130,13 @@ def look_back(w, to, source, n, size, is_ring):
 
 
 @exact
-def _add(target, source, n):
-    for j in range(n):
-        target[j] += source[j]
-
-
-@exact
 def send_ahead(w, to, source, n, size, is_ring):
     """Add to row ``to`` what each follower sends to his leader: adjoint of looking ahead."""
     if not (is_ring and n >= size):
-        _add(w[to:], w[source + 1 :], n - 1)
+        add(w, to, w, source + 1, n - 1)
         return
     for j in range(0, n, size):
-        _add(w[to + j :], w[source + j + 1 :], size - 1)
+        add(w, to + j, w, source + j + 1, size - 1)
         w[to + j + size - 1] += w[source + j]
 
 
@@ -148,10 +144,10 @@ def send_ahead(w, to, source, n, size, is_ring):
 def send_back(w, to, source, n, size, is_ring):
     """Add to row ``to`` what each leader sends to his follower: adjoint of looking back."""
     if not (is_ring and n >= size):
-        _add(w[to + 1 :], w[source:], n - 1)
+        add(w, to + 1, w, source, n - 1)
         return
     for j in range(0, n, size):
-        _add(w[to + j + 1 :], w[source + j :], size - 1)
+        add(w, to + j + 1, w, source + j, size - 1)
         w[to + j] += w[source + j + size - 1]
 
 
@@ -168,77 +164,63 @@ def padded(n):
 
 
 @exact
-def _copy(target, source, n):
-    # Slices that begin at 0: an index of unknown sign would be wrapped round at run time, and nothing vectorises.
-    for j in range(n):
-        target[j] = source[j]
+def workspace(size, like):
+    """Return zeros that begin on a cache line: a vector of 64 bytes that straddles two costs two accesses."""
+    made = np.zeros(size + LINE, like.dtype)
+    skip = -(made.ctypes.data // like.itemsize) % (LINE // like.itemsize)
+    return made[skip : skip + size]
 
 
 @exact
-def _fill(target, value, n):
-    for j in range(n):
-        target[j] = value
+def _fetch(w, to, source, at, n, truth):
+    if truth:
+        copy_truth(w, to, source, at, n)
+    else:
+        copy(w, to, source, at, n)
 
 
 @exact
-def load(w, to, source, t, stride, row, first, n, size):
-    """Fill a workspace row from a batch whose strides by step, row and vehicle are ``stride``; ``t`` is the step."""
-    by_row, by_vehicle = stride[1], stride[2]
-    base = t * stride[0] + row * by_row
-    if by_row == 0 and by_vehicle == 0:
-        _fill(w[to:], source[base], n)
+def load(w, to, source, strides, which, t, row, first, n, size, truth):
+    """Fill a workspace row from an address, whose strides by step, row and vehicle are ``strides[which]``.
+
+    ``t`` is the step; ``truth`` says that truth values are there, a byte each.
+    """
+    by_row, by_vehicle = strides[which, 1], strides[which, 2]
+    base = t * strides[which, 0] + row * by_row
+    if by_vehicle == 0 and (by_row == 0 or n <= size):
+        _fetch(w, to, source, base, 1, truth)
+        fill(w, to, w[to], n)
     elif n > size or (first == 0 and n == size):
         if by_row == size and by_vehicle == 1:
-            _copy(w[to:], source[base:], n)
+            _fetch(w, to, source, base, n, truth)
             return
         for left in range(0, n, size):
             if by_vehicle == 0:
-                _fill(w[to + left :], source[base], size)
+                _fetch(w, to + left, source, base, 1, truth)
+                fill(w, to + left, w[to + left], size)
             else:
-                _copy(w[to + left :], source[base:], size)
+                _fetch(w, to + left, source, base, size, truth)
             base += by_row
-    elif by_vehicle == 0:
-        _fill(w[to:], source[base], n)
     else:
         # A piece of one row, which may reach round a ring at either end.
         low, high = max(0, -first), min(n, size - first)
         if low > 0:
-            _copy(w[to:], source[base + size + first :], low)
-        _copy(w[to + low :], source[base + first + low :], high - low)
+            _fetch(w, to, source, base + size + first, low, truth)
+        _fetch(w, to + low, source, base + first + low, high - low, truth)
         if high < n:
-            _copy(w[to + high :], source[base + first + high - size :], n - high)
+            _fetch(w, to + high, source, base + first + high - size, n - high, truth)
 
 
 @exact
-def repeats(stride, n, size):
+def repeats(strides, which, n, size):
     """Whether every tile holds the same values: whole rows, and all rows alike."""
-    return stride[1] == 0 and (n >= size or stride[2] == 0)
+    return strides[which, 1] == 0 and (n >= size or strides[which, 2] == 0)
 
 
 @exact
 def uniform(w, row, n):
     """Whether all values of a workspace row are the same."""
-    values, others = w[row:], 0
-    first = values[0]
+    others, first = 0, w[row]
     for j in range(n):
-        others += values[j] != first
+        others += number(w, row + j, w) != first
     return others == 0
-
-
-@exact
-def store(target, base, w, row, n):
-    """Copy ``n`` values from index ``row`` of the workspace."""
-    _copy(target[base:], w[row:], n)
-
-
-@exact
-def add(target, base, w, row, n):
-    """Add ``n`` values from index ``row`` of the workspace."""
-    _add(target[base:], w[row:], n)
-
-
-@exact
-def clear(w, row, n):
-    """Zero ``n`` values of the workspace."""
-    for j in range(n):
-        w[row + j] = 0

@@ -14,8 +14,8 @@ import numpy as np
 
 from idm_env.kernels.tiles import Array
 
-SMALLEST = 1 << 20
-"""Bytes below which an allocator reuses memory well enough by itself."""
+SMALLEST = 1 << 17
+"""Bytes below which an allocator reuses memory by itself: larger arrays may go back to the system when freed."""
 
 MOST = 24
 """Arrays that are kept for another use."""
