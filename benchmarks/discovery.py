@@ -33,6 +33,7 @@ TRUE = {
     "speed_time_gap": ("slope", 1.0), "set_point_asymmetry": ("strength", 1.0), "relaxation": ("strength", 1.0),
     "follower": ("gain", 1.0), "dead_zone": ("threshold", 1.0), "action_point": ("threshold", 1.0),
     "speed_zone": ("factor", 1.0), "regime_shift": ("strength", 1.0), "lateral": ("gain", 1.0),
+    "curve_speed": ("lateral_accel", 1.0),
     # The driver goes by the true gap, which is the measured one less the bias.
     "gap_bias": ("bias", -1.0),
 }  # fmt: skip
@@ -155,6 +156,15 @@ def oracle(found: Any, truth: Any) -> float | None:
             distance = float(np.ptp(place)) / (count - 1)
             term = terms.unknown_profile("grade", first, distance, count, 0.0)
             values += hidden.slope(first + distance * np.arange(count), strength).tolist()
+        elif name == "speed_profile":
+            place = found.records.signals[:, 18]
+            first, count = float(place.min()), 60
+            distance = float(np.ptp(place)) / (count - 1)
+            term = terms.unknown_profile("speed_profile", first, distance, count, 0.0)
+            values += (hidden.dips(first + distance * np.arange(count), strength) - 1.0).tolist()
+        elif name == "curve_speed":
+            term = terms.given_profile(found.final.model.catalogue.by_name[name])
+            model, values = terms.Model(model.terms, found.final.model.catalogue), [*values, strength]
         elif name == "speed_zone":
             term = terms.placed("speed_zone", strength, *hidden.ZONE_M)
             values += [strength, *hidden.ZONE_M]

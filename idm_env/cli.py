@@ -185,6 +185,7 @@ def explain(
         typer.Option(help="Candidates, by comma: names, or my_file.py:MyEffect; default: the whole catalogue."),
     ] = None,
     known: Annotated[str | None, typer.Option(help="Effects whose values are in the file, such as grade.")] = None,
+    base: Base = None,
     seed: Seed = 0,
     ring_length: RingLength = None,
     place: Place = None,
@@ -192,7 +193,7 @@ def explain(
     where: Where = None,
     resume: Resume = False,
 ) -> None:
-    """Fit IDM, find the residual, trace it to the effect that the model lacks, add it, and report before and after.
+    """Fit a law, find the residual, trace it to the effect that the model lacks, add it, and report before and after.
 
     Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
     """
@@ -207,7 +208,7 @@ def explain(
         trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
         if where is not None:
             trajectories = trajectories.where(where)
-        result, models = _explain(report, trajectories, out, by, names, given, seed, resume)
+        result, models = _explain(report, trajectories, out, by, names, given, seed, resume, base or "idm")
     _explained(result, models, out)
 
 
@@ -220,6 +221,7 @@ def _explain(
     known: tuple[str, ...] = (),
     seed: int = 0,
     resume: bool = False,
+    base: str = "idm",
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Write the report, and return it with the names of the models compared."""
     import json
@@ -228,8 +230,9 @@ def _explain(
 
     _work_begins()
     found = discover(
-        trajectories, by=by, effects=effects, known=known, out=out, resume=resume, seed=seed, on_progress=report
-    )
+        trajectories, by=by, effects=effects, known=known, out=out, resume=resume, seed=seed, base=base,
+        on_progress=report,
+    )  # fmt: skip
     report("writing the report", 0, 0, "")
     write_report(found, out)
     result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
@@ -237,7 +240,7 @@ def _explain(
 
 
 def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
-    from idm_env.discovery.words import ERRORS, ceilings, weight
+    from idm_env.discovery.words import ERRORS, ceilings, laws, weight
     from idm_env.report import account
 
     console.print(f"Verdict: [bold]{result['verdict'].replace('_', ' ')}[/bold]. ", end="")
@@ -254,6 +257,8 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
     if before is not None:
         told = ceilings(result["ceilings"], before["gap_rmse_m"])
         console.print(f"What could be explained at all: {told}", style="dim", highlight=False)
+    if result["bases"]:
+        console.print(laws(result["bases"]), soft_wrap=True, highlight=False)
     files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
     best = ", which predicts best" if len(files) > 1 else ""
     console.print(

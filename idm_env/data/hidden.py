@@ -18,6 +18,9 @@ SHIFT_TIME_S = 100.0
 REFERENCE_SPEED = 20.0
 SIGN_WIDTH = 0.3
 RELAXATION_TIME_S = 15.0
+DIPS_M = (500.0, 1000.0, 1400.0, 2000.0, 2600.0)
+BENDS_PER_M = {400.0: 1 / 80, 900.0: -1 / 120, 1500.0: 1 / 60, 2100.0: -1 / 90, 2700.0: 1 / 70}
+"""Where bends are, and their curvature, to the left positive."""
 PRESSURE_CAP = 4.0
 REACH_M = 25.0
 
@@ -53,6 +56,8 @@ EFFECTS: dict[str, Strength] = {
     "speed_time_gap": Strength("k", -0.4, -0.2),
     "set_point_asymmetry": Strength("k", 0.2, 0.1),
     "relaxation": Strength("beta", 0.7, 0.35),
+    "speed_profile": Strength("depth", 0.6, 0.4),
+    "curve_speed": Strength("mps2", 2.0, 3.0),
 }
 """Every effect of the catalogue. ``gap_bias`` changes the measured gap, not the motion."""
 
@@ -90,6 +95,16 @@ class View:
 def slope(position: np.ndarray, steepest: float) -> np.ndarray:
     """Return the road's slope (rise over run) at positions in m: two waves, together at most `steepest`."""
     return steepest * (0.6 * np.sin(2 * np.pi * position / 730.0) + 0.4 * np.sin(2 * np.pi * position / 1170.0 + 1.0))
+
+
+def dips(position: np.ndarray, depth: float) -> np.ndarray:
+    """Return the desired speed at positions in m relative to that elsewhere: five dips by `depth`, about 200 m long."""
+    return 1.0 - depth * np.max([np.exp(-(((position - x) / 80.0) ** 2)) for x in DIPS_M], axis=0)
+
+
+def curvature(position: np.ndarray) -> np.ndarray:
+    """Return the road's curvature (1/m) at positions in m."""
+    return np.sum([k * np.exp(-(((position - x) / 80.0) ** 2)) for x, k in BENDS_PER_M.items()], axis=0)
 
 
 def wanted(
@@ -168,6 +183,10 @@ def _adapted(view: View, drivers: Drivers, on: dict[str, float]) -> tuple[np.nda
     if "speed_zone" in on:
         inside = (view.position > ZONE_M[0]) & (view.position < ZONE_M[1])
         top = np.where(inside, on["speed_zone"] * top, top)
+    if "speed_profile" in on:
+        top = top * dips(view.position, on["speed_profile"])
+    if "curve_speed" in on:
+        top = np.minimum(top, np.sqrt(on["curve_speed"] / np.maximum(np.abs(curvature(view.position)), 1e-6)))
     return time_gap, top
 
 

@@ -67,7 +67,8 @@ def generate(
         runs: Number of runs.
         followers: Number of followers behind each leader.
         seconds: Duration of a run.
-        effect: A name of `EFFECTS`, a mapping from names to strengths, or None.
+        effect: A name of `EFFECTS`, a mapping from names to strengths, or None. With ``curve_speed`` the table has a
+            column curvature (1/m).
         strength: ``"middle"``, ``"half"``, or the value itself, where `effect` is a name.
         noise: White noise of every measured position (and gap), standard deviation in m.
         correlated_noise: Further noise of positions with a memory of 1 s, standard deviation in m.
@@ -107,6 +108,9 @@ def generate(
         table = _with_gap(random, truth, table, noise, on.get("gap_bias", 0.0))
     if laps:
         table = table.with_columns(track_s_m=pl.col("position_m") % scripted.LAP_M)
+    if "curve_speed" in on:
+        bends = hidden.curvature(truth.motion["position_m"].to_numpy())
+        table = table.with_columns(pl.Series("curvature", bends))
     if grade_column:
         slopes = hidden.slope(truth.motion["position_m"].to_numpy(), on.get("grade", 0.0))
         table = table.with_columns(pl.Series("grade", slopes))

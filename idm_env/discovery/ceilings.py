@@ -19,7 +19,7 @@ from idm_env.discovery import judge
 from idm_env.discovery.free import Stand
 from idm_env.discovery.model import Frozen
 from idm_env.discovery.records import Records, whole
-from idm_env.discovery.solve import NAMES, Solution, Task, solve
+from idm_env.discovery.solve import Solution, Task, solve
 
 NEIGHBOURS = 10
 EVERY = 4
@@ -82,7 +82,10 @@ def between_halves(at: Stand) -> float:
     rows = at.task.rows
     other = replace(at.task, rows=replace(rows, valid=at.scored))
     theta = solve(other, Frozen(at.model, at.values), at.theta, np.zeros(0), iterations=10, tolerance=1e-4).theta
-    i = NAMES.index("time_gap")
+    names = [p.name for p in at.model.catalogue.own]
+    if "time_gap" not in names:
+        return float("nan")
+    i = names.index("time_gap")
     return float(np.corrcoef(at.theta[seen, i], theta[seen, i])[0, 1])
 
 

@@ -16,7 +16,7 @@ from idm_env.checks import nearest
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import ceilings, free, judge, places, records, search, shared, summary, words
+from idm_env.discovery import bases, ceilings, free, judge, places, records, search, shared, summary, words
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import calibrate
@@ -24,9 +24,21 @@ from idm_env.discovery.decide import Decided, Round, decide
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
-from idm_env.discovery.solve import NAMES, Solution, Task
+from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, improves
-from idm_env.effects import ALL, CANDIDATES, IDM, PACKAGED, Brakes, Effect, candidates, make, named, register
+from idm_env.effects import (
+    ALL,
+    CANDIDATES,
+    PACKAGED,
+    Brakes,
+    CarFollowing,
+    Effect,
+    base_named,
+    candidates,
+    make,
+    named,
+    register,
+)  # fmt: skip
 from idm_env.progress import OnProgress, silent
 
 
@@ -71,6 +83,7 @@ def discover(
     seed: int = 0,
     located: bool = True,
     lockbox: float = 0.25,
+    base: str | CarFollowing = "idm",
 ) -> Discovery:
     """Find the effect that IDM lacks on ``trajectories``, or say that there is none or that the data cannot tell.
 
@@ -87,36 +100,39 @@ def discover(
         seed: Of the draw of the lockbox and of sign flips.
         located: Whether effects without a name are looked for too.
         lockbox: Share of the runs that neither fit nor choose.
+        base: The car-following law that is to be completed, if not IDM.
 
     Raises:
         ValueError: For unknown effects, or a folder left by other data.
         DataError: For data that cannot be used.
     """
     progress = on_progress or silent
+    law = base_named(base) if isinstance(base, str) else base
     chosen = _chosen(effects, known)
     prepared = prepare(trajectories, by, place)
     refused = terms.testable(prepared, chosen)
-    tried = [e for e in chosen if e.name not in refused and e.name not in known]
+    tried = [_measured(prepared, e) for e in chosen if e.name not in refused and e.name not in known]
     names = [e.name for e in tried]
     if not names:
         why = "; ".join(f"{name}: {reason}" for name, reason in refused.items()) or "all of them are known"
         raise ValueError(f"no candidate can be tried on these data ({why}). Name others, or leave out --effects.")
     fit_runs, kept_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
-    options = (list(map(repr, tried)), tuple(known), seed, located, lockbox)
+    options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
     mark = keep.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
     saved = keep.Store(None if out is None else out / keep.UNFINISHED / "explain", mark, resume)
-    task = Task(rows, search.first_noise(rows), search.first_prior())
+    task = Task(rows, search.first_noise(rows), search.first_prior(law))
     told = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
-    base = Model(told, twin.Catalogue.of([*own, *(terms.known_effect(term) for term in told)], prepared.period))
-    searching = Search(task, names, located and effects is None, saved, progress, base)
-    progress("calibration", 0, 0, "idm")
+    given = [*own, *(terms.known_effect(term) for term in told)]
+    bare = Model(told, twin.Catalogue.of(given, prepared.period, law))
+    searching = Search(task, names, located and effects is None, saved, progress, bare)
+    progress("calibration", 0, 0, law.name)
     theta, calibrated = calibrate(
-        prepared.of_runs(fit_runs), by, task.prior.centre, lambda _, *state: progress("calibration", *state)
+        prepared.of_runs(fit_runs), by, task.prior.centre, law, lambda _, *state: progress("calibration", *state)
     )
-    progress("null", 0, 0, "idm")
-    null = searching.null(base, theta)
+    progress("null", 0, 0, law.name)
+    null = searching.null(bare, theta)
     decided = decide(searching, null, seed)
     saved.remove()
     progress("final check", 0, 0, "runs kept for the end")
@@ -140,6 +156,12 @@ def discover(
     kept = prepared.of_runs(kept_runs) if kept_runs else prepared
     report["ceilings"] = ceilings.told(decided.stand, kept, decided.null)
     report["error"]["floor"] = ceilings.floor(kept, ceilings.drift(trajectories))
+    report["bases"] = [] if not kept_runs else bases.compared(
+        decided.null, prepared.of_runs(fit_runs), prepared.of_runs(kept_runs), adapt=by == "driver", seed=seed,
+        on_law=lambda *state: progress("other laws", *state),
+    )  # fmt: skip
+    for key in ("sentence", "details", "found", "partial"):
+        report[key] = words.of_law(report[key], law.title)
     report["details"] += words.cautions(report["data"]["at_bounds"], calibrated["groups"], calibrated["converged"])
     return discovery
 
@@ -204,28 +226,40 @@ def _split(prepared: Records, share: float, seed: int) -> tuple[list[str], list[
     return [r for r in runs if r not in kept], [r for r in runs if r in kept]
 
 
+def _measured(prepared: Records, effect: Effect) -> Effect:
+    """Return an effect whose profile a column gives with that profile, any other as it is."""
+    if effect.sought != "given":
+        return effect
+    first, distance, profile = _profile(prepared, effect.column)
+    knots = tuple(first + distance * i for i in range(len(profile)))
+    return replace(effect, knots=knots, profile=tuple(profile), period=prepared.period or None)  # type: ignore[call-arg]
+
+
 def _known_term(prepared: Records, name: str) -> Term:
     """Return the effect with its profile over places as the file gives it."""
-    column = ALL[name].column
+    return terms.known_profile(name, *_profile(prepared, ALL[name].column), prepared.period)
+
+
+def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]:
+    """Return first place, distance and values of a column over places; DataError where no record tells."""
     # Where a record does not tell, the profile of the others is taken for the same place.
     told = [e for e in prepared.episodes if column in e.columns]
     if not told:
         raise ValueError(
-            f"known effect '{name}' needs a column {column} (rise over run) without holes, and no record has it. "
-            "Fill it in."
+            f"a profile over places needs the column {column} without holes, and no record has it. Fill it in."
         )
     place = np.concatenate([e.place_m for e in told])
-    slope = np.concatenate([e.columns[column] for e in told])
+    value = np.concatenate([e.columns[column] for e in told])
     period = prepared.period
     place = np.mod(place, period) if period else place
     low, high = (0.0, period) if period else (float(place.min()), float(place.max()))
     count = int(np.clip((high - low) / 30.0, 3, 60))
     distance = (high - low) / (count if period else count - 1)
     index = np.round((place - low) / distance).astype(int) % count
-    total = np.bincount(index, slope, minlength=count)
+    total = np.bincount(index, value, minlength=count)
     number = np.bincount(index, minlength=count)
     profile = np.interp(np.arange(count), np.flatnonzero(number), total[number > 0] / number[number > 0])
-    return terms.known_profile(name, low, distance, profile.tolist(), period)
+    return low, distance, profile.tolist()
 
 
 # -- after the search ------------------------------------------------------------------------------------------------
@@ -309,16 +343,17 @@ def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) ->
     added.sort(key=lambda e: e.rank if e.hook == "adapt" else 0)
     seen = np.unique(prepared.group)
     middle = np.exp(np.median(theta[seen], axis=0))
+    law = final.model.catalogue.base
 
     def bounded(values: np.ndarray) -> dict[str, float]:
-        return {n: float(np.clip(v, p.low, p.high)) for n, v, p in zip(NAMES, values, IDM.declared, strict=True)}
+        return {p.name: float(np.clip(v, p.low, p.high)) for v, p in zip(values, law.declared, strict=True)}
 
     drivers = {}
     for group in seen:
-        drivers[prepared.groups[group]] = {"idm": bounded(np.exp(theta[group]))}
+        drivers[prepared.groups[group]] = {law.name: bounded(np.exp(theta[group]))}
     return SavedModel(
-        effects=(IDM(), *added, Brakes()),
-        parameters={"idm": bounded(middle), **numbers},
+        effects=(law, *added, Brakes()),
+        parameters={law.name: bounded(middle), **numbers},
         dt=prepared.dt,
         integration="midpoint",
         drivers=drivers if by != "all" else {},

@@ -27,7 +27,7 @@ class Stand:
     """A model in free simulation: ``task`` over all time, θ from the part that is not ``scored``, and errors (m) there.
 
     ``rmse_m`` are the gap's errors on the scored time with every weight of ``GRID_S``, of which ``task.prior.alike_s``
-    is the best. ``absorb`` [G, 5, 5] is the inverse curvature of that calibration, ``weight`` [R] what a row's squares
+    is the best. ``absorb`` [G, P, P] is the inverse curvature of that calibration, ``weight`` [R] what a row's squares
     count: one over its own mean square plus the usual one, so that a few hopeless followers do not decide.
     """
 
@@ -65,7 +65,7 @@ class Stand:
 
 
 def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, theta: np.ndarray) -> Stand:
-    """Calibrate a model on every other block of time in free simulation, from log θ [G, 5], and see how it stands.
+    """Calibrate a model on every other block of time in free simulation, from log θ [G, P], and see how it stands.
 
     The weight of the prior decides more on short or noisy records than any effect does: with too light a one drivers
     are over-fitted, and an effect that only regularises them looks like a finding. So every model has the weight with
@@ -95,7 +95,7 @@ def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, thet
     usual = max(float(np.median(square)), 1e-6)
     return Stand(
         replace(task, rows=rows), scored, model, values, fitted.theta, meters,
-        np.linalg.inv(matrix + 1e-9 * np.eye(5)), 1.0 / (square + usual), units(records, MANY_RUNS),
+        np.linalg.inv(matrix + 1e-9 * np.eye(matrix.shape[-1])), 1.0 / (square + usual), units(records, MANY_RUNS),
         tuple(np.sqrt(squares).tolist()),
     )  # fmt: skip
 

@@ -101,9 +101,9 @@ def unweighed(
     records: Records, model: Model, values: np.ndarray, prior: Prior, rows: Rows | None = None,
     start: np.ndarray | None = None,
 ) -> tuple[Task, np.ndarray]:  # fmt: skip
-    """Return the task of a calibration and its first fit: log θ [G, 5] with a prior that hardly weighs anything.
+    """Return the task of a calibration and its first fit: log θ [G, P] with a prior that hardly weighs anything.
 
-    From two starts, the prior's centre and ``start`` [G, 5]; every group keeps the better one.
+    From two starts, the prior's centre and ``start`` [G, P]; every group keeps the better one.
     """
     rows = whole(records) if rows is None else rows
     frozen, empty = Frozen(model, values), np.zeros(0)
@@ -186,7 +186,7 @@ def judge(
     """Return the errors on held-out records.
 
     With ``adapt`` θ of every driver comes from every other block of time (30 s, or a quarter of a shorter record), with
-    the population as prior, and the blocks between are scored; without it ``theta`` [G, 5] is used, and everything
+    the population as prior, and the blocks between are scored; without it ``theta`` [G, P] is used, and everything
     scored.
     """
     rows = whole(records)

@@ -1,7 +1,7 @@
 """Discovery's rollout of one driver behind a record, with a whole catalogue of effects in one compiled loop.
 
 Discovery rolls out the same records some thousand times with small changes of parameters. So one step of a real
-simulator, ``Simulator(Lane(), (IDM(), every candidate, Brakes()), dt, "midpoint")``, is recorded and printed into the
+simulator, ``Simulator(Lane(), (base, every candidate, Brakes()), dt, "midpoint")``, is recorded and printed into the
 loop of ``march_loops``, each effect behind a flag; absent effects cost one comparison. No equation stands here.
 
 Parameters of a row are a flat vector φ, laid out by a ``Catalogue``; behind them come tables of ``ROOM`` numbers, each
@@ -26,9 +26,10 @@ from idm_env import history
 from idm_env.discovery import march_loops
 from idm_env.discovery.slots import SETS, TARGETS, Push
 from idm_env.discovery.slots import Slot as Changed
-from idm_env.effects import IDM, Brakes, Effect
+from idm_env.effects import IDM, Brakes, CarFollowing, Effect
 from idm_env.effects.free import FEATURES
 from idm_env.kernels import functions, staged
+from idm_env.parameters import Parameter
 from idm_env.roads import Lane
 from idm_env.scalar import library
 from idm_env.scalar.graph import Slot, TimeStep
@@ -38,6 +39,8 @@ from idm_env.scalar.straight import Straight
 from idm_env.step import Stepping
 
 ROOM = march_loops.ROOM
+BASE = IDM()
+"""The car-following law unless another one is named."""
 SLOTS = 4
 """Curves and intervals without a name that a model can have at once."""
 NONE, CURVE, INTERVAL = 0, 1, 2
@@ -67,15 +70,31 @@ _BESIDE = {"distance": "signals[i, 11]", "speed": "signals[i, 12]", "present": "
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Candidates as the loop has them, and how φ and the flags are laid out."""
+    """A car-following law and candidates as the loop has them, and how θ, φ and the flags are laid out.
+
+    θ are the law's parameters, each driver's own. ``located`` says whether there is room for what has no name; a loop
+    without it compiles in a fraction of the time.
+    """
 
     effects: tuple[Effect, ...]
+    base: CarFollowing = BASE
+    located: bool = True
 
     @classmethod
-    def of(cls, effects: Sequence[Effect] = (), period: float = 0.0) -> Catalogue:
+    def of(cls, effects: Sequence[Effect] = (), period: float = 0.0, base: CarFollowing = BASE) -> Catalogue:
         """Return the package's candidates and ``effects``, which replace those of the same name, on a lap (m)."""
         given = {e.name: e for e in (*(known.make(name) for name in known.CANDIDATES), *effects)}
-        return cls(tuple(_on_lap(e, period) for e in given.values()))
+        return cls(tuple(_on_lap(e, period) for e in given.values()), base)
+
+    @property
+    def own(self) -> tuple[Parameter, ...]:
+        """Declarations of θ."""
+        return self.base.declared
+
+    @cached_property
+    def bounds(self) -> np.ndarray:
+        """Bounds of log θ [P, 2]."""
+        return np.log(np.array([(p.low, p.high) for p in self.own]))
 
     @cached_property
     def by_name(self) -> dict[str, Effect]:
@@ -86,7 +105,7 @@ class Catalogue:
     def flagged(self) -> tuple[Effect, ...]:
         """Everything behind a flag, adaptations in the order in which they act."""
         labels = [(label, False) for label in map(str, range(SLOTS))] + [(PULSE, True)]
-        slots = [kind for label, given in labels for kind in _slots(label, given)]
+        slots = [kind for label, given in labels for kind in _slots(label, given)] if self.located else []
         return tuple(sorted((*self.effects, *slots), key=lambda e: e.rank if e.hook == "adapt" else 0))
 
     @cached_property
@@ -110,8 +129,8 @@ class Catalogue:
     @cached_property
     def tables(self) -> dict[str, int]:
         """Number of the table of every slot ("0", "1", …) and of every effect with a profile."""
-        profiles = [e.name for e in self.effects if e.sought == "profile"]
-        return {name: i for i, name in enumerate((*map(str, range(SLOTS)), *profiles))}
+        profiles = [e.name for e in self.effects if e.sought in ("profile", "given")]
+        return {name: i for i, name in enumerate((*map(str, range(SLOTS if self.located else 0)), *profiles))}
 
     def table_at(self, name: str) -> int:
         """Return where a table begins in φ."""
@@ -203,9 +222,11 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     read_tables = {node.label for node in graph.serial if node.op == "table"}
     for name, number in catalogue.tables.items():
         if number not in read_tables:
-            raise ValueError(f"effect '{name}' is sought as a profile and does not read it by effects.places.curve.")
+            raise ValueError(
+                f"effect '{name}' is sought or given as a profile and does not read it by effects.places.curve."
+            )
     memories = list(made.begin)
-    driver = {f"idm.{p.name}": f"th[{i}]" for i, p in enumerate(IDM.declared)}
+    driver = {f"{catalogue.base.name}.{p.name}": f"th[{i}]" for i, p in enumerate(catalogue.own)}
     inputs = {slot_name(e.name, ""): "pulse_now" for e in _slots(PULSE)}
     for effect in catalogue.effects:
         inputs |= {slot_name(effect.name, part): text for part, text in _BESIDE.items()}
@@ -260,9 +281,9 @@ def _recorded(catalogue: Catalogue, dt: float, graph: Regions) -> Recording:
         wrapped.append(Behind(effect, graph, f"on {effect.name}", table))
     beside = [e.name for e in catalogue.effects if e.beyond == "vehicle in an adjacent lane"]
     inputs = [(name, tuple(_BESIDE), (False,) * len(_BESIDE)) for name in beside]
-    inputs += [(e.name, ("",), (False,)) for e in _slots(PULSE)]
+    inputs += [(e.name, ("",), (False,)) for e in (_slots(PULSE) if catalogue.located else ())]
     memories = tuple(e.name for e in catalogue.effects if e.remembers)
-    stepping = Stepping(Lane(), (IDM(), *wrapped, Brakes()), dt, "midpoint")  # type: ignore[arg-type]
+    stepping = Stepping(Lane(), (catalogue.base, *wrapped, Brakes()), dt, "midpoint")  # type: ignore[arg-type]
     return record(stepping, Form(tuple(inputs), memories, present=False), graph)
 
 

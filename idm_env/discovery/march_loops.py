@@ -121,7 +121,7 @@ def march(
     ``signals`` [samples, columns] holds all records, record r in rows ``bounds[r] : bounds[r + 1]``. Row i starts on
     its measured state at sample ``start[i]`` of ``record[i]`` and runs ``steps`` steps. In ``lead`` steps before that
     it is placed on the record and responds; ``whole`` winds memories up from the record's beginning. ``theta``
-    [copies, groups, 5]; ``phi`` [copies, groups, …] and ``on`` [copies, flags] as a catalogue lays them out;
+    [copies, groups, P]; ``phi`` [copies, groups, …] and ``on`` [copies, flags] as a catalogue lays them out;
     ``tables`` [tables, 3] is (form, number of knots, place in φ); ``back`` is how many steps of the past are kept;
     ``pulse`` [copies, 3] is (first step, end step, amount); ``k`` are constants that depend on dt. Every ``every``
     steps a sample is kept; rows in which a record ends keep their last state.

@@ -22,7 +22,8 @@ class Term:
 
     ``effect`` is the catalogue's name or None for what is only located; ``what`` and ``coordinate`` say what changes
     and over which coordinate; ``form`` is NONE, CURVE or INTERVAL; ``knots`` (first, distance, count) of a curve.
-    ``starts`` are values of all parameters to start a search from; ``made`` is the effect with its static choices.
+    ``starts`` are values of all parameters to start a search from; ``made`` is the effect with its static choices. A
+    curve that ``fades`` is nothing from a knot's distance beyond its ends on: nobody was seen there.
     """
 
     label: str
@@ -37,6 +38,7 @@ class Term:
     profile: tuple[float, ...] | None = None
     smoothness: float = 0.0
     made: Effect | None = None
+    fades: bool = False
 
     @property
     def size(self) -> int:
@@ -55,7 +57,13 @@ class Term:
         at = catalogue.table_at(self.effect or str(slot))
         if self.form == twin.INTERVAL:
             return [at + 4, at, at + 1][: self.size]
-        return [at + 4 + i for i in range(self.size)]
+        return [at + 4 + self.fades + i for i in range(self.size)]
+
+    @property
+    def drawn(self) -> tuple[float, float, int]:
+        """First knot, distance and count of the curve with the knots at which it has faded."""
+        first, distance, count = self.knots
+        return (first - distance, distance, count + 2) if self.fades else self.knots
 
 
 @dataclass(frozen=True)
@@ -119,7 +127,7 @@ class Model:
         tables = np.array([(twin.NONE, 2, self.catalogue.table_at(n)) for n in self.catalogue.tables], np.int64)
         for term, slot in self._slots:
             if term.form != twin.NONE:
-                tables[self.catalogue.tables[term.effect or str(slot)], :2] = term.form, term.knots[2]
+                tables[self.catalogue.tables[term.effect or str(slot)], :2] = term.form, term.drawn[2]
         return tables
 
     def phi(self, values: np.ndarray) -> np.ndarray:
@@ -132,7 +140,7 @@ class Model:
             at = self.catalogue.table_at(term.effect or str(slot))
             phi[..., at + 3] = term.period
             if term.form == twin.CURVE:
-                phi[..., at], phi[..., at + 1] = term.knots[0], 1.0 / term.knots[1]
+                phi[..., at], phi[..., at + 1] = term.drawn[0], 1.0 / term.drawn[1]
                 if term.profile is not None:
                     phi[..., at + 4 : at + 4 + len(term.profile)] = term.profile
             else:
@@ -163,6 +171,10 @@ class Frozen(Model):
         return phi
 
 
+SPREAD = 0.3
+"""Prior width of a curve's knots, in units of what it changes: m/s², or relative."""
+STATES = ("speed", "gap", "closing_speed", "lead_accel")
+"""Coordinates of the state: a curve without a name over one of them ends where nobody was seen."""
 EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed": 0.2, "lead_accel": 0.1}
 """Half-width over which an interval of a located effect sets in."""
 
@@ -207,20 +219,27 @@ def unknown_profile(effect: str | Effect, first: float, distance: float, count: 
     declared = replace(one, knots=knots).parameters  # type: ignore[call-arg]
     parameters = tuple(replace(p, default=0.0) for p in declared)
     return Term(
-        one.name, one.name, parameters, ((0.0,) * count,), what="slope", coordinate="position", form=twin.CURVE,
-        knots=(first, distance, count), period=period, smoothness=0.03, made=one,
+        one.name, one.name, parameters, ((0.0,) * count,), what=one.changes, coordinate="position", form=twin.CURVE,
+        knots=(first, distance, count), period=period, smoothness=abs(one.strength_of(SPREAD)), made=one,
     )  # fmt: skip
 
 
-def known_profile(name: str, first: float, distance: float, profile: Sequence[float], period: float) -> Term:
-    """Return an effect whose profile over position is known, and of which some share acts."""
+def known_profile(effect: str | Effect, first: float, distance: float, profile: Sequence[float], period: float) -> Term:
+    """Return an effect whose profile over position is known: its parameters are what drivers make of it."""
     places = tuple(first + distance * i for i in range(len(profile)))
-    one = catalogue.make(name, knots=places, profile=tuple(profile))
-    share = tuple(replace(p, default=0.5) for p in one.parameters)
+    kind = effect if isinstance(effect, str) else effect.kind
+    one = catalogue.make(kind, knots=places, profile=tuple(profile))
+    starts = tuple(product(*(_starts(p) for p in one.parameters)))
     return Term(
-        name, name, share, ((0.2,),), what="share", coordinate="position", form=twin.CURVE,
+        one.name, one.name, one.parameters, starts, what="share", coordinate="position", form=twin.CURVE,
         knots=(first, distance, len(profile)), period=period, profile=tuple(profile), made=one,
     )  # fmt: skip
+
+
+def given_profile(effect: Effect) -> Term:
+    """Return the term of an effect that has its profile already."""
+    knots, profile = effect.knots, effect.profile  # type: ignore[attr-defined]
+    return known_profile(effect, knots[0], knots[1] - knots[0], profile, float(effect.period or 0.0))  # type: ignore[attr-defined]
 
 
 def known_effect(term: Term) -> Effect:
@@ -255,7 +274,7 @@ def curve(
     return Term(
         label or f"{what} curve over {coordinate}", None, parameters, ((0.0,) * count,), what=what,
         coordinate=coordinate, form=twin.CURVE, knots=(first, distance, count), period=period,
-        smoothness=0.3 if what == "acceleration" else 0.5,
+        smoothness=0.3 if what == "acceleration" else 0.5, fades=coordinate in STATES,
     )  # fmt: skip
 
 
@@ -271,6 +290,8 @@ def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
             column = twin.COLUMNS.index(f"{NEIGHBOURS[effect.beyond]}_present")
             if records.signals[:, column].mean() < 0.02:
                 refused[effect.name] = f"no {effect.beyond} is measured"
+        if effect.sought == "given" and not any(effect.column in e.columns for e in records.episodes):
+            refused[effect.name] = f"the file has no column {effect.column}"
         if effect.sought in ("interval", "step") and effect.changes not in twin.PULSED:
             refused[effect.name] = (
                 f"an effect that is sought in an interval must say which of {', '.join(twin.PULSED)} it changes, "
@@ -309,9 +330,9 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
         knots = tuple(accumulate(knots, lambda before, k: max(k, before + 1e-6)))
         heights = [0.0, amount, amount, 0.0]
     else:
-        first, distance, count = term.knots
+        first, distance, count = term.drawn
         knots = tuple(float(first + distance * i) for i in range(count))
-        heights = list(values)
+        heights = [0.0, *values, 0.0] if term.fades else list(values)
     if term.effect is not None:
         numbers = values if term.profile is not None else heights
         return [(_made(term, knots), dict(zip(names, map(float, numbers), strict=True)))]
@@ -330,7 +351,9 @@ def _made(term: Term, knots: tuple[float, ...] | None = None) -> Effect:
     assert term.made is not None
     choices: dict[str, object] = {}
     if knots is not None:
-        choices |= {"knots": knots, "profile": term.profile}
+        choices |= {"knots": knots}
+        if any(f.name == "profile" for f in fields(term.made)):
+            choices |= {"profile": term.profile}
     if any(f.name == "period" for f in fields(term.made)):
         choices["period"] = term.period or None
     return replace(term.made, **choices)  # type: ignore[arg-type]

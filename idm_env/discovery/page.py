@@ -13,7 +13,6 @@ from idm_env.discovery.score import ALPHA, FREE_SHARE
 from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
 from idm_env.discovery.verdict import HOLDS, Verdict
 from idm_env.discovery.words import percent as change
-from idm_env.effects import IDM
 from idm_env.report import Block
 
 TITLES = {
@@ -52,6 +51,12 @@ DATA = {
 """Name and meaning of every figure of the data's card."""
 
 
+def title(d: Discovery) -> str:
+    """Return the headline."""
+    told: str = words.of_law(TITLES[d.verdict], d.null.model.catalogue.base.title)
+    return told
+
+
 def number(x: object, digits: int = 3) -> str:
     """Return a number with so many significant digits, a dash for what is not there."""
     if x is None:
@@ -71,8 +76,9 @@ def _between(low: float | None, high: float | None) -> str:
 def blocks(d: Discovery) -> Iterator[Block]:
     """Return the pieces of the page: what fits on a first screen, then everything else."""
     r = d.report
+    law = d.null.model.catalogue.base.title
     yield pages.lead(r["sentence"])
-    yield from _lights(r)
+    yield from _lights(r, law)
     yield from _first_picture(d)
     yield pages.heading("How sure is that")
     yield pages.bullets(r["details"])
@@ -81,6 +87,7 @@ def blocks(d: Discovery) -> Iterator[Block]:
         f"{len(r['error']['held_out_runs'])} runs kept back for the final check · seed {r['seed']}"
     )
     yield from _errors(d)
+    yield from _laws(r)
     yield from _added(r)
     yield from _moved(d)
     for title, figure in pictures.all_of(d):
@@ -91,9 +98,9 @@ def blocks(d: Discovery) -> Iterator[Block]:
     yield pages.note(" · ".join(f"{k} {v}" for k, v in r["versions"].items()))
 
 
-def _lights(r: dict[str, Any]) -> Iterator[Block]:
+def _lights(r: dict[str, Any], law: str) -> Iterator[Block]:
     if not r["helps"]:
-        yield pages.note("No second model came near enough to be compared with IDM on runs kept back.")
+        yield pages.note(f"No second model came near enough to be compared with {law} on runs kept back.")
         return
     yield pages.lights(
         (
@@ -116,8 +123,8 @@ def _first_picture(d: Discovery) -> Iterator[Block]:
     run, vehicle = d.judgement.before.followers[follower]
     yield pages.picture(
         figure,
-        f"The follower kept back whose error with IDM is the median one: run {run}, vehicle {vehicle}. Below: "
-        "simulated less measured gap where it is scored (shaded, as in the table).",
+        f"The follower kept back whose error with {d.judgement.titles[0]} is the median one: run {run}, vehicle "
+        f"{vehicle}. Below: simulated less measured gap where it is scored (shaded, as in the table).",
         pictures.first_screen(d, (4.2, 4.6)),
     )
 
@@ -160,6 +167,28 @@ def _errors(d: Discovery) -> Iterator[Block]:
             f"{percent(partial['share_of_drivers_improved'])} of the followers kept back improve with "
             f"{partial['effect']}, which was not added."
         )
+
+
+def _laws(r: dict[str, Any]) -> Iterator[Block]:
+    if not r["bases"]:
+        return
+    yield pages.heading("Other laws on the same runs")
+    rows = []
+    for law in r["bases"]:
+        row = {"law": law["title"]} | {f"{n} ({u})": number(law[key]) for key, (n, u) in words.ERRORS.items()}
+        gap = law["against"].get("gap_rmse_m")
+        row["change of the gap's error"] = "–" if gap is None else change(gap["ratio"])
+        known = gap is not None and gap["high"] is not None
+        row["95 % interval"] = f"{change(gap['low'])} … {change(gap['high'])}" if known else "–"
+        row["verdict"] = "–" if gap is None else gap["verdict"]
+        rows.append(row)
+    yield pages.table(rows)
+    yield pages.note(
+        "Each alone, without what was added, calibrated and judged alike; changes are against "
+        f"{r['bases'][0]['title']}. Drivers' spread, which is the prior of drivers kept back, comes from free "
+        "simulation here, so that the first row is not to the digit the one above. Another law is completed by explain "
+        "--base."
+    )
 
 
 def _change(values: list[float]) -> str:
@@ -214,12 +243,13 @@ def _moved(d: Discovery) -> Iterator[Block]:
     start = r.get("calibration")
     if start:
         yield pages.note(
-            "The search starts from IDM calibrated in free simulation behind the measured leaders, by exact gradients "
+            f"The search starts from {d.null.model.catalogue.base.title} calibrated in free simulation behind the "
+            "measured leaders, by exact gradients "
             f"through the simulator: {start['episodes']} windows of the fitting runs, mean gap RMSE "
             f"{number(start['gap_rmse_m'])} m, {start['converged']} of {start['groups']} groups converged. "
             + words.weight(r["prior"])
         )
-    declared = {p.name: p for p in IDM.declared}
+    declared = {p.name: p for p in d.null.model.catalogue.own}
     rows = []
     for p in r["parameters"]:
         own = declared[p["parameter"]]

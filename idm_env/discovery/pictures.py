@@ -128,10 +128,11 @@ def _projected(d: Discovery, scored: Any) -> np.ndarray | None:
 def _off(d: Discovery, by_theta: np.ndarray, column: np.ndarray) -> np.ndarray:
     group = d.task.rows.group
     groups = d.task.groups
-    matrix, cross = np.zeros((groups, 5, 5)), np.zeros((groups, 5))
+    own = by_theta.shape[-1]
+    matrix, cross = np.zeros((groups, own, own)), np.zeros((groups, own))
     np.add.at(matrix, group, np.einsum("rmi,rmj->rij", by_theta, by_theta))
     np.add.at(cross, group, np.einsum("rmi,rm->ri", by_theta, column))
-    follow = np.linalg.solve(matrix + 1e-6 * np.eye(5), cross[..., None])[..., 0]
+    follow = np.linalg.solve(matrix + 1e-6 * np.eye(own), cross[..., None])[..., 0]
     return column - np.einsum("rmi,ri->rm", by_theta, follow[group])
 
 

@@ -44,7 +44,7 @@ class Responses:
         rows = self.rows
         response = np.einsum("jrm,rjb->rmb", self.change[WHATS.index(what)], basis)
         groups, count = len(rows.records.groups), basis.shape[-1]
-        cross = np.zeros((groups, 5, count))
+        cross = np.zeros((groups, self.by_theta.shape[-1], count))
         np.add.at(cross, rows.group, np.einsum("rmi,rmb->rib", self.by_theta, response))
         follow = np.einsum("gij,gjb->gib", self.absorbed, cross)
         response -= np.einsum("rmi,rib->rmb", self.by_theta, follow[rows.group])
@@ -81,12 +81,12 @@ def respond(task: Task, solution: Solution) -> Responses:
         "gap": signals[at, 0] - signals[at, 14],
     }
     linear = solution.linear
-    matrix = equations(task, solution.theta, linear)[1][:, :5, :5]
+    matrix = equations(task, solution.theta, linear)[1][:, : linear.own, : linear.own]
     counted = units(records)
     square = counted.sums(rows.record, (linear.residual**2).sum(-1))
     return Responses(
         rows, counted, change, linear.residual, linear.by_theta,
-        np.linalg.inv(matrix + 1e-9 * np.eye(5)), coordinates, square,
+        np.linalg.inv(matrix + 1e-9 * np.eye(len(matrix[0]))), coordinates, square,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
-from idm_env.discovery.solve import BOUNDS, Linear, Solution, Task, cost_of, equations, prior_of, projected
+from idm_env.discovery.solve import Linear, Solution, Task, cost_of, equations, prior_of, projected
 from idm_env.discovery.units import rho, signs, units
 from idm_env.parameters import Parameter
 
@@ -42,10 +42,12 @@ def held_out(task: Task, solution: Solution) -> np.ndarray:
         # Drivers of several runs share θ, which then stays that of all runs: to first order.
         moved = linear.residual + np.einsum("rmq,rq->rm", projected(solution), change[rows.run])
         return counted.sums(rows.record, (moved**2).sum(-1))
+    own = linear.own
     part = replace(task, prior=solution.prior)
-    gradient, matrix = equations(part, solution.theta, Linear(shifted, linear.jacobian[:5]))
-    step = -np.linalg.solve(matrix + 1e-9 * np.eye(5), gradient[..., None])[..., 0]
-    theta = np.clip(solution.theta + np.clip(step, -0.5, 0.5), BOUNDS[:, 0], BOUNDS[:, 1])
+    gradient, matrix = equations(part, solution.theta, Linear(shifted, linear.jacobian[:own], own))
+    step = -np.linalg.solve(matrix + 1e-9 * np.eye(own), gradient[..., None])[..., 0]
+    low, high = solution.model.catalogue.bounds.T
+    theta = np.clip(solution.theta + np.clip(step, -0.5, 0.5), low, high)
     by_group = np.zeros((task.groups, len(solution.values)))
     by_group[rows.group] = change[rows.run]
     values = np.repeat((solution.values + by_group)[None], 2, axis=0)

@@ -11,12 +11,13 @@ import torch
 from idm_env.discovery import model as terms
 from idm_env.discovery import noise as noises
 from idm_env.discovery import places
+from idm_env.discovery.march import BASE
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out, log_gain
-from idm_env.discovery.solve import NAMES, Prior, Solution, Task, finish, linearise, solve
+from idm_env.discovery.solve import Prior, Solution, Task, finish, linearise, solve
 from idm_env.discovery.units import Units, units
-from idm_env.effects import IDM, Effect
+from idm_env.effects import CarFollowing, Effect
 from idm_env.effects.base import Sought
 from idm_env.keep import Store
 from idm_env.progress import OnProgress
@@ -55,7 +56,7 @@ class Search:
         return units(self.task.rows.records)
 
     def null(self, model: Model, theta: np.ndarray, values: np.ndarray | None = None) -> Solution:
-        """Fit a null and its noise in turn until both stand, from log θ [G, 5] and φ [Q]; updates ``task``."""
+        """Fit a null and its noise in turn until both stand, from log θ [G, P] and φ [Q]; updates ``task``."""
         values = _starting_values(model) if values is None else values
         solution = solve(self.task, model, theta, values)
         for _ in range(3):
@@ -71,14 +72,15 @@ class Search:
     def _renoised(self, solution: Solution) -> Task:
         errors = self.task.errors(solution.theta[None], solution.model, solution.values[None])[0]
         noise = noises.estimate(errors, self.task.rows.joined)
-        prior = replace(population(solution.theta, self.task.rows), alike_s=self.task.prior.alike_s)
-        return replace(self.task, noise=noise, prior=prior)
+        prior = population(solution.theta, self.task.rows, solution.model.catalogue.base)
+        return replace(self.task, noise=noise, prior=replace(prior, alike_s=self.task.prior.alike_s))
 
     def round(self, solution: Solution, number: int) -> tuple[list[Scored], np.ndarray]:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [units]."""
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
         wanted = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
+        wanted += [terms.given_profile(e) for e in self._sought("given") if e.name not in have]
         found = []
         responses = places.respond(self.task, solution)
         for i, term in enumerate(wanted):
@@ -174,21 +176,20 @@ class Search:
             values = responses.coordinates[coordinate]
             first, distance, count = term.knots
             basis = places.hats(values, first, distance, count, term.period)
-            what = "acceleration" if term.what == "slope" else term.what
-            scale = -9.81 if term.what == "slope" else 1.0
-            spread = term.smoothness * abs(scale)
-            start, gains = places.linear_curve(responses, what, basis, spread)
-            if term.effect is None and gains.mean() < WORTH:
+            spread = term.smoothness if term.made is None else terms.SPREAD
+            start, gains = places.linear_curve(responses, term.what, basis, spread)
+            if gains.mean() < WORTH and (term.effect is None or term.what != "acceleration"):
                 result.append(Scored(term, None, gains))
                 return
             low, high = term.parameters[0].low, term.parameters[0].high
+            begin = start if term.made is None else np.array([term.made.strength_of(float(x)) for x in start])
             result.append(
                 self._nested(
                     solution,
                     term,
                     before,
                     f"{number}/{term.label}",
-                    [np.append(solution.values, np.clip(start / scale, 0.9 * low, 0.9 * high))],
+                    [np.append(solution.values, np.clip(begin, 0.9 * low, 0.9 * high))],
                 )
             )
 
@@ -256,20 +257,20 @@ def _starting_values(model: Model) -> np.ndarray:
     return np.concatenate([np.zeros(0), *(np.array(t.starts[0]) for t in model.terms)])
 
 
-def population(theta: np.ndarray, rows: Rows) -> Prior:
+def population(theta: np.ndarray, rows: Rows, base: CarFollowing = BASE) -> Prior:
     """Return the drivers' own spread as prior: median and scaled median deviation of log θ over fitted groups."""
     seen = np.unique(rows.group)
     if len(seen) < 5:
-        return first_prior()
+        return first_prior(base)
     centre = np.median(theta[seen], axis=0)
     spread = 1.4826 * np.median(np.abs(theta[seen] - centre), axis=0)
     return Prior(centre, np.clip(1.5 * spread, 0.3, WIDTH))
 
 
-def first_prior() -> Prior:
-    """Return the weak prior that a search starts from."""
-    assert {p.name for p in IDM.declared} == set(NAMES)
-    return Prior(np.log([POPULATION[n] for n in NAMES]), np.full(5, WIDTH))
+def first_prior(base: CarFollowing = BASE) -> Prior:
+    """Return the weak prior that a search starts from, of the parameters of a car-following law."""
+    centre = [POPULATION.get(p.name, p.default) for p in base.declared]
+    return Prior(np.log(centre), np.full(len(centre), WIDTH))
 
 
 def first_noise(rows: Rows) -> noises.Noise:

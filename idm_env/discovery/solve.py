@@ -17,12 +17,9 @@ from idm_env.discovery import march as twin
 from idm_env.discovery.model import Model
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Rows
-from idm_env.effects import IDM
 from idm_env.fitting.solver import Box, Normal, Progress, minimise
 from idm_env.parameters import Parameter
 
-NAMES = tuple(p.name for p in IDM.declared)
-BOUNDS = np.log(np.array([(p.low, p.high) for p in IDM.declared]))
 STEP = 1e-4
 """Relative difference by which derivatives with respect to θ are taken."""
 LONGEST = 0.5
@@ -31,7 +28,7 @@ LONGEST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Log-normal prior of θ: centre [5] and width [5] of log θ; ``free`` lets the centre follow the drivers.
+    """Log-normal prior of θ: centre [P] and width [P] of log θ; ``free`` lets the centre follow the drivers.
 
     ``alike_s`` is its weight in free simulation, where errors of so many seconds count as one (``free.stand``).
     ``seen`` are the groups that have data: their mean is the centre, so that a shift of all of them costs nothing.
@@ -75,7 +72,7 @@ class Task:
     def predict(
         self, theta: np.ndarray, model: Model, values: np.ndarray, pulse: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return predicted gap and speed [C, R, samples]; log θ [C, G, 5], values [C, Q] or [C, G, Q]."""
+        """Return predicted gap and speed [C, R, samples]; log θ [C, G, P], values [C, Q] or [C, G, Q]."""
         rows, records = self.rows, self.rows.records
         copies = len(theta)
         if values.ndim == 2:
@@ -131,25 +128,26 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Residual [R, m] and its derivatives by log θ and φ [5 + Q, R, m] at one point."""
+    """Residual [R, m] and its derivatives by log θ and φ [P + Q, R, m] at one point; P is ``own``."""
 
     residual: np.ndarray
     jacobian: np.ndarray
+    own: int
 
     @property
     def by_theta(self) -> np.ndarray:
-        """Derivatives by log θ [R, m, 5]."""
-        return np.moveaxis(self.jacobian[:5], 0, -1)
+        """Derivatives by log θ [R, m, P]."""
+        return np.moveaxis(self.jacobian[: self.own], 0, -1)
 
     @property
     def by_phi(self) -> np.ndarray:
         """Derivatives by φ [R, m, Q]."""
-        return np.moveaxis(self.jacobian[5:], 0, -1)
+        return np.moveaxis(self.jacobian[self.own :], 0, -1)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """log θ [G, 5], values [Q], cost, the linearisation there, and how θ follows φ [G, 5, Q] (times −1)."""
+    """log θ [G, P], values [Q], cost, the linearisation there, and how θ follows φ [G, P, Q] (times −1)."""
 
     model: Model
     theta: np.ndarray
@@ -179,16 +177,16 @@ def differences(parameters: tuple[Parameter, ...], values: np.ndarray) -> np.nda
 
 def linearise(task: Task, model: Model, theta: np.ndarray, values: np.ndarray) -> Linear:
     """Return the residual and its derivatives by forward differences."""
-    count = model.entries.size
-    step = np.append(np.full(5, STEP), differences(model.parameters, values))
-    many = np.repeat(theta[None], 6 + count, axis=0)
-    shared = np.repeat(values[None], 6 + count, axis=0)
-    for i in range(5):
+    count, own = model.entries.size, theta.shape[-1]
+    step = np.append(np.full(own, STEP), differences(model.parameters, values))
+    many = np.repeat(theta[None], 1 + own + count, axis=0)
+    shared = np.repeat(values[None], 1 + own + count, axis=0)
+    for i in range(own):
         many[1 + i, :, i] += STEP
     for i in range(count):
-        shared[6 + i, i] += step[5 + i]
+        shared[1 + own + i, i] += step[own + i]
     residual = task.residual(task.errors(many, model, shared))
-    return Linear(residual[0], (residual[1:] - residual[0]) / step[:, None, None])
+    return Linear(residual[0], (residual[1:] - residual[0]) / step[:, None, None], own)
 
 
 def prior_of(model: Model) -> np.ndarray:
@@ -199,11 +197,12 @@ def prior_of(model: Model) -> np.ndarray:
 
 
 def equations(task: Task, theta: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
-    """Return every group's gradient [G, 5 + Q] and matrix [G, 5 + Q, 5 + Q], with the prior of θ in them."""
+    """Return every group's gradient [G, P + Q] and matrix [G, P + Q, P + Q], with the prior of θ in them."""
     gradient, matrix = _sums(task, linear)
     weight = task.prior.width**-2.0
-    gradient[:, :5] += weight * (theta - task.prior.centre)
-    matrix[:, :5, :5] += np.diag(weight)
+    own = linear.own
+    gradient[:, :own] += weight * (theta - task.prior.centre)
+    matrix[:, :own, :own] += np.diag(weight)
     return gradient, matrix
 
 
@@ -231,7 +230,8 @@ class _Nested:
         self.prior = task.known
         self.stiffness = torch.from_numpy(prior_of(model))
         of_phi = np.array([(p.low, p.high, _longest(p)) for p in model.parameters]).reshape(-1, 3)
-        of_theta = np.column_stack((BOUNDS, np.full(5, LONGEST)))
+        bounds = model.catalogue.bounds
+        of_theta = np.column_stack((bounds, np.full(len(bounds), LONGEST)))
         self.boxes = Box(*torch.from_numpy(of_theta.T)), Box(*torch.from_numpy(of_phi.T))
         self.at: tuple[Tensor, Tensor, Linear] | None = None
 
@@ -264,7 +264,7 @@ def _longest(p: Parameter) -> float:
 def solve(
     task: Task, model: Model, theta: np.ndarray, values: np.ndarray, *, iterations: int = 12, tolerance: float = 2e-4
 ) -> Solution:
-    """Minimise over θ of every group and φ, from log θ [G, 5] and values [Q]."""
+    """Minimise over θ of every group and φ, from log θ [G, P] and values [Q]."""
     nested = _Nested(task, model)
     begin = Progress.begin(torch.tensor(theta[None]), torch.tensor(values[None]), damping=1e-3)
     found, now = minimise(nested, begin, iterations, tolerance=tolerance)
@@ -278,9 +278,10 @@ def finish(task: Task, model: Model, theta: np.ndarray, values: np.ndarray, line
     """Return the solution at a point: φ's matrix per group with θ eliminated, and the prior centred there."""
     prior = task.known.following(torch.from_numpy(theta[None]))
     _, matrix = equations(replace(task, prior=prior), theta, linear)
-    cross = matrix[:, :5, 5:]
-    follow = np.linalg.solve(matrix[:, :5, :5] + 1e-9 * np.eye(5), cross)
-    big = matrix[:, 5:, 5:] - np.einsum("giq,gis->gqs", cross, follow)
+    own = linear.own
+    cross = matrix[:, :own, own:]
+    follow = np.linalg.solve(matrix[:, :own, :own] + 1e-9 * np.eye(own), cross)
+    big = matrix[:, own:, own:] - np.einsum("giq,gis->gqs", cross, follow)
     return Solution(model, theta, values, cost, linear, big, prior, task.rows.group, follow)
 
 

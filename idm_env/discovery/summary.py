@@ -15,7 +15,7 @@ from idm_env.discovery.model import Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.score import Strength, interval_of, powerful, strength_of
 from idm_env.discovery.shared import Shared
-from idm_env.discovery.solve import BOUNDS, NAMES, Solution, Task
+from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude
 from idm_env.effects import ALL
@@ -72,10 +72,11 @@ class Judgement:
         """Plain names of the models: the null and, where there is one, the model beside it."""
         known = [words.plain(t.effect or t.label) for t in self.null.model.terms]
         lists = [known] if self.compared is None else [known, [*known, self.tried]]
-        return tuple(" with ".join(["IDM", *([" and ".join(names)] if names else [])]) for names in lists)
+        law = self.null.model.catalogue.base.title
+        return tuple(" with ".join([law, *([" and ".join(names)] if names else [])]) for names in lists)
 
     def names(self) -> dict[str, str]:
-        """Return which model every file holds: IDM first, then the model beside it."""
+        """Return which model every file holds: the law alone first, then the model beside it."""
         if self.compared is None:
             return {"model.yaml": self.titles[0]}
         files = ("model_idm.yaml", "model.yaml") if self.corrected_is_best else ("model.yaml", "model_corrected.yaml")
@@ -245,7 +246,7 @@ def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: i
                 "looks_like": [] if effect is None else list(effect.looks_like),
                 "told_by": "" if effect is None else effect.told_by,
                 "parameters": parameters,
-                "what": term.what if term.what != "slope" else "acceleration",
+                "what": term.what,
                 "where": where,
                 "p_value": float(this.tested.p_value[winner]),
                 "held_out_gain": float(1.0 - np.exp(-this.tested.gain[winner])),
@@ -312,7 +313,7 @@ def _parameters(thetas: list[Solution], prepared: Records) -> list[dict[str, Any
     seen = np.unique(prepared.group)
     rows = []
     errors = [standard_errors(s) for s in thetas]
-    for i, name in enumerate(NAMES):
+    for i, name in enumerate(p.name for p in thetas[0].model.catalogue.own):
         row: dict[str, Any] = {"parameter": name}
         for label, s, e in zip(("before", "after"), thetas, errors, strict=True):
             values = np.exp(s.theta[seen, i])
@@ -327,7 +328,7 @@ def _parameters(thetas: list[Solution], prepared: Records) -> list[dict[str, Any
 
 
 def standard_errors(solution: Solution) -> np.ndarray:
-    """Return standard errors of log θ [G, 5]; a residual that is correlated over 5 s counts every 5 s once."""
+    """Return standard errors of log θ [G, P]; a residual that is correlated over 5 s counts every 5 s once."""
     linear = solution.linear
     # The groups of a calibration are those of its normal equations; rows are summed by group there already.
     groups = len(solution.theta)
@@ -340,7 +341,7 @@ def standard_errors(solution: Solution) -> np.ndarray:
     np.add.at(square, of, (linear.residual**2).sum(1))
     np.add.at(count, of, (linear.by_theta != 0).any(-1).sum(1))
     variance = np.maximum(square / np.maximum(count, 1), 1e-9)
-    inverse = np.linalg.inv(matrix / variance[:, None, None] + 1e-9 * np.eye(5))
+    inverse = np.linalg.inv(matrix / variance[:, None, None] + 1e-9 * np.eye(matrix.shape[-1]))
     return np.sqrt(np.einsum("gii->gi", inverse))
 
 
@@ -377,11 +378,10 @@ def _data(
 
 
 def at_bounds(solution: Solution) -> dict[str, int]:
-    """Return how many groups have each IDM parameter at a bound."""
-    out = {}
-    for i, name in enumerate(NAMES):
-        low, high = BOUNDS[i]
-        out[name] = int(((solution.theta[:, i] < low + 1e-3) | (solution.theta[:, i] > high - 1e-3)).sum())
+    """Return how many groups have each of the drivers' parameters at a bound."""
+    out, catalogue = {}, solution.model.catalogue
+    for i, (p, (low, high)) in enumerate(zip(catalogue.own, catalogue.bounds, strict=True)):
+        out[p.name] = int(((solution.theta[:, i] < low + 1e-3) | (solution.theta[:, i] > high - 1e-3)).sum())
     return out
 
 

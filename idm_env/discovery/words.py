@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -278,6 +279,26 @@ def ceilings(told: Mapping[str, float | None], before_m: float | None) -> str:
         )
     text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+def of_law(texts: Any, title: str) -> Any:
+    """Return texts, and what contains them, with the name of another law in the place of IDM's."""
+    if isinstance(texts, str):
+        return re.sub(r"\bIDM\b", title, texts)
+    if isinstance(texts, list):
+        return [of_law(x, title) for x in texts]
+    return {k: of_law(v, title) for k, v in texts.items()} if isinstance(texts, dict) else texts
+
+
+def laws(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return in one line how the gap's error of other car-following laws compares with that of the first."""
+    first, *others = rows
+    told = [
+        f"{row['title']} {percent(row['against']['gap_rmse_m']['ratio'])} ({row['against']['gap_rmse_m']['verdict']})"
+        for row in sorted(others, key=lambda row: float(row["gap_rmse_m"] or 0.0))
+        if row["against"].get("gap_rmse_m", {}).get("ratio") is not None
+    ]
+    return f"Other laws alone, gap in free simulation against {first['title']}: {', '.join(told)}."
 
 
 def spoken(item: str) -> str:

@@ -29,5 +29,5 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
         write_json(paths["report.json"], discovery.report)
         for name, model in discovery.models.items():
             save_model(paths[name], model)
-        write_page(paths["report.html"], page.TITLES[discovery.verdict], page.blocks(discovery))
+        write_page(paths["report.html"], page.title(discovery), page.blocks(discovery))
     return paths

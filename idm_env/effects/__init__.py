@@ -21,6 +21,7 @@ from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLim
 from idm_env.effects.neighbours import BrakeLight, Follower, Lateral, LeaderAcceleration, SecondLeader
 from idm_env.effects.noise import AccelNoise, Noise, PerceptionNoise, Wander
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
+from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
 from idm_env.effects.registry import entered, is_candidate, lives, read
 from idm_env.effects.surroundings import Drag, Grade
 from idm_env.effects.time_gaps import Relaxation, SetPointAsymmetry, SpeedTimeGap
@@ -56,6 +57,8 @@ ALL: dict[str, type[Effect]] = {
         ActionPoint,
         Grade,
         SpeedZone,
+        SpeedProfile,
+        CurveSpeed,
         RegimeShift,
         Lateral,
         GapBias,
@@ -91,6 +94,8 @@ CANDIDATES: tuple[str, ...] = (
     "action_point",
     "grade",
     "speed_zone",
+    "speed_profile",
+    "curve_speed",
     "regime_shift",
     "lateral",
     "gap_bias",
@@ -196,6 +201,7 @@ __all__ = [
     "ConstantTimeGap",
     "Control",
     "Curve",
+    "CurveSpeed",
     "DeadZone",
     "Delay",
     "Drag",
@@ -223,6 +229,7 @@ __all__ = [
     "SecondLeader",
     "SetPointAsymmetry",
     "SpeedDependentGap",
+    "SpeedProfile",
     "SpeedTimeGap",
     "SpeedZone",
     "Traction",

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import torch
 from torch import Tensor
+
+
+def rising(name: str, knots: tuple[float, ...], profile: tuple[float, ...] | None = None) -> None:
+    """Raise ValueError for knots that do not rise, or a profile of another length."""
+    if len(knots) < 2 or any(b <= a for a, b in pairwise(knots)):
+        raise ValueError(f"{name}.knots = {knots} must be at least two rising positions (m).")
+    if profile is not None and len(profile) != len(knots):
+        raise ValueError(f"{name}.profile has {len(profile)} values for {len(knots)} knots: give one each.")
 
 
 def along(position: Tensor, period: float | None) -> Tensor:

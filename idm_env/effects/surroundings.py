@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P, Sought
-from idm_env.effects.places import along, curve
+from idm_env.effects.places import along, curve, rising
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -46,21 +45,21 @@ class Grade(Effect):
     period: float | None = None
 
     def __post_init__(self) -> None:
-        if len(self.knots) < 2 or any(b <= a for a, b in pairwise(self.knots)):
-            raise ValueError(f"grade.knots = {self.knots} must be at least two rising positions (m).")
-        if self.profile is not None and len(self.profile) != len(self.knots):
-            raise ValueError(
-                f"grade.profile has {len(self.profile)} slopes for {len(self.knots)} knots: give one each."
-            )
+        rising(self.kind, self.knots, self.profile)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The share of a known profile, or the slope at every knot."""
         if self.profile is not None:
-            return (Parameter("share", "", "1", 1.0, -2.0, 3.0, null=0.0),)
+            return (Parameter("share", "", "1", 1.0, -2.0, 3.0, null=0.0, starts=(0.2,)),)
         return tuple(
             Parameter(f"slope_{i}", f"θ{i}", "1", 0.02 * (-1) ** i, -0.2, 0.2, null=0.0) for i in range(len(self.knots))
         )
+
+    @classmethod
+    def strength_of(cls, change: float) -> float:
+        """Return the slope that pulls by ``change`` (m/s²)."""
+        return change / -GRAVITY
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return gravity's part (m/s²)."""

@@ -36,7 +36,13 @@ def places(records: Records) -> dict[str, tuple[Term, tuple[float, ...]]]:
     step = (high - low) / 6
     slopes = (0.02, -0.03, 0.04, 0.0, -0.01, 0.03, -0.02)
     middle = (low + 2 * step, low + 4 * step)
+    bends = (0.0, 0.02, -0.01, 0.03, 0.0, 0.015, 0.0)
     return {
+        "speed_profile": (
+            terms.unknown_profile("speed_profile", low, step, 7, 0.0),
+            (0.0, -0.4, -0.5, 0.1, -0.6, 0.0, -0.3),
+        ),
+        "curve_speed": (terms.known_profile("curve_speed", low, step, bends, 0.0), (2.5,)),
         "grade": (terms.unknown_profile("grade", low, step, 7, 0.0), slopes),
         "known grade": (terms.known_profile("grade", low, step, slopes, 0.0), (0.6,)),
         "speed_zone": (terms.placed("speed_zone", 0.6, *middle), (0.6, *middle)),
@@ -137,3 +143,21 @@ def test_a_printed_loop_depends_on_no_number() -> None:
     """Neither the time step nor the length of a lap makes another text, which would be compiled again."""
     texts = {march.loop(Catalogue.of((), lap), dt).text for lap, dt in ((230.0, 0.1), (231.5, 0.1), (230.0, 0.04))}
     assert len(texts) == 1 and march.loop(Catalogue.of(), 0.1).text not in texts
+
+
+def test_what_has_no_name_ends_with_the_states_that_were_seen() -> None:
+    """A residual over the state is nothing beyond them: held on, it drove free simulations away by tens of metres."""
+    term = terms.curve("acceleration", "speed", 5.0, 5.0, 3)
+    (effect,), numbers = terms.effects_of(Model((term,)), np.array([0.3, -0.2, 0.4]))
+    simulator = Simulator(Lane(), (IDM(), effect, Brakes()))
+    params = simulator.defaults(dtype=torch.float64)
+    params[effect.name] = {k: torch.tensor(v, dtype=torch.float64) for k, v in numbers[effect.name].items()}
+    bare = simulator.without(effect.name)
+    added = {}
+    for speed in (0.0, 2.5, 5.0, 15.0, 17.5, 20.0, 28.0):
+        state = simulator.state(torch.zeros(1).double(), torch.tensor([speed]).double(), params)
+        added[speed] = float(simulator.acceleration(state, {}, params) - bare.acceleration(state, {}, params))
+    expected = {0.0: 0.0, 2.5: 0.15, 5.0: 0.3, 15.0: 0.4, 17.5: 0.2, 20.0: 0.0, 28.0: 0.0}
+    assert added == pytest.approx(expected, abs=1e-12)
+    # Places go on as they ended: a road does not stop being what it is.
+    assert not terms.curve("time_gap", "position", 0.0, 100.0, 5).fades

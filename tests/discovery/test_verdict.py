@@ -105,6 +105,8 @@ def test_every_effect_is_told_with_equation_and_sign(name: str) -> None:
         term = terms.simple(name)
     elif cls.sought == "profile":
         term = terms.unknown_profile(name, 0.0, 100.0, 7, 0.0)
+    elif cls.sought == "given":
+        term = terms.given_profile(cls())
     else:
         term = terms.placed(name, *((0.5, 100.0, 200.0) if cls.sought == "interval" else (0.5, 100.0)))
     strength = term.parameters[0]

@@ -49,8 +49,8 @@ def test_what_discovery_has_to_know_of_a_candidate_stands_in_its_class(name: str
     known = {*CANDIDATES, *(p.name for p in IDM.declared)}
     assert {item.split()[0] for item in cls.looks_like} <= known - {name}
     assert set(cls.cancels) <= set(CANDIDATES) - {name}
-    assert bool(cls.column) <= (cls.sought == "profile")
-    if cls.sought == "anywhere":
+    assert bool(cls.column) <= (cls.sought in ("profile", "given"))
+    if cls.sought in ("anywhere", "given"):
         for p in effect.parameters:
             least, most = p.searched or (p.low, p.high)
             assert p.starts and all(least < start < most for start in p.starts), p.name
@@ -86,7 +86,7 @@ def test_a_strength_has_a_gradient_at_its_null(effect: Effect) -> None:
     gradients = {p.name: leaves[p.name].grad for p in strengths}
     assert all(g is None or torch.isfinite(g) for g in gradients.values())
     found = [name for name, g in gradients.items() if g is not None and g != 0]
-    if effect.kind in ("curve", "driver_curve", "grade"):
+    if effect.kind in ("curve", "driver_curve", "grade", "speed_profile"):
         assert found
     else:
         assert found == [p.name for p in strengths]
