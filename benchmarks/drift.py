@@ -31,7 +31,7 @@ from idm_env.drift.estimate import Estimate, estimate  # noqa: E402
 from idm_env.drift.linear import Drivers  # noqa: E402
 from idm_env.drift.linear import Path as Record  # noqa: E402
 from idm_env.effects import IDM, AccelNoise, Brakes, Effect, Noise, Replay, Wander  # noqa: E402
-from idm_env.fitting.batch import Batch, part  # noqa: E402
+from idm_env.fitting.batch import Batch  # noqa: E402
 from idm_env.fitting.fit import fit  # noqa: E402
 from idm_env.fitting.prior import Prior  # noqa: E402
 from idm_env.fitting.problem import IDM_NAMES  # noqa: E402
@@ -93,7 +93,7 @@ def block_s(e: Episode) -> float:
 def even(e: Episode) -> list[Episode]:
     """Return the blocks of an episode that calibrate."""
     size = round(block_s(e) / e.dt)
-    return [part(e, i, min(i + size + 1, len(e))) for i in range(0, len(e) - 1, 2 * size) if len(e) - i > 4]
+    return [e.part(i, min(i + size + 1, len(e))) for i in range(0, len(e) - 1, 2 * size) if len(e) - i > 4]
 
 
 def calibrated(items: list[Episode], own: list[Episode], centre: np.ndarray, spread: np.ndarray) -> np.ndarray:
@@ -209,7 +209,7 @@ def by_residual(
             known.append(float(coefficients @ known[: -ORDER - 1 : -1]))
             ahead[j : j + stride, i] = known[-1]
     model = simulator(dt, Noise())
-    made = Batch.of([part(items[r], t, t + steps + 1) for r, t in starts], substeps=1)
+    made = Batch.of([items[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
     params = bare.params(torch.tensor(theta[[r for r, _ in starts]]), torch.zeros(len(starts), dtype=torch.float64))
     params["noise"] = {"sigma": torch.ones((), dtype=torch.float64)}
     inputs = dict(made.inputs(model))

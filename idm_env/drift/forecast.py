@@ -10,7 +10,7 @@ import torch
 
 from idm_env.drift.estimate import Likelihood, Settings
 from idm_env.drift.linear import Drivers, Path
-from idm_env.fitting.batch import Batch, part
+from idm_env.fitting.batch import Batch
 
 
 def followed(drivers: Drivers, settings: Settings, theta: np.ndarray, passes: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -57,7 +57,7 @@ def _chunk(
     starts: list[tuple[int, int]], steps: int, count: int, seed: int,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     simulator, d = drivers.simulator, drivers.driver
-    batch = Batch.of([part(drivers.batch.episodes[r], t, t + steps + 1) for r, t in starts], substeps=1)
+    batch = Batch.of([drivers.batch.episodes[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
     random = np.random.default_rng(seed)
     rows, at = np.array([r for r, _ in starts]), np.array([t for _, t in starts])
     values, vectors = np.linalg.eigh(levels[1][at, rows])
