@@ -46,18 +46,18 @@ class Simulator(Stepping):
         return Compiled(self.road, self.effects, self.dt, self.integration, backend, dynamic)
 
     def _covered(self, inputs: Inputs, steps: int) -> None:
-        undrawn = next((name for name in self.draws if name not in inputs), None)
-        if undrawn is not None:
-            raise ValueError(
-                f"effect '{undrawn}' takes normals, and none were given. Draw them with seed=…, or pass "
-                f"inputs={{'{undrawn}': …}}."
-            )
         for name, value in inputs.items():
             if name not in self.by_name:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
             have = min(len(x) for x in _leaves(value) if x is not None)
             if have < steps:
                 raise ValueError(f"input '{name}' covers {have} steps of {steps}. Its first dimension is time.")
+        undrawn = next((name for name in self.draws if name not in inputs), None)
+        if undrawn is not None:
+            raise ValueError(
+                f"effect '{undrawn}' takes normals, and none were given. Draw them with seed=…, or pass "
+                f"inputs={{'{undrawn}': …}}."
+            )
 
     def slices(self, inputs: Inputs, steps: int) -> list[dict[str, Any]]:
         """Return the inputs of each step, from inputs with a leading time dimension.

@@ -60,8 +60,8 @@ class Curve(Effect):
 
     @property
     def name(self) -> str:
-        """``curve_`` and the feature, so that several curves fit into one simulator."""
-        return f"curve_{self.feature}"
+        """``curve_over_`` and the feature, so that several curves fit into one simulator."""
+        return f"curve_over_{self.feature}"
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

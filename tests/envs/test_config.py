@@ -27,7 +27,7 @@ def write(path, content):
 def test_a_model_comes_back_the_same(tmp_path):
     model = Model(
         (IDM(), Brakes(), Delay(max_delay=1.0), Curve(feature="gap", knots=(0.0, 20.0))),
-        {"idm": {"time_gap": 1.2}, "delay": {"delay": 0.4}, "curve_gap": {"knot_0": 0.3}},
+        {"idm": {"time_gap": 1.2}, "delay": {"delay": 0.4}, "curve_over_gap": {"knot_0": 0.3}},
         0.2,
         "euler",
         {"r/1": {"idm": {"time_gap": 0.9}}},
