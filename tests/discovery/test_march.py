@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -161,3 +165,29 @@ def test_what_has_no_name_ends_with_the_states_that_were_seen() -> None:
     assert added == pytest.approx(expected, abs=1e-12)
     # Places go on as they ended: a road does not stop being what it is.
     assert not terms.curve("time_gap", "position", 0.0, 100.0, 5).fades
+
+
+TWO_CATALOGUES = """
+import sys
+import numpy as np
+from idm_env.data import episodes, synthetic
+from idm_env.discovery.march import Catalogue
+from idm_env.discovery.model import Model, simple
+from idm_env.discovery.records import gather
+from idm_env.effects import make
+from tests.discovery.test_march import twin
+
+records = gather(episodes(synthetic.generate(11, runs=1, followers=1, seconds=30.0)[0], smooth=True))
+for name in sys.argv[1:]:
+    assert np.isfinite(twin(records, Model((simple(name),), Catalogue((make(name),))), np.array([0.0]))).any()
+"""
+
+
+def test_what_one_process_compiled_for_two_catalogues_serves_another(tmp_path: Path) -> None:
+    """A kept loop names no printed file but its own: a process that prints only the second finds it whole."""
+    kept = os.environ | {"IDM_ENV_CACHE": str(tmp_path / "printed"), "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+    for names in (("drag", "gap_bias"), ("gap_bias",)):
+        done = subprocess.run(
+            [sys.executable, "-c", TWO_CATALOGUES, *names], env=kept, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr[-500:]
