@@ -10,6 +10,7 @@ import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 from typing import Any
 
 _entered: list[str] = []
@@ -52,11 +53,8 @@ def rollout(*call: Any) -> Any:
     return None
 
 
-_functions: dict[str, Callable[..., Any]] = {}
-
-
+@cache
 def _function(place: str) -> Callable[..., Any]:
-    if place not in _functions:
-        module, _, name = place.partition(":")
-        _functions[place] = getattr(importlib.import_module(module), name)
-    return _functions[place]
+    module, _, name = place.partition(":")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return found

@@ -14,20 +14,15 @@ import torch
 from torch import Tensor
 
 from idm_env.effects.base import CarFollowing, P
-from idm_env.effects.idm import IDM, interaction
+from idm_env.effects.idm import IDM, OfFiveParameters, interaction
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
 FIVE = IDM.declared
 
 
-def _five(p: P) -> Driver:
-    """Return the driver of IDM's five parameters as they stand."""
-    return Driver(p["max_accel"], p["comfort_decel"], p["time_gap"], p["min_gap"], p["desired_speed"])
-
-
 @dataclass(frozen=True)
-class IDMPlus(CarFollowing):
+class IDMPlus(OfFiveParameters):
     """IDM+ (Schakel, van Arem, Netten 2010, IEEE ITSC, 759): the free and the following term do not add up.
 
     ::
@@ -43,10 +38,6 @@ class IDMPlus(CarFollowing):
     equation: ClassVar[str] = "a min(1 − (v/v0)⁴, 1 − (s*/s)²)"
     declared: ClassVar[tuple[Parameter, ...]] = FIVE
 
-    def driver(self, p: P) -> Driver:
-        """Return the five parameters as they stand."""
-        return _five(p)
-
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return A (m/s²)."""
         square = (scene.speed / driver.desired_speed) ** 2
@@ -55,7 +46,7 @@ class IDMPlus(CarFollowing):
 
 
 @dataclass(frozen=True)
-class IIDM(CarFollowing):
+class IIDM(OfFiveParameters):
     """The Improved IDM (Treiber and Kesting 2013, Traffic Flow Dynamics, section 11.3.7).
 
     ::
@@ -71,10 +62,6 @@ class IIDM(CarFollowing):
     title: ClassVar[str] = "improved IDM"
     equation: ClassVar[str] = "f (1 − z^(2a/f)) for z = s*/s < 1, a (1 − z²) above; f = a (1 − (v/v0)⁴)"
     declared: ClassVar[tuple[Parameter, ...]] = FIVE
-
-    def driver(self, p: P) -> Driver:
-        """Return the five parameters as they stand."""
-        return _five(p)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return A (m/s²)."""
@@ -180,7 +167,7 @@ class Gipps(CarFollowing):
 
 
 @dataclass(frozen=True)
-class ConstantTimeGap(CarFollowing):
+class ConstantTimeGap(OfFiveParameters):
     """A linear controller of the time gap, as adaptive cruise control is usually built, with lag and limits.
 
     ::
@@ -209,10 +196,6 @@ class ConstantTimeGap(CarFollowing):
         Parameter("desired_speed", "v0", "m/s", 33.0, 1.0, 70.0, role="shape"),
     )
     cruise_gain: float = 0.4
-
-    def driver(self, p: P) -> Driver:
-        """Return the limits a and b, T, s0 and v0."""
-        return _five(p)
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return A (m/s²)."""

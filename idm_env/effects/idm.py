@@ -42,8 +42,16 @@ def soft_floor(x: Tensor, floor: Tensor | float, sharpness: float) -> Tensor:
     return floor + softplus(sharpness * (x - floor), threshold=20.0) / sharpness
 
 
+class OfFiveParameters(CarFollowing):
+    """A car-following law whose parameters hold the five of a driver by their names."""
+
+    def driver(self, p: P) -> Driver:
+        """Return the five parameters as they stand."""
+        return Driver(p["max_accel"], p["comfort_decel"], p["time_gap"], p["min_gap"], p["desired_speed"])
+
+
 @dataclass(frozen=True)
-class IDM(CarFollowing):
+class IDM(OfFiveParameters):
     """Intelligent Driver Model (Treiber, Hennecke, Helbing 2000, Phys. Rev. E 62, 1805).
 
     ::
@@ -75,10 +83,6 @@ class IDM(CarFollowing):
         """The five of the literature, and δ where it is free."""
         free = (Parameter("exponent", "δ", "1", 4.0, 1.0, 12.0, role="shape"),)
         return self.declared + (free if self.exponent is None else ())
-
-    def driver(self, p: P) -> Driver:
-        """Return the five parameters as they stand."""
-        return Driver(p["max_accel"], p["comfort_decel"], p["time_gap"], p["min_gap"], p["desired_speed"])
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return A (m/s²)."""
