@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.envs.beginnings import Beginnings, mapped
 from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Untraceable
@@ -80,6 +81,7 @@ class Batch:
         self._seen: np.ndarray | None = None
         self._draw: Draw | None = None
         self._pool: World | None = None
+        self._beginnings = Beginnings(self._begin, count)
         self._block: dict[str, Tensor] | None = None
         self._drawn: dict[str, np.ndarray] = {}
         self._used = 0
@@ -124,6 +126,7 @@ class Batch:
         # Seeds beyond 63 bits are folded: Gymnasium allows any whole number.
         self.seeds[rows] = [int(s) & ((1 << 63) - 1) for s in seeds]
         self.episodes[rows] = -1
+        self._beginnings.forget()
 
     def reset(self, rows: np.ndarray | None = None, state: State | None = None) -> Tensor | np.ndarray:
         """Begin a new episode in all or in some rows (indices); return the observations of all of them.
@@ -134,11 +137,8 @@ class Batch:
         index = np.arange(self.count) if rows is None else rows
         self.episodes[index] += 1
         device = self.settings.device
-        draw = Draw.of(
-            torch.as_tensor(self.seeds[index], device=device), torch.as_tensor(self.episodes[index], device=device)
-        )
-        with torch.no_grad():
-            fresh = self._begin(draw)
+        draw = self._draws(index, self.episodes[index])
+        fresh = self._beginnings.take(index, self.episodes)
         if state is not None:
             fresh = fresh._replace(state=self._given(state, len(index)))
         if every or not self.begun or self._draw is None:
@@ -153,13 +153,19 @@ class Batch:
             return self._seen
         else:
             where = torch.as_tensor(index, device=device)
-            self.world = _map(lambda old, new: old.index_put((where,), new), self.world, fresh)
+            self.world = mapped(lambda old, new: old.index_put((where,), new), self.world, fresh)
             self._draw = Draw(self._draw.key.index_put((where,), draw.key))
         self._block = None
         assert self.world is not None
         return self.task.observe(self.world)
 
-    def _begin(self, draw: Draw) -> World:
+    def _draws(self, rows: np.ndarray, episodes: np.ndarray) -> Draw:
+        device = self.settings.device
+        return Draw.of(torch.as_tensor(self.seeds[rows], device=device), torch.as_tensor(episodes, device=device))
+
+    @torch.no_grad()
+    def _begin(self, rows: np.ndarray, episodes: np.ndarray) -> World:
+        draw = self._draws(rows, episodes)
         if not self.task.warmup_pool:
             return self.task.reset(draw, self.params)
         if self._pool is None:
@@ -167,7 +173,7 @@ class Batch:
             seeds = torch.arange(size, device=device)
             self._pool = self.task.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params)
         picked = (draw.uniforms(_POOL_STREAM, 1, torch.float64).squeeze(-1) * self.task.warmup_pool).long()
-        return _map(lambda pooled: pooled[picked], self._pool)
+        return mapped(lambda pooled: pooled[picked], self._pool)
 
     def _given(self, state: State, rows: int) -> State:
         if state.position.shape != (rows, self.task.vehicles):
@@ -183,6 +189,7 @@ class Batch:
         self.task.simulator.check(params)
         self.params = params
         self._pool = None
+        self._beginnings.forget()
 
     # -- steps ---------------------------------------------------------------------------------------------------
 
@@ -316,19 +323,4 @@ class Batch:
     def detach(self) -> None:
         """Cut the graph behind the present state, for truncated back-propagation."""
         if self.world is not None:
-            self.world = _map(lambda x: x.detach(), self.world)
-
-
-Tree = TypeVar("Tree")
-
-
-def _map(function: Callable[..., Tensor], first: Tree, *rest: Any) -> Tree:
-    """Apply a function to every tensor of like-shaped tuples and mappings; None stays None."""
-    if first is None:
-        return first
-    if isinstance(first, Tensor):
-        return function(first, *rest)  # type: ignore[return-value]
-    if isinstance(first, Mapping):
-        return {k: _map(function, v, *(r[k] for r in rest)) for k, v in first.items()}  # type: ignore[return-value]
-    assert isinstance(first, tuple)
-    return type(first)(*(_map(function, *parts) for parts in zip(first, *rest, strict=True)))  # type: ignore[return-value]
+            self.world = mapped(lambda x: x.detach(), self.world)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.envs.past import Past
 from idm_env.history import PAST
 from idm_env.kernels import threads as pool
 from idm_env.kernels import tiles
@@ -66,11 +67,12 @@ class Plan:
         after: After,
         world: World,
         arrays: Arrays,
+        past: Past,
         kind: tuple[bool, bool],
         draws: tuple[str, ...],
     ) -> None:
         made = self._recorded = _record(task, before, after, world, kind, draws)
-        self._task, self._world, self._arrays = task, world, arrays
+        self._task, self._world, self._arrays, self._past = task, world, arrays, past
         self._rows, self._size = rows, size = world.state.speed.shape
         kernel, self._real = (
             made.kernel,
@@ -84,9 +86,7 @@ class Plan:
         self._same = [(n, other, (rows, *s)) for n, (other, s) in made.after.same.items()]
         self._constant = {n: np.repeat(x[None], rows, 0) for n, x in made.after.constants.items()}
         self._inputs = [self._input(n) for n in (*kernel.numbers, *kernel.flags)]
-        self._slots = slots = world.state.memory[PAST].shape[-2] if kernel.signals else 0
-        for held in arrays:
-            held.setdefault("past", np.zeros((1, 1), self._real))
+        self._slots = slots = past.slots if kernel.signals else 0
         wide = tiles.width(size, slots)
         around = tiles.halo(1, kernel.program.reach)
         self._small = rows * size < 2 * pool.GRAIN
@@ -155,13 +155,17 @@ class Plan:
         if normals is not bound.normals:
             bound.hear(normals, self._normals)
         old, new = self._arrays[side], self._arrays[1 - side]
-        call = (old["past"], new["past"], *self._kernel, at)
+        if self._slots:
+            self._past.make_room()
+        call = (self._past.rows, self._past.newest, *self._kernel, at)
         threads = 1 if self._small else pool.count(rows * self._size)
         if threads == 1:
             advance(bound.places[side], bound.strides, *self._work, *call, bound.loaded, 0, self._tiles)
             bound.loaded = self._tiles == 1
         else:
             self._split(bound, side, call, threads)
+        if self._slots:
+            self._past.newest += 1
         np.add(old["state_step"], 1, out=new["state_step"])
         told = {name: np.empty(shape, kind) for name, shape, kind in self._answers}
         made.after.run(rows, self._told[side], told.values())

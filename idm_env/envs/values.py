@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.envs.past import Past
 from idm_env.envs.plan import After, Array, Before, Plan, named
 from idm_env.history import PAST
-from idm_env.kernels.lanes import past_rows, past_tensor
 from idm_env.tasks import Task, World
 from idm_env.types import Params, State
 
@@ -29,6 +28,7 @@ class Values:
         self._plans: dict[tuple[bool, bool], Plan] = {}
         self._key: Any = None
         self.arrays: tuple[dict[str, Array], dict[str, Array]] = ({}, {})
+        self.past: Past
         self.side = 0
         self.world: World | None = None
 
@@ -36,14 +36,13 @@ class Values:
         """Take over worlds; they are copied."""
         key = (world.state.speed.shape, world.state.speed.dtype, tuple(world.state.memory), tuple(world.episode))
         if key != self._key:
-            self._key, self._plans, self.arrays = key, {}, ({}, {})
+            self._key, self._plans, self.arrays, self.past = key, {}, ({}, {}), Past(world.state)
         self.world = world
         state = world.state
         for name, x in named(world).items():
             self._put(name, x)
         self._put("clock", _clock(state))
-        if PAST in state.memory:
-            self._put("past", torch.from_numpy(_past(state)))
+        self.past.load(state)
 
     def replace(self, rows: Array, fresh: World) -> None:
         """Replace some rows (indices) by the worlds of ``fresh``."""
@@ -54,9 +53,7 @@ class Values:
             held[name].reshape(count, *values.shape[1:])[rows] = values
             if other[name] is not held[name] and name not in _DYNAMIC:
                 other[name].reshape(count, *values.shape[1:])[rows] = values
-        if PAST in fresh.state.memory:
-            past = _past(fresh.state).reshape(len(held["past"]), len(rows), -1)
-            held["past"].reshape(len(past), count, -1)[:, rows] = past
+        self.past.replace(rows, fresh.state)
 
     def _put(self, name: str, x: Tensor) -> None:
         held, other = self.arrays[self.side], self.arrays[1 - self.side]
@@ -66,20 +63,19 @@ class Values:
                 # What no step changes must be the same on both sides.
                 np.copyto(other[name], held[name])
             return
-        flat = np.array(x.detach().numpy(), order="C")
-        held[name] = flat if name == "past" else flat.reshape(-1)
+        held[name] = np.array(x.detach().numpy(), order="C").reshape(-1)
         other[name] = held[name] if name.startswith("episode_") or name == "state_length" else held[name].copy()
 
     def current(self, own: bool = True) -> World:
-        """Return the worlds as tensors of their own, or as views that hold until the next step."""
+        """Return the worlds as tensors of their own, or without the past as views that hold until the next step."""
         assert self.world is not None
         state, held = self.world.state, self.arrays[self.side]
         if own:
             held = {name: x.copy() for name, x in held.items()}
         leaves = {n: torch.from_numpy(held[n]).view(x.shape) for n, x in named(self.world).items()}
         memory = {name: leaves.get(f"memory_{name}", x) for name, x in state.memory.items()}
-        if PAST in memory:
-            memory[PAST] = past_tensor(held["past"], state.memory[PAST].shape[-2], tuple(state.speed.shape))
+        if PAST in memory and own:
+            memory[PAST] = self.past.tensor()
         fields: Any = {n.removeprefix("state_"): x for n, x in leaves.items() if n.startswith("state_")}
         episode = {n.removeprefix("episode_"): x for n, x in leaves.items() if n.startswith("episode_")}
         return World(state._replace(**fields, memory=memory), episode)
@@ -100,7 +96,7 @@ class Values:
         if plan is None:
             assert self.world is not None
             draws = tuple(normals or ())
-            plan = Plan(self.task, self._before, self._after, self.world, self.arrays, kind, draws)
+            plan = Plan(self.task, self._before, self._after, self.world, self.arrays, self.past, kind, draws)
             self._plans[kind] = plan
         told = plan.run(self.side, action, live, normals, at, params)
         self.side = 1 - self.side
@@ -112,8 +108,3 @@ _DYNAMIC = {f"state_{name}" for name in ("position", "speed", "accel", "gap", "s
 
 def _clock(state: State) -> Tensor:
     return state.step.to(state.speed.dtype).unsqueeze(-1).expand(state.speed.shape)
-
-
-def _past(state: State) -> Array:
-    past = past_rows(state.memory[PAST], tuple(state.speed.shape))
-    return np.tile(past, (math.prod(state.memory[PAST].shape[-2:]) // len(past), 1))

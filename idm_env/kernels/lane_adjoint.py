@@ -93,7 +93,7 @@ def give_back(w, ah, n, signals, recalls, now):
 def step_back(w, h, ah, n, size, measures, phases, back, looks, recalls, sends, k, now):
     """Carry the adjoint of a tile back by one step, in place; the states are those before that step."""
     m, signals = padded(n), measures[SIGNALS]
-    perceive(w, h, n, size, measures, phases, looks, recalls, k, now)
+    perceive(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, now)
     if measures[NUMBERS] + measures[FLAGS]:
         look(w, n, size, measures, looks, CLOSE)  # whose neighbour comes or goes is an input of this step
     for phase in (CLOSE, RESPOND):
@@ -120,7 +120,7 @@ def recompute(
         if t + 1 < steps or phases[SENSE]:
             if measures[NUMBERS] + measures[FLAGS]:
                 load_inputs(w, operands, strides, begin_step + t, row, first, n, size, measures)
-            step(w, h, n, size, measures, phases, looks, recalls, k, slots + t)
+            step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots + t)
 
 
 @exact

@@ -69,44 +69,47 @@ def look(w, n, size, measures, looks, when):
 
 
 @exact
-def fetch(w, h, n, signals, recalls, now):
+def fetch(w, h, pitch, n, signals, recalls, now):
     """Fill the rows of what drivers recall; ``now`` is the place of this step in the past."""
     for i in range(recalls.shape[0]):
         ago, signal, to = recalls[i, 0], recalls[i, 1], recalls[i, 2]
         if uniform(w, ago, n):
-            copy(w, to, h, ((now - int(w[ago])) * signals + signal) * ROW, n)
+            copy(w, to, h, ((now - int(w[ago])) * signals + signal) * pitch, n)
         else:
             for j in range(n):
                 back = int(number(w, ago + j, w))
-                w[to + j] = number(h, ((now - back) * signals + signal) * ROW + j, w)
+                w[to + j] = number(h, ((now - back) * signals + signal) * pitch + j, w)
 
 
 @exact
-def remember(w, h, n, signals, signal_rows, now):
+def remember(w, h, pitch, n, signals, signal_rows, now):
     """Put the signals of this step into the past."""
     for i in range(signals):
-        copy(h, (now * signals + i) * ROW, w, signal_rows + i * ROW, n)
+        copy(h, (now * signals + i) * pitch, w, signal_rows + i * ROW, n)
 
 
 @exact
-def perceive(w, h, n, size, measures, phases, looks, recalls, k, now):
+def perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now):
     """Do all of a step that comes before the response."""
     m = padded(n)
     look(w, n, size, measures, looks, SENSE)
     look(w, n, size, measures, looks, RESPOND)
     if phases[SENSE]:
         call(phases[SENSE], w, m, k)  # type: ignore[call-arg]
-        remember(w, h, n, measures[SIGNALS], measures[SIGNAL_ROWS], now)
+        remember(w, h, pitch, n, measures[SIGNALS], measures[SIGNAL_ROWS], now)
         look(w, n, size, measures, looks, RECALL)
         call(phases[RECALL], w, m, k)  # type: ignore[call-arg]
-        fetch(w, h, n, measures[SIGNALS], recalls, now)
+        fetch(w, h, pitch, n, measures[SIGNALS], recalls, now)
 
 
 @exact
-def step(w, h, n, size, measures, phases, looks, recalls, k, now):
-    """Advance a tile by one step, in place; ``now`` is the place of this step in the past."""
+def step(w, h, pitch, n, size, measures, phases, looks, recalls, k, now):
+    """Advance a tile by one step, in place; ``now`` is the place of this step in the past.
+
+    The past of the tile begins at address ``h``, oldest step first, and has a row of ``pitch`` numbers for each signal.
+    """
     m = padded(n)
-    perceive(w, h, n, size, measures, phases, looks, recalls, k, now)
+    perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now)
     call(phases[RESPOND], w, m, k)  # type: ignore[call-arg]
     look(w, n, size, measures, looks, CLOSE)
     call(phases[CLOSE], w, m, k)  # type: ignore[call-arg]
@@ -185,7 +188,7 @@ def forward(
         for t in range(begin_step, begin_step + steps):
             if has_inputs:
                 load_inputs(w, operands, strides, t, row, first, n, size, measures)
-            step(w, h, n, size, measures, phases, looks, recalls, k, slots + t - begin_step)
+            step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots + t - begin_step)
             if every:
                 copy(kept, t * count + at, w, measures[POSITION] + skip, own)
                 copy(kept, (every + t) * count + at, w, measures[SPEED] + skip, own)

@@ -24,10 +24,8 @@ from idm_env.kernels.lane_loops import (
     fetch_next,
     fetch_states,
     load_inputs,
-    load_past,
     load_static,
     step,
-    store_past,
 )
 from idm_env.kernels.memory import copy
 from idm_env.kernels.printed import TileKernel
@@ -36,12 +34,13 @@ from idm_env.kernels.tiles import ROW, Array, exact, load, place, workspace
 
 @exact
 def advance(
-    places, strides, w, h, past, past_end, measures, phases, looks, recalls, read, k, extent, t, kept, begin, end,
+    places, strides, w, h, past, newest, measures, phases, looks, recalls, read, k, extent, t, kept, begin, end,
 ):  # fmt: skip
     """Do one step of tiles ``begin`` to ``end``.
 
     ``places`` are addresses: of the states now, of the states Δt later, and of the operands, numbers before truth
-    values. ``w`` and ``h`` are the workspace and the past of a tile, ``extent`` is
+    values. ``past`` is (steps · signals, vehicles), oldest step first; the step before this one is at ``newest``, and
+    this one comes behind it. ``w`` and ``h`` are the workspace and the past of a piece of a long row, ``extent`` is
     (slots of the past, rows, size, width of a tile, halo), ``t`` the step in operands that have time. ``kept`` says
     that the last call with this ``w`` was the same single tile with the same parameters.
     """
@@ -49,7 +48,7 @@ def advance(
     states, signals, is_ring = measures[STATES], measures[SIGNALS], measures[IS_RING] != 0
     dense, many = len(strides) - 1, measures[STATICS] + measures[PARAMETERS]
     operands, count, filled = places[2 * states :], rows * size, 0
-    has_inputs = measures[NUMBERS] + measures[FLAGS] > 0
+    has_inputs, all_past = measures[NUMBERS] + measures[FLAGS] > 0, past.ctypes.data
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
         if tile + 1 < end:
@@ -58,17 +57,25 @@ def advance(
             fetch_next(operands, strides[:many], following, size, k)
         for i in read:
             load(w, measures[STATE_ROWS] + i * ROW, places[i], strides, dense, 0, row, first, n, size, False)
-        load_past(h, past.ctypes.data, False, 0, slots, signals, strides, row, first, n, size, count)
         if not kept:
             load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
             filled = max(filled, n)
         if has_inputs:
             load_inputs(w, operands, strides, t, row, first, n, size, measures)
-        step(w, h, n, size, measures, phases, looks, recalls, k, slots)
         at = row * size + first + skip
+        if size <= wide:
+            # Whole rows find their past where it lies: it is a hundred times as long as a state.
+            step(w, all_past + at * k.itemsize, count, n, size, measures, phases, looks, recalls, k, newest + 1)
+        else:
+            for s in range(slots):
+                for i in range(signals):
+                    source = all_past + ((newest + 1 - slots + s) * signals + i) * count * k.itemsize
+                    load(h, (s * signals + i) * ROW, source, strides, dense, 0, row, first, n, size, False)
+            step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots)
+            for i in range(signals):
+                copy(all_past, ((newest + 1) * signals + i) * count + at, h, (slots * signals + i) * ROW + skip, own)
         for i in range(states):
             copy(places[states + i], at, w, measures[STATE_ROWS] + i * ROW + skip, own)
-        store_past(h, past_end.ctypes.data, slots, slots, signals, at, skip, own, count)
 
 
 def workspaces(kernel: TileKernel, slots: int, real: np.dtype[Any]) -> tuple[Array, Array]:
