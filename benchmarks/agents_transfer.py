@@ -49,6 +49,7 @@ def models(out: Path) -> dict[str, Any]:
     from idm_env.config import save_model
     from idm_env.data import episodes, synthetic
     from idm_env.discovery import discover, write_report
+    from idm_env.fitting.drivers import Estimates
     from idm_env.fitting.fit import fit
     from idm_env.fitting.job import model_of
 
@@ -56,7 +57,7 @@ def models(out: Path) -> dict[str, Any]:
     plain, corrected = out / "plain.yaml", out / "corrected" / "model.yaml"
     out.mkdir(parents=True, exist_ok=True)
     if not plain.exists():
-        save_model(plain, model_of(fit(episodes(trajectories, max_gap=None, smooth=True), by="all")))
+        save_model(plain, model_of(Estimates.of(fit(episodes(trajectories, max_gap=None, smooth=True), by="all"))))
     if not corrected.exists():
         write_report(discover(trajectories, seed=DATA_SEED), corrected.parent)
     drivers = truth.drivers[:22]

@@ -15,7 +15,6 @@ import os
 import sys
 import time
 from collections import Counter, defaultdict
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +54,9 @@ class Job:
     ou: float
     seed: int
     runs: int = 10
+
+    def __str__(self) -> str:
+        return self.key
 
     @property
     def key(self) -> str:
@@ -181,7 +183,7 @@ def oracle(found: Any, truth: Any) -> float | None:
     return float(judge.judge(kept, model, np.array(values), prior, None, True).summary()["gap_rmse_m"])
 
 
-def measure(job: Job) -> dict[str, Any]:
+def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
     """Run the tool on one set and score what it says."""
     from idm_env.discovery import discover
 
@@ -308,9 +310,10 @@ def main() -> None:
         j for j in jobs(arguments.sets, arguments.clean, arguments.first_seed, arguments.few) if arguments.only in j.key
     ]
     missing = [j for j in wanted if j.key not in done]
-    with ProcessPoolExecutor(arguments.jobs) as pool, arguments.out.open("a") as file:
-        for number, future in enumerate(as_completed([pool.submit(measure, j) for j in missing]), 1):
-            row = future.result()
+    from idm_env.executor import opened
+
+    with opened("processes", arguments.jobs) as executor, arguments.out.open("a") as file:
+        for number, (_, row) in enumerate(executor.map(measure, missing), 1):
             done[row["key"]] = row
             file.write(json.dumps(row) + "\n")
             file.flush()

@@ -60,6 +60,9 @@ def _ranged(*names: str, help: str, low: float, high: float, unit: str = "") -> 
 
 
 Data = Annotated[Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.")]
+DataOrFolder = Annotated[
+    Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.")
+]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if missing.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
 Seed = Annotated[int, _ranged(help="Seed of everything random.", low=0, high=1e9)]
@@ -67,7 +70,7 @@ RingLength = Annotated[
     float | None, _ranged(help="Circumference (m), if the traffic runs on a ring.", low=1.0, high=1e6, unit="m")
 ]
 Place = Annotated[str | None, typer.Option(help="Column that names places, such as track_s_m on a lap.")]
-Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim or openacc.")]
+Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim, openacc, highd, exid, pneuma or i24.")]
 MaxGap = Annotated[
     float,
     _ranged(help="Gaps above this (m) mean a lost leader and are left out.", low=0.1, high=math.inf, unit="m"),
@@ -90,6 +93,16 @@ Base = Annotated[
 ]
 Step = Annotated[
     float | None, _ranged("--dt", help="Use every n-th sample, to this step (s).", low=0.001, high=100.0, unit="s")
+]
+
+Workers = Annotated[
+    str, typer.Option("--executor", help="Where parts of the work run: serial, processes or ray. Results are the same.")
+]
+Jobs = Annotated[
+    int | None, _ranged(help="Parts that run at a time, one thread each; default: one per processor.", low=1, high=1e5)
+]
+RayAddress = Annotated[
+    str | None, typer.Option(help="Address of a Ray cluster, host:port or auto; default: Ray on this machine.")
 ]
 
 
@@ -123,7 +136,7 @@ def _show(title: str, rows: list[dict[str, Any]]) -> None:
 
 @app.command()
 def fit(
-    data: Data,
+    data: DataOrFolder,
     out: Out = Path("out/fit"),
     by: Annotated[str, typer.Option(help="driver, all, or a column such as vehicle_name.")] = "driver",
     held_out: Annotated[str | None, typer.Option(help='"column=value", or a share of the runs such as 0.25.')] = None,
@@ -148,6 +161,9 @@ def fit(
     dt: Step = None,
     where: Where = None,
     resume: Resume = False,
+    executor: Workers = "serial",
+    jobs: Jobs = None,
+    ray_address: RayAddress = None,
 ) -> None:
     """Calibrate IDM, or another law, by gradients through the simulator, per driver, group or pooled.
 
@@ -158,14 +174,17 @@ def fit(
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
         checks.within("--held-out", share, 0.001, 0.999)
     with shown(console) as report:
-        from idm_env.fitting.job import Options, Source, fit_file
+        from idm_env.executor import opened
+        from idm_env.fitting.job import fit_file
+        from idm_env.fitting.options import Options, Source
 
         _work_begins()
         source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
         options = Options(
             by, share, objective, relative, loss, method, integration, starts, seed, substeps, model, base,  # type: ignore[arg-type]
         )  # fmt: skip
-        result = fit_file(source, options, out, resume=resume, on_progress=report)
+        with opened(executor, jobs, ray_address) as workers:
+            result = fit_file(source, options, out, resume=resume, executor=workers, on_progress=report)
     rows = [{"": "fitted", **result["fit"]}]
     if result["held_out"] is not None:
         rows.append({"": "held out", **result["held_out"]})
@@ -177,7 +196,10 @@ def fit(
 
 @app.command()
 def explain(
-    data: Data,
+    data: Annotated[
+        list[Path],
+        typer.Argument(help="Trajectories: csv, csv.gz, parquet. Several data sets: files, a folder, 'drives/*.csv'."),
+    ],
     out: Out = Path("out/explain"),
     by: Annotated[str, typer.Option(help="Who shares IDM parameters: driver, all, or a column.")] = "driver",
     effects: Annotated[
@@ -192,51 +214,38 @@ def explain(
     layout: Layout = "auto",
     where: Where = None,
     resume: Resume = False,
+    executor: Workers = "serial",
+    jobs: Jobs = None,
+    ray_address: RayAddress = None,
 ) -> None:
     """Fit a law, find the residual, trace it to the effect that the model lacks, add it, and report before and after.
 
     Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
     """
     with shown(console) as report:
-        from idm_env.data import load
+        from idm_env.discovery.sets import Question, explain_sets, files_of
+        from idm_env.discovery.sets import explain as explain_one
+        from idm_env.executor import opened
 
-    names, given = _names("--effects", effects), _names("--known", known) or ()
-    with keep.results(out, EXPLAINED, [data]), shown(console) as report:
-        from idm_env.data import load
-
-        report("reading", 0, 0, data.name)
-        trajectories = load(data, ring_length=ring_length, place=place, layout=layout)
-        if where is not None:
-            trajectories = trajectories.where(where)
-        result, models = _explain(report, trajectories, out, by, names, given, seed, resume, base or "idm")
-    _explained(result, models, out)
-
-
-def _explain(
-    report: OnProgress,
-    trajectories: Any,
-    out: Path,
-    by: str = "driver",
-    effects: tuple[str, ...] | None = None,
-    known: tuple[str, ...] = (),
-    seed: int = 0,
-    resume: bool = False,
-    base: str = "idm",
-) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Write the report, and return it with the names of the models compared."""
-    import json
-
-    from idm_env.discovery import discover, write_report
-
-    _work_begins()
-    found = discover(
-        trajectories, by=by, effects=effects, known=known, out=out, resume=resume, seed=seed, base=base,
-        on_progress=report,
-    )  # fmt: skip
-    report("writing the report", 0, 0, "")
-    write_report(found, out)
-    result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    return result, found.judgement.titles
+        files = files_of(data)
+        asked = Question(
+            by, _names("--effects", effects), _names("--known", known) or (), seed, ring_length, place, layout,
+            None if where is None else tuple(where), base or "idm",
+        )  # fmt: skip
+        _work_begins()
+        rows: list[dict[str, Any]] = []
+        if len(files) == 1:
+            result, models = explain_one(files[0], out, asked, resume=resume, on_progress=report)
+        else:
+            with opened(executor, jobs, ray_address) as workers:
+                rows = explain_sets(files, out, asked, resume=resume, executor=workers, on_progress=report)
+    if not rows:
+        _explained(result, models, out)
+        return
+    _show(f"{len(rows)} data sets", [
+        {"set": row["set"], "verdict": row["verdict"].replace("_", " "), "effects": row["effects"]} for row in rows
+    ])  # fmt: skip
+    _done(out, f"Every set's own report is in {out}/NAME; sets.csv has them all.")
 
 
 def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
@@ -305,8 +314,11 @@ def demo(
     """
     names = (*EXPLAINED, *(("platoon.csv",) if data is None else ()))
     with keep.results(out, names, [data]) as folder, shown(console) as report:
-        from idm_env.data import load, synthetic
+        from idm_env.data import synthetic
+        from idm_env.discovery.sets import Question
+        from idm_env.discovery.sets import explain as explain_one
 
+        _work_begins()
         path = data
         if path is None:
             report("generating", 0, 0, "platoon.csv")
@@ -315,8 +327,7 @@ def demo(
             columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
             keep.write(path, made.table.select(columns).write_csv)
             console.print(f"Ten runs of a leader and three followers: {path}")
-        report("reading", 0, 0, path.name)
-        result, models = _explain(report, load(path), out)
+        result, models = explain_one(path, out, Question(), on_progress=report)
     _explained(result, models, out)
 
 
@@ -338,7 +349,8 @@ def simulate(
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
     with shown(console) as report:
-        from idm_env.fitting.job import Source, simulate_file
+        from idm_env.fitting.job import simulate_file
+        from idm_env.fitting.options import Source
 
         _work_begins()
         source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
@@ -471,23 +483,28 @@ FixedParameters = Annotated[bool, typer.Option("--fixed-parameters", help="Keep 
 
 @app.command("filter")
 def filter_(
-    data: Data,
+    data: DataOrFolder,
     out: Out = Path("out/filter"),
     recipe: Recipe = "default",
     fixed_parameters: FixedParameters = False,
     model: Corrected = None,
     layout: Layout = "auto",
     resume: Resume = False,
+    executor: Workers = "serial",
+    jobs: Jobs = None,
+    ray_address: RayAddress = None,
 ) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
     with shown(console) as report:
+        from idm_env.executor import opened
         from idm_env.trajectories.files import filter_file
 
         _work_begins()
-        result = filter_file(
-            data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            model=model, on_progress=report,
-        )  # fmt: skip
+        with opened(executor, jobs, ray_address) as workers:
+            result = filter_file(
+                data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
+                model=model, executor=workers, on_progress=report,
+            )  # fmt: skip
     _methods(result)
     _done(out, result["account"])
 
@@ -505,7 +522,7 @@ def _methods(result: dict[str, Any]) -> None:
 
 @app.command()
 def reconstruct(
-    data: Data,
+    data: DataOrFolder,
     out: Out = Path("out/reconstruct"),
     dt: Annotated[float, _ranged(help="Step of the dense trajectories (s).", low=0.01, high=2.0, unit="s")] = 0.1,
     recipe: Recipe = "default",
@@ -513,16 +530,21 @@ def reconstruct(
     model: Corrected = None,
     layout: Layout = "auto",
     resume: Resume = False,
+    executor: Workers = "serial",
+    jobs: Jobs = None,
+    ray_address: RayAddress = None,
 ) -> None:
     """Reconstruct dense trajectories from sparse ones, a second or more between points."""
     with shown(console) as report:
+        from idm_env.executor import opened
         from idm_env.trajectories.files import reconstruct_file
 
         _work_begins()
-        result = reconstruct_file(
-            data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-            model=model, on_progress=report,
-        )  # fmt: skip
+        with opened(executor, jobs, ray_address) as workers:
+            result = reconstruct_file(
+                data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
+                model=model, executor=workers, on_progress=report,
+            )  # fmt: skip
     _methods(result)
     _done(out, result["account"])
 
@@ -532,13 +554,18 @@ def predict(
     scenarios: Annotated[list[Path], typer.Argument(help="Waymo Open Motion scenarios: JSON, json.gz or TFRecord.")],
     out: Out = Path("out/predict"),
     resume: Resume = False,
+    executor: Workers = "serial",
+    jobs: Jobs = None,
+    ray_address: RayAddress = None,
 ) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
     with shown(console) as report:
+        from idm_env.executor import opened
         from idm_env.prediction.files import predict_files
 
         _work_begins()
-        result = predict_files(scenarios, out, resume=resume, on_progress=report)
+        with opened(executor, jobs, ray_address) as workers:
+            result = predict_files(scenarios, out, resume=resume, executor=workers, on_progress=report)
     names = {"minADE_8s": "minADE (m)", "minFDE_8s": "minFDE (m)", "miss_rate_8s": "miss rate", "mAP_8s": "mAP"}
     rows = [{"method": r["method"], **{title: r[key] for key, title in names.items()}} for r in result["methods"]]
     _show(f"8 s ahead, {result['agents_with_known_future']} agents", rows)

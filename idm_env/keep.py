@@ -14,6 +14,7 @@ import io
 import json
 import os
 import shutil
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -33,12 +34,14 @@ R = TypeVar("R")
 # -- files -----------------------------------------------------------------------------------------------------------
 
 
-def write(path: Path, writer: Callable[[Path], Any]) -> None:
+def write(path: Path, writer: Callable[[Path], Any], *, shared: bool = False) -> None:
     """Let ``writer`` write a file; one of that name is replaced only by a whole one.
 
+    ``shared``: others may write the same file at the same time, and the last whole one stays.
     OSError, in one line, where the disk is full; nothing is left of the file then.
     """
-    beside = path.with_name(f".{path.stem}.idm-env-part{path.suffix}")
+    mine = f"-{uuid.uuid4().hex}" if shared else ""
+    beside = path.with_name(f".{path.stem}.idm-env-part{mine}{path.suffix}")
     try:
         writer(beside)
         os.replace(beside, path)
@@ -114,6 +117,8 @@ def results(out: str | Path, names: Sequence[str], inputs: Iterable[Path | str |
     for given in inputs:
         if given is not None and Path(given).resolve().is_relative_to(left):
             raise ValueError(f"{given} belongs to an interrupted run, which removes it at its end. Copy it elsewhere.")
+        if given is not None and Path(given).is_dir() and folder.resolve().is_relative_to(Path(given).resolve()):
+            raise ValueError(f"{folder} lies in {given}, whose files are all read. Give --out a folder elsewhere.")
     for name in names:
         not_an_input(folder / name, inputs)
     mark = _mark(folder)
@@ -232,7 +237,7 @@ class Store:
             self._memory[key] = content
         else:
             sealed = hashlib.sha256(content).digest() + content
-            write(self.folder / f"{key}.kept", lambda beside: beside.write_bytes(sealed))
+            write(self.folder / f"{key}.kept", lambda beside: beside.write_bytes(sealed), shared=True)
 
     def _get(self, key: str, reader: Callable[[bytes], Any]) -> Any:
         key = quote(key, safe="")

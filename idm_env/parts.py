@@ -14,6 +14,8 @@ from idm_env.report import plain
 class Parts:
     """Numbered parts in a ``Store``: tables as parquet, and a summary that marks a part as done.
 
+    A part may be done more than once, and at the same time: whoever is last leaves the same.
+
     ValueError for what ``Store`` refuses, and for a table of a finished part that is not what was written.
     """
 
@@ -27,7 +29,7 @@ class Parts:
 
     def write(self, number: int, name: str, table: pl.DataFrame) -> None:
         """Write a table of a part."""
-        keep.write(self.path(number, name), table.write_parquet)
+        keep.write(self.path(number, name), table.write_parquet, shared=True)
 
     def done(self, number: int) -> bool:
         """Tell whether a part is finished, with its tables as they were written."""
@@ -49,11 +51,14 @@ class Parts:
         """Return what is remembered of all parts, in their order."""
         return [self.store.get_json(key)["summary"] for key in self.store.kept()]
 
+    def tables(self, name: str) -> list[Path]:
+        """Return the files of all parts' tables of a name, in the order of the parts."""
+        return sorted(self.folder.glob(f"[0-9]*.{name}.parquet"))
+
     def join(self, name: str, target: Path) -> None:
-        """Write the tables of all parts as one, without holding them in memory."""
-        paths = sorted(self.folder.glob(f"[0-9]*.{name}.parquet"))
-        whole = pl.scan_parquet(paths, missing_columns="insert", extra_columns="ignore")
-        keep.write(target, whole.sink_parquet)
+        """Write the tables of all parts as one, csv or parquet by the target's name, holding one of them at a time."""
+        whole = pl.scan_parquet(self.tables(name), missing_columns="insert", extra_columns="ignore")
+        keep.write(target, whole.sink_csv if target.suffix == ".csv" else whole.sink_parquet)
 
     def remove(self) -> None:
         """Remove the folder: the run has ended."""

@@ -17,7 +17,8 @@ from idm_env.cli import EXPLAINED
 from idm_env.data import synthetic
 from idm_env.discovery import write
 from idm_env.fitting import job
-from idm_env.fitting.job import Options, Source, fit_file, simulate_file
+from idm_env.fitting.job import fit_file, simulate_file
+from idm_env.fitting.options import Options, Source
 from idm_env.parts import Parts
 from idm_env.prediction.files import predict_files
 from idm_env.trajectories import files

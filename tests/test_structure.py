@@ -30,12 +30,14 @@ ALLOWED = {
     "fonts": set(),
     "report": {"fonts", "keep"},
     "progress": set(),
+    "executor": {"progress"},
+    "parts": {"keep", "report"},
     "diagrams": {"report", "fonts"},
     "config": {"types", "parameters", "checks", "effects", "roads", "simulator", "keep"},
     "data": set(),
     "fitting": {
         "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "report", "metrics",
-        "checks", "keep", "progress", "diagrams",
+        "checks", "keep", "progress", "diagrams", "executor", "parts",
     },
     "drift": {"types", "parameters", "simulator", "fitting", "progress"},
 }  # fmt: skip

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 
 
 class DataError(ValueError):
@@ -30,6 +30,27 @@ class Repair:
 
     def __str__(self) -> str:
         return self.text
+
+
+@dataclass
+class Counted:
+    """Repairs by kind and wording, added up over the pieces of a file."""
+
+    found: dict[tuple[str, str], int] = field(default_factory=dict)
+
+    def add(self, repairs: Sequence[Repair]) -> None:
+        """Count repairs; a number at the beginning of a text is added up."""
+        for repair in repairs:
+            text = repair.text.removeprefix(f"{repair.count} ")
+            key = repair.kind, ("# " if text != repair.text else "") + text
+            again = key in self.found and not text.startswith("#") and text == repair.text
+            self.found[key] = repair.count if again else self.found.get(key, 0) + repair.count
+
+    def repairs(self) -> tuple[Repair, ...]:
+        """Return the repairs with their sums."""
+        return tuple(
+            Repair(kind, count, text.replace("# ", f"{count} ", 1)) for (kind, text), count in self.found.items()
+        )
 
 
 def nearest(name: str, names: Iterable[str], cutoff: float = 0.5) -> str | None:

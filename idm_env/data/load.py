@@ -5,16 +5,16 @@ from __future__ import annotations
 import gzip
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import polars as pl
 
-from idm_env.data import ngsim, openacc, tidy
+from idm_env.data import drones, folder, ngsim, openacc, tidy
 from idm_env.data.errors import DataError, Repair, listed
 from idm_env.data.trajectories import Trajectories
 
-LAYOUTS = ("auto", "tidy", "ngsim", "openacc")
+LAYOUTS = ("auto", "tidy", "ngsim", "openacc", *drones.CSV, *drones.FILES)
 EXTENSIONS = (".csv", ".csv.gz", ".parquet")
 BATCH_BYTES, BATCH_ROWS = 16_000_000, 200_000
 """Text and rows that ``batches`` holds at a time."""
@@ -31,7 +31,8 @@ def load(
         path: A csv, csv.gz or parquet file: a tidy table, an NGSIM file or an OpenACC file.
         ring_length: Length in m of a closed road, on which a leader may be behind.
         place: Column with the coordinate of places (hills, zones), such as ``"track_s_m"``; position_m if None.
-        layout: ``"tidy"``, ``"ngsim"``, ``"openacc"``, or ``"auto"`` to tell by the columns.
+        layout: ``"tidy"``, ``"ngsim"``, ``"openacc"``, ``"highd"``, ``"exid"``, ``"pneuma"``, ``"i24"``, or ``"auto"``
+            to tell by the file.
 
     Raises:
         DataError: If the file cannot be read or used; one line that names the value, the rule and the cure.
@@ -54,6 +55,8 @@ def read(path: str | Path, *, layout: str = "auto") -> tuple[pl.DataFrame, list[
     path = Path(path)
     if layout not in LAYOUTS:
         raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
+    if own := _own_reader(path, layout):
+        return own(path)
     extension, lines = _checked(path)
     above = openacc.header_line(lines)
     try:
@@ -69,11 +72,21 @@ def read(path: str | Path, *, layout: str = "auto") -> tuple[pl.DataFrame, list[
 def batches(path: str | Path, *, layout: str = "auto") -> Iterator[tuple[pl.DataFrame, list[Repair]]]:
     """Yield what ``read`` returns piece by piece, so that a file of any size needs little memory.
 
-    OpenACC files, and NGSIM files of several places or periods, whose rows explain each other, come as one piece.
+    Of a folder of parquet files, one after the other; ``name=value`` in the names of folders below it is a column.
+    Files whose rows explain each other come as one piece: OpenACC, NGSIM of several places or periods, and drones'.
     """
     path = Path(path)
     if layout not in LAYOUTS:
         raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
+    if path.is_dir():
+        for file in folder.files_of(path):
+            given = [pl.lit(value).alias(name) for name, value in folder.partition(path, file).items()]
+            for frame, repairs in batches(file, layout=layout):
+                yield frame.with_columns(given), repairs
+        return
+    if own := _own_reader(path, layout):
+        yield own(path)
+        return
     extension, lines = _checked(path)
     if layout == "openacc" or (layout == "auto" and openacc.header_line(lines) is not None):
         yield read(path, layout=layout)
@@ -81,7 +94,8 @@ def batches(path: str | Path, *, layout: str = "auto") -> Iterator[tuple[pl.Data
     try:
         for number, table in enumerate(_pieces(path, extension)):
             names = [name.strip().lower() for name in table.columns]
-            if number == 0 and ngsim.matches(names) and ("location" in names or "frame_id" not in names):
+            explain_each_other = ngsim.matches(names) and ("location" in names or "frame_id" not in names)
+            if number == 0 and (explain_each_other or drones.layout_of(table.columns)):
                 yield read(path, layout=layout)
                 return
             yield _plain_layout(table, layout, path.name)
@@ -118,10 +132,26 @@ def _pieces(path: Path, extension: str) -> Iterator[pl.DataFrame]:
         raise _unreadable(path, error) from None
 
 
+def _own_reader(path: Path, layout: str) -> Callable[[Path], tuple[pl.DataFrame, list[Repair]]] | None:
+    """Return the reader of a layout that is no table, by its name or by how the file begins; None for tables."""
+    if layout in drones.FILES or (layout == "auto" and path.name.lower().endswith(".json")):
+        if not path.is_file():
+            raise DataError(f"{path} does not exist; check the path.")
+        return drones.FILES[layout if layout in drones.FILES else "i24"]
+    if layout == "auto" and path.is_file() and path.name.lower().endswith(".csv"):
+        first = _first_lines(path, 1)[0].replace(" ", "")
+        if first.startswith("track_id;type;"):
+            return drones.pneuma
+    return None
+
+
 def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     table = _once(table, source)
     if layout == "ngsim" or (layout == "auto" and ngsim.matches(table.columns)):
         return ngsim.read(table, source)
+    found = layout if layout in drones.CSV else drones.layout_of(table.columns) if layout == "auto" else None
+    if found:
+        return drones.CSV[found](table, source)
     if layout == "auto" and not tidy.matches(table.columns):
         plain = {re.sub(r"\W+", "_", name.lower()).strip("_"): name for name in table.columns}
         near = [

@@ -2,16 +2,79 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import polars as pl
 import torch
+from torch import Tensor
 
 from idm_env import report as page
 from idm_env.fitting.evaluate import Errors
 from idm_env.fitting.fit import Fit
+from idm_env.parameters import Parameter, catalogue
+from idm_env.simulator import Simulator
 
 MOST_ROWS = 1000
 """Drivers that the page lists; all are in drivers.csv."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What was fitted, [groups, parameters] each, whether by one fit or by several that know nothing of each other.
+
+    ``dt`` is the data's time step (s), ``fixed`` what was not fitted and has not its default.
+    """
+
+    simulator: Simulator
+    dt: float
+    fixed: Mapping[str, float]
+    names: tuple[str, ...]
+    groups: tuple[str, ...]
+    values: Tensor
+    standard_error: Tensor
+    at_bound: Tensor
+    identified: Tensor
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Declarations of what was fitted."""
+        known = catalogue(self.simulator.effects)
+        return tuple(known[name] for name in self.names)
+
+    def own_for(self, groups: Sequence[str], pooled: Tensor) -> tuple[Tensor, list[str]]:
+        """Return values [G, P] for ``groups``, and the groups that the fit has not seen.
+
+        A group that was fitted keeps its values; any other gets the ``pooled`` ones [P].
+        """
+        index = {name: i for i, name in enumerate(self.groups)}
+        rows = [self.values[index[name]] if name in index else pooled for name in groups]
+        return torch.stack(rows), [name for name in groups if name not in index]
+
+    @classmethod
+    def of(cls, found: Fit) -> Estimates:
+        """Return what one fit found."""
+        problem, told = found.problem, found.uncertainty
+        return cls(
+            problem.simulator, problem.batch.dt, problem.fixed, found.names, problem.groups, found.values(),
+            told.standard_error, told.at_bound, told.identified,
+        )  # fmt: skip
+
+    @classmethod
+    def joined(cls, table: pl.DataFrame, simulator: Simulator, dt: float, fixed: Mapping[str, float]) -> Estimates:
+        """Return what several fits found, from the rows of their ``Fit.table()``."""
+        names = tuple(table["parameter"].unique(maintain_order=True))
+        count = len(names)
+
+        def column(name: str) -> Tensor:
+            return torch.from_numpy(table[name].to_numpy().copy()).reshape(-1, count)
+
+        return cls(
+            simulator, dt, fixed, names, tuple(table["group"].gather_every(count)), column("estimate"),
+            column("standard_error"), column("at_bound"), column("identified"),
+        )  # fmt: skip
 
 
 def table(found: Fit, error: Errors) -> list[dict[str, Any]]:
@@ -36,19 +99,18 @@ def table(found: Fit, error: Errors) -> list[dict[str, Any]]:
     return rows
 
 
-def bounds(found: Fit) -> list[dict[str, Any]]:
+def bounds(found: Estimates) -> list[dict[str, Any]]:
     """Return one row per parameter: median, 10 and 90 %, and how many groups have it on a bound or not identified."""
-    values, flags = found.values(), found.uncertainty
+    values = found.values
     rows = []
-    for i, (name, p) in enumerate(zip(found.names, found.problem.parameters, strict=True)):
-        on = flags.at_bound[:, i]
+    for i, (name, p) in enumerate(zip(found.names, found.parameters, strict=True)):
+        on = found.at_bound[:, i]
         lower = on & (values[:, i] < 0.5 * (p.low + p.high))
-        share = torch.tensor([0.1, 0.5, 0.9], dtype=values.dtype)
-        low, middle, high = torch.quantile(values[:, i], share).tolist()
+        low, middle, high = np.quantile(values[:, i].numpy(), [0.1, 0.5, 0.9]).tolist()
         rows.append({
             "parameter": name, "symbol": p.symbol, "unit": p.unit, "median": middle, "p10": low, "p90": high,
             "low": p.low, "high": p.high, "groups": len(values), "on_low": int(lower.sum()),
-            "on_high": int((on & ~lower).sum()), "not_identified": int((~flags.identified[:, i] & ~on).sum()),
+            "on_high": int((on & ~lower).sum()), "not_identified": int((~found.identified[:, i] & ~on).sum()),
         })  # fmt: skip
     return rows
 
@@ -64,8 +126,11 @@ def sentence(rows: list[dict[str, Any]]) -> str:
     return f"Bounds: {', '.join(told)}." if told else "Bounds: no parameter is on one."
 
 
-def blocks(found: Fit, rows: list[dict[str, Any]], shares: list[dict[str, Any]]) -> list[page.Block]:
-    """Return the table of parameters with their shares at bounds, and the table of drivers."""
+def blocks(found: Estimates, rows: Sequence[dict[str, Any]], shares: list[dict[str, Any]]) -> list[page.Block]:
+    """Return the table of parameters with their shares at bounds, and the table of drivers.
+
+    ``rows`` are those of the first ``MOST_ROWS`` drivers at least.
+    """
 
     def share(count: int, groups: int) -> page.Cell:
         return page.Cell(f"{count} ({100 * count / groups:.0f} %)" if count else "0", count, 2 * count > groups)
@@ -85,30 +150,30 @@ def blocks(found: Fit, rows: list[dict[str, Any]], shares: list[dict[str, Any]])
         }
         for row in shares
     ]
-    several = len(rows) > MOST_ROWS
+    several = len(found.groups) > MOST_ROWS
     listed = [_row(found, row) for row in rows[:MOST_ROWS]]
     return [
         page.table(parameters),
         page.note("10 % and 90 %: so many of the groups lie below. Lowest and highest: where a parameter may lie."),
-        page.heading("One row per driver" if found.problem.groups != ("all",) else "All drivers together"),
+        page.heading("One row per driver" if found.groups != ("all",) else "All drivers together"),
         page.table(listed),
         page.note(
             "After ±: standard error, which allows for correlated residuals, not for a wrong model. ⊣: on its bound, "
             "?: not identified by these data (standard error above half of the value). A click on a heading sorts. "
-            + (f"The first {MOST_ROWS} of {len(rows)} rows; all" if several else "The same rows")
+            + (f"The first {MOST_ROWS} of {len(found.groups)} rows; all" if several else "The same rows")
             + " are in drivers.csv."
         ),
     ]
 
 
-def _row(found: Fit, row: dict[str, Any]) -> dict[str, Any]:
+def _row(found: Estimates, row: dict[str, Any]) -> dict[str, Any]:
     shown: dict[str, Any] = {
         "driver": row["group"], "episodes": row["episodes"], "gap RMSE (m)": page.Cell(
             f"{row['gap_rmse_m']:.2f}", row["gap_rmse_m"]
         ),
     }  # fmt: skip
-    on, doubtful = row["bounds"].split(), row["not_identified"].split()
-    for name, p in zip(found.names, found.problem.parameters, strict=True):
+    on, doubtful = (row["bounds"] or "").split(), (row["not_identified"] or "").split()
+    for name, p in zip(found.names, found.parameters, strict=True):
         value, spread = row[name], row[f"{name}_error"]
         unit = "" if p.unit == "1" else f" ({p.unit})"
         # A spread that says nothing is not a number worth reading; drivers.csv has it.

@@ -1,4 +1,4 @@
-"""How well a model reproduces drivers: errors per episode, and parameters for drivers that no fit has seen."""
+"""How well a model reproduces drivers: errors per episode."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from idm_env.fitting.fit import Fit
 from idm_env.fitting.problem import Problem, Simulated
 
 
@@ -54,17 +53,6 @@ def errors(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Errors, Simul
         ),
         simulated,
     )
-
-
-def own_for(found: Fit, problem: Problem, pooled: Tensor) -> tuple[Tensor, list[str]]:
-    """Return own values for the groups of another problem, and the groups that the fit has not seen.
-
-    A group that was fitted keeps its values; any other gets the ``pooled`` ones [P].
-    """
-    index = {name: i for i, name in enumerate(found.problem.groups)}
-    unseen = [name for name in problem.groups if name not in index]
-    rows = [pooled if name in unseen else found.own[index[name]] for name in problem.groups]
-    return torch.stack(rows), unseen
 
 
 def like(problem: Problem, other: Problem) -> Problem:

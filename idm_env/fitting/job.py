@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import polars as pl
 import torch
@@ -14,170 +13,166 @@ import torch
 from idm_env import keep
 from idm_env import report as page
 from idm_env.config import Model, Numbers, load_model, save_model
-from idm_env.data import LEADER_LOST_GAP_M, DataError, Episodes, Repair, Trajectories, episodes, load
-from idm_env.data.episode import windows
-from idm_env.data.fingerprint import fingerprints, fitted_on
-from idm_env.effects import Brakes, Effect, Replay, base_named
-from idm_env.fitting import drivers, pictures
+from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories
+from idm_env.data.fingerprint import fingerprints
+from idm_env.data.folder import Share, shares, stamp
+from idm_env.effects import Brakes, base_named
+from idm_env.executor import Executor, Serial
+from idm_env.fitting import drivers, pictures, pieces
 from idm_env.fitting.batch import Batch
-from idm_env.fitting.evaluate import Errors, errors, own_for
-from idm_env.fitting.fit import Fit, Method, base_simulator, fit
-from idm_env.fitting.problem import Loss, Objective, Problem, Simulated, group_of
+from idm_env.fitting.drivers import Estimates
+from idm_env.fitting.evaluate import Errors, errors
+from idm_env.fitting.options import Options, Source, behind_records
+from idm_env.fitting.pieces import Joined, Piece
+from idm_env.fitting.problem import Problem, Simulated, group_of
+from idm_env.parts import Parts
 from idm_env.progress import OnProgress, silent
 from idm_env.roads import Lane
-from idm_env.simulator import Integration, Simulator
+from idm_env.simulator import Simulator
 
 FITTED = ("parameters.parquet", "drivers.csv", "model.yaml", "report.json", "report.html")
 SIMULATED = ("simulated.parquet", "report.json", "report.html")
 """What ``fit_file`` and ``simulate_file`` write."""
-
-
-@dataclass(frozen=True)
-class Source:
-    """How a file is read: see ``idm_env.data.load`` and ``episodes``.
-
-    ``where`` (``column=value``, or several that must all hold) selects runs or drivers; ``window`` (s) cuts long
-    episodes.
-    """
-
-    path: Path
-    ring_length: float | None = None
-    place: str | None = None
-    layout: str = "auto"
-    max_gap: float | None = LEADER_LOST_GAP_M
-    min_seconds: float = 5.0
-    dt: float | None = None
-    smooth: bool = False
-    window: float | None = None
-    where: str | Sequence[str] | None = None
-
-    def trajectories(self) -> Trajectories:
-        """Read and check the file."""
-        read = load(self.path, ring_length=self.ring_length, place=self.place, layout=self.layout)
-        return read if self.where is None else read.where(self.where)
-
-    def episodes(self, trajectories: Trajectories) -> Episodes:
-        """Return the drivers behind leaders, cut to windows where asked."""
-        found = episodes(
-            trajectories, min_seconds=self.min_seconds, max_gap=self.max_gap, smooth=self.smooth, dt=self.dt
-        )
-        if self.window is None:
-            return found
-        return Episodes(tuple(windows(found, self.window)), found.left_out)
-
-
-@dataclass(frozen=True)
-class Options:
-    """How a model is fitted, as in ``idm_env.fitting.fit.fit``; ``held_out``: ``column=value`` or a share of runs."""
-
-    by: str = "driver"
-    held_out: str | float | None = None
-    objective: Objective = "spacing"
-    relative: bool = False
-    loss: Loss = "rmse"
-    method: Method = "lm"
-    integration: Integration = "ballistic"
-    starts: int = 4
-    seed: int = 0
-    substeps: int | None = None
-    model: str | None = None
-    base: str | None = None
-
-    def simulator(self) -> tuple[Simulator, dict[str, float]]:
-        """Return what is calibrated and the parameters that stay.
-
-        That is the car-following law ``base`` (None: IDM), or a saved model, whose effects are kept.
-        """
-        if self.model is None:
-            return base_simulator(base=base_named(self.base or "idm"), integration=self.integration), {}
-        if self.base is not None:
-            raise ValueError(f"base = '{self.base}', and the model {self.model} has one. Leave one of them out.")
-        saved = load_model(Path(self.model))
-        simulator = Simulator(Lane(), _behind_records(saved), dt=saved.dt, integration=saved.integration)
-        kept = {
-            f"{effect}.{name}": float(value)
-            for effect, parameters in saved.parameters.items() if effect != simulator.base.name
-            for name, value in parameters.items()
-        }  # fmt: skip
-        return simulator, kept
-
-
-def _behind_records(model: Model) -> tuple[Effect, ...]:
-    """Return a model's effects with replayed leaders, without an agent's control."""
-    effects = tuple(e for e in model.effects if e.name != "control")
-    return effects if "replay" in {e.name for e in effects} else (*effects, Replay())
+MOST_DRIVERS = 10_000
+"""Drivers that a model.yaml has of its own, at most; drivers.csv has all."""
 
 
 def fit_file(
-    source: Source, options: Options, out: Path, *, resume: bool = False, on_progress: OnProgress | None = None
+    source: Source,
+    options: Options,
+    out: Path,
+    *,
+    resume: bool = False,
+    part: int = pieces.PART,
+    executor: Executor | None = None,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Fit IDM, or another car-following law, to a file and return the report; write it, the parameters and the model.
 
     Writes ``parameters.parquet`` (one row per group and parameter), ``drivers.csv`` (one row per group),
-    ``model.yaml``, ``report.json`` and ``report.html``.
+    ``model.yaml`` (without drivers of its own above ``MOST_DRIVERS``), ``report.json`` and ``report.html``.
+
+    The work is done in parts of ``part`` groups by ``executor`` (None: here), on which no byte of the first three
+    depends. The path may be a folder of parquet files with columns run_id, vehicle_id, time_s and position_m at least:
+    it is fitted by driver, some runs at a time, and never held as a whole.
 
     Held-out runs take no part in the fit. Where their group was fitted they are simulated with its parameters,
     otherwise with those of a pooled fit of the fitting runs. DataError and ValueError for what cannot be read or
-    fitted.
+    fitted; PartsError names parts that failed for another reason, and keeps the others for ``resume``.
     """
+    work = _Work(source, options, out.absolute(), resume, part, executor or Serial(), on_progress or silent)
     with keep.results(out, FITTED, (source.path, options.model)):
-        return _fit_file(source, options, out, resume, on_progress or silent)
+        return _fit_folder(work) if source.path.is_dir() else _fit_file(work)
 
 
-def _fit_file(source: Source, options: Options, out: Path, resume: bool, progress: OnProgress) -> dict[str, Any]:
-    progress("reading", 0, 0, source.path.name)
+class _Work(NamedTuple):
+    """What one call of ``fit_file`` was asked for."""
+
+    source: Source
+    options: Options
+    out: Path
+    resume: bool
+    part: int
+    executor: Executor
+    progress: OnProgress
+
+    def pieces(self, data: Sequence[Sequence[Episode] | Share], by: str, name: str) -> tuple[Piece, ...]:
+        """Return the parts of a fit and where they are kept; one that is alone is kept step by step."""
+        inputs = stamp(self.source.path), self.options.model and Path(self.options.model)
+        asked = dataclasses.replace(self.source, path=Path()), self.options, by, self.part
+        kept = self.out / keep.UNFINISHED
+        parts = Parts(kept / f"{name}-parts", keep.fingerprint(asked, *inputs), self.resume)
+        alone = kept / name if len(data) == 1 else None
+        return tuple(
+            Piece(n, len(data), one, self.source, self.options, by, parts, alone, self.resume)
+            for n, one in enumerate(data)
+        )
+
+    def fit(self, data: Sequence[Sequence[Episode] | Share], by: str, name: str, before: str = "") -> Joined:
+        """Fit all parts and return what they found."""
+        cut = self.pieces(data, by, name)
+        parts = cut[0].parts
+        try:
+            pieces.run(self.executor, cut, lambda phase, *state: self.progress(before + phase, *state))
+            return pieces.join(parts, self.options)
+        except ValueError:
+            if not parts.summaries() or not parts.tables(pieces.PARAMETERS):
+                parts.remove()  # nothing of it could go on
+            raise
+
+
+def _fit_file(work: _Work) -> dict[str, Any]:
+    source, options = work.source, work.options
+    work.progress("reading", 0, 0, source.path.name)
     trajectories = source.trajectories()
     fitting, held = trajectories, None
     if options.held_out is not None:
         fitting, held = trajectories.split(options.held_out, seed=options.seed)
     chosen = source.episodes(fitting)
-    simulator, kept = options.simulator()
+    found = work.fit(pieces.cut(chosen, options.by, work.part), options.by, "fit")
+    held_out, left_out, pooled = None, list(chosen.left_out), found
+    if held is not None:
+        if options.by != "all":
+            pooled = work.fit([chosen], "all", "pooled", "held out: ")
+        held_out, lost = _held_out(source, options, held, found.estimates, pooled.estimates)
+        left_out += lost
+    data = {**trajectories.summary(), "left_out": [str(r) for r in chosen.left_out], "episodes": len(chosen)}
+    data["account"] = _account(trajectories.repairs, left_out)
+    result = _write(work, found, held_out, data, fingerprints(trajectories, _drivers(chosen)).values())
+    pooled.parts.remove()
+    return result
 
-    def run(by: str, checkpoint: str, before: str = "") -> Fit:
-        return fit(
-            chosen, by=by, simulator=simulator, objective=options.objective, relative=options.relative,
-            loss=options.loss, method=options.method, starts=options.starts, seed=options.seed,
-            substeps=options.substeps, fixed=kept, checkpoint=out / keep.UNFINISHED / checkpoint, resume=resume,
-            on_progress=lambda phase, *state: progress(before + phase, *state),
-        )  # fmt: skip
 
-    found = run(options.by, "fit")
-    progress("errors", 0, 0, "in free simulation")
-    error, simulated = errors(found.problem, found.own, found.shared)
-    left_out = list(chosen.left_out)
-    bounds = drivers.bounds(found)
+def _fit_folder(work: _Work) -> dict[str, Any]:
+    """Fit a folder by driver, some runs at a time."""
+    source, options = work.source, work.options
+    if options.by != "driver":
+        raise ValueError(f"by = '{options.by}' needs all rows at once, and {source.path} is a folder. Give one file.")
+    if options.held_out is not None:
+        raise ValueError("held_out cannot be drawn from a folder. Keep a file back, and simulate the model on it.")
+    work.progress("reading", 0, 0, source.path.name)
+    found = work.fit(shares(source.path, work.part), "driver", "fit")
+    tracks = [track for told in found.summaries for track in told["tracks"]]
+    return _write(work, found, None, pieces.account_of(found, source.path.name), tracks)
+
+
+def _write(
+    work: _Work, found: Joined, held_out: dict[str, Any] | None, data: dict[str, Any], tracks: Iterable[str]
+) -> dict[str, Any]:
+    """Join the parts to the files that were promised, and return the report."""
+    out, options, estimates = work.out, work.options, found.estimates
+    bounds, many = drivers.bounds(estimates), len(estimates.groups) > drivers.MOST_ROWS
     result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
-        "data": {**trajectories.summary(), "left_out": [str(r) for r in chosen.left_out], "episodes": len(chosen)},
-        "options": {**vars(options), "free": found.names},
+        "data": data,
+        "options": {**vars(options), "free": estimates.names},
         "fit": {
-            **error.summary(),
-            "groups": len(found.problem.groups),
-            "converged": int(found.converged.sum()),
+            **found.errors.summary(),
+            "groups": len(estimates.groups),
+            "converged": found.converged,
             "iterations": found.iterations,
         },
-        "held_out": None,
+        "held_out": held_out,
         "at_bounds": drivers.sentence(bounds),
         "bounds": bounds,
-        "parameters": found.table(),
+        "parameters": [],
         "versions": page.versions(),
     }
-    if held is not None:
-        pooled = found if options.by == "all" else run("all", "pooled", "held out: ")
-        result["held_out"], lost = _held_out(source, options, held, found, pooled)
-        left_out += lost
-    result["data"]["account"] = _account(trajectories, left_out)
-    progress("writing", 0, 0, "the report")
-    table = drivers.table(found, error)
-    keep.write(out / "drivers.csv", pl.DataFrame(table).write_csv)
-    keep.write(out / "parameters.parquet", pl.DataFrame(result["parameters"]).write_parquet)
-    marked = fitted_on(trajectories, _drivers(chosen))
-    model = dataclasses.replace(model_of(found, options.by), substeps=options.substeps, fitted_on=marked)
+    work.progress("writing", 0, 0, "the report")
+    found.parts.join(pieces.DRIVERS, out / "drivers.csv")
+    found.parts.join(pieces.PARAMETERS, out / "parameters.parquet")
+    if not many:
+        result["parameters"] = pl.read_parquet(out / "parameters.parquet").to_dicts()
+    table = pl.scan_parquet(found.parts.tables(pieces.DRIVERS)).head(drivers.MOST_ROWS).collect().to_dicts()
+    model = dataclasses.replace(model_of(estimates, options.by), substeps=options.substeps)
+    if len(estimates.groups) <= MOST_DRIVERS:
+        model = dataclasses.replace(model, fitted_on={"source": data["source"], "tracks": sorted(set(tracks))})
     save_model(out / "model.yaml", model)
     page.write_json(out / "report.json", result)
-    title = f"{simulator.base.title} fitted to {source.path.name}"
-    page.write_page(out / "report.html", title, _fit_page(result, found, error, simulated, table))
+    title = f"{estimates.simulator.base.title} fitted to {data['source']}"
+    page.write_page(out / "report.html", title, _fit_page(result, found, table))
+    found.parts.remove()
     return result
 
 
@@ -185,24 +180,23 @@ def _drivers(items: Episodes) -> list[tuple[str, str]]:
     return [(episode.run_id, episode.vehicle_id) for episode in items]
 
 
-def _account(trajectories: Trajectories, left_out: Iterable[Repair]) -> str:
-    return page.account(((r.kind, r.count) for r in trajectories.repairs), ((r.kind, r.count) for r in left_out))
+def _account(repairs: Iterable[Repair], left_out: Iterable[Repair]) -> str:
+    return page.account(((r.kind, r.count) for r in repairs), ((r.kind, r.count) for r in left_out))
 
 
 def _held_out(
-    source: Source, options: Options, held: Trajectories, found: Fit, pooled: Fit
+    source: Source, options: Options, held: Trajectories, found: Estimates, pooled: Estimates
 ) -> tuple[dict[str, Any], tuple[Repair, ...]]:
     """Return the errors on runs that the fit has not seen, and what of them was left out."""
     items = source.episodes(held)
     batch = Batch.of(items, substeps=options.substeps)
     group, names = group_of(batch.episodes, options.by)
-    fitted = found.problem
     problem = Problem(
-        fitted.simulator, batch, fitted.own, (), group, names,
-        objective=fitted.objective, relative=fitted.relative, loss=fitted.loss, fixed=fitted.fixed,
+        dataclasses.replace(found.simulator, dt=batch.step), batch, found.names, (), group, names,
+        objective=options.objective, relative=options.relative, loss=options.loss, fixed=found.fixed,
     )  # fmt: skip
-    own, unseen = own_for(found, problem, pooled.own[0])
-    error, _ = errors(problem, own, found.shared)
+    own, unseen = found.own_for(names, pooled.values[0])
+    error, _ = errors(problem, own, own[0, :0])
     return {
         **error.summary(),
         "runs": held.runs(),
@@ -211,9 +205,11 @@ def _held_out(
     }, items.left_out
 
 
-def model_of(found: Fit, by: str = "driver") -> Model:
-    """Return a fit ``by`` groups as a model: their median as its parameters, every group as a driver of its own."""
-    values = found.values()
+def model_of(found: Estimates, by: str = "driver") -> Model:
+    """Return estimates ``by`` groups as a model: their median as its parameters, every group as a driver of its own.
+
+    Above ``MOST_DRIVERS`` groups it has the median only.
+    """
 
     def numbers(row: torch.Tensor) -> Numbers:
         nested: Numbers = {}
@@ -222,26 +218,24 @@ def model_of(found: Fit, by: str = "driver") -> Model:
             nested.setdefault(effect, {})[parameter] = value
         return nested
 
-    simulator = found.problem.simulator
-    several = len(found.problem.groups) > 1
-    middle = numbers(values.median(0).values)
-    for name, value in found.problem.fixed.items():
+    simulator = found.simulator
+    several = 1 < len(found.groups) <= MOST_DRIVERS
+    middle = numbers(found.values.median(0).values)
+    for name, value in found.fixed.items():
         effect, parameter = name.split(".")
         middle.setdefault(effect, {})[parameter] = value
     return Model(
         effects=simulator.without("replay").effects if "replay" in simulator.by_name else simulator.effects,
         parameters=middle,
-        dt=found.problem.batch.dt,
+        dt=found.dt,
         integration=simulator.integration,
-        drivers={g: numbers(values[i]) for i, g in enumerate(found.problem.groups)} if several else {},
+        drivers={g: numbers(found.values[i]) for i, g in enumerate(found.groups)} if several else {},
         by=by,
     )
 
 
-def _fit_page(
-    result: dict[str, Any], found: Fit, error: Errors, simulated: Simulated, table: list[dict[str, Any]]
-) -> list[page.Block]:
-    held = result["held_out"]
+def _fit_page(result: dict[str, Any], joined: Joined, table: list[dict[str, Any]]) -> list[page.Block]:
+    held, found = result["held_out"], joined.estimates
     lead = (
         f"{result['fit']['episodes']} episodes of {result['fit']['groups']} groups: mean gap RMSE "
         f"{result['fit']['gap_rmse_m']:.2f} m, speed RMSE {result['fit']['speed_rmse_mps']:.2f} m/s, in free "
@@ -250,6 +244,11 @@ def _fit_page(
     if held is not None:
         lead += f" On {held['episodes']} episodes held out: {held['gap_rmse_m']:.2f} m."
     rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": "held out", **held}])
+    drawn = joined.pictures
+    several = (
+        [page.note(f"Pictures are of the first of {len(joined.summaries)} parts.")] if joined.summaries[1:] else []
+    )
+    titles = ("Measured and simulated", "Residuals", "In space and time")
     return [
         page.lead(lead),
         page.lead(result["at_bounds"]),
@@ -258,14 +257,10 @@ def _fit_page(
             f"{result['fit']['converged']} of {result['fit']['groups']} groups converged. A value on its bound is not "
             "an estimate: the data would have it beyond."
         ),
-        page.heading("Measured and simulated"),
-        pictures.examples(found.problem, error, simulated),
-        page.heading("Residuals"),
-        pictures.residuals(found.problem, simulated),
-        page.heading("In space and time"),
-        *pictures.space_time(found.problem, simulated),
+        *several,
+        *(block for title, one in zip(titles, drawn, strict=False) for block in (page.heading(title), one)),
         page.heading("Parameters"),
-        *([pictures.parameters(found)] if len(found.problem.groups) > 1 else []),
+        *([pictures.parameters(found)] if len(found.groups) > 1 else []),
         *drivers.blocks(found, table, result["bounds"]),
         *_data_section(result),
     ]
@@ -353,7 +348,7 @@ def _simulate_file(
             **trajectories.summary(),
             "left_out": [str(r) for r in items.left_out],
             "episodes": len(items),
-            "account": _account(trajectories, items.left_out),
+            "account": _account(trajectories.repairs, items.left_out),
         },
         "drivers_with_own_parameters": matched,
         "error": error.summary(),
@@ -393,7 +388,7 @@ def _errors_table(rows: list[dict[str, Any]]) -> page.Block:
 def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, torch.Tensor, int]:
     """Return a problem with all parameters of a model, their values per episode, and how many drivers were matched."""
     batch = Batch.of(items, substeps=model.substeps)
-    effects = _behind_records(model)
+    effects = behind_records(model)
     simulator = Simulator(Lane(), effects, dt=batch.step, integration=model.integration)
     names = tuple(f"{e.name}.{p.name}" for e in effects for p in e.parameters)
     try:

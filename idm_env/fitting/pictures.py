@@ -9,8 +9,8 @@ import numpy as np
 from idm_env import diagrams
 from idm_env import report as page
 from idm_env.data import Episode
+from idm_env.fitting.drivers import Estimates
 from idm_env.fitting.evaluate import Errors
-from idm_env.fitting.fit import Fit
 from idm_env.fitting.problem import Problem, Simulated
 
 MEASURED, SIMULATED = "#20242c", "#d1495b"
@@ -121,13 +121,13 @@ def _lane(episode: Episode) -> int:
     return -1 if lanes is None or not len(lanes) else int(np.median(lanes))
 
 
-def parameters(found: Fit) -> page.Block:
+def parameters(found: Estimates) -> page.Block:
     """Draw the distribution over groups of every free parameter, or estimates with intervals for a few groups."""
     names = found.names
     figure, axes = page.figure(1, len(names), size=(2.3 * len(names), 2.8))
-    values = found.values().numpy()
-    spread = found.uncertainty.standard_error.numpy()
-    for i, (name, p) in enumerate(zip(names, found.problem.parameters, strict=True)):
+    values = found.values.numpy()
+    spread = found.standard_error.numpy()
+    for i, (name, p) in enumerate(zip(names, found.parameters, strict=True)):
         axis = axes[0, i]
         if len(values) > 12:
             axis.hist(values[:, i], bins=min(30, len(values) // 3), color="#2e6f9e")
@@ -138,7 +138,7 @@ def parameters(found: Fit) -> page.Block:
             room = np.stack((values[:, i] - p.low, p.high - values[:, i])).clip(0.0)
             bars = np.minimum(half, room)
             axis.errorbar(np.arange(len(values)), values[:, i], bars, fmt="o", color="#2e6f9e", capsize=3)
-            axis.set_xticks(np.arange(len(values)), [g[:14] for g in found.problem.groups], rotation=90, fontsize=7)
+            axis.set_xticks(np.arange(len(values)), [g[:14] for g in found.groups], rotation=90, fontsize=7)
         axis.set_title(f"{name.split('.')[1]} {p.symbol} ({p.unit})", fontsize=9)
         axis.grid(alpha=0.25)
     caption = "Estimates of all groups." if len(values) > 12 else "Estimates with 95 % intervals."

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -15,6 +15,7 @@ from idm_env import report as page
 from idm_env.data import DataError
 from idm_env.data.scenario import Scenario
 from idm_env.data.womd import count, scenarios
+from idm_env.executor import Executor, Serial
 from idm_env.parts import Parts
 from idm_env.prediction import report as written
 from idm_env.prediction.metrics import Case, Score, intervals, score, shape_of, summary
@@ -45,6 +46,7 @@ def predict_files(
     *,
     baselines: bool = True,
     resume: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Predict the agents of scenario files (JSON or TFRecord) and return the report, also written to ``out``.
@@ -53,31 +55,34 @@ def predict_files(
     driver's five), ``report.json`` and ``report.html`` with the benchmark's metrics where the future is known, over
     all agents, per scene and per kind, against the single futures of ``METHODS``. A file or an agent that cannot be
     used is left out and counted; the others are done. Without numba the paper's row is absent. ``resume`` goes on after
-    the last finished file.
+    the last finished file. Files are done by ``executor`` (None: here), on which no prediction depends.
 
     Raises:
         DataError: If no file holds a scenario that can be used, or ``resume`` finds a run on other files or settings.
     """
     files = [Path(path) for path in paths]
     with keep.results(out, OUTPUT, files) as folder:
-        return _predict_files(files, folder, baselines, resume, on_progress or silent)
+        return _predict_files(files, folder.absolute(), baselines, resume, executor or Serial(), on_progress or silent)
 
 
 def _predict_files(
-    files: Sequence[Path], out: Path, baselines: bool, resume: bool, progress: OnProgress
+    files: Sequence[Path], out: Path, baselines: bool, resume: bool, executor: Executor, progress: OnProgress
 ) -> dict[str, Any]:
     parts = Parts(out / keep.UNFINISHED / "predict", _fingerprint(files, baselines), resume)
     progress("counting", 0, 0, "scenarios")
     counts = [count(path) for path in files]
-    everything, before = sum(counts), 0
-    for number, path in enumerate(files):
-        if not parts.done(number):
-            names = [name for name in available() if baselines or name == OURS]
-            _file(parts, number, path, names, lambda done, b=before, p=path: progress(  # type: ignore[misc]
-                "predict", b + done, everything, p.name
-            ))  # fmt: skip
-        before += counts[number]
-        progress("predict", before, everything, path.name)
+    names = tuple(name for name in available() if baselines or name == OURS)
+    everything = sum(counts)
+    jobs = [
+        _Job(parts, number, path.absolute(), names, sum(counts[:number]), everything)
+        for number, path in enumerate(files) if not parts.done(number)
+    ]  # fmt: skip
+    before = everything - sum(counts[job.number] for job in jobs)
+    if before:
+        progress("predict", before, everything, "")
+    for index, _ in executor.map(_predict_file, jobs, progress):
+        before += counts[jobs[index].number]
+        progress("predict", before, everything, jobs[index].path.name)
     progress("writing", 0, 0, "the report")
     report, pictures = _report(parts.summaries())
     if not report["scenarios"]:
@@ -92,6 +97,29 @@ def _predict_files(
     written.write(out, report, pictures)
     parts.remove()
     return report
+
+
+class _Job(NamedTuple):
+    """One file to predict: where its part is kept, by which methods, and how many scenarios there are before it."""
+
+    parts: Parts
+    number: int
+    path: Path
+    methods: tuple[str, ...]
+    before: int
+    everything: int
+
+    def __str__(self) -> str:
+        return self.path.name
+
+
+def _predict_file(job: _Job, progress: OnProgress) -> None:
+    """Do one file."""
+
+    def on_scenario(done: int) -> None:
+        progress("predict", job.before + done, job.everything, job.path.name)
+
+    _file(job.parts, job.number, job.path, job.methods, on_scenario)
 
 
 def _fingerprint(files: Sequence[Path], baselines: bool) -> str:

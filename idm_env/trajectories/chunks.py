@@ -69,11 +69,11 @@ class Plan:
 
 def done(
     parts: Parts, number: int, tracks: list[Track], settings: Settings, plan: Plan, recent: Sequence[Filtered],
-    on_stage: Callable[[float, str], None] = lambda share, words: None,
+    told: dict[str, Any], on_stage: Callable[[float, str], None] = lambda share, words: None,
 ) -> list[Filtered]:  # fmt: skip
     """Do one chunk and write its part: the table, the parameters, and last the tallies, which mark it done.
 
-    ``on_stage`` is called with the share that is done and what comes next.
+    ``told`` is what else is to be known of it. ``on_stage`` is called with the share that is done and what comes next.
     """
     others = baselines.available() if settings.baselines else ()
     stages = 2 + len(others)
@@ -107,6 +107,7 @@ def done(
             "overlaps": total,
             "new_overlaps": new,
             "calibration_seconds": calibration,
+            **told,
         },
     )
     return filtered

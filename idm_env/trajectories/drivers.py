@@ -11,7 +11,7 @@ from idm_env.data import Episode, Record
 from idm_env.data.records import FAR_M
 from idm_env.effects import IDM
 from idm_env.fitting.fit import Fit, fit
-from idm_env.fitting.job import Options
+from idm_env.fitting.options import Options
 from idm_env.trajectories.recipe import Filtered
 
 SHORTEST_S = 10.0

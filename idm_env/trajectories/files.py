@@ -10,6 +10,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ import numpy as np
 import polars as pl
 
 from idm_env import keep
-from idm_env.data import DataError
+from idm_env.data import DataError, Repair
+from idm_env.data.folder import stamp
+from idm_env.executor import Executor, Serial
 from idm_env.parts import Parts
 from idm_env.progress import OnProgress, silent
 from idm_env.report import account, versions
@@ -28,7 +31,7 @@ from idm_env.trajectories.recipe import Filtered, recipe
 from idm_env.trajectories.report import write_report
 from idm_env.trajectories.scores import Motion, Tally
 from idm_env.trajectories.smoother import Noise
-from idm_env.trajectories.spool import Spool
+from idm_env.trajectories.spool import Shelf, Spool
 from idm_env.trajectories.tracks import Pieces, Track
 
 OUTPUT = ("trajectories.parquet", "parameters.parquet", "report.json", "report.html")
@@ -49,6 +52,7 @@ def filter_file(
     layout: str = "auto",
     chunk: int = CHUNK,
     resume: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Filter every track of a file and return the report, also written to ``out``.
@@ -57,13 +61,14 @@ def filter_file(
     standard deviations), ``parameters.parquet``, ``report.json`` and ``report.html``. ``recipe="paper"`` is the
     published one; ``fixed_parameters`` keeps its five parameters, and leaves out the calibration in the default one.
     ``model`` is a model.yaml, such as explain writes, whose effects the calibration keeps.
-    Tracks that cannot be used are left out and counted. ``resume`` goes on after the last finished chunk.
+    Tracks that cannot be used are left out and counted. ``resume`` goes on after the last finished chunk. ``path`` may
+    be a folder of parquet files. Runs are done by ``executor`` (None: here), on which no trajectory depends.
 
     Raises:
         DataError: If the file as a whole cannot be used, or ``resume`` finds a run with other data or settings.
     """
     settings = Settings("filter", None, recipe, fixed_parameters, baselines, chunk, model)
-    return run(path, out, settings, layout=layout, resume=resume, on_progress=on_progress)
+    return run(path, out, settings, layout=layout, resume=resume, executor=executor, on_progress=on_progress)
 
 
 def reconstruct_file(
@@ -78,6 +83,7 @@ def reconstruct_file(
     layout: str = "auto",
     chunk: int = CHUNK,
     resume: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Reconstruct dense tracks of step ``dt`` (s) from sparse ones; holes are bridged. Else as ``filter_file``.
@@ -87,7 +93,7 @@ def reconstruct_file(
     if not 0.01 <= dt <= 2.0:
         raise DataError(f"dt = {dt:g} s is outside [0.01, 2] s; 0.1 s suits vehicles.")
     settings = Settings("reconstruct", dt, recipe, fixed_parameters, baselines, chunk, model)
-    return run(path, out, settings, layout=layout, resume=resume, on_progress=on_progress)
+    return run(path, out, settings, layout=layout, resume=resume, executor=executor, on_progress=on_progress)
 
 
 def run(
@@ -97,6 +103,7 @@ def run(
     *,
     layout: str = "auto",
     resume: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Do what ``filter_file`` and ``reconstruct_file`` say."""
@@ -106,15 +113,15 @@ def run(
     progress("compiling", 0, 0, "the loops")
     _compile()
     with keep.results(out, OUTPUT, (path, settings.model)) as folder:
-        return _run(Path(path), folder, settings, layout, resume, progress)
+        return _run(Path(path), folder.absolute(), settings, layout, resume, executor or Serial(), progress)
 
 
 def _run(
-    path: Path, out: Path, settings: Settings, layout: str, resume: bool, progress: OnProgress
+    path: Path, out: Path, settings: Settings, layout: str, resume: bool, executor: Executor, progress: OnProgress
 ) -> dict[str, Any]:  # fmt: skip
     progress("reading", 0, 0, path.name)
     model = None if settings.model is None else Path(settings.model)
-    parts = Parts(out / keep.UNFINISHED / settings.task, keep.fingerprint(settings, layout, path, model), resume)
+    parts = Parts(out / keep.UNFINISHED / settings.task, keep.fingerprint(settings, layout, stamp(path), model), resume)
     try:
         spool = Spool(path, parts.folder / "spool", layout, settings.chunk)
         bridge = 2.0 if settings.task == "filter" else None
@@ -122,27 +129,10 @@ def _run(
     except DataError:
         parts.remove()  # nothing of it could go on
         raise
-    lost: list[tuple[str, str]] = []
-    notes: list[tuple[str, str]] = []
-    recent: list[Filtered] = []
-    for number in range(spool.chunks):
-        pieces = Pieces(spool.table(number), bridge)
-        tracks = list(pieces)
-        lost += pieces.left_out
-        notes += pieces.notes
-        recent = [f for f in recent if tracks and _reaches(f, tracks)]
-        begin, everybody = number * settings.chunk, len(spool.vehicles)
-        end = min(begin + settings.chunk, everybody)
-        if parts.done(number):
-            recent += chunks.restored(parts, number, tracks)
-        else:
-            recent += chunks.done(
-                parts, number, tracks, settings, plan, recent,
-                lambda share, words, b=begin, e=end, n=everybody: progress(  # type: ignore[misc]
-                    settings.task, b + int(share * (e - b)), n, words
-                ),
-            )  # fmt: skip
-        progress(settings.task, end, everybody, "")
+    _chunks(spool, parts, settings, plan, bridge, executor, progress)
+    told = parts.summaries()
+    for part in told:
+        spool.count([Repair(*repair) for repair in part["repairs"]])
     scored = []
     if settings.task == "reconstruct":
         progress("scoring", 0, 0, "points left out of the file")
@@ -150,11 +140,71 @@ def _run(
     progress("writing", 0, 0, "the report")
     parts.join(TRAJECTORIES, out / "trajectories.parquet")
     parts.join(PARAMETERS, out / "parameters.parquet")
-    report = _report(spool, parts, settings, plan, lost, notes) | {"left_out_points": scored}
+    report = _report(spool, told, settings, plan) | {"left_out_points": scored}
     drawn = pictures.space_time(out / "trajectories.parquet", spool, bridge)
     write_report(out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet"), drawn)
     parts.remove()
     return report
+
+
+@dataclass(frozen=True)
+class _Strand:
+    """Chunks that have to be done one after the other, and all that they need."""
+
+    numbers: tuple[int, ...]
+    shelf: Shelf
+    parts: Parts
+    settings: Settings
+    plan: Plan
+    bridge: float | None
+
+    def __str__(self) -> str:
+        begin, end = self.vehicles
+        return f"vehicles {begin + 1} to {end}"
+
+    @property
+    def vehicles(self) -> tuple[int, int]:
+        return self.shelf.borders[self.numbers[0]], self.shelf.borders[self.numbers[-1] + 1]
+
+
+def _chunks(
+    spool: Spool, parts: Parts, settings: Settings, plan: Plan, bridge: float | None, executor: Executor,
+    progress: OnProgress,
+) -> None:  # fmt: skip
+    """Do all chunks that are not done yet, a strand wherever the executor has room for it."""
+    strands = [_Strand(numbers, spool.shelf, parts, settings, plan, bridge) for numbers in spool.strands()]
+    missing = [s for s in strands if not all(parts.done(number) for number in s.numbers)]
+    everybody = len(spool.vehicles)
+    done = everybody - sum(s.vehicles[1] - s.vehicles[0] for s in missing)
+    for index, _ in executor.map(_strand, missing, progress):
+        done += missing[index].vehicles[1] - missing[index].vehicles[0]
+        progress(settings.task, done, everybody, "")
+
+
+def _strand(strand: _Strand, progress: OnProgress) -> None:
+    """Do the chunks of a strand that are not done yet; each meets the vehicles of those before it."""
+    parts, settings, borders = strand.parts, strand.settings, strand.shelf.borders
+    recent: list[Filtered] = []
+    for number in strand.numbers:
+        table = strand.shelf.table(number)
+        pieces = Pieces(table, strand.bridge)
+        tracks = list(pieces)
+        recent = [f for f in recent if tracks and _reaches(f, tracks)]
+        begin, end = borders[number], borders[number + 1]
+        if parts.done(number):
+            recent += chunks.restored(parts, number, tracks)
+        else:
+            told = {
+                "left_out": pieces.left_out, "notes": pieces.notes,
+                "repairs": [[r.kind, r.count, r.text] for r in table.repairs],
+            }  # fmt: skip
+            recent += chunks.done(
+                parts, number, tracks, settings, strand.plan, recent, told,
+                lambda share, words, b=begin, e=end: progress(  # type: ignore[misc]
+                    settings.task, b + int(share * (e - b)), borders[-1], words
+                ),
+            )  # fmt: skip
+        progress(settings.task, end, borders[-1], "")
 
 
 def _compile() -> None:
@@ -189,7 +239,7 @@ def _any_track(spool: Spool, bridge: float | None) -> list[tuple[np.ndarray, np.
     """Return the tracks of the first chunk that has any."""
     lost: list[tuple[str, str]] = []
     for number in range(spool.chunks):
-        pieces = Pieces(spool.table(number, counting=False), bridge)
+        pieces = Pieces(spool.shelf.table(number), bridge)
         found = [(t.time_s, t.position_m) for t in pieces]
         if found:
             return found
@@ -206,13 +256,14 @@ def _reaches(filtered: Filtered, tracks: Sequence[Track]) -> bool:
 
 
 def _report(
-    spool: Spool, parts: Parts, settings: Settings, plan: Plan, lost: Sequence[tuple[str, str]],
-    notes: Sequence[tuple[str, str]],
+    spool: Spool, parts: Sequence[dict[str, Any]], settings: Settings, plan: Plan
 ) -> dict[str, Any]:  # fmt: skip
     """Return the report of all parts."""
     tallies: dict[str, Tally] = {}
     totals = dict.fromkeys(("overlaps", "new_overlaps", "calibration_seconds"), 0.0)
-    for part in parts.summaries():
+    lost = [item for part in parts for item in part["left_out"]]
+    notes = [item for part in parts for item in part["notes"]]
+    for part in parts:
         for name, values in part["tallies"].items():
             tallies.setdefault(name, Tally()).merge(Tally(**values))
         for name in totals:

@@ -7,6 +7,7 @@ they are brought together by vehicle, in the order in which vehicles appear.
 from __future__ import annotations
 
 import shutil
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import polars as pl
 from idm_env import keep
 from idm_env.data import DataError, Repair, directions
 from idm_env.data.clean import check_columns, identifiers, natural, numbers
+from idm_env.data.errors import Counted
 from idm_env.data.load import batches
 from idm_env.data.speeds import length_assumed
 from idm_env.trajectories.tracks import Table, check_units, has_length, prepared, with_leaders
@@ -27,76 +29,86 @@ BUCKET_ROWS = 400_000
 KEY = ["run_id", "vehicle_id"]
 
 
-@dataclass
-class Counted:
-    """Repairs by kind and wording, added up over the pieces of a file."""
+@dataclass(frozen=True)
+class Shelf:
+    """Chunks of vehicles on disk, to be read by whoever works on them: their borders, and who is of the chunk's run.
 
-    found: dict[tuple[str, str], int]
+    Attributes:
+        source: Name of the file.
+        folder: Where the buckets are.
+        borders: First vehicle of every chunk, and the number of vehicles.
+        per_bucket: Chunks in a bucket.
+    """
 
-    def add(self, repairs: Sequence[Repair]) -> None:
-        """Count repairs; a number at the beginning of a text is added up."""
-        for repair in repairs:
-            text = repair.text.removeprefix(f"{repair.count} ")
-            key = repair.kind, ("# " if text != repair.text else "") + text
-            again = key in self.found and not text.startswith("#") and text == repair.text
-            self.found[key] = repair.count if again else self.found.get(key, 0) + repair.count
+    source: str
+    folder: Path
+    borders: tuple[int, ...]
+    per_bucket: int
 
-    def repairs(self) -> tuple[Repair, ...]:
-        """Return the repairs with their sums."""
-        return tuple(
-            Repair(kind, count, text.replace("# ", f"{count} ", 1)) for (kind, text), count in self.found.items()
-        )
+    def table(self, number: int) -> Table:
+        """Return the table of one chunk, with what was repaired."""
+        return self.part(number, range(self.borders[number], self.borders[number + 1]))
+
+    def part(self, number: int, vehicles: range) -> Table:
+        """Return the table of some vehicles of a chunk."""
+        files = sorted(self.folder.glob(f"vehicles-{number // self.per_bucket:03d}-*.parquet"))
+        inside = pl.col("number").is_between(vehicles.start, vehicles.stop - 1)
+        frame = pl.scan_parquet(files, missing_columns="insert").filter(inside).collect()
+        frame, repairs = prepared(frame.sort("number", maintain_order=True).drop("number"))
+        return Table(frame, tuple(repairs), self.source)
 
 
 class Spool:
     """The vehicles of a file in the order of their appearance, and their rows in buckets under ``folder``.
 
+    Chunks are ``chunk`` vehicles at most and end where a run does, unless it has more than that.
+
     Attributes:
         source: Name of the file.
         vehicles: (run, vehicle) of every vehicle.
+        shelf: The chunks.
     """
 
     def __init__(self, path: str | Path, folder: Path, layout: str, chunk: int) -> None:
         self.source = Path(path).name
-        self.folder, self.chunk = folder, chunk
-        self._counted = Counted({})
+        self.folder = folder
+        self._counted = Counted()
         if folder.exists():
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
         raw, index = self._read(path, layout)
         self.vehicles: list[tuple[str, str]] = index.select(KEY).rows()
-        self._per_bucket = max(1, -(-self.chunks // MOST_BUCKETS))
+        borders = _borders([run for run, _ in self.vehicles], chunk)
+        self.shelf = Shelf(self.source, folder, borders, max(1, -(-(len(borders) - 1) // MOST_BUCKETS)))
         self._distribute(self._led(raw, index), index)
 
     @property
     def chunks(self) -> int:
         """Number of chunks of vehicles."""
-        return -(-len(self.vehicles) // self.chunk)
+        return len(self.shelf.borders) - 1
 
     @property
     def repairs(self) -> tuple[Repair, ...]:
-        """What was repaired so far; repeats of a time are counted as chunks are read."""
+        """What was repaired when the file was spooled, and what was counted since."""
         return self._counted.repairs()
 
-    def table(self, number: int, *, counting: bool = True) -> Table:
-        """Return the table of one chunk."""
-        first = number * self.chunk
-        return self._table(range(first, min(first + self.chunk, len(self.vehicles))), counting)
+    def count(self, repairs: Sequence[Repair]) -> None:
+        """Count what was repaired in a chunk."""
+        self._counted.add(repairs)
+
+    def strands(self) -> list[tuple[int, ...]]:
+        """Return the chunks that have to be done one after the other, because a run goes on from one to the next."""
+        found: list[list[int]] = []
+        for number, begin in enumerate(self.shelf.borders[:-1]):
+            goes_on = begin and self.vehicles[begin][0] == self.vehicles[begin - 1][0]
+            found[-1].append(number) if goes_on else found.append([number])
+        return [tuple(strand) for strand in found]
 
     def picked(self, indices: Sequence[int]) -> Iterator[Table]:
         """Yield the tables of single vehicles."""
         for index in indices:
-            yield self._table(range(index, index + 1), False)
-
-    def _table(self, vehicles: range, counting: bool) -> Table:
-        bucket = vehicles.start // self.chunk // self._per_bucket
-        files = sorted(self.folder.glob(f"vehicles-{bucket:03d}-*.parquet"))
-        inside = pl.col("number").is_between(vehicles.start, vehicles.stop - 1)
-        frame = pl.scan_parquet(files, missing_columns="insert").filter(inside).collect()
-        frame, repairs = prepared(frame.sort("number", maintain_order=True).drop("number"))
-        if counting:
-            self._counted.add(repairs)
-        return Table(frame, (), self.source)
+            number = bisect_right(self.shelf.borders, index) - 1
+            yield self.shelf.part(number, range(index, index + 1))
 
     def _read(self, path: str | Path, layout: str) -> tuple[list[Path], pl.DataFrame]:
         """Write the pieces of a file and return them, with an index of its vehicles in their order."""
@@ -167,7 +179,10 @@ class Spool:
 
     def _distribute(self, files: list[Path], index: pl.DataFrame) -> None:
         """Bring the rows together by buckets of vehicles."""
-        self._partition(files, pl.col("number") // (self.chunk * self._per_bucket), "vehicles", index)
+        firsts = self.shelf.borders[: -1 : self.shelf.per_bucket]
+        self._partition(
+            files, pl.lit(pl.Series(firsts)).search_sorted(pl.col("number"), "right") - 1, "vehicles", index
+        )
 
     def _partition(
         self, files: list[Path], bucket: pl.Expr, name: str, index: pl.DataFrame | None = None
@@ -182,6 +197,20 @@ class Spool:
                 keep.write(self.folder / f"{name}-{key:03d}-{n:05d}.parquet", part.write_parquet)
             path.unlink()
         return self.folder
+
+
+def _borders(runs: Sequence[str], chunk: int) -> tuple[int, ...]:
+    """Return where chunks of at most ``chunk`` vehicles begin, and the end; runs that fit are not divided."""
+    borders, begin = [0], 0
+    for index in range(1, len(runs) + 1):
+        if index < len(runs) and runs[index] == runs[begin]:
+            continue
+        if index - borders[-1] > chunk and begin > borders[-1]:
+            borders.append(begin)
+        while index - borders[-1] > chunk:
+            borders.append(borders[-1] + chunk)
+        begin = index
+    return (*borders, len(runs))
 
 
 def _indexed(index: pl.DataFrame | None, piece: pl.DataFrame) -> pl.DataFrame:

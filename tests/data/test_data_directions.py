@@ -79,7 +79,7 @@ def test_filter_mirrors_too_whatever_the_pieces(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(importlib.import_module("idm_env.data.load"), "BATCH_ROWS", 100)
     made = spool.Spool(path, tmp_path / "spool", "auto", 100)
     whole = from_frame(table)
-    for found in (made.table(0).frame, whole.frame):
+    for found in (made.shelf.table(0).frame, whole.frame):
         assert {k: v - {""} for k, v in leaders(found).items()} == {
             "1": set(), "2": {"1"}, "3": {"2"}, "7": set(), "8": {"7"}, "9": {"8"},
         }  # fmt: skip

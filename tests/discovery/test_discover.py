@@ -138,7 +138,8 @@ def test_an_interrupted_search_goes_on(tmp_path: Path) -> None:
 
 
 def test_the_corrected_model_is_fitted_to_other_drivers(drag: Discovery, tmp_path: Path) -> None:
-    from idm_env.fitting.job import Options, Source, fit_file
+    from idm_env.fitting.job import fit_file
+    from idm_env.fitting.options import Options, Source
 
     corrected = write_report(drag, tmp_path)["model.yaml"]
     others = synthetic.generate(22, runs=2, followers=2, seconds=60.0, effect="leader_acceleration")[0]

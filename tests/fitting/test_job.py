@@ -10,7 +10,8 @@ import pytest
 
 from idm_env.config import load_model
 from idm_env.data import synthetic
-from idm_env.fitting.job import FITTED, Options, Source, fit_file, simulate_file
+from idm_env.fitting.job import FITTED, fit_file, simulate_file
+from idm_env.fitting.options import Options, Source
 
 
 @pytest.fixture(scope="module")

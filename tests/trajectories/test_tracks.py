@@ -123,7 +123,10 @@ def test_a_spool_holds_what_the_whole_table_holds(
     spool = spooled(tmp_path, frame, name=name)
     assert spool.chunks == 3 and [vehicle for _, vehicle in spool.vehicles] == list("01234")
     whole = {track.key: track for track in Pieces(from_frame(frame))}
-    found = {t.key: t for number in range(3) for t in Pieces(spool.table(number))}
+    tables = [spool.shelf.table(number) for number in range(3)]
+    found = {t.key: t for table in tables for t in Pieces(table)}
+    for table in tables:
+        spool.count(table.repairs)
     assert list(found) == list(whole)
     for key, track in whole.items():
         assert np.allclose(found[key].time_s, track.time_s) and np.allclose(found[key].position_m, track.position_m)
@@ -140,7 +143,7 @@ def test_units_that_are_named_are_converted(tmp_path: Path) -> None:
         {"vehicle_id": "a", "time_ms": 1e3 * TIME, "position_ft": 10 * TIME / 0.3048, "length_ft": 15.0}
     )
     spool = spooled(tmp_path, frame)
-    (track,) = Pieces(spool.table(0))
+    (track,) = Pieces(spool.shelf.table(0))
     assert np.allclose(track.time_s, TIME) and np.allclose(track.position_m, 10 * TIME)
     assert track.length_m == pytest.approx(4.572)
     assert sorted(r.text.split()[0] for r in spool.repairs) == ["length_ft", "position_ft", "time_ms"]
@@ -171,7 +174,7 @@ import resource, sys
 from pathlib import Path
 from idm_env.trajectories.spool import Spool
 spool = Spool(sys.argv[1], Path(sys.argv[2]), "auto", 100)
-rows = sum(spool.table(number).frame.height for number in range(spool.chunks))
+rows = sum(spool.shelf.table(number).frame.height for number in range(spool.chunks))
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """
 

@@ -1,0 +1,171 @@
+"""Readers of four published layouts: highD and exiD (leveLXData), pNEUMA, and I-24 MOTION.
+
+Made from the formats as their authors publish them; no file of theirs is part of the project.
+
+============  ==========================================================================================================
+highD         Krajewski et al. 2018, ``NN_tracks.csv``: 25 frames/s; x, y the upper left corner of the bounding box (m),
+              ``width`` along the road; ``precedingId`` 0 for nobody. Lanes of both directions, told by ``xVelocity``.
+exiD          Moers et al. 2022, ``NN_tracks.csv``: 25 frames/s; centre, heading, and the way travelled since the track
+              began (m); ``leadId`` −1 for nobody. Ways of two vehicles share no origin, so that gaps come from centres.
+pNEUMA        Barmpounakis and Geroliminis 2020: one vehicle per line, separated by semicolons, latitude, longitude,
+              speed (km/h), two accelerations and time (s) repeated. No lanes and no leaders: tracks to filter.
+I-24 MOTION   Gloudemans et al. 2023: JSON, one document per vehicle with arrays; back centre, feet, ``direction`` 1 or
+              −1, y from the left yellow line, lanes of 12 feet.
+============  ==========================================================================================================
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from idm_env.data.errors import DataError, Repair, missing_column
+
+FRAME_S = 0.04
+FOOT_M = 0.3048
+LANE_FT = 12.0
+EARTH_M = 6_371_000.0
+LENGTHS_M = {"car": 5.0, "taxi": 5.0, "motorcycle": 2.5, "medium vehicle": 5.83, "heavy vehicle": 12.5, "bus": 12.5}
+"""Nominal lengths by the types of pNEUMA, which measures none."""
+
+Read = tuple[pl.DataFrame, list[Repair]]
+
+
+def layout_of(columns: list[str]) -> str | None:
+    """Return which of the layouts a csv's header is of, None for none of them."""
+    names = {name.strip() for name in columns}
+    if {"frame", "id", "xVelocity", "laneId"} <= names:
+        return "highd"
+    if {"frame", "trackId", "xCenter", "traveledDistance"} <= names:
+        return "exid"
+    return None
+
+
+def highd(frame: pl.DataFrame, source: str) -> Read:
+    """Return the tidy table of a highD recording; each direction is a run."""
+    _need(frame, ("frame", "id", "x", "width", "xVelocity", "laneId"), source)
+    right = (pl.col("xVelocity").mean() > 0).over("id")
+    front = pl.when(right).then(pl.col("x") + pl.col("width")).otherwise(-pl.col("x"))
+    leader = pl.when(pl.col("precedingId") > 0).then(pl.col("precedingId"))
+    table = frame.select(
+        pl.when(right).then(pl.lit("right")).otherwise(pl.lit("left")).alias("run_id"),
+        pl.col("id").alias("vehicle_id"),
+        (pl.col("frame") * FRAME_S).round(6).alias("time_s"),
+        front.alias("position_m"),
+        pl.col("xVelocity").abs().alias("speed_mps"),
+        pl.col("width").median().over("id").alias("length_m"),
+        pl.col("laneId").alias("lane"),
+        *([leader.alias("leader_id")] if "precedingId" in frame.columns else []),
+    )
+    return table, []
+
+
+def exid(frame: pl.DataFrame, source: str) -> Read:
+    """Return the tidy table of an exiD recording, with gaps between the bodies of a vehicle and its leader."""
+    _need(frame, ("frame", "trackId", "xCenter", "yCenter", "length", "traveledDistance", "leadId"), source)
+    run = pl.col("recordingId").cast(pl.String) if "recordingId" in frame.columns else pl.lit("0")
+    frame = frame.with_columns(run.alias("run_id"))
+    ahead = frame.select("run_id", "frame", "trackId", "xCenter", "yCenter", "length").rename({"trackId": "leadId"})
+    joined = frame.join(ahead, on=["run_id", "frame", "leadId"], how="left", suffix="_lead", maintain_order="left")
+    apart = (
+        (pl.col("xCenter_lead") - pl.col("xCenter")) ** 2 + (pl.col("yCenter_lead") - pl.col("yCenter")) ** 2
+    ).sqrt()
+    speed = "lonVelocity" if "lonVelocity" in frame.columns else None
+    table = joined.select(
+        "run_id",
+        pl.col("trackId").alias("vehicle_id"),
+        (pl.col("frame") * FRAME_S).round(6).alias("time_s"),
+        (pl.col("traveledDistance") + pl.col("length") / 2).alias("position_m"),
+        *([pl.col(speed).alias("speed_mps")] if speed else []),
+        pl.col("length").alias("length_m"),
+        (apart - (pl.col("length") + pl.col("length_lead")) / 2).alias("gap_m"),
+        pl.when(pl.col("leadId") >= 0).then(pl.col("leadId")).alias("leader_id"),
+    )
+    return table, []
+
+
+def pneuma(path: Path) -> Read:
+    """Return the tidy table of a pNEUMA file: the way of every vehicle, without leaders."""
+    parts, broken, assumed = [], 0, 0
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
+        cells = [cell.strip() for cell in line.strip().rstrip(";").split(";")]
+        try:
+            numbers = np.array([float(cell) for cell in cells[4:]]).reshape(-1, 6)
+        except ValueError:
+            broken += bool(line.strip())
+            continue
+        if len(numbers) < 2:
+            broken += bool(line.strip())
+            continue
+        latitude, longitude, speed, _, _, time = numbers.T
+        north = np.radians(np.diff(latitude)) * EARTH_M
+        east = np.radians(np.diff(longitude)) * EARTH_M * np.cos(np.radians(latitude[0]))
+        kind = cells[1].lower()
+        assumed += 1
+        parts.append(pl.DataFrame({
+            "vehicle_id": cells[0], "time_s": time, "speed_mps": speed / 3.6, "length_m": LENGTHS_M.get(kind, 5.0),
+            "position_m": np.concatenate([[0.0], np.cumsum(np.hypot(north, east))]), "vehicle_class": cells[1],
+        }))  # fmt: skip
+    if not parts:
+        raise DataError(f"{path.name}: no line holds a track of pNEUMA's layout; is it the unzipped csv?")
+    repairs = [Repair("length assumed", assumed, f"{assumed} vehicles have the nominal length of their type.")]
+    if broken:
+        repairs.append(Repair("broken line", broken, f"{broken} lines that hold no whole track were left out."))
+    return pl.concat(parts).with_columns(pl.lit(None, pl.String).alias("leader_id")), repairs
+
+
+def i24(path: Path) -> Read:
+    """Return the tidy table of an I-24 MOTION file; each direction is a run, its vehicles driving towards larger x."""
+    try:
+        documents = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DataError(f"{path.name} is no JSON ({str(error)[:80]}); is it complete?") from None
+    parts, broken = [], 0
+    for document in documents if isinstance(documents, list) else [documents]:
+        try:
+            direction = 1.0 if float(document["direction"]) > 0 else -1.0
+            time, x, y = (np.asarray(document[name], float) for name in ("timestamp", "x_position", "y_position"))
+            length, name = float(np.median(document["length"])), document["_id"]
+            name = str(name["$oid"] if isinstance(name, dict) else name)
+            parts.append(pl.DataFrame({
+                "run_id": "east" if direction > 0 else "west", "vehicle_id": name, "time_s": time,
+                "position_m": (direction * x + length) * FOOT_M, "length_m": length * FOOT_M,
+                "lane": np.floor(np.abs(y) / LANE_FT).astype(np.int64) + 1,
+            }))  # fmt: skip
+        except (KeyError, TypeError, ValueError, pl.exceptions.PolarsError):
+            broken += 1
+    if not parts:
+        raise DataError(f"{path.name}: no document has _id, direction, timestamp, x_position, y_position and length.")
+    table = pl.concat(parts)
+    # Vehicles are sampled by their own clocks: one clock for all, so that leaders are measured at the same times.
+    table = _on_one_clock(table.with_columns(pl.col("time_s") - pl.col("time_s").min()))
+    repairs = [Repair("broken document", broken, f"{broken} documents without a whole track were left out.")]
+    return table, repairs if broken else []
+
+
+def _on_one_clock(table: pl.DataFrame) -> pl.DataFrame:
+    parts = []
+    for track in table.partition_by("run_id", "vehicle_id", maintain_order=True):
+        track = track.sort("time_s").unique("time_s", maintain_order=True)
+        time = track["time_s"].to_numpy()
+        ticks = np.arange(np.ceil(time[0] / FRAME_S - 1e-6), np.floor(time[-1] / FRAME_S + 1e-6) + 1)
+        clock = np.round(ticks * FRAME_S, 6)
+        nearest = np.clip(np.searchsorted(time, clock), 0, len(time) - 1)
+        position = np.interp(clock, time, track["position_m"].to_numpy())
+        parts.append(track[nearest].with_columns(pl.Series("time_s", clock), pl.Series("position_m", position)))
+    return pl.concat(parts)
+
+
+def _need(frame: pl.DataFrame, names: tuple[str, ...], source: str) -> None:
+    for name in names:
+        if name not in frame.columns:
+            raise missing_column(name, frame.columns, source)
+
+
+CSV: dict[str, Callable[[pl.DataFrame, str], Read]] = {"highd": highd, "exid": exid}
+FILES: dict[str, Callable[[Path], Read]] = {"pneuma": pneuma, "i24": i24}
+"""Layouts by name: those of a csv's columns, and those that read the file themselves."""

@@ -1,0 +1,114 @@
+"""A partitioned folder of parquet files, larger than memory: which runs it has, and some of them at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from idm_env.data import tidy
+from idm_env.data.clean import natural
+from idm_env.data.errors import DataError, missing_column
+from idm_env.data.trajectories import Trajectories
+
+_FILE = "idm_env_file"
+
+
+@dataclass(frozen=True)
+class Share:
+    """Some whole runs of a folder, the files that hold their rows, and how many vehicles they have."""
+
+    folder: Path
+    files: tuple[str, ...]
+    runs: tuple[str, ...]
+    vehicles: int
+
+    def __str__(self) -> str:
+        first, last = self.runs[0], self.runs[-1]
+        return f"run {first}" if first == last else f"runs {first} to {last}"
+
+    def trajectories(self, *, ring_length: float | None = None, place: str | None = None) -> Trajectories:
+        """Read and check these runs. DataError for what cannot be used."""
+        try:
+            frame = _scan(self.folder, list(self.files)).filter(_run().is_in(self.runs)).drop(_FILE).collect()
+            table, repairs = tidy.read(frame)
+            return Trajectories.from_frame(
+                table, source=f"{self.folder.name}, {self}", ring_length=ring_length, place=place, repairs=repairs
+            )
+        except (pl.exceptions.PolarsError, OSError) as error:
+            raise _unreadable(self.folder, error) from error
+
+
+def shares(folder: Path, vehicles: int) -> list[Share]:
+    """Return the folder's runs, in the order of their names, in shares of about so many ``vehicles``.
+
+    Only the columns of identifiers are read, in pieces. A run is never divided: whoever drives in it may be somebody's
+    neighbour.
+
+    Raises:
+        DataError: If there is no parquet file, none of them can be read, or a column is missing.
+    """
+    files = files_of(folder)
+    try:
+        scan = _scan(folder, files)
+        names = scan.collect_schema().names()
+        for name in ("run_id", "vehicle_id", "time_s", "position_m"):
+            if name not in names:
+                raise missing_column(name, [n for n in names if n != _FILE], folder.name)
+        keys = scan.select(_run().alias("run_id"), "vehicle_id", _FILE).group_by("run_id", _FILE)
+        found = keys.agg(pl.col("vehicle_id").unique()).collect(engine="streaming")
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise _unreadable(folder, error) from error
+    if found["run_id"].null_count():
+        raise DataError(f"{folder.name}: run_id is empty in some rows; name the run of every row.")
+    runs = found.group_by("run_id").agg(
+        pl.col("vehicle_id").explode().n_unique().alias("vehicles"), pl.col(_FILE).sort()
+    )
+    cut: list[Share] = []
+    for run, count, where in runs.sort(natural("run_id"), "run_id").select("run_id", "vehicles", _FILE).rows():
+        if cut and cut[-1].vehicles + count <= vehicles:
+            last = cut.pop()
+            both = tuple(sorted({*last.files, *where}))
+            cut.append(Share(folder, both, (*last.runs, run), last.vehicles + count))
+        else:
+            cut.append(Share(folder, tuple(where), (run,), count))
+    if not cut:
+        raise DataError(f"{folder} holds no rows; give a folder of parquet files with trajectories.")
+    return cut
+
+
+def files_of(folder: Path) -> list[str]:
+    """Return the parquet files in a folder and below it, in the order of their names. DataError if there is none."""
+    found = sorted(str(path) for path in folder.rglob("*.parquet") if not path.name.startswith((".", "_")))
+    if not found:
+        raise DataError(f"{folder} is a folder without a parquet file; name a file, or a folder of parquet files.")
+    return found
+
+
+def stamp(path: Path) -> Path | list[tuple[str, int, int]]:
+    """Return what tells a file, or a folder, from another: itself, or names, sizes and times of all files in it."""
+    if not path.is_dir():
+        return path
+    found = [Path(name) for name in files_of(path)]
+    return [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in found]
+
+
+def partition(folder: Path, file: str) -> dict[str, str]:
+    """Return the columns that the names of folders between give: ``run_id=7/rows.parquet`` has run_id 7."""
+    between = Path(file).relative_to(folder).parts[:-1]
+    return {name: value for name, equals, value in (part.partition("=") for part in between) if equals}
+
+
+def _scan(folder: Path, files: list[str]) -> pl.LazyFrame:
+    hive = any("=" in file.removeprefix(str(folder)) for file in files)
+    return pl.scan_parquet(files, hive_partitioning=hive, include_file_paths=_FILE)
+
+
+def _run() -> pl.Expr:
+    return pl.col("run_id").cast(pl.String)
+
+
+def _unreadable(folder: Path, error: Exception) -> DataError:
+    reason = str(error).strip().splitlines()[0][:150] if str(error).strip() else type(error).__name__
+    return DataError(f"{folder} cannot be read ({reason}); its parquet files must have one set of columns.")

@@ -1,0 +1,176 @@
+"""``explain`` over one data set or over many: one folder of results each, and a table of all verdicts."""
+
+from __future__ import annotations
+
+import glob
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from idm_env import keep
+from idm_env import report as page
+from idm_env.data import DataError, load
+from idm_env.data.load import EXTENSIONS
+from idm_env.discovery.discover import discover
+from idm_env.discovery.write import OUTPUT, write_report
+from idm_env.executor import Executor, Serial
+from idm_env.parts import Parts
+from idm_env.progress import OnProgress, silent
+
+SETS = ("sets.csv", "report.html")
+"""What ``explain_sets`` writes beside the folders of the sets."""
+COLUMNS = ("set", "verdict", "effects", "gap_rmse_before_m", "gap_rmse_after_m", "sentence", "folder")
+
+
+@dataclass(frozen=True)
+class Question:
+    """How ``explain`` reads a file and what it looks for: see ``discover`` and ``data.load``."""
+
+    by: str = "driver"
+    effects: tuple[str, ...] | None = None
+    known: tuple[str, ...] = ()
+    seed: int = 0
+    ring_length: float | None = None
+    place: str | None = None
+    layout: str = "auto"
+    where: tuple[str, ...] | None = None
+    base: str = "idm"
+
+
+def explain(
+    path: Path, out: Path, question: Question, *, resume: bool = False, on_progress: OnProgress | None = None
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Explain one file, write the results, and return the report and the names of the models compared."""
+    progress = on_progress or silent
+    with keep.results(out, OUTPUT, [path]):
+        progress("reading", 0, 0, path.name)
+        trajectories = load(path, ring_length=question.ring_length, place=question.place, layout=question.layout)
+        if question.where is not None:
+            trajectories = trajectories.where(question.where)
+        found = discover(
+            trajectories, by=question.by, effects=question.effects, known=question.known, out=out, resume=resume,
+            seed=question.seed, base=question.base, on_progress=progress,
+        )  # fmt: skip
+        progress("writing the report", 0, 0, "")
+        write_report(found, out)
+    result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    return result, found.judgement.titles
+
+
+def files_of(given: Sequence[Path]) -> list[Path]:
+    """Return the files that paths, folders and patterns such as ``drives/*.csv`` name, in order, each once.
+
+    DataError for a folder or a pattern without a file.
+    """
+    found: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            some = sorted(p for p in path.iterdir() if p.name.lower().endswith(EXTENSIONS) and p.is_file())
+        elif path.exists() or not glob.has_magic(str(path)):
+            some = [path]
+        else:
+            some = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
+        if not some:
+            raise DataError(f"{path} holds no data set; name files that end in {', '.join(EXTENSIONS)}.")
+        found += some
+    return list(dict.fromkeys(found))
+
+
+@dataclass(frozen=True)
+class _Set:
+    """One data set, where its results go, and where it is marked as done."""
+
+    number: int
+    path: Path
+    out: Path
+    question: Question
+    parts: Parts
+    resume: bool
+
+    def __str__(self) -> str:
+        return self.path.name
+
+
+def explain_sets(
+    paths: Sequence[Path],
+    out: Path,
+    question: Question,
+    *,
+    resume: bool = False,
+    executor: Executor | None = None,
+    on_progress: OnProgress | None = None,
+) -> list[dict[str, Any]]:
+    """Explain every file by itself, into ``out/NAME``, and return one row per file, also written to ``sets.csv``.
+
+    A file that cannot be used has its reason in its row; the others are done. No result depends on ``executor``.
+    """
+    progress, out = on_progress or silent, out.absolute()
+    names = _names(paths)
+    with keep.results(out, SETS, paths):
+        stamps = [(p, p.stat().st_size, p.stat().st_mtime_ns) if p.exists() else p for p in paths]
+        parts = Parts(out / keep.UNFINISHED / "sets", keep.fingerprint(question, stamps), resume)
+        sets = [
+            _Set(n, path.absolute(), out / name, question, parts, resume)
+            for n, (path, name) in enumerate(zip(paths, names, strict=True)) if not parts.done(n)
+        ]  # fmt: skip
+        done = len(paths) - len(sets)
+        for _ in (executor or Serial()).map(_explain_set, sets, progress):
+            done += 1
+            progress("sets", done, len(paths), "")
+        rows = parts.summaries()
+        keep.write(out / "sets.csv", pl.DataFrame(rows, infer_schema_length=None).select(COLUMNS).write_csv)
+        page.write_page(out / "report.html", f"{len(rows)} data sets", _page(rows))
+        parts.remove()
+    return rows
+
+
+def _explain_set(one: _Set, on_progress: OnProgress) -> None:
+    row: dict[str, Any] = dict.fromkeys(COLUMNS) | {"set": one.path.name, "folder": one.out.name}
+    try:
+        report, _ = explain(one.path, one.out, one.question, resume=one.resume, on_progress=on_progress)
+    except ValueError as error:
+        one.parts.finish(one.number, row | {"verdict": "not done", "effects": "", "sentence": str(error)})
+        return
+    before, after = report["error"]["before"], (report["partial"] or report["error"])["after"]
+    one.parts.finish(one.number, row | {
+        "verdict": report["verdict"], "sentence": report["sentence"],
+        "effects": " ".join(found["effect"] or found["label"] for found in report["found"]),
+        "gap_rmse_before_m": before and before["gap_rmse_m"], "gap_rmse_after_m": after and after["gap_rmse_m"],
+    })  # fmt: skip
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return a folder's name for every file: its own without extension, numbered where that is there twice."""
+    found: list[str] = []
+    for path in paths:
+        name = path.name.split(".")[0]
+        count = sum(n == name or n.startswith(f"{name}-") for n in found)
+        found.append(f"{name}-{count + 1}" if count else name)
+    return found
+
+
+def _page(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
+    verdicts: dict[str, int] = {}
+    for row in rows:
+        verdicts[row["verdict"]] = verdicts.get(row["verdict"], 0) + 1
+    told = ", ".join(f"{verdict.replace('_', ' ')}: {count}" for verdict, count in sorted(verdicts.items()))
+    table = [
+        {
+            "data set": row["set"], "verdict": row["verdict"].replace("_", " "), "effects": row["effects"],
+            "gap RMSE before (m)": row["gap_rmse_before_m"], "after (m)": row["gap_rmse_after_m"],
+            "in words": row["sentence"],
+        }
+        for row in rows
+    ]  # fmt: skip
+    return [
+        page.lead(f"{told}."),
+        page.table(table, digits={"gap RMSE before (m)": 2, "after (m)": 2}),
+        page.note(
+            "Errors are of runs kept back in every set. Each set was judged by itself: over many sets some verdicts "
+            "are wrong by chance. Every set has its own report, in the folder of its name."
+        ),
+    ]

@@ -1,0 +1,186 @@
+"""A fit in parts: some drivers each, fitted by whoever the executor gives them to, joined afterwards.
+
+Parts know nothing of each other: a part's drivers start from the pooled optimum of that part. So a part is the same
+bytes wherever and how often it is done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import torch
+
+from idm_env import report as page
+from idm_env.data import DataError, Episode, Repair, Trajectories
+from idm_env.data.errors import Counted
+from idm_env.data.fingerprint import fingerprints
+from idm_env.data.folder import Share
+from idm_env.executor import Executor
+from idm_env.fitting import drivers, pictures
+from idm_env.fitting.evaluate import Errors, errors
+from idm_env.fitting.fit import fit
+from idm_env.fitting.options import Options, Source
+from idm_env.fitting.problem import group_of
+from idm_env.parts import Parts
+from idm_env.progress import OnProgress
+
+PART = 2000
+"""Drivers of a part, about."""
+PARAMETERS, DRIVERS, ERRORS = "parameters", "drivers", "errors"
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of a fit: the episodes in hand, or runs of a folder that are read by whoever fits them."""
+
+    number: int
+    of: int
+    data: Sequence[Episode] | Share
+    source: Source
+    options: Options
+    by: str
+    parts: Parts
+    checkpoint: Path | None = None
+    resume: bool = False
+
+    def __str__(self) -> str:
+        if isinstance(self.data, Share):
+            return str(self.data)
+        first, last = (f"{e.run_id}/{e.vehicle_id}" for e in (self.data[0], self.data[-1]))
+        return f"drivers {first} to {last}"
+
+
+def cut(items: Sequence[Episode], by: str, size: int) -> list[list[Episode]]:
+    """Return episodes in parts of ``size`` groups each, in the order of the groups."""
+    group, names = group_of(items, by)
+    cuts: list[list[Episode]] = [[] for _ in range(-(-len(names) // size))]
+    for number, episode in zip(group.tolist(), items, strict=True):
+        cuts[number // size].append(episode)
+    return cuts
+
+
+def run(executor: Executor, pieces: Sequence[Piece], on_progress: OnProgress) -> None:
+    """Fit all pieces that are not done yet; PartsError names those that failed."""
+    missing = [piece for piece in pieces if not piece.parts.done(piece.number)]
+    done = len(pieces) - len(missing)
+    for _ in executor.map(_fit_piece, missing, on_progress):
+        done += 1
+        if len(pieces) > 1:
+            on_progress("parts", done, len(pieces), "")
+
+
+def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
+    """Fit one piece and write what is found; what a folder's data do not allow is left out and told."""
+    parts, number, options = piece.parts, piece.number, piece.options
+    summary: dict[str, Any] = {}
+    if isinstance(piece.data, Share):
+        try:
+            trajectories = piece.source.trajectories(piece.data)
+            items = piece.source.episodes(trajectories)
+        except DataError as wrong:
+            parts.finish(number, {"lost": str(wrong), "share": str(piece.data)})
+            return
+        summary = _told(trajectories, items.left_out)
+        summary["tracks"] = sorted(set(fingerprints(trajectories, [(e.run_id, e.vehicle_id) for e in items]).values()))
+        data: Sequence[Episode] = items
+    else:
+        data = piece.data
+    simulator, fixed = options.simulator()
+    found = fit(
+        data, by=piece.by, simulator=simulator, objective=options.objective, relative=options.relative,
+        loss=options.loss, method=options.method, starts=options.starts, seed=options.seed, substeps=options.substeps,
+        fixed=fixed, checkpoint=piece.checkpoint, resume=piece.resume, on_progress=on_progress,
+    )  # fmt: skip
+    on_progress("errors", 0, 0, "in free simulation")
+    error, simulated = errors(found.problem, found.own, found.shared)
+    parts.write(number, PARAMETERS, pl.DataFrame(found.table()))
+    parts.write(number, DRIVERS, pl.DataFrame(drivers.table(found, error)))
+    parts.write(number, ERRORS, pl.DataFrame({name: getattr(error, name).numpy() for name in Errors._fields}))
+    drawn = []
+    if number == 0:
+        drawn = [pictures.examples(found.problem, error, simulated), pictures.residuals(found.problem, simulated)]
+        drawn += pictures.space_time(found.problem, simulated)
+    parts.finish(number, summary | {
+        "iterations": found.iterations, "converged": int(found.converged.sum()), "dt": found.problem.batch.dt,
+        "pictures": [{"text": b.text, "image": b.image, "narrow": b.narrow} for b in drawn],
+    })  # fmt: skip
+
+
+def _told(trajectories: Trajectories, left_out: Sequence[Repair]) -> dict[str, Any]:
+    """Return what a part of a folder is, so that all of them can be added up."""
+
+    def plain(repairs: Sequence[Repair]) -> list[list[Any]]:
+        return [[r.kind, r.count, r.text] for r in repairs]
+
+    kept = {k: v for k, v in trajectories.summary().items() if k not in ("source", "repairs")}
+    return {"data": kept, "repairs": plain(trajectories.repairs), "left_out": plain(left_out)}
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """What all pieces of a fit found: estimates, errors of every episode, and what each piece told."""
+
+    parts: Parts
+    estimates: drivers.Estimates
+    errors: Errors
+    summaries: list[dict[str, Any]]
+    lost: list[dict[str, Any]]
+
+    @property
+    def converged(self) -> int:
+        """How many groups converged."""
+        return sum(told["converged"] for told in self.summaries)
+
+    @property
+    def iterations(self) -> int:
+        """Most iterations of any piece."""
+        return max(told["iterations"] for told in self.summaries)
+
+    @property
+    def pictures(self) -> list[page.Block]:
+        """Measured against simulated, residuals, and space and time, of the first piece that has them."""
+        return [page.Block("figure", **block) for told in self.summaries for block in told["pictures"]]
+
+
+def join(parts: Parts, options: Options) -> Joined:
+    """Return what the pieces found. DataError if none found anything."""
+    told = parts.summaries()
+    good = [summary for summary in told if "lost" not in summary]
+    if not good:
+        raise DataError(f"no part can be fitted: {told[0]['lost']}")
+    odd = next((s["dt"] for s in good if abs(s["dt"] - good[0]["dt"]) > 1e-9), None)
+    if odd is not None:
+        raise DataError(f"some runs have steps of {good[0]['dt']:g} s, others of {odd:g} s. Give one --dt.")
+    simulator, fixed = options.simulator()
+    table = pl.concat([pl.read_parquet(path) for path in parts.tables(PARAMETERS)])
+    errors = pl.concat([pl.read_parquet(path) for path in parts.tables(ERRORS)])
+    estimates = drivers.Estimates.joined(table, simulator, good[0]["dt"], fixed)
+    measures = Errors(*(torch.from_numpy(errors[name].to_numpy().copy()) for name in Errors._fields))
+    return Joined(parts, estimates, measures, good, [summary for summary in told if "lost" in summary])
+
+
+def account_of(found: Joined, source: str) -> dict[str, Any]:
+    """Return what the parts of a folder are together, as ``Trajectories.summary`` says it of a file."""
+    data = [told["data"] for told in found.summaries]
+    repairs, left_out = Counted(), Counted()
+    for told in found.summaries:
+        repairs.add([Repair(*one) for one in told["repairs"]])
+        left_out.add([Repair(*one) for one in told["left_out"]])
+    left_out.add([Repair("part", 1, f"{told['share']} left out: {told['lost']}") for told in found.lost])
+    sums = ("rows", "runs", "vehicles", "followers", "vehicle_seconds")
+    return {
+        "source": source,
+        **{name: sum(one[name] for one in data) for name in sums},
+        "time_steps_s": sorted({step for one in data for step in one["time_steps_s"]}),
+        "place": data[0]["place"],
+        "repairs": [{"kind": r.kind, "count": r.count, "text": r.text} for r in repairs.repairs()],
+        "left_out": [r.text for r in left_out.repairs()],
+        "episodes": len(found.errors.gap_rmse),
+        "account": page.account(
+            ((r.kind, r.count) for r in repairs.repairs()), ((r.kind, r.count) for r in left_out.repairs())
+        ),
+    }
