@@ -361,15 +361,27 @@ def simulate(
 
 
 @app.command()
-def effects() -> None:
-    """List the catalogue of effects with their parameters."""
+def effects(
+    model: Annotated[Path | None, typer.Argument(help="A model.yaml: only the effects in it.")] = None,
+    cite: Annotated[bool, typer.Option("--cite", help="Print the publications that they are taken from.")] = False,
+) -> None:
+    """List the catalogue of effects, or the effects of a model, with their parameters or their publications."""
     from idm_env.effects import ALL
     from idm_env.parameters import table
 
+    if model is not None:
+        from idm_env.config import load_model
+
+        chosen = {effect.name: effect for effect in load_model(model).effects}
+    else:
+        chosen = {name: cls() for name, cls in ALL.items()}
+    if cite:
+        for line in citations({name: type(effect) for name, effect in chosen.items()}):
+            print(line)
+        return
     rows = []
-    for name, cls in ALL.items():
-        effect = cls()
-        summary = (cls.__doc__ or "").strip().splitlines()[0]
+    for name, effect in chosen.items():
+        summary = (type(effect).__doc__ or "").strip().splitlines()[0]
         for row in table([effect]) or [{"parameter": name, "symbol": "", "unit": "", "default": "", "null": ""}]:
             keep = {
                 k: str(row[k] if row[k] is not None else "") for k in ("parameter", "symbol", "unit", "default", "null")
@@ -377,6 +389,28 @@ def effects() -> None:
             rows.append({**keep, "what": summary})
             summary = ""
     _show("Effects", rows)
+
+
+def citations(effects: dict[str, Any]) -> list[str]:
+    """Return every publication once, with the effects that are taken from it, and which effects name none."""
+    by_source: dict[str, list[str]] = {}
+    for name, cls in effects.items():
+        for source in cls.sources:
+            by_source.setdefault(source, []).append(name)
+    bare = [name for name, cls in effects.items() if not cls.sources]
+    lines = [f"{source} [{', '.join(names)}]" for source, names in sorted(by_source.items())]
+    return [*lines, *([f"Without a publication of their own: {', '.join(bare)}."] if bare else [])]
+
+
+@app.command()
+def doctor() -> None:
+    """Say what works on this machine and what does not, with the cure. Ends with code 1 if something is broken."""
+    from idm_env.doctor import findings
+
+    found = findings()
+    _show("This machine", [{"what": f.what, "state": f.state, "found": f.told, "cure": f.cure} for f in found])
+    if any(finding.state == "broken" for finding in found):
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import email
 import importlib.metadata
+import os
 import shutil
 import subprocess
 import sys
@@ -77,3 +78,33 @@ def test_it_declares_what_it_imports_and_no_extra_for_what_it_does_not_carry(whe
     assert not undeclared
     used = set().union(*imported(wheel))
     assert everything == used & everything
+
+
+def test_it_works_where_there_is_no_checkout(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    """Installed into a fresh environment that sees the same libraries, but not an editable installation of this."""
+    place = tmp_path / "environment"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", place], check=True)
+    site = next(place.glob("lib/python*/site-packages"))
+    # As plain paths: what is installed editable there is found by .pth files, which only a site's own folder reads.
+    paths = [p for p in sys.path if "site-packages" in p]
+    (site / "libraries.pth").write_text("\n".join(paths))
+    install = [sys.executable, "-m", "pip", "--python", place / "bin" / "python", "install", "--quiet", "--no-deps"]
+    subprocess.run([*install, str(wheel.filename)], check=True)
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"IDM_ENV_CACHE": str(tmp_path / "c")}
+
+    def call(*command: object, **more: str) -> str:
+        told = subprocess.run(
+            [str(part) for part in command], cwd=tmp_path, env=environment | more, text=True, capture_output=True
+        )
+        assert told.returncode == 0, told.stderr
+        return told.stdout
+
+    python, command = place / "bin" / "python", place / "bin" / "idm-env"
+    assert str(site) in call(python, "-c", "import idm_env; print(idm_env.__file__)")
+    time = [0.1 * i for i in range(100)]
+    rows = [f"{v},{t:.1f},{20 * t - 30 * v:.2f},1" for v in range(3) for t in time]
+    (tmp_path / "my.csv").write_text("\n".join(["vehicle_id,time_s,position_m,lane", *rows]) + "\n")
+    call(command, "plot", "my.csv", "--html", "--out", "drawn.png")  # its page is a file of the package
+    assert "<svg" in (tmp_path / "drawn.html").read_text() or "canvas" in (tmp_path / "drawn.html").read_text()
+    found = call(command, _IDM_ENV_COMPLETE="complete_bash", COMP_WORDS="idm-env fi", COMP_CWORD="1")
+    assert found.split() == ["fit", "filter"]

@@ -55,6 +55,7 @@ class Effect:
     ==============  ====================================================================================================
     ``title``       its plain name
     ``equation``    what it adds to IDM, in one line
+    ``sources``     the publications it is taken from, in full (``effects/references.py``); none for common knowledge
     ``wording``     what drivers do then, in a clause: with the strength below its null, and above
     ``looks_like``  what it is most easily confused with: candidates, or parameters and curves in plain words
     ``told_by``     data that would tell it from these
@@ -82,6 +83,7 @@ class Effect:
     draws: ClassVar[bool] = False
     hook: ClassVar[Hook]
 
+    sources: ClassVar[tuple[str, ...]] = ()
     title: ClassVar[str] = ""
     equation: ClassVar[str] = ""
     wording: ClassVar[tuple[str, str]] = ("", "")

@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.parameters import Parameter
 from idm_env.types import Beside, Driver, Scene, Wish
@@ -45,6 +46,7 @@ class Mobil(Effect):
     """
 
     kind: ClassVar[str] = "mobil"
+    sources: ClassVar[tuple[str, ...]] = (references.KESTING_2007,)
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("politeness", "p", "1", 0.2, -1.0, 2.0, role="shape"),
         Parameter("threshold", "Δa_th", "m/s²", 0.1, 0.0, 5.0, role="threshold"),
@@ -84,6 +86,7 @@ class MandatoryChange(Effect):
     """
 
     kind: ClassVar[str] = "mandatory_change"
+    sources: ClassVar[tuple[str, ...]] = (references.KESTING_2007,)
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("strength", "A", "m/s²", 4.0, 0.0, 100.0, role="shape"),
         Parameter("reach", "D", "m", 300.0, 1.0, 5000.0, role="shape"),

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.effects.idm import soft_floor
 from idm_env.parameters import Parameter
@@ -20,6 +21,10 @@ class Asymmetry(Effect):
     """Weaker acceleration than braking: ``a > 0: (1 − k) a``, ``a < 0: (1 + k) a`` (Newell; Laval and Leclercq)."""
 
     kind: ClassVar[str] = "asymmetry"
+    sources: ClassVar[tuple[str, ...]] = (
+        references.NEWELL_1965,
+        references.LAVAL_2010,
+    )
     title: ClassVar[str] = "asymmetry"
     equation: ClassVar[str] = "a > 0: (1 − k) a, a < 0: (1 + k) a"
     wording: ClassVar[tuple[str, str]] = (
@@ -42,12 +47,13 @@ class Asymmetry(Effect):
 
 @dataclass(frozen=True)
 class ActionPoint(Effect):
-    """Acceleration is held until it differs from the wanted one by Δa (Treiber and Kesting 2017, Transp. Res. B 104).
+    """Acceleration is held until it differs from the wanted one by Δa (Treiber and Kesting 2018, Transp. Res. B 117).
 
     Δa has no gradient: search from the ``starts``.
     """
 
     kind: ClassVar[str] = "action_point"
+    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2018,)
     adds: ClassVar[bool] = False
     title: ClassVar[str] = "action points"
     equation: ClassVar[str] = "a is held until the wanted one differs by Δa"
@@ -181,6 +187,7 @@ class Traction(Effect):
     """
 
     kind: ClassVar[str] = "traction"
+    sources: ClassVar[tuple[str, ...]] = (references.RAJAMANI_2012,)
     rank: ClassVar[int] = 90
     sees_truth: ClassVar[bool] = True
     adds: ClassVar[bool] = False

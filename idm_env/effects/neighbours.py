@@ -11,6 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from idm_env.effects import references
 from idm_env.effects.base import Effect, Neighbour, P
 from idm_env.effects.idm import interaction
 from idm_env.parameters import Parameter
@@ -25,6 +26,7 @@ class SecondLeader(Effect):
     """
 
     kind: ClassVar[str] = "second_leader"
+    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2006,)
     title: ClassVar[str] = "second leader"
     equation: ClassVar[str] = "(1 − w) (s*₁/s₁)² + w (s*₂/(s₂/2))² in place of (s*₁/s₁)²"
     wording: ClassVar[tuple[str, str]] = (

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import torch
 
+from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.parameters import Parameter
 from idm_env.types import Imagined, Neighbour, Scene
@@ -22,6 +23,7 @@ class Delay(Effect):
     """
 
     kind: ClassVar[str] = "delay"
+    sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2006,)
     rank: ClassVar[int] = -10
     title: ClassVar[str] = "reaction delay"
     equation: ClassVar[str] = "all that IDM sees is taken at t − τ"
@@ -61,6 +63,7 @@ class DeadZone(Effect):
     """
 
     kind: ClassVar[str] = "dead_zone"
+    sources: ClassVar[tuple[str, ...]] = (references.WIEDEMANN_1974,)
     title: ClassVar[str] = "threshold of looming"
     equation: ClassVar[str] = "Δv is seen as 0 while 1.8 |Δv| / s² < θ"
     wording: ClassVar[tuple[str, str]] = (

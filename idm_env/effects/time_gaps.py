@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -22,6 +23,7 @@ class SpeedTimeGap(Effect):
     """
 
     kind: ClassVar[str] = "speed_time_gap"
+    sources: ClassVar[tuple[str, ...]] = (references.ZHOU_2005,)
     rank: ClassVar[int] = 2
     title: ClassVar[str] = "speed-dependent time gap"
     equation: ClassVar[str] = "T → T (1 + k (v / (20 m/s) − 1))"
@@ -53,6 +55,10 @@ class SetPointAsymmetry(Effect):
     """
 
     kind: ClassVar[str] = "set_point_asymmetry"
+    sources: ClassVar[tuple[str, ...]] = (
+        references.NEWELL_1965,
+        references.YEO_2009,
+    )
     rank: ClassVar[int] = 2
     title: ClassVar[str] = "asymmetric time gap"
     equation: ClassVar[str] = "T → T (1 + k a_lead / √(a_lead² + 0.09 m²/s⁴))"
@@ -93,6 +99,7 @@ class Relaxation(Effect):
     """
 
     kind: ClassVar[str] = "relaxation"
+    sources: ClassVar[tuple[str, ...]] = (references.LAVAL_2008,)
     rank: ClassVar[int] = 2
     title: ClassVar[str] = "relaxation of the time gap"
     equation: ClassVar[str] = "T → T (1 + β (m − 1)), τ dm/dt = s √(1 − (v/v0)⁴) / (s0 + v T) − m"

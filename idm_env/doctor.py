@@ -1,0 +1,152 @@
+"""What works on this machine and what does not, each with its cure: ``idm-env doctor``."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import tempfile
+from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+EXTRAS = ("data", "kernels", "render", "sb3", "ray")
+
+
+class Finding(NamedTuple):
+    """One thing that was looked at: ``ok``, ``missing`` (something is slower or absent) or ``broken``, and the cure."""
+
+    what: str
+    state: str
+    told: str
+    cure: str = ""
+
+
+def findings(folder: Path = Path()) -> list[Finding]:
+    """Return what was found; ``folder`` is where results would be written."""
+    return [
+        *_versions(), *(_extra(name) for name in EXTRAS), _kernels(), _threads(), _gpu(), _cache(),
+        _writable("compiled loops", _numba_cache(), "Set NUMBA_CACHE_DIR to a folder that you may write to."),
+        _writable("results", folder, "Go to a folder that you may write to, or give --out one."),
+    ]  # fmt: skip
+
+
+def _versions() -> list[Finding]:
+    system = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    found = [Finding("system", "ok", system)]
+    for name in ("idm-env", "torch", "numpy", "gymnasium", "pettingzoo"):
+        try:
+            found.append(Finding(name, "ok", version(name)))
+        except PackageNotFoundError:
+            if name == "idm-env":
+                found.append(Finding(name, "missing", "runs from a checkout that is not installed", "pip install -e ."))
+            else:
+                found.append(Finding(name, "broken", "not installed", f"pip install {name}"))
+    return found
+
+
+def _extra(name: str) -> Finding:
+    """Return whether all that an extra asks for is installed."""
+    try:
+        lines = requires("idm-env") or []
+    except PackageNotFoundError:
+        return Finding(f"extra {name}", "missing", "not known: the package is not installed", "pip install -e '.[all]'")
+    mine = [line for line in lines if re.search(rf"extra == ['\"]{name}['\"]", line)]
+    have, absent = [], []
+    for line in mine:
+        asked = re.split(r"[^\w.-]", line, maxsplit=1)[0]
+        try:
+            have.append(f"{asked} {version(asked)}")
+        except PackageNotFoundError:
+            absent.append(asked)
+    if absent or not mine:
+        told = f"absent: {', '.join(absent)}" if absent else "not known to the installed package"
+        return Finding(f"extra {name}", "missing", told, f"pip install 'idm-env[{name}]'")
+    return Finding(f"extra {name}", "ok", ", ".join(have))
+
+
+def _kernels() -> Finding:
+    """Run a compiled lane beside the torch path."""
+    if os.environ.get("IDM_ENV_KERNELS") == "0":
+        return Finding("kernels", "missing", "IDM_ENV_KERNELS=0: all runs in torch, slower", "Unset the variable.")
+    if find_spec("numba") is None:
+        return Finding("kernels", "missing", "no numba: all runs in torch, slower", "pip install 'idm-env[kernels]'")
+    try:
+        return _compared()
+    except Exception as error:
+        words = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+        return Finding("kernels", "broken", words, "Delete the caches below; IDM_ENV_KERNELS=0 does without kernels.")
+
+
+def _compared() -> Finding:
+    import torch
+
+    from idm_env import IDM, Brakes, Lane, Simulator
+    from idm_env.kernels import dispatch
+
+    simulator = Simulator(Lane(), (IDM(), Brakes()), dt=0.1)
+    params = simulator.defaults(dtype=torch.float64)
+    position = torch.tensor([60.0, 30.0, 0.0], dtype=torch.float64)
+    state = simulator.state(position, torch.full_like(position, 12.0), params)
+    refused = dispatch.refusal(simulator, state, {}, params)
+    if refused is not None:
+        return Finding("kernels", "missing", refused, "")
+    compiled, _ = simulator.rollout(state, {}, params, 50)
+    with dispatch.off():
+        plain, _ = simulator.rollout(state, {}, params, 50)
+    apart = float((compiled.gap - plain.gap).abs().max())
+    if not apart < 1e-9:
+        return Finding("kernels", "broken", f"a compiled lane is {apart:g} m from torch's", "Delete the caches below.")
+    return Finding("kernels", "ok", f"numba {version('numba')}; a compiled lane agrees with torch's")
+
+
+def _threads() -> Finding:
+    import torch
+
+    have = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    used = torch.get_num_threads()
+    told = f"{used} of {have} processors"
+    if used < have:
+        return Finding("threads", "missing", told, f"Set OMP_NUM_THREADS={have}, or use --executor processes.")
+    if used > have:
+        return Finding("threads", "missing", told, f"Set OMP_NUM_THREADS={have}: more threads only cost time.")
+    return Finding("threads", "ok", told)
+
+
+def _gpu() -> Finding:
+    import torch
+
+    if torch.cuda.is_available():
+        return Finding("GPU", "ok", f"{torch.cuda.get_device_name()}; device='cuda' runs in torch, without kernels")
+    built = torch.version.cuda
+    if built is None:
+        return Finding("GPU", "missing", "this torch is built without CUDA; nothing here needs one", "")
+    return Finding("GPU", "missing", f"torch is built for CUDA {built}, and no device answers", "Look at nvidia-smi.")
+
+
+def _cache() -> Finding:
+    from idm_env.scalar import library
+
+    told, asked, used = "cache of printed steps", os.environ.get("IDM_ENV_CACHE"), library.folder()
+    cure = "Set IDM_ENV_CACHE to a folder that you may write to."
+    if asked and Path(asked).resolve() != used.resolve():
+        return Finding(told, "broken", f"IDM_ENV_CACHE={asked} cannot be written; {used} is used", cure)
+    if used.name.startswith("idm_env_"):
+        return Finding(told, "missing", f"no cache can be written: {used} is lost at the end", cure)
+    return _writable(told, used, cure)
+
+
+def _numba_cache() -> Path:
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(named) if named else Path(__file__).parent / "kernels" / "__pycache__"
+
+
+def _writable(what: str, folder: Path, cure: str) -> Finding:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".idm-env-doctor"):
+            pass
+    except OSError as error:
+        return Finding(what, "broken", f"{folder}: {error.strerror or error}", cure)
+    return Finding(what, "ok", str(folder.resolve()))
