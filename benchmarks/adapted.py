@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from idm_env.data import load
-from idm_env.discovery import free, judge, records, search
+from idm_env.discovery import judge, records, search
 from idm_env.discovery import model as terms
 from idm_env.discovery.discover import prepare
 from idm_env.discovery.model import Frozen, Model
@@ -38,8 +38,7 @@ def fitted(training: records.Records) -> list[Solution]:
         searching = search.Search(task, (), False, Store(None, "", False), lambda *_: None)
         starts = [np.zeros(0)] if name is None else [np.array(s) for s in terms.simple(name).starts]
         best = min((searching.null(model, theta, s) for s in starts), key=lambda s: s.cost)
-        stand = free.stand(training, best.model, best.values, best.prior, best.theta)
-        found.append(searching.weigh(best, stand.task.prior.alike_s))
+        found.append(searching.weighed(best)[1])
     return found
 
 

@@ -29,7 +29,7 @@ def judged(law: CarFollowing, null: Solution, fit: Records, kept: Records, adapt
     weak, rows = search.first_prior(law), whole(fit)
     task = Task(rows, None, weak)
     centre = np.tile(weak.centre, (task.groups, 1))
-    first = solve(task, Frozen(model, values), centre, np.zeros(0), iterations=25, tolerance=1e-4)
+    first = solve(task, Frozen(model, values), centre, np.zeros(0), iterations=15, tolerance=1e-3)
     prior = replace(search.population(first.theta, rows, law), alike_s=null.prior.alike_s)
     own = None if adapt else judge.calibrate(fit, model, values, prior, start=first.theta).theta
     return judge.judge(kept, model, values, prior, own, adapt)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import ttest_1samp
 
 from idm_env.discovery import free, judge, places, together
+from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import whole
 from idm_env.discovery.score import ALPHA, FREE_SHARE, Tested, at_level, held_out, log_gain, westfall_young
@@ -26,6 +27,8 @@ FEWEST_RUNS = 3
 MOST_ROUNDS = 3
 SAME = 0.15
 """Candidates whose gain is within this share of the best one's are told apart by nothing but their names."""
+SPANS = 5
+"""Knots from which on a curve has in it what an interval would say; a ramp has not."""
 AT_FLOOR = 1.15
 """A corrected model whose free simulation errs by no more times the noise of measurement lacks nothing worth a name.
 
@@ -78,7 +81,7 @@ def decide(searching: Search, null: Solution, seed: int) -> Decided:
 
     A latency shorter than a step of the data becomes part of the null: it is how they were integrated or recorded.
     """
-    at, null = weighed(searching, null)
+    at, null = searching.weighed(null)
     null, steps, rounds = _rounds(searching, null, seed)
     if len(steps) == len(rounds) - 1:
         pair = _pairs(searching, steps[-1] if steps else null, rounds[-1], seed)
@@ -88,7 +91,7 @@ def decide(searching: Search, null: Solution, seed: int) -> Decided:
             assert chosen is not None
             steps.append(searching.null(chosen.model, chosen.theta, chosen.values))
     if steps:
-        steps[-1] = weighed(searching, _delete(searching, steps[-1], len(null.model.terms)))[1]
+        steps[-1] = searching.weighed(_delete(searching, steps[-1], len(null.model.terms)))[1]
     joined = _joined(searching, null, steps, rounds, seed)
     return Decided(null, steps, rounds, joined, at)
 
@@ -101,18 +104,12 @@ def _joined(
     few = last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS
     if few or (steps and _at_floor(searching, now)):
         return None
-    joined, forward = together.grow(searching, weighed(searching, now)[0], len(null.model.terms), seed)
+    joined, forward = together.grow(searching, searching.weighed(now)[0], len(null.model.terms), seed)
     rounds += [
         Round(s.scored, s.tested, last.before, last.left, s.winner, equivalent=s.equivalent, free=True)
         for s in forward if s.scored
     ]  # fmt: skip
     return joined
-
-
-def weighed(searching: Search, now: Solution) -> tuple[free.Stand, Solution]:
-    """Return how a model of windows stands in free simulation of the runs that may choose, and it with that weight."""
-    at = free.stand(searching.task.rows.records, now.model, now.values, now.prior, now.theta)
-    return at, searching.weigh(now, at.task.prior.alike_s)
 
 
 def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, list[Solution], list[Round]]:
@@ -144,7 +141,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
             break
         chosen = scored[this.winner].solution
         assert chosen is not None
-        now = weighed(searching, searching.null(chosen.model, chosen.theta, chosen.values))[1]
+        now = searching.weighed(searching.null(chosen.model, chosen.theta, chosen.values))[1]
         if not steps and _is_a_step(now, searching.task.rows.records.dt):
             null = now
             rounds.pop()
@@ -166,7 +163,7 @@ def _is_a_step(now: Solution, dt: float) -> bool:
 def _at_floor(searching: Search, now: Solution) -> bool:
     """Tell whether only the noise of measurement is left; what smoothing does at sharp bends would be named next."""
     kept = searching.task.rows.records
-    square = judge.free_run_squares(kept, now).sum() / len(whole(kept).valid.nonzero()[0])
+    square = searching.free_run_squares(now).sum() / len(whole(kept).valid.nonzero()[0])
     return bool(square <= (AT_FLOOR * judge.floor(kept)["gap_rmse_m"]) ** 2)
 
 
@@ -201,7 +198,13 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
 
 
 def _same_class(term: Term, model: Model) -> bool:
-    """Tell whether the model has an effect already that only sharp inputs tell from this one."""
+    """Tell whether the model has an effect already that only sharp inputs tell from this one, or a curve that spans it.
+
+    A curve with many knots over a coordinate contains other changes of the same quantity over it: these are its error.
+    """
+    fine = [t for t in model.terms if t.form == CURVE and t.knots[2] >= SPANS]
+    if any((t.what, t.coordinate) == (term.what, term.coordinate) for t in fine):
+        return True
     return _late(term.effect) and any(_late(t.effect) and t.effect != term.effect for t in model.terms)
 
 
@@ -257,8 +260,7 @@ def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
 
     Drivers' own noise adds up in free simulation: with 0.1 m/s² of it, right findings can miss the 2 %.
     """
-    prepared = searching.task.rows.records
-    before, after = (judge.free_run_squares(prepared, s) for s in (now, chosen))
+    before, after = (searching.free_run_squares(s) for s in (now, chosen))
     if after.sum() <= 1.02**2 * before.sum():
         return True
     return bool(ttest_1samp(log_gain(after, before), 0.0, alternative="greater").pvalue > ALPHA)

@@ -94,6 +94,8 @@ def respond(task: Task, solution: Solution) -> Responses:
 class Found:
     """The best interval [begin, end) and amount on all runs, its linear gain, and honest gains of every unit.
 
+    Edges are those of bins of ``width``.
+
     ``gains`` [units] is the gain in log RMSE of each with interval and amount from the other runs; ``stable`` [units]
     says whether they chose nearly the same interval.
     """
@@ -104,6 +106,7 @@ class Found:
     gain: float
     gains: np.ndarray
     stable: np.ndarray
+    width: float
 
 
 def bins_of(values: np.ndarray, width: float, most: int = 60) -> tuple[np.ndarray, float]:
@@ -122,7 +125,7 @@ def scan(
     ``open_end`` takes only intervals that last to the end: steps.
     """
     values = responses.coordinates[coordinate]
-    edges, _ = bins_of(values, width)
+    edges, width = bins_of(values, width)
     count = len(edges) - 1
     if count < 2 + shortest:
         return None
@@ -144,7 +147,7 @@ def scan(
             gains[unit] = log_gain(gained, responses.square[unit])
         stable[mine] = abs(i - total[0]) <= 1 and abs(j - total[1]) <= 1
     i, j, amount, gain = total
-    return Found(float(edges[i]), float(edges[j + 1]), amount, gain, gains, stable)
+    return Found(float(edges[i]), float(edges[j + 1]), amount, gain, gains, stable, width)
 
 
 def _by_run(responses: Responses) -> list[np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Records:
     runs: tuple[str, ...]
     period: float
 
-    @property
+    @cached_property
     def gap(self) -> np.ndarray:
         """Measured gap (m)."""
         return self.signals[:, 0] - self.signals[:, 14]
@@ -177,7 +178,12 @@ class Rows:
     def __len__(self) -> int:
         return len(self.record)
 
-    @property
+    def some(self, wanted: np.ndarray) -> Rows:
+        """Return some of the rows, whole records of them."""
+        each = {name: getattr(self, name)[wanted] for name in ("record", "start", "valid", "joined", "block")}
+        return replace(self, **each)
+
+    @cached_property
     def group(self) -> np.ndarray:
         """Group of every row."""
         return self.records.group[self.record]
@@ -187,7 +193,7 @@ class Rows:
         """Run of every row."""
         return self.records.run[self.record]
 
-    @property
+    @cached_property
     def samples(self) -> np.ndarray:
         """Index of every kept sample, [rows, samples], inside the record."""
         ahead = self.start[:, None] + self.every * (1 + np.arange(self.steps // self.every))

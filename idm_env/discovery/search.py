@@ -8,14 +8,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from idm_env.discovery import judge, places
 from idm_env.discovery import model as terms
 from idm_env.discovery import noise as noises
-from idm_env.discovery import places
+from idm_env.discovery.free import Stand, stand
 from idm_env.discovery.march import BASE
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out, log_gain
-from idm_env.discovery.solve import Prior, Solution, Task, finish, linearise, solve
+from idm_env.discovery.solve import Linear, Prior, Solution, Task, finish, linearise, projected, solve
 from idm_env.discovery.units import Units, units
 from idm_env.effects import CarFollowing, Effect
 from idm_env.effects.base import Sought
@@ -25,6 +26,10 @@ from idm_env.progress import OnProgress
 POPULATION = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
 WIDTH = 0.6
 """Width of the first, weak prior of log θ; later the drivers' own spread is taken, between 0.3 and this."""
+FAINT = 0.002
+"""Share of the squared error, at best on the very data, below which a candidate is fitted in one step only."""
+NEAR, RACED = 0.3, 3
+"""Starts whose share is that near the best one's are fitted, so many at most."""
 WORTH = 0.01
 """Linear gain in log RMSE from which a located candidate is worth a nested fit."""
 
@@ -49,6 +54,10 @@ class Search:
     saved: Store
     on_progress: OnProgress
     base: Model = field(default_factory=Model)
+    stood: tuple[Stand, Solution] | None = None
+    """The model that was weighed last, and how it stands in free simulation."""
+    squares: dict[Solution, np.ndarray] = field(default_factory=dict)
+    """What ``free_run_squares`` has said."""
 
     @property
     def units(self) -> Units:
@@ -64,10 +73,23 @@ class Search:
             solution = solve(self.task, model, solution.theta, solution.values, iterations=6)
         return solution
 
-    def weigh(self, null: Solution, alike_s: float) -> Solution:
-        """Set the weight of the prior in free simulation; return the null with it."""
-        self.task = replace(self.task, prior=replace(self.task.prior, alike_s=alike_s))
-        return replace(null, prior=replace(null.prior, alike_s=alike_s))
+    def weighed(self, now: Solution) -> tuple[Stand, Solution]:
+        """Return how a model of windows stands in free simulation of the runs that may choose, and it with that weight.
+
+        The weight of the prior becomes that of the task.
+        """
+        if self.stood is None or self.stood[1] is not now:
+            at = stand(self.task.rows.records, now.model, now.values, now.prior, now.theta)
+            alike_s = at.task.prior.alike_s
+            self.task = replace(self.task, prior=replace(self.task.prior, alike_s=alike_s))
+            self.stood = at, replace(now, prior=replace(now.prior, alike_s=alike_s))
+        return self.stood
+
+    def free_run_squares(self, now: Solution) -> np.ndarray:
+        """Return every unit's squared gap errors (m²) of free simulation of the runs that may choose."""
+        if now not in self.squares:
+            self.squares[now] = judge.free_run_squares(self.task.rows.records, now)
+        return self.squares[now]
 
     def _renoised(self, solution: Solution) -> Task:
         errors = self.task.errors(solution.theta[None], solution.model, solution.values[None])[0]
@@ -134,13 +156,43 @@ class Search:
             best = finish(self.task, model, theta, values, linear, kept["cost"])
         else:
             starts = starts or [np.append(solution.values, s) for s in term.starts]
-            first = [solve(self.task, model, solution.theta, s, iterations=5) for s in starts]
-            best = min(first, key=lambda s: s.cost)
-            best = solve(self.task, model, best.theta, best.values, iterations=iterations)
+            share, scaled = self._promise(solution, model, term, np.array(starts))
+            # Chance alone lowers the error by the number of parameters over that of the errors.
+            if share.max() < FAINT + term.size / solution.linear.residual.size:
+                best = solve(self.task, model, solution.theta, scaled[share.argmax()], iterations=1)
+            else:
+                wanted = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
+                first = [solve(self.task, model, solution.theta, s, iterations=5) for s in wanted]
+                best = min(first, key=lambda s: s.cost)
+                best = solve(self.task, model, best.theta, best.values, iterations=iterations)
             arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
             self.saved.put(key, {**arrays, "cost": float(best.cost)})
         gains = log_gain(before, held_out(self.task, best))
         return Scored(term, best, gains)
+
+    def _promise(
+        self, solution: Solution, model: Model, term: Term, starts: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return by which share every start [S, Q] lowers the squared error [S], and the starts scaled to do so.
+
+        A start's response, after θ has followed it, is scaled by one number, which scales strengths.
+        """
+        task, linear = self.task, solution.linear
+        residual = task.residual(task.errors(np.repeat(solution.theta[None], len(starts), axis=0), model, starts))
+        responses = np.concatenate([linear.jacobian[: linear.own], residual - linear.residual])
+        tried = Linear(linear.residual, responses, linear.own)
+        moved = projected(finish(task, model, solution.theta, starts[0], tried, 0.0))
+        square = np.einsum("rms,rms->s", moved, moved) + 1e-9
+        push = np.einsum("rms,rm->s", moved, linear.residual)
+        strengths = [p for p in term.parameters if p.role == "strength"]
+        both_ways = bool(strengths) and all(p.null is not None and p.low < p.null < p.high for p in strengths)
+        scale = np.clip(-push / square, -4.0 if both_ways else 0.0, 4.0)
+        share = -(2.0 * scale * push + scale**2 * square) / (linear.residual**2).sum()
+        scaled = starts.copy()
+        for i, p in enumerate(term.parameters, start=starts.shape[1] - term.size):
+            if p.role == "strength" and p.null is not None:
+                scaled[:, i] = np.clip(p.null + scale * (starts[:, i] - p.null), p.low, p.high)
+        return share, scaled
 
     def _sought(self, what: Sought) -> list[Effect]:
         effects = [self.base.catalogue.by_name[n] for n in self.names]
@@ -165,7 +217,8 @@ class Search:
             if named is None and found.gains.mean() < WORTH:
                 result.append(Scored(term, None, found.gains))
                 return
-            one = self._nested(solution, term, before, f"{number}/{term.label}")
+            starts = [np.append(solution.values, s) for s in _around(term, found, open_end)]
+            one = self._nested(solution, term, before, f"{number}/{term.label}", starts)
             # Runs that chose another place than all together are judged by what they would have gained there.
             gains = np.where(found.stable, one.gains, found.gains)
             result.append(Scored(term, one.solution, gains, found.stable))
@@ -242,6 +295,17 @@ def _interval_term(
     term = terms.interval(what, coordinate, found.begin, 1e6 if open_end else found.end, amount,
                           period if coordinate == "position" else 0.0)  # fmt: skip
     return replace(term, label=f"{what} step in {coordinate}") if open_end else term
+
+
+def _around(term: Term, found: places.Found, open_end: bool) -> list[np.ndarray]:
+    """Return starts of an interval: with the edges found, and with each a bin before and after.
+
+    An edge that is off by a bin may not reach the right one: in between, every driver's own parameters make up for it.
+    """
+    start, shifts = np.array(term.starts[0]), (0.0, -found.width, found.width)
+    ends = (0.0,) if open_end else shifts
+    moved = [(0.0, a, b)[: term.size] for a in shifts for b in ends]
+    return [start + m for m in moved]
 
 
 def _knots(values: np.ndarray, distance: float, most: int, period: float = 0.0) -> tuple[float, float, int]:

@@ -117,13 +117,27 @@ class Task:
         return replace(self.prior, seen=tuple(np.unique(self.rows.group)))
 
     @cached_property
-    def of_group(self) -> list[np.ndarray]:
-        """Rows of every group."""
-        return [np.flatnonzero(self.rows.group == g) for g in range(self.groups)]
+    def of_group(self) -> list[tuple[int, slice]]:
+        """Groups that have rows, and theirs in ``order``."""
+        group, begin, count = np.unique(self.rows.group[self.order], return_index=True, return_counts=True)
+        return [(int(g), slice(b, b + n)) for g, b, n in zip(group, begin, count, strict=True)]
+
+    @cached_property
+    def order(self) -> np.ndarray | slice:
+        """Rows in the order of their groups; as a rule they are so already."""
+        group = self.rows.group
+        return slice(None) if (np.diff(group) >= 0).all() else np.argsort(group, kind="stable")
 
     def per_group(self, x: np.ndarray) -> np.ndarray:
         """Sum [R, ...] over the rows of every group."""
-        return np.stack([x[rows].sum(0) for rows in self.of_group])
+        total = np.zeros((self.groups, *x.shape[1:]))
+        total[[g for g, _ in self.of_group]] = np.add.reduceat(x[self.order], [r.start for _, r in self.of_group])
+        return total
+
+    def of_rows(self, wanted: np.ndarray) -> Task:
+        """Return the task of some rows, all those of their groups."""
+        noise = self.noise and replace(self.noise, weight=self.noise.weight[wanted])
+        return replace(self, rows=self.rows.some(wanted), noise=noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,16 +224,22 @@ def _sums(task: Task, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
     """Return Jᵀr [G, N] and JᵀJ [G, N, N] over the rows of every group."""
     count = len(linear.jacobian)
     gradient, matrix = np.zeros((task.groups, count)), np.zeros((task.groups, count, count))
-    for group, rows in enumerate(task.of_group):
-        j = linear.jacobian[:, rows].reshape(count, -1)
-        gradient[group], matrix[group] = j @ linear.residual[rows].reshape(-1), j @ j.T
+    jacobian, residual = linear.jacobian[:, task.order], linear.residual[task.order]
+    for group, rows in task.of_group:
+        j = jacobian[:, rows].reshape(count, -1)
+        gradient[group], matrix[group] = j @ residual[rows].reshape(-1), j @ j.T
     return gradient, matrix
 
 
 def cost_of(task: Task, theta: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return the cost of every copy and group [C, G]: squared residuals and the prior."""
     known = (((theta - task.prior.centre) / task.prior.width) ** 2).sum(-1)
-    return np.asarray(task.per_group((residual**2).sum(-1).T).T + known)
+    return np.asarray(task.per_group(_squares(residual).T).T + known)
+
+
+def _squares(residual: np.ndarray) -> np.ndarray:
+    """Return the sums of squares of rows: [..., R] of [..., R, m]."""
+    return np.asarray(np.einsum("...m,...m->...", residual, residual))
 
 
 class _Nested:
@@ -238,19 +258,26 @@ class _Nested:
     def costs(self, own: Tensor, shared: Tensor) -> Tensor:
         """Return the sums of squared residuals [C, G]."""
         residual = self.task.residual(self.task.errors(own.numpy(), self.model, shared.numpy()))
-        return torch.from_numpy(self.task.per_group((residual**2).sum(-1).T)).T
+        return torch.from_numpy(self.task.per_group(_squares(residual).T)).T
 
     def normal(self, own: Tensor, shared: Tensor) -> Normal:
         """Return the normal equations of one copy."""
         linear = self.linear(own, shared)
         gradient, matrix = _sums(self.task, linear)
-        cost = self.task.per_group((linear.residual**2).sum(-1))
+        cost = self.task.per_group(_squares(linear.residual))
         return Normal(*(torch.from_numpy(x[None]) for x in (cost, gradient, matrix)))
 
     def linear(self, own: Tensor, shared: Tensor) -> Linear:
-        """Return the linearisation of one copy; the last one is kept."""
-        if self.at is None or not (torch.equal(self.at[0], own) and torch.equal(self.at[1], shared)):
-            self.at = own, shared, linearise(self.task, self.model, own[0].numpy(), shared[0].numpy())
+        """Return the linearisation of one copy; of groups at which nothing has changed the last one is kept."""
+        theta, values = own[0].numpy(), shared[0].numpy()
+        if self.at is None or not torch.equal(self.at[1], shared):
+            self.at = own, shared, linearise(self.task, self.model, theta, values)
+        moved = (theta != self.at[0][0].numpy()).any(-1)[self.task.rows.group]
+        if moved.any():
+            part = linearise(self.task.of_rows(moved), self.model, theta, values)
+            residual, jacobian = self.at[2].residual.copy(), self.at[2].jacobian.copy()
+            residual[moved], jacobian[:, moved] = part.residual, part.jacobian
+            self.at = own, shared, Linear(residual, jacobian, part.own)
         return self.at[2]
 
 

@@ -158,8 +158,8 @@ def make(kind: str, **choices: object) -> Effect:
     if kind not in ALL:
         raise ValueError(f"unknown effect {shown(kind)}.{nearest(str(kind), ALL)}")
     cls = ALL[kind]
-    hints = get_type_hints(cls)
-    known = {field.name: hints[field.name] for field in fields(cls)}
+    hints = get_type_hints(cls) if choices else {}
+    known = {field.name: hints[field.name] for field in fields(cls)} if choices else {}
     for choice, value in choices.items():
         if choice not in known:
             raise ValueError(f"effect '{kind}' has no choice {shown(choice)}.{nearest(choice, known)}")

@@ -143,7 +143,8 @@ class Batch:
         """Return the measured state at the first sample, in the full shape that the parameters broadcast to."""
         at, _ = self.columns(simulator)
         position = self.position[0, :, at]
-        shape = torch.broadcast_shapes(position.shape, *(x.shape for p in params.values() for x in p.values()))
+        # Of numpy: torch's own imports sympy at its first call, a CPU second.
+        shape = np.broadcast_shapes(position.shape, *(x.shape for p in params.values() for x in p.values()))
         return simulator.state(
             position.expand(shape),
             self.all_speed[0, :, at].expand(shape),

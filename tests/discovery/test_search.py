@@ -1,0 +1,90 @@
+"""A round of the search: what is tried, from where, and how much of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from idm_env.data import episodes, synthetic
+from idm_env.discovery import model as terms
+from idm_env.discovery import search
+from idm_env.discovery.decide import _same_class
+from idm_env.discovery.model import Model
+from idm_env.discovery.records import Records, gather, whole, windows
+from idm_env.discovery.search import Search
+from idm_env.discovery.solve import Solution, Task, _Nested, linearise
+from idm_env.keep import Store
+
+
+def begun(records: Records, *names: str) -> tuple[Search, Solution]:
+    """Return a search with its null."""
+    rows = windows(records)
+    task = Task(rows, search.first_noise(rows), search.first_prior())
+    searching = Search(task, names, False, Store(None, "", False), lambda *_: None)
+    return searching, searching.null(Model(), np.tile(task.prior.centre, (task.groups, 1)))
+
+
+def made(seed: int, **choices: object) -> Records:
+    trajectories, _ = synthetic.generate(seed, **choices)  # type: ignore[arg-type]
+    return gather(list(episodes(trajectories, smooth=True, min_seconds=12.0)))
+
+
+def test_a_time_is_found_although_its_scan_ends_a_bin_off() -> None:
+    """Drivers' own parameters make up for a wrong time, so that between two bins the cost has a local minimum."""
+    searching, null = begun(made(90150, effect="regime_shift"), "regime_shift")
+    scored, _ = searching.round(null, 1)
+    solution = scored[0].solution
+    assert solution is not None
+    strength, time = solution.values
+    assert strength == pytest.approx(0.35, abs=0.03) and time == pytest.approx(100.0, abs=0.5)
+
+
+def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("leader_acceleration", "memory", "drag", "dead_zone", "speed_time_gap")
+    copies: list[int] = []
+    predict = Task.predict
+
+    def counted(self: Task, theta: np.ndarray, *rest: object) -> tuple[np.ndarray, np.ndarray]:
+        copies.append(len(theta))
+        return predict(self, theta, *rest)  # type: ignore[arg-type]
+
+    for hidden in (None, "speed_time_gap"):
+        searching, null = begun(made(31, runs=6, followers=2, seconds=120.0, effect=hidden), *names)
+        monkeypatch.setattr(Task, "predict", counted)
+        for term in map(terms.simple, names):
+            copies.clear()
+            model = Model().adding(term)
+            share, scaled = searching._promise(null, model, term, np.array(term.starts))
+            assert len(share) == len(scaled) == len(term.starts) and copies == [len(term.starts)]
+            found = searching._nested(null, term, np.ones(len(searching.units)), term.label).solution
+            assert found is not None
+            lowered = 1.0 - (found.linear.residual**2).sum() / (null.linear.residual**2).sum()
+            if term.label == hidden:
+                assert lowered > share.max() > 0.1 and found.values[0] == pytest.approx(-0.4, abs=0.05)
+            elif hidden is None:
+                assert share.max() < search.FAINT and lowered < 2 * search.FAINT and sum(copies) < 60
+        monkeypatch.undo()
+
+
+def test_only_groups_that_moved_are_rolled_out_again(platoon: Records) -> None:
+    """Free simulation, and windows, whose errors depend on those before: the same bits as everything anew."""
+    searching, null = begun(platoon, "drag")
+    for task in (searching.task, Task(whole(platoon), None, searching.task.prior)):
+        model, values = Model((terms.simple("drag"),)), np.array([1e-4])
+        nested = _Nested(task, model)
+        shared, first = torch.tensor(values[None]), torch.tensor(null.theta[None])
+        nested.linear(first, shared)
+        other = first.clone()
+        other[:, [1, 4]] += 0.05
+        got, anew = nested.linear(other, shared), linearise(task, model, other[0].numpy(), values)
+        assert (got.residual == anew.residual).all() and (got.jacobian == anew.jacobian).all()
+        assert (got.residual != nested.task.residual(task.errors(first.numpy(), model, values[None]))[0]).any()
+
+
+def test_a_curve_has_intervals_over_its_coordinate_in_it() -> None:
+    zone, shift = terms.placed("speed_zone", 0.7, 500.0, 900.0), terms.placed("regime_shift", 0.3, 100.0)
+    profile = terms.unknown_profile("speed_profile", 0.0, 80.0, 40, 0.0)
+    ramp = terms.curve("time_gap", "time", 0.0, 200.0, 2, label="time_gap ramp")
+    assert _same_class(zone, Model((profile,))) and not _same_class(profile, Model((zone,)))
+    assert not _same_class(shift, Model((profile,))) and not _same_class(shift, Model((ramp,)))
