@@ -103,9 +103,11 @@ def report(
     power = len(fit_runs) >= MANY_RUNS or powerful(list(strengths.values()), first.tested, smallest)
     refusal = judged.refusal
     common = judged.shared
+    others = [name for f in found if f["effect"] for name in f["equivalent"] if name in ALL]
     verdict = conclude(
-        bool(found), any(f["effect"] for f in found), refusal, structured, first.left, power, common is not None
-    )
+        bool(found), any(f["effect"] for f in found), refusal, structured, first.left, power, common is not None,
+        apart=not others,
+    )  # fmt: skip
     if verdict is Verdict.CANNOT_TELL and not power and (refusal is None or refusal.reason is Reason.NO_GAIN):
         refusal = Refusal(Reason.NO_POWER, len(fit_runs))
     errors = judged.errors
@@ -114,7 +116,9 @@ def report(
         "schema": SCHEMA,
         "verdict": verdict.value,
         "reason": None if refusal is None else refusal.reason.value,
-        "sentence": words.headline(verdict, [f["clause"] for f in found], refusal, judged.tried, errors, common),
+        "sentence": words.headline(
+            verdict, [f["clause"] for f in found], refusal, judged.tried, errors, common, others
+        ),
         "details": [*words.details(verdict, found, [] if judged.added else entries, left),
                     *words.excluded(verdict, strengths)],
         "found": found,

@@ -22,6 +22,7 @@ class Verdict(str, Enum):
 
     NONE = "none"
     NAMED = "named"
+    ONE_OF = "one_of"
     LOCATED = "located"
     UNEXPLAINED = "unexplained"
     CANNOT_TELL = "cannot_tell"
@@ -69,7 +70,7 @@ def holds(errors: Mapping[str, Comparison]) -> bool:
 
 def conclude(
     added: bool, named: bool, refusal: Refusal | None, structured: bool, left: np.ndarray, power: bool = True,
-    shared: bool = False,
+    shared: bool = False, apart: bool = True,
 ) -> Verdict:  # fmt: skip
     """Return the verdict.
 
@@ -81,9 +82,10 @@ def conclude(
         left: Gains [units] of any smooth function of the state over the null.
         power: Whether what is in the catalogue would have been found, were it there.
         shared: Whether vehicles of one run miss the model alike at one time.
+        apart: Whether no other effect of the catalogue did about as well as one that was added.
     """
     if added:
-        return Verdict.NAMED if named else Verdict.LOCATED
+        return (Verdict.NAMED if apart else Verdict.ONE_OF) if named else Verdict.LOCATED
     if shared:
         return Verdict.LOCATED
     if refusal is not None and refusal.reason is Reason.FEW_RUNS:

@@ -127,7 +127,7 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
 
 def headline(
     verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison],
-    shared: Shared | None = None,
+    shared: Shared | None = None, others: Sequence[str] = (),
 ) -> str:  # fmt: skip
     """Say in one sentence what is missing, or why nothing can be said.
 
@@ -138,12 +138,15 @@ def headline(
         tried: Plain names of what came nearest, "" for nothing.
         errors: How errors on runs kept back changed with what was added or came nearest.
         shared: What vehicles of one run do alike, told where nothing was added.
+        others: Effects that these data do not tell from what was added.
     """
     if shared is not None and not clauses:
         return common(shared)
-    if verdict in (Verdict.NAMED, Verdict.LOCATED):
+    if verdict in (Verdict.NAMED, Verdict.ONE_OF, Verdict.LOCATED):
         text = ", and ".join(clauses)
-        unnamed = "" if verdict is Verdict.NAMED else "; the catalogue has no name for it"
+        unnamed = "; the catalogue has no name for it" if verdict is Verdict.LOCATED else ""
+        if verdict is Verdict.ONE_OF:
+            unnamed = f"; or {' or '.join(plain(x) for x in others)}, which these data do not tell from it"
         return f"{text[0].upper()}{text[1:]}{unnamed}{_but(errors)}."
     if verdict is Verdict.NONE:
         return (

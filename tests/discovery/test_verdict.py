@@ -50,6 +50,8 @@ def test_nothing_is_an_improvement_whose_errors_rise(three: tuple[Comparison, ..
 def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
     flat, steep = np.full(8, 0.001), np.full(8, 0.2)
     assert conclude(True, True, None, True, flat) is Verdict.NAMED
+    assert conclude(True, True, None, True, flat, apart=False) is Verdict.ONE_OF
+    assert conclude(True, False, None, True, flat, apart=False) is Verdict.LOCATED
     assert conclude(True, False, None, True, flat) is Verdict.LOCATED
     assert conclude(False, False, Refusal(Reason.FEW_RUNS, 3), True, steep) is Verdict.CANNOT_TELL
     assert conclude(False, False, Refusal(Reason.NO_GAIN), False, flat) is Verdict.NONE
@@ -152,6 +154,14 @@ def test_a_finding_tells_what_it_does_for_every_error(lag: Discovery, tmp_path: 
     first = page[: page.index("How sure is that")]
     assert report["sentence"].split(" (")[0] in first and first.count('class="light better"') == 3
     assert first.count("<img") == 1 and "<table" not in first
+
+
+def test_what_data_do_not_tell_apart_is_one_of() -> None:
+    """Leaders here brake too gently to tell a delay from a lag."""
+    report = discover(few(effect="lag", strength=0.25), effects=["lag", "delay"], located=False).report
+    first, other = report["found"][0]["effect"], report["found"][0]["equivalent"]
+    assert report["verdict"] == "one_of" and {first, *other} == {"lag", "delay"}
+    assert f"; or {words.plain(other[0])}, which these data do not tell from it" in report["sentence"]
 
 
 def test_the_other_model_of_an_earlier_run_does_not_stay(lag: Discovery, tmp_path: Path) -> None:
