@@ -46,7 +46,8 @@ def cases(folder: Path) -> dict[str, dict[str, Any]]:
         found[f"ZalaZone, {name}"] = part
         found[f"ZalaZone, {name}, grade known"] = {**part, "known": ("grade",)}
     found["TGSIM"] = {"file": "tgsim_pairs.parquet"}
-    found["AstaZero"] = {"file": "openacc_astazero.parquet"}
+    found["AstaZero, ACC"] = {"file": "openacc_astazero.parquet", "where": ["acc_run=ACC"]}
+    found["AstaZero, all"] = {"file": "openacc_astazero.parquet"}
     found["I-80 lanes"] = {"file": "ngsim_i80_lanes.parquet"}
     return found
 
@@ -82,6 +83,8 @@ def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
         "known": report["known"],
         "why": report["reason"],
         "partial": report["partial"],
+        "helps": {key: (h["verdict"], h["ratio"], h["low"], h["high"]) for key, h in report["helps"].items()},
+        "ceilings": report["ceilings"],
         "before": report["error"]["before"],
         "after": report["error"]["after"],
         "held_out_drivers": len(drivers),

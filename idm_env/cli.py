@@ -361,6 +361,36 @@ def simulate(
 
 
 @app.command()
+def drift(
+    data: Data,
+    out: Out = Path("out/drift"),
+    drivers: Annotated[int, _ranged(help="Drivers at most, evenly spread over the file.", low=2, high=10000)] = 60,
+    ring_length: RingLength = None,
+    place: Place = None,
+    layout: Layout = "auto",
+    max_gap: MaxGap = 80.0,
+    min_seconds: MinSeconds = 20.0,
+    dt: Step = None,
+    where: Where = None,
+) -> None:
+    """Say how unsteady drivers are: what of them wanders, how much (sigma) and for how long (tau).
+
+    Writes report.json, and model.yaml, drivers who drift: for simulate --model, and as `effects` of every environment.
+    """
+    with shown(console) as report:
+        from idm_env.drift.job import drift_file
+        from idm_env.fitting.options import Source
+
+        _work_begins()
+        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, where=where)
+        result = drift_file(source, out, drivers=drivers, on_progress=report)
+    _show("Log-likelihood that every sort of drift gains over drivers who do not drift", result["sorts"])
+    console.print(result["sentence"], soft_wrap=True, highlight=False)
+    console.print(result["data"]["account"], soft_wrap=True, markup=False, highlight=False)
+    console.print(f"Model: [bold]{(out / 'model.yaml').resolve()}[/bold]", soft_wrap=True)
+
+
+@app.command()
 def effects(
     model: Annotated[Path | None, typer.Argument(help="A model.yaml: only the effects in it.")] = None,
     cite: Annotated[bool, typer.Option("--cite", help="Print the publications that they are taken from.")] = False,

@@ -39,7 +39,10 @@ ALLOWED = {
         "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "report", "metrics",
         "checks", "keep", "progress", "diagrams", "executor", "parts",
     },
-    "drift": {"types", "parameters", "simulator", "fitting", "progress"},
+    "drift": {
+        "types", "parameters", "effects", "roads", "simulator", "data", "config", "fitting", "keep", "report",
+        "progress",
+    },
 }  # fmt: skip
 """What a part may import of the package; parts that are not named may import anything but what FORBIDDEN says."""
 

@@ -1,17 +1,18 @@
 """How much drivers drift, and for how long: σ and τ by an approximate marginal likelihood, with intervals.
 
-What is approximated: the step of a calibrated driver is linear about the most likely path (gap, speed, levels), so that
-the path integrates out in closed form: the innovations of a Kalman filter give the likelihood of σ, τ and the noise of
-measurement, a smoother the path, and the two alternate (Laplace's approximation with the Gauss–Newton curvature). A
-driver's own mean of T is part of the path: a level that stays. His other parameters are those of his calibration, and
-what is not known of them is not in the intervals. Noise of measurement is taken as white and normal.
+What is approximated: the step of a driver is linear about the most likely path (gap, speed, levels), so that the path
+integrates out in closed form: the innovations of a Kalman filter give the likelihood of σ, τ and the noise of
+measurement, and the path itself, and the two alternate. Every driver's own parameters are levels that stay, log-normal
+about what is known before, and integrate out with the rest: a calibration in free simulation bends them towards his
+drift, and what it bent would count as drift again. Noise of measurement is taken as white and normal.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -29,7 +30,20 @@ QUIETEST = 0.01
 """Least noise of measurement (m and m/s)."""
 NUDGE = 0.02
 """By how much logarithms of the settings are moved to see the curvature."""
+NEAR = 0.3
+"""Distance from a limit, on the logarithm, within which a number counts as at it: there the likelihood is flat."""
+FLAT = 4.0
+"""Curvature below which a number is known worse than by half of itself: the likelihood is no parabola there."""
 LIKELY = 1.96
+LONGEST = 0.3
+"""By how much a driver's log θ may move from one path to the next."""
+SPREAD = 0.3
+"""Spread of drivers' log θ about what is usual.
+
+Centre and spread of the drivers, estimated along, ran away along what records hardly tell: s0 against T.
+"""
+USUAL = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
+"""Usual drivers."""
 SKIPPED = 10
 """Innovations at the beginning of a record that do not count."""
 
@@ -38,24 +52,27 @@ SKIPPED = 10
 class Settings:
     """What a filter assumes: σ and τ (s) of every drift [k], noise of gap (m) and speed (m/s) [2].
 
-    ``style`` is the standard deviation of drivers' own log T about their calibration; ``jitter`` is white acceleration
-    (m/s per √s) beside the drift: errors of the leader's record, and what a linear step leaves out.
+    ``spread`` [p] is the standard deviation of what drivers' own log θ has more than theirs in a path: over drivers, or
+    of what is not known of one. ``jitter`` is white acceleration (m/s per √s) beside the drift: errors of the leader's
+    record, and what a linear step leaves out.
     """
 
     sigma: np.ndarray
     memory_time: np.ndarray
     noise: np.ndarray
-    style: float
     jitter: float
+    spread: np.ndarray
 
     def packed(self) -> np.ndarray:
-        """Return logarithms of σ, τ, noise, style and jitter, one after the other."""
-        return np.log(np.concatenate((self.sigma, self.memory_time, self.noise, [self.style, self.jitter])))
+        """Return logarithms of σ, τ, noise and jitter, one after the other."""
+        return np.log(np.concatenate((self.sigma, self.memory_time, self.noise, [self.jitter])))
 
     def unpacked(self, x: np.ndarray) -> Settings:
         """Return settings from such logarithms."""
         k, y = len(self.sigma), np.exp(x)
-        return Settings(y[:k], y[k : 2 * k], y[2 * k : -2], float(y[-2]), float(y[-1]))
+        return replace(
+            self, sigma=y[:k], memory_time=y[k : 2 * k], noise=y[2 * k : -1], jitter=float(y[-1])
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,20 +97,42 @@ class Estimate:
             rows.append({"name": name, "estimate": math.exp(x), "low": low, "high": high})
         return rows
 
+    @property
+    def theta(self) -> np.ndarray:
+        """Every driver's most likely own log θ [rows, p]."""
+        own = self.path.theta + self.path.level[0, :, : len(self.drivers.free)]
+        return np.clip(own, *self.drivers.bounds)
+
+
+def usual(free: Sequence[str]) -> np.ndarray:
+    """Return the log parameters [p] of usual IDM drivers; ``free`` are full names."""
+    return np.log([USUAL[name.split(".")[1]] for name in free])
+
 
 class Likelihood:
     """The marginal likelihood of settings, about a path."""
 
     def __init__(self, drivers: Drivers, path: Path) -> None:
+        self.drivers, self.path = drivers, path
         batch, linear = drivers.measured, drivers.linearise(path)
-        self.dt = batch.dt
-        steps = (linear.to, linear.by_state, linear.by_level, path.gap, path.speed, path.level)
+        steps = (linear.to, linear.by_state, linear.by_level, path.gap, path.speed)
         measured = (np.ascontiguousarray(x.numpy()) for x in (batch.gap, batch.speed))
-        self.given = (np.array([len(e) for e in batch.episodes]), *measured, *map(np.ascontiguousarray, steps))
+        self.length = np.array([len(e) for e in batch.episodes])
+        self.given = (self.length, *measured, *map(np.ascontiguousarray, steps))
+
+    def centred(self, theta: np.ndarray) -> Likelihood:
+        """Return the same with levels of log θ counted from ``theta`` [rows, p]: no step changes by that."""
+        own = len(self.drivers.free)
+        level = self.path.level.copy()
+        level[..., :own] += self.path.theta - theta
+        other = copy(self)
+        other.path = replace(self.path, theta=theta, level=level)
+        return other
 
     def _settings(self, s: Settings) -> tuple[np.ndarray | float, ...]:
-        decay = np.append(1.0, np.exp(-self.dt / s.memory_time))
-        return decay, np.append(s.style, s.sigma), s.noise, s.jitter**2 * self.dt
+        dt = self.drivers.batch.dt
+        decay = np.append(np.ones(len(s.spread)), np.exp(-dt / s.memory_time))
+        return self.path.level, decay, np.append(s.spread, s.sigma), s.noise, s.jitter**2 * dt
 
     def __call__(self, s: Settings) -> float:
         """Return the log-likelihood of all records."""
@@ -111,9 +150,10 @@ def estimate(
     free: Sequence[str],
     theta: np.ndarray,
     *,
+    spread: float | np.ndarray = SPREAD,
     measured: Batch | None = None,
     noise: tuple[float, float] | None = None,
-    rounds: int = 3,
+    rounds: int = 5,
     on_progress: OnProgress = silent,
 ) -> Estimate:
     """Estimate σ and τ of every drifting effect of the simulator, and the noise of measurement, on measured drivers.
@@ -122,7 +162,8 @@ def estimate(
         simulator: One step per sample; ``midpoint``, so that no step's delay is taken for a driver's.
         batch: Drivers and those around them, smoothed, one sample per step (``substeps=1``).
         free: Full names of the parameters in which drivers differ.
-        theta: Their logarithms [rows, p], from a calibration.
+        theta: Their logarithms [rows, p] or [p] as far as known before: what is usual, or of a calibration.
+        spread: How well ``theta`` is known, one number or [p]; 0 for sure.
         measured: The same with gap and speed as measured; None takes ``batch`` for that.
         noise: Noise of measured gap (m) and speed (m/s), where it is known; None estimates it along.
         rounds: How often steps are linearised about a new path.
@@ -133,22 +174,20 @@ def estimate(
     """
     drivers = Drivers(simulator, batch, measured or batch, tuple(free))
     known = catalogue(simulator.effects)
-    k = len(drivers.drifts)
     settings = Settings(
         np.array([known[f"{n}.sigma"].default for n in drivers.drifts]),
         np.array([known[f"{n}.memory_time"].default for n in drivers.drifts]),
-        np.array(noise or (0.1, 0.1)), 0.2, 0.1,
+        np.array(noise or (0.1, 0.1)), 0.1, np.broadcast_to(np.asarray(spread, float), len(free)).copy(),
     )  # fmt: skip
     limits = _limits(drivers, noise)
-    path = Path(batch.gap.numpy(), batch.speed.numpy(), np.zeros((*batch.gap.shape, 1 + k)), theta)
+    path = Path.at(drivers, np.broadcast_to(np.clip(theta, *drivers.bounds), (len(batch), len(free))).copy())
     for number in range(rounds):
         around = Likelihood(drivers, path)
         settings = _maximised(around, settings, limits)
         on_progress("drift", number + 1, rounds, around(settings))
-        if number < rounds - 1:
-            path = _path(path, around.filtered(settings)[2], settings)
+        path = _path(around, settings)
     names = [f"{n}.{p}" for p in ("sigma", "memory_time") for n in drivers.drifts]
-    names += ["gap_noise_m", "speed_noise_mps", "style", "jitter"]
+    names += ["gap_noise_m", "speed_noise_mps", "jitter"]
     error = _errors(around, settings, limits)
     return Estimate(drivers, settings, tuple(names), error, around(settings), path)
 
@@ -158,7 +197,7 @@ def _limits(drivers: Drivers, noise: tuple[float, float] | None) -> np.ndarray:
     highest = [known[f"{n}.sigma"].high for n in drivers.drifts]
     found = [(1e-3 * x, x) for x in highest] + [(2.0 * drivers.batch.dt, 300.0)] * len(highest)
     both = [(QUIETEST, 5.0)] * 2 if noise is None else [(x, x) for x in noise]
-    return np.log([*found, *both, (0.01, 0.8), JITTER])
+    return np.log([*found, *both, JITTER])
 
 
 def _maximised(around: Likelihood, settings: Settings, limits: np.ndarray) -> Settings:
@@ -167,20 +206,46 @@ def _maximised(around: Likelihood, settings: Settings, limits: np.ndarray) -> Se
         return value if math.isfinite(value) else 1e12
 
     x0 = np.clip(settings.packed(), limits[:, 0], limits[:, 1])
-    options = {"maxiter": 40, "ftol": 1e-9, "eps": 1e-4}
+    options = {"maxiter": 20, "ftol": 1e-8, "eps": 1e-4}
     return settings.unpacked(minimize(cost, x0, method="L-BFGS-B", bounds=limits, options=options).x)
 
 
-def _path(path: Path, mean: np.ndarray, settings: Settings) -> Path:
-    reach = 3.0 * np.append(settings.style, settings.sigma)
-    level = np.clip(mean[..., 2:], -reach, reach)
-    return Path(np.maximum(mean[..., 0], 0.2), np.maximum(mean[..., 1], 0.0), level, path.theta)
+def _path(around: Likelihood, settings: Settings) -> Path:
+    """Return where the next steps are linear about: drivers as their whole records tell, the rest as the past tells.
+
+    A drift that knows the sample that it is about to explain would be told apart from the driver by nothing: his
+    parameters would follow every innovation.
+    """
+    mean, own, path = around.filtered(settings)[0], len(settings.spread), around.path
+    last = mean[around.length - 1, np.arange(len(around.length)), 2 : 2 + own]
+    before = path.level[0, :, :own]
+    theta = path.theta + np.clip(last, before - LONGEST, before + LONGEST)
+    theta = np.clip(theta, *around.drivers.bounds)
+    level = np.zeros_like(path.level)
+    level[..., :own] = theta - path.theta
+    known, covariance, _ = around.centred(theta).filtered(replace(settings, spread=np.zeros(own)))
+    return predicted(replace(path, level=level), settings, around.drivers.batch.dt, known, covariance)
+
+
+def predicted(path: Path, settings: Settings, dt: float, mean: np.ndarray, covariance: np.ndarray) -> Path:
+    """Return a path with gap and speed as filtered, and drifts as foreseen one sample earlier."""
+    own = len(settings.spread)
+    decay, level, unsure = np.exp(-dt / settings.memory_time), path.level.copy(), np.zeros_like(path.unsure)
+    reach = 3.0 * settings.sigma
+    level[..., own:] = 0.0
+    level[1:, :, own:] = np.clip(decay * mean[:-1, :, 2 + own :], -reach, reach)
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)[:-1, :, 2 + own :]
+    unsure[1:] = np.sqrt(settings.sigma**2 + decay**2 * (np.maximum(variance, 0.0) - settings.sigma**2))
+    return replace(
+        path, gap=np.maximum(mean[..., 0], 0.2), speed=np.maximum(mean[..., 1], 0.0), level=level, unsure=unsure
+    )  # fmt: skip
 
 
 def _errors(around: Likelihood, settings: Settings, limits: np.ndarray) -> np.ndarray:
-    """Return standard errors of the packed settings, from the curvature; inf for what lies at a limit."""
+    """Return standard errors of the packed settings, from the curvature; inf for what lies at a limit or is flat."""
     x = settings.packed()
-    inside = [int(i) for i in np.flatnonzero((x > limits[:, 0] + 1e-3) & (x < limits[:, 1] - 1e-3))]
+    free = limits[:, 1] > limits[:, 0]
+    inside = [int(i) for i in np.flatnonzero(free & (x > limits[:, 0] + NEAR) & (x < limits[:, 1] - NEAR))]
 
     def value(*moves: tuple[int, float]) -> float:
         y = x.copy()
@@ -197,6 +262,9 @@ def _errors(around: Likelihood, settings: Settings, limits: np.ndarray) -> np.nd
             both = value((i, NUDGE), (j, NUDGE)) - up[a] - up[b] + here
             curvature[a, b] = curvature[b, a] = -both / NUDGE**2
     error = np.full(len(x), np.inf)
+    # What the likelihood hardly knows (a jitter next to nothing) may not spoil the others.
+    told = np.diag(curvature) > FLAT
+    inside, curvature = [i for i, y in zip(inside, told, strict=True) if y], curvature[np.ix_(told, told)]
     variance = np.diag(np.linalg.pinv(curvature))
     error[inside] = np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.inf)
     return error

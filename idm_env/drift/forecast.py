@@ -8,23 +8,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from idm_env.drift.estimate import Likelihood, Settings
+from idm_env.drift.estimate import Likelihood, Settings, predicted
 from idm_env.drift.linear import Drivers, Path
 from idm_env.fitting.batch import Batch
 
 
 def followed(drivers: Drivers, settings: Settings, theta: np.ndarray, passes: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean [T, rows, 1 + k] and covariance of a driver's levels, each from the record up to that sample only.
+    """Return mean [T, rows, p + k] and covariance of a driver's levels, each from the record up to that sample only.
 
     Steps are linear about the record and about the levels that the pass before had found one sample earlier.
     """
-    batch = drivers.batch
-    level = np.zeros((*batch.gap.shape, 1 + len(drivers.drifts)))
-    reach = 3.0 * np.append(settings.style, settings.sigma)
+    path = Path.at(drivers, theta)
     for _ in range(passes):
-        path = Path(batch.gap.numpy(), batch.speed.numpy(), level, theta)
         mean, covariance, _ = Likelihood(drivers, path).filtered(settings)
-        level = np.clip(np.concatenate((mean[:1, :, 2:], mean[:-1, :, 2:])), -reach, reach)
+        path = predicted(path, settings, drivers.batch.dt, mean, covariance)
     return mean[..., 2:], covariance[..., 2:, 2:]
 
 
@@ -64,7 +61,8 @@ def _chunk(
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
     normals = random.standard_normal((count, *levels[0].shape[2:], len(starts)))
     level = levels[0][at, rows] + np.einsum("rij,njr->nri", root, normals)
-    params = drivers.params(torch.tensor(theta[rows]), torch.tensor(level[..., 0]))
+    own = len(drivers.free)
+    params = drivers.params(torch.tensor(np.clip(theta[rows] + level[..., :own], *drivers.bounds)))
     for j, name in enumerate(drivers.drifts):
         one = torch.ones((), dtype=torch.float64)
         params[name] = {**params[name], "sigma": settings.sigma[j] * one, "memory_time": settings.memory_time[j] * one}
@@ -74,7 +72,7 @@ def _chunk(
             sigma = torch.tensor(settings.jitter / math.sqrt(simulator.dt), dtype=torch.float64)
             params[effect.name] = {**params[effect.name], "sigma": sigma}
     memory = {
-        name: torch.tensor(level[..., j + 1] / settings.sigma[j]).unsqueeze(-1).expand(state.speed.shape).contiguous()
+        name: torch.tensor(level[..., own + j] / settings.sigma[j]).unsqueeze(-1).expand(state.speed.shape).contiguous()
         for j, name in enumerate(drivers.drifts)
     }
     state = state._replace(memory={**state.memory, **memory}, step=state.step.expand(state.speed.shape[:-1]))

@@ -5,6 +5,7 @@ Nothing here knows an equation: derivatives are those of ``Simulator.step``, at 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,28 +19,39 @@ from idm_env.types import Record
 
 STILL = 600.0
 """A memory time (s) at which a level stays as it is over a step."""
+NARROW = 1e-3
+"""Points of a level closer than this tell no slope."""
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Where drivers are linearised: gap (m) and speed (m/s) [T, rows], levels [T, rows, 1 + k], log θ [rows, p].
+    """Where drivers are linearised: gap (m) and speed (m/s) [T, rows], levels [T, rows, p + k], log θ [rows, p].
 
-    Levels are a driver's own log time gap less the population's, which stays, and σn of every drift.
+    Levels are what a driver's own log θ has more than ``theta``, which stays, and σn of every drift.
 
-    A level belongs to the step that ends at its sample, as the level of a step is that after its normal.
+    A level belongs to the step that ends at its sample, as the level of a step is that after its normal. ``unsure`` is
+    the standard deviation of drifts' levels about the path [T, rows, k].
     """
 
     gap: np.ndarray
     speed: np.ndarray
     level: np.ndarray
     theta: np.ndarray
+    unsure: np.ndarray
+
+    @classmethod
+    def at(cls, drivers: Drivers, theta: np.ndarray) -> Path:
+        """Return the path of drivers on their records who do not drift, known for sure."""
+        gap, speed = drivers.batch.gap.numpy(), drivers.batch.speed.numpy()
+        k = len(drivers.drifts)
+        return cls(gap, speed, np.zeros((*gap.shape, len(drivers.free) + k)), theta, np.zeros((*gap.shape, k)))
 
 
 @dataclass(frozen=True, eq=False)
 class Linear:
     """Steps about a path: gap and speed after a step ``to`` [T − 1, rows, 2], and their derivatives.
 
-    ``by_state`` [T − 1, rows, 2, 2] by gap and speed, ``by_level`` [T − 1, rows, 2, 1 + k] by levels of the step.
+    ``by_state`` [T − 1, rows, 2, 2] by gap and speed, ``by_level`` [T − 1, rows, 2, p + k] by levels of the step.
     """
 
     path: Path
@@ -63,63 +75,79 @@ class Drivers:
         self.simulator, self.batch, self.measured, self.free = simulator, batch, measured, free
         self.drifts = tuple(e.name for e in simulator.effects if e.draws and e.remembers)
         known = catalogue(simulator.effects)
-        self.bounds = np.log([[known[name].low, known[name].high] for name in free])
+        self.bounds = np.log([[known[name].low, known[name].high] for name in free]).T
         self.at, self.driver = batch.columns(simulator)
 
-    def params(self, theta: Tensor, style: Tensor) -> dict[str, dict[str, Tensor]]:
-        """Return parameters of drivers with log θ [..., p], and drift in units of its level: σ = 1, standing still.
+    @property
+    def levels(self) -> int:
+        """Number of levels: every parameter of a driver, and every drift."""
+        return len(self.free) + len(self.drifts)
 
-        ``style`` is added to the log time gap.
-        """
+    def params(self, theta: Tensor) -> dict[str, dict[str, Tensor]]:
+        """Return parameters of drivers with log θ [..., p], and drift in units of its level: σ = 1, standing still."""
         params = self.simulator.defaults(dtype=torch.float64)
         for i, name in enumerate(self.free):
             effect, parameter = name.split(".")
-            by = style if parameter == "time_gap" else 0.0
-            params[effect][parameter] = (theta[..., i] + by).exp().unsqueeze(-1)
+            params[effect][parameter] = theta[..., i].exp().unsqueeze(-1)
         for name in self.drifts:
             one = torch.ones((), dtype=torch.float64)
             params[name] = {**params[name], "sigma": one, "memory_time": STILL * one}
         return params
 
-    def linearise(self, path: Path, first: int = 0, last: int | None = None) -> Linear:
-        """Return the steps from the samples ``first`` to ``last`` − 1 (all but the last sample), about the path."""
-        batch, simulator, d = self.batch, self.simulator, self.driver
-        begin, end = first, len(batch.gap) - 1 if last is None else last
-        gap, speed = (torch.tensor(x[begin:end], requires_grad=True) for x in (path.gap, path.speed))
-        level = [
-            torch.tensor(path.level[begin + 1 : end + 1, :, j], requires_grad=True) for j in range(1 + len(self.drifts))
-        ]
-        params = self.params(torch.tensor(path.theta), level[0])
-        now, later = batch.position[begin:end, :, self.at], batch.position[begin + 1 : end + 1, :, self.at]
-        ahead = now[..., d - 1] - batch.length[:, self.at][:, d - 1] - gap
-        position = torch.cat((now[..., :d], ahead.unsqueeze(-1), now[..., d + 1 :]), -1)
-        speeds, accels = (x[begin:end, :, self.at] for x in (batch.all_speed, batch.accel))
-        speeds = torch.cat((speeds[..., :d], speed.unsqueeze(-1), speeds[..., d + 1 :]), -1)
-        present = batch.present[..., self.at] if self.at != slice(1, 3) else None
-        state = simulator.state(
-            position, speeds, params, length=batch.length[:, self.at], accel=accels,
-            present=None if present is None else present[begin:end],
-            step=batch.first_step + torch.arange(begin, end)[:, None],
-        )  # fmt: skip
-        levels = {name: level[j + 1].unsqueeze(-1).expand(position.shape) for j, name in enumerate(self.drifts)}
-        there, faster = (x[begin + 1 : end + 1, :, self.at] for x in (batch.all_speed, batch.accel))
-        record = Record(
-            later, there, faster,
-            (torch.arange(position.shape[-1]) != d).expand(position.shape),
-            None if present is None else present[begin + 1 : end + 1],
-        )  # fmt: skip
-        still = torch.zeros_like(position)
-        inputs = {"replay": record, **dict.fromkeys(simulator.draws, still)}
-        after = simulator.step(state._replace(memory={**state.memory, **levels}), inputs, params)
-        made = [after.gap[..., d], after.speed[..., d]]
+    def linearise(self, path: Path) -> Linear:
+        """Return the steps from all samples but the last, linear about the path.
+
+        Where a drift is unsure a step is the best line over what it may be, by three points of Gauss and Hermite: a
+        time gap that varies brakes more than its mean does.
+        """
+        gap, speed = (torch.tensor(x[:-1], requires_grad=True) for x in (path.gap, path.speed))
+        level = [torch.tensor(path.level[1:, :, j], requires_grad=True) for j in range(self.levels)]
+        made = self._stepped(path, gap, speed, level)
         slopes = [torch.autograd.grad(x.sum(), (gap, speed, *level), retain_graph=True) for x in made]
 
         def both(part: slice) -> np.ndarray:
             return np.stack([np.stack([g.numpy() for g in s[part]], -1) for s in slopes], -2)
 
-        return Linear(
-            path,
-            np.stack([x.detach().numpy() for x in made], -1),
-            both(slice(0, 2)),
-            both(slice(2, None)),
-        )
+        to, by_level = np.stack([x.detach().numpy() for x in made], -1), both(slice(2, None))
+        middle = to.copy()
+        for j in range(len(self.drifts)):
+            off, at = math.sqrt(3.0) * path.unsure[1:, :, j], len(self.free) + j
+            if not off.any():
+                continue
+            with torch.no_grad():
+                ends = [[*level[:at], level[at] + sign * torch.tensor(off), *level[at + 1 :]] for sign in (1.0, -1.0)]
+                high, low = (
+                    np.stack([x.numpy() for x in self._stepped(path, gap, speed, end)], -1) for end in ends
+                )  # fmt: skip
+            to += (high + low - 2.0 * middle) / 6.0
+            by_level[..., at] = np.where(
+                off[..., None] > NARROW, (high - low) / (2.0 * np.maximum(off, NARROW))[..., None], by_level[..., at]
+            )
+        return Linear(path, to, both(slice(0, 2)), by_level)
+
+    def _stepped(self, path: Path, gap: Tensor, speed: Tensor, level: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return gap and speed after a step from every sample but the last."""
+        batch, simulator, d, own = self.batch, self.simulator, self.driver, len(self.free)
+        params = self.params(torch.tensor(path.theta) + torch.stack(level[:own], -1))
+        now, later = batch.position[:-1, :, self.at], batch.position[1:, :, self.at]
+        ahead = now[..., d - 1] - batch.length[:, self.at][:, d - 1] - gap
+        position = torch.cat((now[..., :d], ahead.unsqueeze(-1), now[..., d + 1 :]), -1)
+        speeds, accels = (x[:-1, :, self.at] for x in (batch.all_speed, batch.accel))
+        speeds = torch.cat((speeds[..., :d], speed.unsqueeze(-1), speeds[..., d + 1 :]), -1)
+        present = batch.present[..., self.at] if self.at != slice(1, 3) else None
+        state = simulator.state(
+            position, speeds, params, length=batch.length[:, self.at], accel=accels,
+            present=None if present is None else present[:-1],
+            step=batch.first_step + torch.arange(len(gap))[:, None],
+        )  # fmt: skip
+        levels = {name: level[own + j].unsqueeze(-1).expand(position.shape) for j, name in enumerate(self.drifts)}
+        there, faster = (x[1:, :, self.at] for x in (batch.all_speed, batch.accel))
+        record = Record(
+            later, there, faster,
+            (torch.arange(position.shape[-1]) != d).expand(position.shape),
+            None if present is None else present[1:],
+        )  # fmt: skip
+        still = torch.zeros_like(position)
+        inputs = {"replay": record, **dict.fromkeys(simulator.draws, still)}
+        after = simulator.step(state._replace(memory={**state.memory, **levels}), inputs, params)
+        return after.gap[..., d], after.speed[..., d]

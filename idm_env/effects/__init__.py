@@ -19,7 +19,7 @@ from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
 from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
 from idm_env.effects.neighbours import BrakeLight, Follower, Lateral, LeaderAcceleration, SecondLeader
-from idm_env.effects.noise import AccelNoise, Noise, PerceptionNoise, Wander
+from idm_env.effects.noise import DRIFTS, AccelNoise, Noise, PerceptionNoise, Wander
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
 from idm_env.effects.registry import entered, is_candidate, lives, read
@@ -189,6 +189,7 @@ __all__ = [
     "ALL",
     "BASES",
     "CANDIDATES",
+    "DRIFTS",
     "FVDM",
     "IDM",
     "IIDM",

@@ -175,3 +175,7 @@ class PerceptionNoise(Effect):
     def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return n."""
         return _level(self, scene, p)
+
+
+DRIFTS: tuple[Effect, ...] = (Wander(), Wander(of="desired_speed"), AccelNoise(), PerceptionNoise())
+"""Sorts of drift that records of followers can tell apart."""

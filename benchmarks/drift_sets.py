@@ -1,0 +1,152 @@
+"""Known drift found again: generated drivers of whom nothing is known, and drivers who do not drift.
+
+    python -m benchmarks.drift_sets [--sets 50] [--out drift_sets.jsonl] [--first-seed 1000]
+
+A set is 20 drivers of 90 s, sampled every 0.2 s with errors of 0.1 m and 0.05 m/s, whose parameters differ by 20 %
+about others than those that the estimate takes for usual; leaders change their speed every 12 s or so. The sorts of
+drift take turns, then none. ``tell`` sees them as it sees a file. One line of JSON per set is kept, so that a run goes
+on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+import numpy as np  # noqa: E402 (threads are set before numpy starts)
+import polars as pl  # noqa: E402
+import torch  # noqa: E402
+
+from idm_env.data import Trajectories, episodes  # noqa: E402
+from idm_env.drift.kinds import behind_a_record, tell  # noqa: E402
+from idm_env.effects import DRIFTS, AccelNoise, Effect, PerceptionNoise, Wander  # noqa: E402
+from idm_env.fitting.problem import IDM_NAMES  # noqa: E402
+from idm_env.types import Record  # noqa: E402
+
+DT, SECONDS, DRIVERS = 0.2, 90.0, 20
+GAP_NOISE, SPEED_NOISE = 0.1, 0.05
+CENTRE, SPREAD = np.log([1.4, 1.8, 1.3, 2.2, 30.0]), np.array([0.2, 0.2, 0.2, 0.2, 0.1])
+HIDDEN: tuple[tuple[Effect, float, float], ...] = (
+    (Wander(), 0.25, 15.0),
+    (AccelNoise(), 0.2, 3.0),
+    (PerceptionNoise(), 0.1, 10.0),
+    (Wander(of="desired_speed"), 0.2, 20.0),
+    (Wander(), 0.0, 15.0),
+)
+"""Drift, σ and τ (s); σ of a set is up to a half more or less."""
+
+
+def leaders(random: np.random.Generator, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return position, speed and acceleration [steps + 1, drivers] of vehicles that now and then want another speed."""
+    fine, every = 0.025, round(DT / 0.025)
+    speed = random.uniform(8.0, 16.0, DRIVERS)
+    position, accel, target = np.zeros(DRIVERS), np.zeros(DRIVERS), speed.copy()
+    kept = [(position, speed, accel)]
+    for k in range(steps * every):
+        target = np.where(random.random(DRIVERS) < fine / 12.0, random.uniform(3.0, 22.0, DRIVERS), target)
+        accel = accel + fine * (np.clip((target - speed) / 2.5, -2.5, 1.3) - accel)
+        faster = np.maximum(speed + accel * fine, 0.0)
+        position, speed = position + 0.5 * fine * (speed + faster), faster
+        if (k + 1) % every == 0:
+            kept.append((position, speed, accel))
+    found = [np.array(x) for x in zip(*kept, strict=True)]
+    return found[0], found[1], found[2]
+
+
+def made(seed: int, drift: Effect, sigma: float, memory_time: float) -> Trajectories:
+    """Return the trajectories of a set."""
+    random, simulator = np.random.default_rng(seed), behind_a_record(DT, drift)
+    theta = CENTRE + SPREAD * random.normal(size=(DRIVERS, len(CENTRE)))
+    params = simulator.defaults(dtype=torch.float64)
+    for i, name in enumerate(IDM_NAMES):
+        params["idm"][name.removeprefix("idm.")] = torch.tensor(np.exp(theta[:, i])).unsqueeze(-1)
+    params[drift.name] = {"sigma": torch.tensor(sigma).double(), "memory_time": torch.tensor(memory_time).double()}
+    steps = round(SECONDS / DT)
+    x, v, a = leaders(random, steps)
+    gap = np.exp(theta[:, 3]) + v[0] * np.exp(theta[:, 2])
+    both = [torch.tensor(np.stack((y, np.zeros_like(y)), -1)) for y in (x, v, a)]
+    record = Record(*(y[1:] for y in both), torch.tensor([True, False]).expand(steps, DRIVERS, 2))
+    position = torch.tensor(np.stack((x[0], x[0] - 5.0 - gap), -1))
+    start = simulator.state(position, torch.tensor(np.stack((v[0], v[0]), -1)), params, accel=both[2][0], seed=seed)
+    _, kept = simulator.rollout(start, {"replay": record}, params, steps, seed=seed + 1)
+    tables = []
+    for i in range(DRIVERS):
+        for vehicle in (0, 1):
+            noise = vehicle * random.normal(size=(2, steps))
+            measured = kept.gap[:, i, 1].numpy() + GAP_NOISE * noise[0] if vehicle else np.full(steps, np.nan)
+            tables.append(pl.DataFrame({
+                "run_id": f"{i:02d}", "vehicle_id": vehicle, "leader_id": [0 if vehicle else None] * steps,
+                "time_s": DT * np.arange(1, steps + 1), "position_m": kept.position[:, i, vehicle].numpy(),
+                "speed_mps": np.maximum(kept.speed[:, i, vehicle].numpy() + SPEED_NOISE * noise[1], 0.0),
+                "length_m": 5.0, "gap_m": measured,
+            }, schema_overrides={"leader_id": pl.Int64}))  # fmt: skip
+    table = pl.concat(tables).with_columns(pl.col("gap_m").fill_nan(None))
+    return Trajectories.from_frame(table, source=f"set {seed}")
+
+
+def scored(seed: int) -> dict[str, Any]:
+    """Return what ``tell`` says of a set, beside what is hidden in it."""
+    drift, sigma, memory_time = HIDDEN[seed % len(HIDDEN)]
+    sigma *= float(np.exp(np.random.default_rng(seed).uniform(-0.4, 0.4)))
+    begin, trajectories = time.process_time(), made(seed, drift, sigma, memory_time)
+    told = tell(list(episodes(trajectories, smooth=True)), list(episodes(trajectories)), DRIFTS)
+    rows = {str(row["name"]): row for row in told.found[drift.name].table()}
+    return {
+        "seed": seed, "hidden": drift.name if sigma else "none", "sigma": sigma, "memory_time": memory_time,
+        "one_of": told.one_of, "gain": told.gain,
+        "estimates": [rows[f"{drift.name}.{key}"] for key in ("sigma", "memory_time")],
+        "cpu_s": time.process_time() - begin,
+    }  # fmt: skip
+
+
+def table(sets: list[dict[str, Any]]) -> str:
+    """Return what came out, by sort."""
+    lines = [
+        "hidden | sets | right name alone | among those named | sigma: median error, covered | "
+        "tau: median error, covered",
+        "--- | --- | --- | --- | --- | ---",
+    ]
+    for name in dict.fromkeys(s["hidden"] for s in sets):
+        rows = [s for s in sets if s["hidden"] == name]
+        if name == "none":
+            lines.append(f"none | {len(rows)} | {sum(not s['one_of'] for s in rows)} | – | – | –")
+            continue
+        texts = [f"{sum(s['one_of'] == [name] for s in rows)}", f"{sum(name in s['one_of'] for s in rows)}"]
+        for i, key in enumerate(("sigma", "memory_time")):
+            error = [abs(s["estimates"][i]["estimate"] / s[key] - 1.0) for s in rows]
+            inside = [s["estimates"][i]["low"] <= s[key] <= s["estimates"][i]["high"] for s in rows]
+            texts.append(f"{100 * np.median(error):.0f} %, {sum(inside)} of {len(rows)}")
+        lines.append(f"{name} | {len(rows)} | {' | '.join(texts)}")
+    return "\n".join([*lines, f"CPU seconds per set, median: {np.median([s['cpu_s'] for s in sets]):.0f}"])
+
+
+def main() -> None:
+    """Run the sets that are not there yet, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sets", type=int, default=60)
+    parser.add_argument("--first-seed", type=int, default=1000)
+    parser.add_argument("--out", type=Path, default=Path("drift_sets.jsonl"))
+    arguments = parser.parse_args()
+    done = {}
+    if arguments.out.exists():
+        done = {s["seed"]: s for s in map(json.loads, arguments.out.read_text().splitlines())}
+    wanted = range(arguments.first_seed, arguments.first_seed + arguments.sets)
+    for seed in wanted:
+        if seed not in done:
+            done[seed] = json.loads(json.dumps(scored(seed)))
+            with arguments.out.open("a") as file:
+                file.write(json.dumps(done[seed]) + "\n")
+            print(f"{seed}: {done[seed]['hidden']}, told {done[seed]['one_of']}", file=sys.stderr, flush=True)
+    print(table([done[seed] for seed in wanted]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""The command ``drift``: a file of measured traffic in, how its drivers drift and drivers who do so out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from idm_env import keep
+from idm_env import report as page
+from idm_env.config import Model, Numbers, save_model
+from idm_env.data.fingerprint import fitted_on
+from idm_env.drift.estimate import Estimate
+from idm_env.drift.kinds import Told, tell
+from idm_env.effects import DRIFTS, Replay
+from idm_env.fitting.options import Source
+from idm_env.progress import OnProgress, silent
+
+WRITTEN = ("model.yaml", "report.json")
+
+
+def drift_file(
+    source: Source, out: Path, *, drivers: int = 60, on_progress: OnProgress | None = None
+) -> dict[str, Any]:
+    """Say how the drivers of a file drift, and return the report; write it and ``model.yaml``.
+
+    ``drivers`` are taken at most, evenly spread over the file. DataError and ValueError for what cannot be read.
+    """
+    with keep.results(out, WRITTEN, (source.path,)):
+        progress = on_progress or silent
+        progress("reading", 0, 0, source.path.name)
+        trajectories = source.trajectories()
+        smooth, measured = (replace(source, smooth=x).episodes(trajectories) for x in (True, False))
+        chosen = np.unique(np.linspace(0, len(smooth) - 1, min(drivers, len(smooth))).astype(int))
+        pair = [[found[i] for i in chosen] for found in (smooth, measured)]
+        told = tell(*pair, on_progress=lambda name, done, total, _: progress(name, done, total, ""))
+        best = told.found[told.one_of[0]] if told.one_of else told.steady
+        marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in pair[0]])
+        save_model(out / "model.yaml", replace(model_of(best), fitted_on=marked))
+        left_out = ((r.kind, r.count) for r in smooth.left_out)
+        result = {
+            "schema": 1,
+            "command": page.command_line(),
+            "verdict": told.verdict,
+            "one_of": list(told.one_of),
+            "sentence": sentence(told),
+            "sorts": _sorts(told),
+            "estimates": {name: e.table() for name, e in {"none": told.steady, **told.found}.items()},
+            "data": {
+                **trajectories.summary(), "episodes": len(smooth), "taken": len(chosen), "dt": best.drivers.batch.dt,
+                "account": page.account(((r.kind, r.count) for r in trajectories.repairs), left_out),
+            },
+            "versions": page.versions(),
+        }  # fmt: skip
+        page.write_json(out / "report.json", result)
+        return result
+
+
+def model_of(found: Estimate) -> Model:
+    """Return drivers who drift as estimated: the median driver and everyone's own parameters."""
+    drivers, names = found.drivers, found.drivers.free
+
+    def numbers(row: np.ndarray) -> Numbers:
+        nested: Numbers = {}
+        for name, value in zip(names, np.exp(row).tolist(), strict=True):
+            effect, parameter = name.split(".")
+            nested.setdefault(effect, {})[parameter] = value
+        return nested
+
+    s = found.settings
+    drifts = {
+        name: {"sigma": float(s.sigma[j]), "memory_time": float(s.memory_time[j])}
+        for j, name in enumerate(drivers.drifts)
+    }
+    records: dict[str, list[np.ndarray]] = {}
+    for e, theta in zip(drivers.batch.episodes, found.theta, strict=True):
+        records.setdefault(f"{e.run_id}/{e.vehicle_id}", []).append(theta)
+    effects = tuple(e for e in drivers.simulator.effects if not isinstance(e, Replay))
+    return Model(
+        effects, {**numbers(np.median(found.theta, 0)), **drifts}, drivers.simulator.dt,
+        drivers.simulator.integration, {key: numbers(np.mean(x, 0)) for key, x in records.items()},
+    )  # fmt: skip
+
+
+def sentence(told: Told) -> str:
+    """Return in one sentence how drivers drift."""
+    if not told.one_of:
+        return "No drift: white noise beside steady drivers explains these records as well."
+    titles = {kind.name: f"{kind.title} ({kind.name})" for kind in DRIFTS}
+    rows = {str(row["name"]): row for row in told.found[told.one_of[0]].table()}
+    told_of = []
+    for key, symbol, unit in (("sigma", "sigma", ""), ("memory_time", "tau", " s")):
+        row = rows[f"{told.one_of[0]}.{key}"]
+        told_of.append(f"{symbol} {row['estimate']:.3g}{unit} ({row['low']:.3g} to {row['high']:.3g})")
+    others = ", ".join(titles[n] for n in told.one_of[1:])
+    apart = f" Not told apart from: {others}." if others else ""
+    return f"Drivers drift: {titles[told.one_of[0]]}, {', '.join(told_of)}.{apart}"
+
+
+def _sorts(told: Told) -> list[dict[str, Any]]:
+    rows = []
+    for name in sorted(told.found, key=lambda n: -told.gain[n]):
+        found = {str(row["name"]): row for row in told.found[name].table()}
+        rows.append({
+            "sort": name, "log_likelihood": told.gain[name],
+            "sigma": found[f"{name}.sigma"]["estimate"], "tau_s": found[f"{name}.memory_time"]["estimate"],
+        })  # fmt: skip
+    return rows

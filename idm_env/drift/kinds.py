@@ -1,0 +1,86 @@
+"""What sort of drift it is: every sort estimated on the same records, against drivers who do not drift."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from idm_env.data import Episode
+from idm_env.drift.estimate import Estimate, estimate, usual
+from idm_env.effects import DRIFTS, IDM, Brakes, Effect, Replay
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.problem import IDM_NAMES
+from idm_env.parameters import catalogue
+from idm_env.progress import OnProgress, silent
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
+
+FOUND = 10.0
+"""Log-likelihood by which drift must beat white noise alone: e^(−10) for two numbers more; steps are not linear."""
+LEAST = 0.1
+"""Share of the usual σ below which drift is what smoothing and steps leave, and nobody's."""
+APART = 5.0
+"""Log-likelihood by which the best sort must beat another to be told from it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Estimates by name of the drift, that without any, and ``one_of``: sorts that the data do not tell apart.
+
+    ``one_of`` is empty for drivers who do not drift; its first is the likeliest.
+    """
+
+    steady: Estimate
+    found: Mapping[str, Estimate]
+    one_of: tuple[str, ...]
+
+    @property
+    def gain(self) -> dict[str, float]:
+        """Log-likelihood that every sort gains over drivers who do not drift."""
+        return {name: e.log_likelihood - self.steady.log_likelihood for name, e in self.found.items()}
+
+    @property
+    def verdict(self) -> str:
+        """``none``, ``named`` or ``one_of``."""
+        return "none" if not self.one_of else "named" if len(self.one_of) == 1 else "one_of"
+
+
+def behind_a_record(dt: float, *drifts: Effect) -> Simulator:
+    """Return IDM with drift behind a record."""
+    return Simulator(Lane(), (IDM(), *drifts, Replay(), Brakes()), dt=dt, integration="midpoint")
+
+
+def tell(
+    smooth: Sequence[Episode],
+    measured: Sequence[Episode],
+    kinds: Sequence[Effect] = DRIFTS,
+    *,
+    noise: tuple[float, float] | None = None,
+    on_progress: OnProgress = silent,
+) -> Told:
+    """Estimate every sort of drift on episodes, smoothed and as measured, and say which one it is.
+
+    Args:
+        smooth: Drivers behind leaders, smoothed.
+        measured: The same as measured.
+        kinds: Drifting effects.
+        noise: Noise of measured gap (m) and speed (m/s), where it is known.
+        on_progress: Called with the name, done, total and the log-likelihood.
+    """
+    batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
+    theta, dt = usual(IDM_NAMES), smooth[0].dt
+
+    def one(i: int, *drifts: Effect) -> Estimate:
+        found = estimate(behind_a_record(dt, *drifts), batch, IDM_NAMES, theta, measured=raw, noise=noise)
+        on_progress(drifts[0].name if drifts else "no drift", i + 1, 1 + len(kinds), found.log_likelihood)
+        return found
+
+    steady = one(0)
+    found = {kind.name: one(i + 1, kind) for i, kind in enumerate(kinds)}
+    told = Told(steady, found, ())
+    order = sorted(found, key=lambda name: -told.gain[name])
+    best = order[0]
+    usual_sigma = {kind.name: catalogue((kind,))[f"{kind.name}.sigma"].default for kind in kinds}
+    if told.gain[best] < FOUND or found[best].settings.sigma[0] < LEAST * usual_sigma[best]:
+        return told
+    return Told(steady, found, tuple(n for n in order if told.gain[best] - told.gain[n] < APART))
