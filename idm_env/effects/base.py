@@ -33,7 +33,7 @@ class Effect:
     hook            meaning                            composition                  example
     ==============  =================================  ===========================  =======================
     ``perceive``    what the driver sees               chained by ``rank``          Delay, GapBias
-    ``adapt``       how the driver's parameters change chained, in simulator order  Memory, SpeedZone
+    ``adapt``       how a driver's parameters change   chained, in simulator order  Memory, SpeedZone
     ``accelerate``  what the driver wants, in m/s²     summed                       IDM, Grade, Noise
     ``limit``       what the vehicle can               chained by ``rank``          Control, Lag, Brakes
     ``place``       put where a record says            chained, after integration   Replay

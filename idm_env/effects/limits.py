@@ -41,7 +41,7 @@ class Asymmetry(Effect):
     )
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return a − k |a|."""
+        """Return ``a − k |a|``."""
         return accel - p["strength"] * accel.abs()
 
 

@@ -57,7 +57,7 @@ class LeaderAcceleration(Effect):
     """Feed-forward of the leader's acceleration, ``+ c a_lead``, as in adaptive and cooperative cruise control.
 
     It is measured or sent, not perceived: a driver's delay does not hold it up. Down a platoon quick changes are
-    multiplied by c from vehicle to vehicle, so that beyond |c| = 1 they grow without end: it is not string stable.
+    multiplied by c from vehicle to vehicle, so that beyond c = ±1 they grow without end: it is not string stable.
     """
 
     kind: ClassVar[str] = "leader_acceleration"

@@ -1,0 +1,72 @@
+"""Sphinx: ``make docs`` builds the site into build/site, without the network, with warnings as errors."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent)]
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+
+import made_from_code  # noqa: E402 (found by the path above)
+
+import idm_env  # noqa: E402
+
+project = "idm_env"
+author = "the idm_env developers"
+release = version = idm_env.__version__
+extensions = [
+    "myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery",
+]  # fmt: skip
+source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+root_doc = "index"
+exclude_patterns = [
+    "_site",
+    "gallery/*.ipynb",
+    "gallery/*.py",
+    "gallery/*.md5",
+    "gallery/*.json",
+    "**/sg_execution_times*",
+]
+highlight_language = "none"
+html_theme = "furo"
+html_title = "idm_env"
+html_static_path: list[str] = []
+html_show_sphinx = False
+html_copy_source = False
+templates_path: list[str] = []
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 3
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+suppress_warnings = ["config.cache"]
+nitpicky = False
+sphinx_gallery_conf = {
+    "examples_dirs": "../build/examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"/(?!train_|find_|stabilise_|two_nodes)",
+    "within_subsection_order": "FileNameSortKey",
+    "download_all_examples": False,
+    "show_signature": False,
+    "min_reported_time": 1e9,
+    "plot_gallery": "True",
+    "abort_on_example_error": True,
+}
+
+
+def setup(app: Any) -> None:
+    """Write the pages that come from code before anything is read, and mend what only GitHub understands."""
+    made_from_code.write(HERE)
+    app.connect("source-read", _links)
+
+
+def _links(app: Any, name: str, text: list[str]) -> None:
+    """Let links to the README lead to the first page."""
+    text[0] = text[0].replace("](../README.md)", "](index.md)").replace("(../README.md#", "(index.md#")

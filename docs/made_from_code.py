@@ -1,0 +1,348 @@
+"""Pages that are made from the code at every build: environments, effects, commands, reports, figures, limits, API."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import inspect
+import re
+import shutil
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+UNITS = {
+    "speed": "m/s", "relative_speed": "m/s", "headway": "m", "gap": "m", "deviation": "m", "accel": "m/s²",
+    "lead_accel": "m/s²",
+}  # fmt: skip
+JOBS = ("explain", "fit", "filter", "reconstruct", "predict", "simulate")
+MODULES = (
+    "simulator", "types", "parameters", "effects", "roads", "tasks", "envs.gym", "envs.vector",
+    "envs.pettingzoo", "data", "data.episode", "data.synthetic", "fitting.fit", "fitting.job",
+    "fitting.options", "discovery.discover", "discovery.sets", "trajectories.files", "prediction.files",
+    "drift.forecast", "executor", "keep", "parts", "config", "metrics", "progress", "report",
+)  # fmt: skip
+
+
+def write(folder: Path) -> None:
+    """Write all of them under ``folder/generated``, only what changed, so that a second build is quick."""
+    out = folder / "generated"
+    (out / "pictures").mkdir(parents=True, exist_ok=True)
+    pages = {
+        "environments.md": environments(), "effects.md": effects(out / "pictures"), "commands.md": commands(),
+        "figures.md": section("Figures"), "limits.md": section("What is not done"), "api.rst": api(),
+    }  # fmt: skip
+    for name, text in pages.items():
+        path = out / name
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+    examples()
+    reports(out / "pictures")
+
+
+# -- environments ----------------------------------------------------------------------------------------------------
+
+
+def environments() -> str:
+    """Return one card per task."""
+    from idm_env.tasks import TASKS
+
+    lines = [
+        "# Environments", "",
+        '`gymnasium.make("DiffIDM-v0", task=NAME, …)`; `make_vec` for a native batch; `idm_env.envs.pettingzoo` for '
+        "one agent per controlled vehicle. Every keyword below is one of `make`, and may stand in YAML.", "",
+    ]  # fmt: skip
+    for name, cls in TASKS.items():
+        lines += _environment(name, cls)
+    lines += ["## Keywords of every task", "", *_keywords(_base(TASKS["ring"]), None), ""]
+    return "\n".join(lines) + "\n"
+
+
+def _base(cls: type) -> type:
+    return next(c for c in cls.__mro__ if c.__name__ == "Task")
+
+
+def _environment(name: str, cls: Any) -> list[str]:
+    import gymnasium
+
+    task = _task(name)
+    with contextlib.suppress(Exception):
+        env: Any = gymnasium.make("DiffIDM-v0", task=name)
+    first, parts = _described(cls)
+    lines = [f"## {name}", "", first, ""]
+    lines += [paragraph + "\n" for paragraph in parts]
+    if task is None:
+        return [*lines, *_keywords(cls, _base(cls))]
+    features = task.features
+    lines += [
+        "| entry of an agent's observation | unit | divided by | lowest | highest |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for entry, scale, low, high in zip(features.names, features.scales, features.low, features.high, strict=True):
+        lines.append(f"| `{entry}` | {_unit(entry)} | {scale:g} | {low:g} | {high:g} |")
+    actions = ", ".join(f"`{c}`" for c in task.commands)
+    low, high = task.command_limits
+    lines += [
+        "",
+        f"**Action**, per agent: {actions} in [−1, 1]; −1 and 1 command {low:g} and {high:g} m/s². **Spaces** by "
+        f"default: observation `{env.observation_space}`, action `{env.action_space}`.",
+        "",
+        f"**Reward** of a step without a crash: between {task.pay.low:g} and {task.pay.high:g}; a crash costs "
+        f"{task.cost_of_crash:g} by default. **Ends**: terminated where vehicles touch, truncated after "
+        f"{task.horizon} steps of {task.simulator.dt:g} s.",
+        "",
+    ]
+    return [*lines, *_keywords(cls, _base(cls))]
+
+
+def _task(name: str) -> Any:
+    from idm_env.tasks import make_task
+
+    try:
+        return make_task(name)
+    except ValueError:  # it needs a file
+        return None
+
+
+def _unit(entry: str) -> str:
+    known = next((unit for key, unit in UNITS.items() if entry.endswith(key)), None)
+    if known is None:
+        known = "m/s" if "speed" in entry else "m/s²" if "accel" in entry else "m" if "gap" in entry else "–"
+    return known
+
+
+def _described(cls: Any) -> tuple[str, list[str]]:
+    """Return the first sentence of a docstring and its paragraphs up to its arguments, as Markdown."""
+    text = inspect.cleandoc(cls.__doc__ or "")
+    text = re.split(r"\n\s*(?:Args|Raises|Attributes):\n", text)[0].replace("``", "`")
+    paragraphs = [" ".join(p.split()) for p in text.split("\n\n") if p.strip()]
+    return paragraphs[0], paragraphs[1:]
+
+
+def _keywords(cls: Any, base: Any) -> list[str]:
+    """Return the keywords of a task, or those that it has beside its base, with their defaults and meanings."""
+    told = _arguments(cls)
+    known = set() if base is None else {f.name for f in dataclasses.fields(base)}
+    fields = [f for f in dataclasses.fields(cls) if f.init and (f.name not in known or f.name in told)]
+    if not fields:
+        return []
+    lines = ["| keyword | default | meaning |", "| --- | --- | --- |"]
+    for f in fields:
+        default = "" if f.default is dataclasses.MISSING else f"`{f.default!r}`"
+        meaning = told.get(f.name, "").replace("|", "\\|")
+        lines.append(f"| `{f.name}` | {default} | {meaning} |")
+    return [*lines, ""]
+
+
+def _arguments(cls: Any) -> dict[str, str]:
+    """Return what a docstring says of each argument."""
+    text = inspect.cleandoc(cls.__doc__ or "")
+    found = re.search(r"\nArgs:\n(.*?)(?:\n\S|\Z)", text, re.DOTALL)
+    if not found:
+        return {}
+    entries = re.split(r"\n(?=    \w+(?:, \w+)*: )", "\n" + textwrap.dedent(found[1]).replace("\n    ", "\n        "))
+    told = {}
+    for entry in re.findall(r"(?m)^    ?(\w+): ((?:.|\n(?!    ?\w+: ))*)", found[1]):
+        told[entry[0]] = " ".join(entry[1].split()).replace("``", "`")
+    return told if told or not entries else {}
+
+
+# -- effects ---------------------------------------------------------------------------------------------------------
+
+
+def effects(pictures: Path) -> str:
+    """Return the catalogue, each effect with its picture where a platoon shows it."""
+    from idm_env.effects import ALL
+
+    lines = [
+        "# Catalogue of effects", "",
+        "Made from the classes: what stands here stands beside the equation. Pictures: the third driver of a platoon "
+        "whose first brakes and accelerates again, plain (grey) and with the effect (blue); what an effect does not "
+        "change is not drawn.", "",
+    ]  # fmt: skip
+    for name, cls in ALL.items():
+        lines += _effect(name, cls, pictures)
+    return "\n".join(lines) + "\n"
+
+
+def _effect(name: str, cls: Any, pictures: Path) -> list[str]:
+    effect = cls()
+    title = cls.title or name.replace("_", " ")
+    lines = [f"## {title}", "", f"`{name}`, class `idm_env.effects.{cls.__name__}`; hook `{cls.hook}`.", ""]
+    if cls.equation:
+        lines += [f"> {cls.equation}", ""]
+    doc = inspect.cleandoc(cls.__doc__ or "").replace("``", "`")
+    for paragraph in (part.strip("\n") for part in re.sub(r"\n?::\n", "\n", doc).split("\n\n")):
+        if paragraph.startswith("    "):
+            lines += ["```text", textwrap.dedent(paragraph), "```", ""]
+        elif paragraph.strip():
+            lines += [" ".join(paragraph.split()), ""]
+    if effect.parameters:
+        lines += [
+            "| parameter | symbol | unit | default | lowest | highest | null |",
+            "| --- | --- | --- | --- | --- | --- | --- |",
+        ]
+        for p in effect.parameters:
+            null = "–" if p.null is None else f"{p.null:g}"
+            lines.append(f"| `{p.name}` | {p.symbol} | {p.unit} | {p.default:g} | {p.low:g} | {p.high:g} | {null} |")
+        lines.append("")
+    if cls.looks_like:
+        lines += [f"**Looks like** {', '.join(cls.looks_like)}. **Told by** {cls.told_by}.", ""]
+    told = [
+        f"*{words}* ({where} its null)" for words, where in zip(cls.wording, ("below", "above"), strict=True) if words
+    ]
+    if told:
+        lines += [f"In a report: {', '.join(told)}.", ""]
+    lines += [f"Source: {source}\n" for source in cls.sources]
+    if response(effect, pictures / f"{name}.png"):
+        lines += [f"![Response with and without {title}](pictures/{name}.png)", ""]
+    return lines
+
+
+def response(effect: Any, path: Path) -> bool:
+    """Draw gap and speed of a driver with the effect and without it; False where there is nothing to see."""
+    from matplotlib.figure import Figure
+
+    from idm_env import IDM, Brakes, Lane, Replay, Simulator
+    from idm_env.effects import CarFollowing
+    from idm_env.kernels import dispatch
+    from idm_env.types import Record
+
+    if path.exists() and path.stat().st_mtime > Path(inspect.getfile(type(effect))).stat().st_mtime:
+        return True
+    if effect.hook == "change" or effect.name in ("replay", "brakes", "idm", "control", "imagined"):
+        return False
+    dt, steps, vehicles = 0.1, 450, 4
+    time = dt * torch.arange(steps + 1, dtype=torch.float64)
+    speed = 18.0 - 9.0 * torch.exp(-(((time - 20.0) / 5.0) ** 2)) + 2.0 * torch.sin(time / 9.0)
+    front = 300.0 + torch.cumulative_trapezoid(speed, dx=dt)
+    accel = torch.gradient(speed, spacing=dt)[0]
+    position = 300.0 - 32.0 * torch.arange(vehicles, dtype=torch.float64)
+    first = (torch.arange(vehicles) == 0).expand(steps, vehicles)
+    record = Record(*(x.unsqueeze(-1).expand(steps, vehicles) for x in (front, speed[1:], accel[1:])), first)
+    kept = []
+    for added in (None, effect):
+        following = added if isinstance(added, CarFollowing) else IDM()
+        more = () if added is None or isinstance(added, CarFollowing) else (added,)
+        try:
+            simulator = Simulator(Lane(), (following, *more, Brakes(), Replay()), dt=dt)
+            params = simulator.defaults(dtype=torch.float64)
+            for p in () if added is None else added.parameters:
+                if p.null is not None and p.default == p.null:
+                    value = (*p.starts, 0.5 * (p.null + (p.high if abs(p.high) < 1e6 else p.null + 1.0)))[0]
+                    params[added.name][p.name] = torch.tensor(float(value), dtype=torch.float64)
+            start = simulator.state(position, torch.full_like(position, float(speed[0])), params)
+            inputs = simulator.drawn(start.gap, {"replay": record}, steps, seed=3)
+            with dispatch.off():  # compiling each set of effects would take longer than all these steps
+                _, rolled = simulator.rollout(start, inputs, params, steps)
+        except (ValueError, KeyError, RuntimeError, TypeError):
+            return False  # it takes something that a lane of drivers does not have
+        kept.append(rolled)
+    if torch.equal(kept[0].gap[:, 2], kept[1].gap[:, 2]):
+        return False
+    figure = Figure(figsize=(8.0, 2.6), layout="constrained")
+    for axis, name, unit in zip(figure.subplots(1, 2), ("gap", "speed"), ("gap (m)", "speed (m/s)"), strict=True):
+        for rolled, colour, label in ((kept[0], "#9a9a9a", "plain"), (kept[1], "#0b5fa5", effect.name)):
+            axis.plot(time[1:], getattr(rolled, name)[:, 2], color=colour, lw=1.4, label=label)
+        axis.set(xlabel="time (s)", ylabel=unit)
+        axis.grid(alpha=0.25)
+    figure.axes[0].legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=90)
+    return True
+
+
+# -- commands, sections of the README, API, examples -----------------------------------------------------------------
+
+
+def commands() -> str:
+    """Return every command with its options, as its help tells them."""
+    import click
+    from typer.main import get_command
+
+    from idm_env.cli import app
+
+    group: Any = get_command(app)
+    lines = ["# Commands", "", "`idm-env COMMAND --help` says the same.", ""]
+    for name, command in group.commands.items():
+        lines += [f"## idm-env {name}", "", " ".join((command.help or "").split("\n\n")[0].split()), ""]
+        lines += [" ".join(p.split()) + "\n" for p in (command.help or "").split("\n\n")[1:]]
+        lines += ["| option | default | meaning |", "| --- | --- | --- |"]
+        for p in command.params:
+            if getattr(p, "hidden", False) or p.name == "help":
+                continue
+            argument = isinstance(p, click.Argument) or p.param_type_name == "argument"
+            names = f"`{p.name.upper()}`" if argument else " ".join(f"`{o}`" for o in (*p.opts, *p.secondary_opts))
+            default = "" if p.default is None or callable(p.default) else f"`{p.default}`"
+            meaning = (getattr(p, "help", None) or "").replace("|", "\\|")
+            lines.append(f"| {names} | {default} | {meaning} |")
+        lines.append("")
+    return "\n".join(lines) + "\n"
+
+
+def section(title: str) -> str:
+    """Return a section of the README as a page of its own."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    found = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+    assert found, f"README has no section {title}"
+    body = re.sub(r"\]\(docs/", "](../", found[1])
+    body = re.sub(r"\]\(#what-agents-learn\)", "](figures.md#what-agents-learn)", body)
+    body = re.sub(r"^### ", "## ", body, flags=re.MULTILINE)
+    return f"# {title}\n{body}"
+
+
+def api() -> str:
+    """Return the reference of the modules that people call."""
+    lines = ["API reference", "=============", ""]
+    for name in MODULES:
+        full = f"idm_env.{name}"
+        lines += [full, "-" * len(full), "", f".. automodule:: {full}", "   :members:", ""]
+    return "\n".join(lines)
+
+
+def examples() -> None:
+    """Copy the examples for the gallery, each with its first sentence as a title."""
+    out = ROOT / "build" / "examples"
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    (out / "README.rst").write_text("Examples\n========\n\nEach runs by itself: ``python examples/NAME.py``.\n")
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        found = re.match(r'"""(.*?)"""\n', text, re.DOTALL)
+        assert found, path
+        title = path.stem.replace("_", " ").capitalize()
+        words = " ".join(found[1].split())
+        head = f'"""\n{title}\n{"=" * len(title)}\n\n{words}\n"""\n'
+        (out / path.name).write_text(head + text[found.end() :], encoding="utf-8")
+
+
+def reports(pictures: Path) -> None:
+    """Run the commands on small generated data, unless there are pictures of them, and keep their reports' pictures."""
+    import base64
+    import tempfile
+
+    from idm_env.data import synthetic
+    from idm_env.fitting.job import fit_file, simulate_file
+    from idm_env.fitting.options import Options, Source
+    from idm_env.trajectories.files import filter_file, reconstruct_file
+
+    if all((pictures / f"{name}-0.png").exists() for name in ("fit", "simulate", "filter", "reconstruct")):
+        return
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        made, _ = synthetic.generate(3, runs=4, followers=2, seconds=60.0, noise=0.15)
+        table = made.table.drop("gap_m", "gap_measured", "speed_mps")
+        table.write_csv(folder / "my.csv")
+        table.gather_every(10).write_csv(folder / "sparse.csv")
+        source = Source(folder / "my.csv", smooth=True)
+        fit_file(source, Options(starts=1, substeps=1), folder / "fit")
+        simulate_file(source, folder / "fit" / "model.yaml", folder / "simulate")
+        filter_file(folder / "my.csv", folder / "filter", baselines=False)
+        reconstruct_file(folder / "sparse.csv", folder / "reconstruct", baselines=False)
+        for name in ("fit", "simulate", "filter", "reconstruct"):
+            page = (folder / name / "report.html").read_text(encoding="utf-8")
+            images = re.findall(r"data:image/png;base64,([^\"]+)", page)
+            image = images[0] if name in ("fit", "simulate") else images[-1]
+            (pictures / f"{name}-0.png").write_bytes(base64.b64decode(image))

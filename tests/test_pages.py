@@ -1,0 +1,118 @@
+"""Pages as a reader sees them: reports, and the site where ``make docs`` has built it, in headless Chromium."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import polars as pl
+import pytest
+
+from idm_env import diagrams, report
+from idm_env.data import synthetic
+from idm_env.fitting.job import fit_file, simulate_file
+from idm_env.fitting.options import Options, Source
+from idm_env.trajectories.files import filter_file, reconstruct_file
+
+ROOT = Path(__file__).resolve().parents[1]
+SITE = ROOT / "build" / "site"
+FIVE = ("index", "jobs/explain", "generated/effects", "generated/environments", "architecture")
+
+
+def loaded() -> ModuleType:
+    """Return docs/check.py, which is no part of the package."""
+    spec = importlib.util.spec_from_file_location("idm_env_docs_check", ROOT / "docs" / "check.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+check = loaded()
+
+
+@pytest.fixture(scope="module")
+def chromium() -> None:
+    """Skip, loudly, where there is no browser."""
+    if check.browser() is None:
+        warnings.warn("no Chromium here (apt-get install chromium): pages are not looked at", stacklevel=1)
+        pytest.skip("no Chromium")
+
+
+@pytest.fixture(scope="module")
+def site() -> Path:
+    """Skip, loudly, where the site was not built."""
+    if not (SITE / "index.html").exists():
+        warnings.warn("no site in build/site (make docs): its pages are not looked at", stacklevel=1)
+        pytest.skip("no site")
+    return SITE
+
+
+def test_the_browser_sees_what_is_wrong(chromium: None, tmp_path: Path) -> None:
+    """An error in the console, a request, a page too wide for a telephone; and no fault in a page that has none."""
+    (tmp_path / "well.html").write_text("<!doctype html><body><p>well</p></body>")
+    (tmp_path / "ill.html").write_text(
+        '<!doctype html><body><p>x</p><div style="width:800px">wide</div><script>nowhere()</script>'
+        '<img src="https://example.com/x.png"></body>'
+    )
+    told = check.wrong([tmp_path / "well.html", tmp_path / "ill.html"])
+    assert len(told) == 3 and not any("well.html" in line for line in told)
+    for words in (
+        "nowhere is not defined",
+        "asks the network for https://example.com",
+        "808 px wide in a window of 400",
+    ):
+        assert any(words in line for line in told)
+
+
+def test_reports_are_well(chromium: None, tmp_path: Path) -> None:
+    """Those of fit, simulate, filter, reconstruct, of several sets, and the page of a plot, made by the commands."""
+    made, _ = synthetic.generate(3, runs=2, followers=2, seconds=20.0)
+    data = tmp_path / "a-file-with-a-name-that-is-too-long-to-be-broken-anywhere.csv"
+    made.table.drop("gap_m", "gap_measured").write_csv(data)
+    fit_file(Source(data), Options(starts=1, substeps=1), tmp_path / "fit")
+    simulate_file(Source(data), tmp_path / "fit" / "model.yaml", tmp_path / "simulate")
+    filter_file(data, tmp_path / "filter", baselines=False)
+    pl.read_csv(data).gather_every(10).write_csv(tmp_path / "sparse.csv")
+    reconstruct_file(tmp_path / "sparse.csv", tmp_path / "reconstruct", baselines=False)
+    pages = [tmp_path / name / "report.html" for name in ("fit", "simulate", "filter", "reconstruct")]
+    panels, _ = diagrams.panels(made), np.zeros(1)
+    diagrams.write_html(tmp_path / "diagram.html", panels, "diagram")
+    rows = [{f"column {i} of a table that is wide": f"{i}" * 12 for i in range(14)} for _ in range(3)]
+    report.write_page(tmp_path / "wide.html", "wide", [report.lead("x"), report.table(rows)])
+    assert check.wrong([*pages, tmp_path / "diagram.html", tmp_path / "wide.html"]) == []
+
+
+def test_links_of_the_site_lead_somewhere(site: Path) -> None:
+    """And to the place that they name."""
+    assert check.dead(site) == []
+
+
+def test_five_pages_of_the_site_are_well(site: Path, chromium: None) -> None:
+    """No error, no request, no sideways scroll."""
+    assert check.wrong([site / f"{name}.html" for name in FIVE]) == []
+
+
+def test_a_dead_link_is_seen(tmp_path: Path) -> None:
+    """A page that is not there, and a place on a page that is."""
+    (tmp_path / "a.html").write_text(
+        '<a href="b.html">b</a><a href="#there">c</a><p id="here"></p><a href="a.html#here">'
+    )
+    assert [line.split("leads to ")[1].split(",")[0] for line in check.dead(tmp_path)] == ["b.html", "#there"]
+
+
+def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
+    """What the observation of ring means, how to use one's own csv, what an effect's equation is."""
+    first = check._Links()
+    first.feed((site / "index.html").read_text(encoding="utf-8"))
+    for page, words in (
+        ("generated/environments.html", "relative_speed"),
+        ("jobs/files.html", "position_m"),
+        ("generated/effects.html", "speed-dependent gap"),
+    ):
+        assert page in first.links and words in (site / page).read_text(encoding="utf-8")
