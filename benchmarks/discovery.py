@@ -250,7 +250,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         named = [bool(r["found"]) and right(r) for r in groups[strength, ou]]
         lines.append(f"{text} | {share(named)} ({share([right(r) for r in groups[strength, ou]])} with faint ones)")
     for ou in (0.0, 0.1, 0.2):
-        none = [bool(r["found"]) for r in rows if r["kind"] == "none" and r["ou"] == ou]
+        none = [bool(r["found"]) or r["verdict"] == "located" for r in rows if r["kind"] == "none" and r["ou"] == ou]
         lines.append(f"something found where nothing is, OU {ou:g} | {share(none)}")
     few = [bool(r["found"]) or r["verdict"] == "located" for r in rows if r["kind"] == "few"]
     lines.append(f"something found where nothing is, 4 to 9 runs, OU 0 to 0.2 | {share(few)}")
