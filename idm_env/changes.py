@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from idm_env.roads.lanes import Linked, Side
+from idm_env.roads.beside import Side, Sideways, preferred
+from idm_env.roads.linked import Linked
 from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
         sides = view.side(order, 1, state), view.side(order, -1, state)
         scene = beside(stepping, view, sides, state, inputs, params)
         wish = wished(stepping, scene, params)
-        claim = view.chosen(sides, wish, due if due.dim() == 0 else due.unsqueeze(-1))
+        prefers = preferred(*sides, wish, stepping.road.handed == "left")  # type: ignore[attr-defined]
+        claim = view.chosen(sides, prefers, due if due.dim() == 0 else due.unsqueeze(-1))
     return view.changed(state, claim)
 
 
@@ -68,12 +70,12 @@ def wished(stepping: Stepping, scene: Scene, params: Params) -> Wish:
 
 
 def beside(
-    stepping: Stepping, view: Linked, sides: tuple[Side, Side], state: State, inputs: Inputs, params: Params
+    stepping: Stepping, view: Sideways, sides: tuple[Side, Side], state: State, inputs: Inputs, params: Params
 ) -> Scene:
     """Return the scene with the driver's own lane, and those on his left and right."""
     scene = stepping.scene(state, inputs)._replace(history=_Now())
     second = view.second_leader(scene.leader, state.length, scene.speed)
-    third = view.follow(state, scene.leader, view.ahead(view.links_now.leader), second.gap, second.present)[1]
+    third = view.follow(state, scene.leader, view.beyond(), second.gap, second.present)[1]
     now = stepping.wanted(scene, params)[0]
     skipped = scene._replace(leader=second, second_leader=scene.second_leader and third)
     without = stepping.wanted(skipped, params)[0]
@@ -85,26 +87,26 @@ def beside(
         wanted=now,
         with_me=view.back(now) * follower.present,
         without_me=view.back(without) * follower.present,
-        ends=view.goes_on(view.links_now.lane),
+        ends=view.goes_on(),
     )
     left, right = (_one_side(stepping, view, side, state, scene, now, params) for side in sides)
     return scene._replace(here=here, left=left, right=right)
 
 
 def _one_side(
-    stepping: Stepping, view: Linked, side: Side, state: State, scene: Scene, now: Tensor, params: Params
+    stepping: Stepping, view: Sideways, side: Side, state: State, scene: Scene, now: Tensor, params: Params
 ) -> Beside:
     """Return a lane beside: the driver behind its leader, and its follower behind the driver, in each driver's slot."""
     there = side.led.to(scene.speed.dtype)
     leader, second = view.follow(state, scene.leader, side.leader, side.gap, there)
     # What is nearer: the leader there or the end of that lane; behind an end there is nobody.
-    nearest = view.before_end(leader, side.lane)
+    nearest = view.before_end(leader, side.ends)
     second = second._replace(present=second.present * (nearest.gap == leader.gap).to(there.dtype))
     n = side.follower
     behind = Neighbour(
         side.back_gap,
-        scene.speed.gather(-1, n),
-        scene.accel.gather(-1, n),
+        view.at(scene.speed, n),
+        view.at(scene.accel, n),
         side.followed.to(scene.speed.dtype),
     )
     own = scene._replace(leader=nearest, second_leader=scene.second_leader and second, behind=scene.behind and behind)
@@ -116,30 +118,27 @@ def _one_side(
         nearest.accel,
         nearest.present,
     )
-    width = scene.speed.shape
-    follower = _of(scene, n, width)._replace(leader=me, second_leader=scene.second_leader and mine)
-    with_me = stepping.wanted(follower, _of(dict(params), n, width))[0]
+    follower = _of(view, scene, n)._replace(leader=me, second_leader=scene.second_leader and mine)
+    with_me = stepping.wanted(follower, _of(view, dict(params), n))[0]
     return Beside(
         exists=side.exists.to(scene.speed.dtype),
         leader=nearest,
         follower=behind,
         wanted=wanted,
         with_me=with_me * behind.present,
-        without_me=now.gather(-1, n) * behind.present,
-        ends=view.goes_on(side.lane),
+        without_me=view.at(now, n) * behind.present,
+        ends=side.ends,
     )
 
 
-def _of(tree: Any, slots: Tensor, shape: torch.Size) -> Any:
-    """Return, in every slot, what belongs to another slot; what is the same for all vehicles stays."""
-    if isinstance(tree, Tensor):
-        if tree.dim() == 0 or tree.shape[-1] != shape[-1] or shape[-1] == 1 or tree.dim() > len(shape):
-            return tree
-        return tree.expand(shape).gather(-1, slots)
+def _of(view: Sideways, tree: Any, slots: Any) -> Any:
+    """Return, in every slot, what belongs to another slot."""
+    if hasattr(tree, "dim"):
+        return view.at(tree, slots)
     if isinstance(tree, Mapping):
-        return {name: _of(x, slots, shape) for name, x in tree.items()}
+        return {name: _of(view, x, slots) for name, x in tree.items()}
     if isinstance(tree, tuple) and hasattr(tree, "_fields"):
-        return type(tree)(*(_of(x, slots, shape) for x in tree))  # type: ignore[call-arg]
+        return type(tree)(*(_of(view, x, slots) for x in tree))  # type: ignore[call-arg]
     return tree
 
 

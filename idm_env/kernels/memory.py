@@ -90,6 +90,25 @@ def add(typing_context: Any, target: Any, to: Any, source: Any, at: Any, n: Any)
 
 
 @intrinsic
+def gather(
+    typing_context: Any, target: Any, to: Any, source: Any, at: Any, index: Any, first: Any, n: Any
+) -> Any:  # fmt: skip
+    """Copy ``n`` numbers from a place to another: those at ``at`` and the places from ``index[first]`` on."""
+    kind = _number(target, source)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        into = _pointer(context, builder, target, arguments[0], arguments[1], kind)
+        base = _pointer(context, builder, source, arguments[2], arguments[3], kind)
+        which = _pointer(context, builder, index, arguments[4], arguments[5], index.dtype)
+        with cgutils.for_range(builder, arguments[6]) as loop:
+            found = builder.gep(base, [builder.load(builder.gep(which, [loop.index]))])
+            builder.store(builder.load(found), builder.gep(into, [loop.index]))
+        return context.get_dummy_value()
+
+    return types.void(target, types.int64, source, types.int64, index, types.int64, types.int64), generate
+
+
+@intrinsic
 def fill(typing_context: Any, target: Any, to: Any, value: Any, n: Any) -> Any:
     """Fill ``n`` numbers of an array from index ``to`` on."""
 
@@ -141,4 +160,4 @@ def prefetch(typing_context: Any, source: Any, at: Any, n: Any, like: Any) -> An
     return types.void(types.int64, types.int64, types.int64, like), generate
 
 
-__all__ = ["LINE", "add", "addresses", "copy", "copy_truth", "fill", "number", "prefetch"]
+__all__ = ["LINE", "add", "addresses", "copy", "copy_truth", "fill", "gather", "number", "prefetch"]

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from idm_env.changes import decided
 from idm_env.history import PAST
 from idm_env.kernels import lanes, tiles
+from idm_env.kernels.deciding import Traffic, decision
 from idm_env.kernels.printed import TileKernel, tile_kernel
 from idm_env.roads import Lanes
-from idm_env.roads.chains import Chains, Places, laid_out
+from idm_env.roads.chains import Chains, Places
 from idm_env.scalar.record import Form
 from idm_env.types import Inputs, Params, State
 
@@ -53,14 +53,19 @@ def rollout(
     own = {name: params[name] for name in inner.by_name}
     every = simulator.decides_after if simulator.changes else max(steps, 1)
     block = lanes.BLOCK if road.ring is not None else every
+    wishes = decision(simulator, Form.of(state._replace(links=None), inputs)) if simulator.changes else ""
+    traffic = Traffic(simulator, state)
     kept: list[tuple[Tensor, ...]] = []
     done, clock = 0, int(state.step.reshape(-1)[0])
     while done < steps:
         if simulator.changes and (clock + done) % every == 0:
-            state = decided(simulator, state, _cut(inputs, done, None), params)
+            after = traffic.decide(wishes, state, _cut(inputs, done, None), params)
+            if after is None:
+                return None
+            state = after
         until = every - (clock + done) % every if simulator.changes else steps - done
         count = min(until, block, steps - done)
-        places = laid_out(road, state, tiles.halo(count, kernel.program.reach))
+        places = traffic.places(state, tiles.halo(count, kernel.program.reach))
         if places is None:
             return None
         given = {n: _placed(_cut(x, done, count), places, state) for n, x in inputs.items() if n in inner.by_name}
@@ -71,6 +76,7 @@ def rollout(
         if some is not None:
             kept.append(tuple(x.gather(-1, places.own.expand(count, *places.own.shape)) for x in some))
         done += count
+    state = state._replace(links=traffic.links)
     return state, tuple(torch.cat(column) for column in zip(*kept, strict=True)) if keep else None
 
 

@@ -7,45 +7,16 @@ where somebody changes, comes or goes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from idm_env.roads.base import Road
-from idm_env.roads.ends import Ending, nearer
-from idm_env.roads.order import Order, laps
-from idm_env.types import FAR, Links, Neighbour, State, Wish
-
-
-class Side(NamedTuple):
-    """The lane on one side of every vehicle: which, whether it may be entered, and who is there.
-
-    ``gap`` (m) would be the vehicle's own, ``back_gap`` the follower's; both are ``FAR`` where nobody is.
-    """
-
-    lane: Tensor
-    exists: Tensor
-    leader: Tensor
-    follower: Tensor
-    led: Tensor
-    followed: Tensor
-    gap: Tensor
-    back_gap: Tensor
-
-
-class Claim(NamedTuple):
-    """What becomes of every vehicle's wish: the lane it is granted (or its own), and bool tensors of why not.
-
-    ``follower`` is the slot of whom the change was judged by, ``judged`` whether there is one.
-    """
-
-    lane: Tensor
-    granted: Tensor
-    refused: Tensor
-    blocked: Tensor
-    follower: Tensor
-    judged: Tensor
+from idm_env.roads.beside import within
+from idm_env.roads.linked import Linked
+from idm_env.roads.order import Order
+from idm_env.types import Links, State
 
 
 ENDLESS = 1e9
@@ -133,28 +104,28 @@ class Lanes(Road):
 
     # -- tables over lanes ---------------------------------------------------------------------------------------
 
-    def _table(self, lane: Tensor, like: Tensor, name: str, none: float) -> Tensor:
-        """Return, for each vehicle, a number of its lane: ``none`` for lanes without an end of their own."""
-        values = [none] * self.count
+    def table(self, name: Literal["opens", "closes", "stops", "leaves"]) -> tuple[float, ...]:
+        """Return a place of every lane (m): where it may be entered sideways, is stopped at, or leaves the road."""
+        far = -ENDLESS if name == "opens" else ENDLESS
+        values = [self.length or ENDLESS if name == "leaves" else far] * self.count
         for end in self.ends:
-            values[end.lane] = getattr(end, name)
-        return torch.tensor(values, dtype=like.dtype, device=like.device)[lane]
+            if name == "opens" or name == "closes":
+                values[end.lane] = getattr(end, name)
+            elif end.closed == (name == "stops"):
+                values[end.lane] = end.end
+        return tuple(values)
+
+    def at_lane(self, lane: Tensor, like: Tensor, name: Literal["opens", "closes", "stops", "leaves"]) -> Tensor:
+        """Return, for each vehicle, a number of its lane."""
+        return torch.tensor(self.table(name), dtype=like.dtype, device=like.device)[lane]
 
     def closed_at(self, lane: Tensor, like: Tensor) -> Tensor:
         """Return where a virtual leader stands on each vehicle's lane (m), ``ENDLESS`` where none does."""
-        values = [ENDLESS] * self.count
-        for end in self.ends:
-            if end.closed:
-                values[end.lane] = end.end
-        return torch.tensor(values, dtype=like.dtype, device=like.device)[lane]
+        return self.at_lane(lane, like, "stops")
 
     def left_at(self, lane: Tensor, like: Tensor) -> Tensor:
         """Return where vehicles leave the road (m)."""
-        values = [ENDLESS if self.length is None else self.length] * self.count
-        for end in self.ends:
-            if not end.closed:
-                values[end.lane] = end.end
-        return torch.tensor(values, dtype=like.dtype, device=like.device)[lane]
+        return self.at_lane(lane, like, "leaves")
 
     @property
     def closed(self) -> bool:
@@ -172,8 +143,8 @@ class Lanes(Road):
         if not self.ends:
             return there
         for each in (lane, to.clamp(0, self.count - 1)):
-            there = there & (position - length >= self._table(each, position, "opens", -ENDLESS))
-            there = there & (position <= self._table(each, position, "closes", ENDLESS))
+            opens, closes = (self.at_lane(each, position, name) for name in ("opens", "closes"))
+            there = there & within(position, length, opens, closes)
         return there
 
     # -- links ---------------------------------------------------------------------------------------------------
@@ -227,207 +198,3 @@ class Lanes(Road):
     def gaps(self, position: Tensor, length: Tensor, circumference: Tensor | float | None = None) -> Tensor:
         """Raise TypeError."""
         return self.ahead(position)
-
-
-class _Look(torch.autograd.Function):
-    """``x[to]`` where ``to`` and ``fro`` are inverse: the adjoint is a gather, too, always in the same order."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(x: Tensor, to: Tensor, fro: Tensor) -> Tensor:
-        return x.gather(-1, to)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _, to, fro = inputs
-        ctx.save_for_backward(to, fro)
-        ctx.save_for_forward(to, fro)
-
-    @staticmethod
-    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
-        to, fro = ctx.saved_tensors
-        own = torch.arange(to.shape[-1], device=to.device)
-        zero = torch.zeros_like(g)
-        # What nobody but oneself has read comes back by `to`; whom nobody follows has himself as follower.
-        return torch.where(to == own, g, zero) + torch.where(fro == own, zero, g.gather(-1, fro)), None, None
-
-    @staticmethod
-    def jvp(ctx: Any, g: Tensor, *_: Any) -> Tensor:
-        to, _fro = ctx.saved_tensors
-        return g.gather(-1, to)
-
-
-@dataclass(frozen=True, eq=False)
-class Linked(Ending):
-    """Lanes as they are in one state: neighbours by its links, ends of lanes merged into the leader."""
-
-    road: Lanes
-    links_now: Links
-    position: Tensor
-
-    def _look(self, x: Tensor, to: Tensor, fro: Tensor) -> Tensor:
-        if x.shape != to.shape:
-            shape = torch.broadcast_shapes(x.shape, to.shape)
-            x, to, fro = x.expand(shape), to.expand(shape), fro.expand(shape)
-        return _Look.apply(x, to, fro) if x.requires_grad else x.gather(-1, to)
-
-    def ahead(self, x: Tensor) -> Tensor:
-        """Return the leader's x; one's own without a leader."""
-        return self._look(x, self.links_now.leader, self.links_now.follower)
-
-    def back(self, x: Tensor) -> Tensor:
-        """Return the follower's x; one's own without a follower."""
-        return self._look(x, self.links_now.follower, self.links_now.leader)
-
-    def _there(self, slot: Tensor, x: Tensor) -> Tensor:
-        if self.road.ring is not None:
-            return torch.ones_like(slot, dtype=x.dtype)
-        return (slot != torch.arange(slot.shape[-1], device=slot.device)).to(x.dtype)
-
-    def led(self, x: Tensor) -> Tensor:
-        """Return 1 for every vehicle with a leader: on a ring for all, be it oneself."""
-        return self._there(self.links_now.leader, x)
-
-    def leads(self, x: Tensor) -> Tensor:
-        """Return 1 for every vehicle with a follower: on a ring for all, be it oneself."""
-        return self._there(self.links_now.follower, x)
-
-    def gaps(self, position: Tensor, length: Tensor, circumference: Tensor | float | None = None) -> Tensor:
-        """Return ``position[leader] − length[leader] − position`` (m), laps added on a ring; FAR without a leader.
-
-        ValueError for a circumference that is given here.
-        """
-        if circumference is not None:
-            raise ValueError(f"the circumference of lanes stands in Lanes(ring=…), and {circumference} was given.")
-        gap = self.ahead(position) - self.ahead(length) - position
-        if self.road.ring is None:
-            return torch.where(self.led(position) > 0, gap, FAR)
-        return gap + laps(position, self.links_now.leader, self.road.ring)
-
-    def room(self) -> Tensor | None:
-        """Return how far each vehicle's lane goes on (m), None where no lane ends."""
-        return self.goes_on(self.links_now.lane) if self.road.closed else None
-
-    def before_end(self, leader: Neighbour, lane: Tensor) -> Neighbour:
-        """Return whichever is nearer to each vehicle: its leader on a lane, or a standing one at the end of it."""
-        return nearer(leader, self.goes_on(lane) if self.road.closed else None)
-
-    def remaining(self, present: Tensor | None, position: Tensor) -> Tensor | None:
-        """Return who is still on the road at these positions (m)."""
-        if present is None or not self.road.leaving:
-            return present
-        return present * (position < self.road.left_at(self.links_now.lane, position)).to(present.dtype)
-
-    # -- changes -------------------------------------------------------------------------------------------------
-
-    def goes_on(self, lane: Tensor) -> Tensor:
-        """Return how far each vehicle could go on on a lane (m)."""
-        return self.road.closed_at(lane, self.position) - self.position
-
-    def order(self, present: Tensor | None) -> Order:
-        """Return the vehicles in order."""
-        return Order.of(self.position, self.links_now.lane, present, self.road.count, self.road.ring)
-
-    def side(self, order: Order, step: int, state: State) -> Side:
-        """Return the lane ``step`` to the left of every vehicle."""
-        position, length, lane = self.position, state.length, self.links_now.lane
-        to = (lane + step).clamp(0, self.road.count - 1)
-        exists = self.road.open_between(lane, lane + step, position, length)
-        if state.present is not None:
-            exists = exists & (state.present > 0)
-        around = order.around(to, position)
-        ahead = position.gather(-1, around.leader) - length.gather(-1, around.leader) - position + around.to_leader
-        back = position - length - position.gather(-1, around.follower) + around.to_follower
-        return Side(
-            to, exists, around.leader, around.follower, around.led, around.followed,
-            torch.where(around.led, ahead, FAR), torch.where(around.followed, back, FAR),
-        )  # fmt: skip
-
-    def follow(
-        self, state: State, leaders: Neighbour, slot: Tensor, gap: Tensor, there: Tensor
-    ) -> tuple[Neighbour, Neighbour]:
-        """Return the vehicle in a slot as a leader at a gap (m), and its own leader as the second one.
-
-        ``leaders`` is everybody's leader; ``there`` is 0 where the slot is nobody's.
-        """
-        speed = state.speed
-        present = there.to(speed.dtype)
-        some = present > 0
-        leader = Neighbour(
-            torch.where(some, gap, FAR),
-            torch.where(some, speed.gather(-1, slot), speed),
-            torch.where(some, state.accel.gather(-1, slot), 0.0),
-            present,
-        )
-        its = Neighbour(*(x.expand_as(speed).gather(-1, slot) for x in leaders))
-        both = (its.present * present) > 0
-        second = Neighbour(
-            torch.where(both, gap + state.length.gather(-1, slot) + its.gap, FAR),
-            torch.where(both, its.speed, speed),
-            torch.where(both, its.accel, 0.0),
-            its.present * present,
-        )
-        return leader, second
-
-    def chosen(self, sides: tuple[Side, Side], wish: Wish, due: Tensor) -> Claim:
-        """Return what becomes of every wish: the better side that is there, safe and free; per gap the best claim.
-
-        A gap of a lane is known by the vehicle at its front. Of claims of equal utility the one towards the road's
-        hand is granted, then the one of the first slot. What overlaps would be no room, whatever a margin says.
-        """
-        left, right = sides
-        hand = self.road.handed == "left"
-        may = [
-            side.exists & (margin >= 0) & (side.gap > 0) & (side.back_gap > 0)
-            for side, margin in ((left, wish.left_margin), (right, wish.right_margin))
-        ]
-        never = torch.full_like(wish.left, -torch.inf)
-        utility = [torch.where(ok, u, never) for ok, u in zip(may, (wish.left, wish.right), strict=True)]
-        to_left = utility[0] >= utility[1] if hand else utility[0] > utility[1]
-        best = torch.where(to_left, utility[0], utility[1])
-        wants = (best > 0) & due
-        blocked = due & ~wants & (torch.maximum(wish.left, wish.right) > 0)
-        to = torch.where(to_left, left.lane, right.lane)
-        led = torch.where(to_left, left.led, right.led)
-        count = best.shape[-1]
-        gap = torch.where(led, torch.where(to_left, left.leader, right.leader), count + to)
-        room = (*best.shape[:-1], count + self.road.count)
-        granted = wants & (best == _most(room, gap, torch.where(wants, best, never), "amax"))
-        hands = granted & (to_left == hand)
-        granted = granted & (hands | ~_most(room, gap, hands.to(best.dtype), "amax").bool())
-        own = torch.arange(count, device=best.device).expand_as(gap)
-        granted = granted & (own == _most(room, gap, torch.where(granted, own, count), "amin"))
-        follower = torch.where(to_left, left.follower, right.follower)
-        judged = torch.where(to_left, left.followed, right.followed)
-        return Claim(
-            torch.where(granted, to, self.links_now.lane), granted, wants & ~granted, blocked, follower, judged
-        )
-
-    def changed(self, state: State, claim: Claim) -> State:
-        """Return the state after the granted changes: new links, and gaps measured where somebody has a new leader."""
-        links = self.links_now
-        links = links._replace(
-            changed=links.changed + claim.granted,
-            refused=links.refused + claim.refused,
-            blocked=links.blocked + claim.blocked,
-        )
-        if not bool(claim.granted.any()):
-            return state._replace(links=links)
-        order = Order.of(self.position, claim.lane, state.present, self.road.count, self.road.ring)
-        leader, follower = order.links()
-        other = claim.granted & claim.judged & (follower != claim.follower)
-        links = links._replace(lane=claim.lane, leader=leader, follower=follower, unjudged=links.unjudged + other)
-        fresh = Linked(self.road, links, self.position).gaps(self.position, state.length)
-        return state._replace(links=links, gap=torch.where(leader != self.links_now.leader, fresh, state.gap))
-
-
-def _most(room: tuple[int, ...], key: Tensor, value: Tensor, how: Literal["amax", "amin"]) -> Tensor:
-    """Return, for every vehicle, the largest or smallest value among those of its key."""
-    worst = torch.zeros((), dtype=value.dtype, device=value.device)
-    if how == "amin":
-        worst = worst + value.max()
-    elif value.is_floating_point():
-        worst = worst + value.min()
-    found = worst.expand(room).clone().scatter_reduce(-1, key, value, how)
-    return found.gather(-1, key)

@@ -169,11 +169,15 @@ class Graph:
 
     def shifted(self, node: Node, by: int) -> Node:
         """Return the same expression of the vehicle ``by`` places ahead (negative: behind)."""
+        return self.renamed(node, lambda slot: Slot(slot.name, slot.shift + by))
+
+    def renamed(self, node: Node, change: Callable[[Slot], Slot]) -> Node:
+        """Return the same expression with other slots read."""
         done: dict[Node, Node] = {}
         for each in ordered([node]):
             if each.op == "input":
                 assert isinstance(each.label, Slot)
-                done[each] = self.input(each.label.name, each.label.shift + by, each.level)
+                done[each] = self.input(*change(each.label), each.level)
             elif each.args:
                 done[each] = self.node(each.op, *(done[a] for a in each.args), label=each.label)
             else:

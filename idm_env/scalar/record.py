@@ -80,7 +80,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class _SeenRoad(Ending):
+class SeenRoad(Ending):
     """A road on which ``ahead`` of an expression is the same expression of the leader."""
 
     road: Road
@@ -114,7 +114,7 @@ class _SeenRoad(Ending):
         return type(self.road).gaps(self, position, length)  # type: ignore[arg-type]
 
 
-class _Parameters(Mapping[str, Mapping[str, Any]]):
+class Parameters(Mapping[str, Mapping[str, Any]]):
     """Every parameter by name; a look at an effect's parameters also notes that this effect is at work."""
 
     def __init__(self, simulator: Stepping, graph: Graph) -> None:
@@ -195,25 +195,13 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
     graph = Graph() if graph is None else graph
     recording = Recording(graph)
     recorder = _Recorder(
-        _SeenRoad(simulator.road, graph), simulator.effects, TimeStep(simulator.dt), simulator.integration, recording
+        SeenRoad(simulator.road, graph), simulator.effects, TimeStep(simulator.dt), simulator.integration, recording
     )
 
-    def read(name: str) -> Any:
-        return Scalar(graph, graph.input(name))
-
-    state = State(
-        position=read("position"),
-        speed=read("speed"),
-        accel=read("accel"),
-        gap=read("gap"),
-        length=read("length"),
-        step=read("step"),
-        present=read("present") if form.present else None,
-        memory={name: read(f"memory of {name}") for name in form.memories},
-    )
-    given = _Parameters(recorder, graph)
+    state = state_of(form, graph)
+    given = Parameters(recorder, graph)
     try:
-        after = recorder.step(state, _inputs(form, graph), given)  # type: ignore[arg-type]
+        after = recorder.step(state, inputs_of_form(form, graph), given)  # type: ignore[arg-type]
         scene, driver = recorder.scene(state, {}), recorder._following.driver(given[recorder._following.name])  # type: ignore[arg-type]
         for effect in simulator.effects:
             if effect.name in form.memories:
@@ -233,7 +221,26 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
     return recording
 
 
-def _inputs(form: Form, graph: Graph) -> dict[str, Any]:
+def state_of(form: Form, graph: Graph) -> State:
+    """Return a state of names."""
+
+    def read(name: str) -> Any:
+        return Scalar(graph, graph.input(name))
+
+    return State(
+        position=read("position"),
+        speed=read("speed"),
+        accel=read("accel"),
+        gap=read("gap"),
+        length=read("length"),
+        step=read("step"),
+        present=read("present") if form.present else None,
+        memory={name: read(f"memory of {name}") for name in form.memories},
+    )
+
+
+def inputs_of_form(form: Form, graph: Graph) -> dict[str, Any]:
+    """Return inputs of names."""
     made: dict[str, Any] = {}
     for effect, fields, truths in form.inputs:
         values: dict[str, Any] = {}
@@ -257,4 +264,14 @@ class _Given:
         return iter(self._values.values())
 
 
-__all__ = ["Form", "Recording", "Untraceable", "record", "slot_name"]
+__all__ = [
+    "Form",
+    "Parameters",
+    "Recording",
+    "SeenRoad",
+    "Untraceable",
+    "inputs_of_form",
+    "record",
+    "slot_name",
+    "state_of",
+]

@@ -254,6 +254,7 @@ FUNCTIONS: dict[str, Rule] = {
     "relu": _one("relu"),
     "softplus": _softplus,
     "lerp": _lerp,
+    "isfinite": lambda graph, a: graph.compare("eq", graph.sub(a, a), graph.constant(0.0)),
     "clamp": _clamp,
     "clip": _clamp,
     "clamp_min": _clamp_min,

@@ -1,0 +1,184 @@
+"""Lanes and their links in place during a rollout: laid out for compiled steps, and changed by compiled decisions."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env.changes import decided
+from idm_env.effects.base import Effect
+from idm_env.kernels import decision_loops, lanes, order_loops
+from idm_env.kernels.memory import addresses
+from idm_env.kernels.operands import operand
+from idm_env.kernels.printed import FUNCTIONS, HEADER
+from idm_env.kernels.tiles import ROW, Array
+from idm_env.roads import Lanes
+from idm_env.roads.chains import Places
+from idm_env.roads.linked import Linked
+from idm_env.scalar import library
+from idm_env.scalar.graph import Slot
+from idm_env.scalar.record import Form, Untraceable
+from idm_env.scalar.wishes import HERE, SEARCHED, SIDES, Wishes
+from idm_env.step import Integration, Stepping
+from idm_env.types import Inputs, Links, Params, State
+
+if TYPE_CHECKING:
+    from idm_env.simulator import Simulator
+
+
+class Decision:
+    """The compiled wishes of one simulator: what the rows of its phase are, and where it begins."""
+
+    def __init__(self, wishes: Wishes, title: str) -> None:
+        self.slots = wishes.slots
+        self._text, self._title = wishes.text(), title
+        self._constants = wishes.constants.values
+
+    @lru_cache(maxsize=2)  # noqa: B019  (as long as the process: decisions are cached, too)
+    def compiled(self, kind: str) -> tuple[int, Array]:
+        """Return the address of the phase in a precision, and its constants."""
+        text = HEADER.format(title=self._title, row=ROW, kind=kind) + self._text
+        module = library.load("wishes", text, (FUNCTIONS,))
+        return int(module.wish.address), np.array([float(x) for x in self._constants], kind)
+
+
+def decision(simulator: Stepping, form: Form) -> Decision | str:
+    """Return the compiled decision of a simulator, or why there is none (said once, as a warning)."""
+    try:
+        return _decision(simulator.road, simulator.effects, simulator.dt, simulator.integration, form)  # type: ignore[arg-type]
+    except TypeError as error:  # an effect with a choice that cannot be hashed
+        return f"an effect cannot be a key: {error}"
+
+
+@lru_cache(maxsize=256)
+def _decision(
+    road: Lanes, effects: tuple[Effect, ...], dt: float, integration: Integration, form: Form
+) -> Decision | str:
+    try:
+        wishes = Wishes(Stepping(road, effects, dt, integration), form)
+    except Untraceable as why:
+        warnings.warn(f"decisions about lanes are not compiled: {why}.", stacklevel=2)
+        return str(why)
+    return Decision(wishes, f"One decision about lanes of {', '.join(e.name for e in effects)}, {integration}.")
+
+
+class Traffic:
+    """The links of a state, in arrays of their own that decisions change."""
+
+    def __init__(self, simulator: Simulator, state: State) -> None:
+        assert isinstance(simulator.road, Lanes) and state.links is not None
+        self.simulator, self.road = simulator, simulator.road
+        self.shape = tuple(state.speed.shape)
+        self.n = self.shape[-1]
+        self.rows = state.speed.numel() // self.n
+        self._links = np.stack([x.expand(self.shape).reshape(-1).numpy() for x in state.links])
+
+    @property
+    def links(self) -> Links:
+        """The links as they are now, in memory that decisions change."""
+        return Links(*(torch.from_numpy(x).view(self.shape) for x in self._links))
+
+    @cached_property
+    def _ring(self) -> float:
+        return self.road.ring or 0.0
+
+    def _present(self, state: State) -> tuple[Array, bool]:
+        if state.present is None:
+            return np.empty(0, state.speed.detach().numpy().dtype), False
+        return lanes.dense(state.present, self.shape), True
+
+    def places(self, state: State, halo: int) -> Places | None:
+        """Return where vehicles lie in a row for as many steps as the halo is for; None where links are no order."""
+        around = halo if self.road.ring is not None else 0
+        wide = self.n + 2 * around * self.road.count
+        position = lanes.dense(state.position, self.shape)
+        slots, own = np.empty(self.rows * wide, np.int64), np.empty(self.rows * self.n, np.int64)
+        led, leads = (np.empty(self.rows * wide, position.dtype) for _ in range(2))
+        if not order_loops.laid(
+            self._links[1], self._links[2], self._links[0], position, *self._present(state), self.rows, self.n,
+            self.road.count, self._ring, around, wide, slots, own, led, leads,
+        ):  # fmt: skip
+            return None
+        at, (there, first, last) = (*self.shape[:-1], wide), (torch.from_numpy(x) for x in (slots, led, leads))
+        there = there.view(at)
+        ends = None
+        if self.road.closed:
+            lane = torch.from_numpy(self._links[0]).view(self.shape).gather(-1, there)
+            ends = self.road.closed_at(lane, state.position)
+        return Places(there, torch.from_numpy(own).view(self.shape), first.view(at), last.view(at), ends)
+
+    def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params) -> State | None:
+        """Return the state after a decision that is due, its links these; None where links are no order."""
+        if isinstance(found, str):
+            after = decided(self.simulator, state._replace(links=self.links), inputs, params)
+            assert after.links is not None
+            self._links = np.stack([x.reshape(-1).numpy() for x in after.links])
+            return after
+        kind = state.speed.detach().numpy().dtype
+        phase, constants = found.compiled(kind.name)
+        plan, places, held = self._plan(found, state, inputs, params)
+        fresh = np.zeros(self.rows * self.n, np.uint8)
+        tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], kind)
+        done = decision_loops.decide(
+            self._links, lanes.dense(state.position, self.shape), *self._present(state), self.rows, self.n,
+            self.road.count, self._ring, self.road.handed == "left", tables, plan, places, phase, constants,
+            len(found.slots), fresh,
+        )  # fmt: skip
+        del held
+        if not done:
+            return None
+        which = torch.from_numpy(np.flatnonzero(fresh))
+        links = self.links
+        if len(which):
+            gap = Linked(self.road, links, state.position).gaps_of(which, state.position, state.length)
+            full = state.gap.expand(self.shape).reshape(-1)
+            state = state._replace(gap=full.index_put((which,), gap).view(self.shape))
+        return state._replace(links=links)
+
+    def _plan(self, found: Decision, state: State, inputs: Inputs, params: Params) -> tuple[Array, Array, list[Array]]:
+        """Return what rows are filled with, whose numbers these are, and the arrays that the plan points to."""
+        rows, held = [], []
+        places: dict[tuple[int, int], int] = {}
+        for slot in found.slots:
+            side, name = _side(slot)
+            if name in KINDS:
+                rows.append((KINDS[name], side, 0, 0, 0, 0))
+                continue
+            array, (_, by_row, by_vehicle) = operand(
+                self._array(name, state, inputs, params).to(state.speed.dtype), self.shape[:-1], self.n
+            )
+            held.append(array)
+            place = places.setdefault((side, slot.shift), len(places)) if by_vehicle else 0
+            rows.append((decision_loops.ARRAY, side, place, int(addresses([array])[0]), by_row, by_vehicle))
+        return np.array(rows, np.int64), np.array(list(places), np.int64).reshape(-1, 2), held
+
+    def _array(self, name: str, state: State, inputs: Inputs, params: Params) -> Tensor:
+        if name in ("led", "leads"):
+            if self.road.ring is not None:
+                return torch.ones((), dtype=state.speed.dtype)
+            own = np.arange(self.n)
+            other = self._links[1 if name == "led" else 2].reshape(-1, self.n) != own
+            return torch.from_numpy(other).view(self.shape)
+        if name.endswith(" now"):
+            return lanes.part_of(inputs, name)
+        if "." in name or name in ("length", "present"):
+            return lanes.static_of(self.simulator, state, params, name)
+        return lanes.starts(state, (name,))[0]
+
+
+KINDS = {
+    **{name: i + 1 for i, name in enumerate(SEARCHED)},
+    HERE[0]: decision_loops.OPENS, HERE[1]: decision_loops.CLOSES, HERE[2]: decision_loops.STOPS,
+}  # fmt: skip
+"""Rows that are searched for instead of read from an array."""
+
+
+def _side(slot: Slot) -> tuple[int, str]:
+    """Return the side of a slot, 0 for the own lane, and its name there."""
+    first, _, rest = slot.name.partition(" ")
+    return (SIDES.index(first) + 1, rest) if first in SIDES else (0, slot.name)

@@ -1,0 +1,282 @@
+"""Compiled decisions about lanes: who is beside whom, what everybody wishes, who is granted it, and the new links.
+
+No equation stands here: what drivers wish is one printed phase (``scalar.wishes``), called through its address for some
+hundred vehicles at a time. Lanes are walked front first: who is beside is found by going down two lanes at once.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+from __future__ import annotations
+
+import numpy as np
+
+from idm_env.kernels.memory import fill, gather, number
+from idm_env.kernels.order_loops import walk
+from idm_env.kernels.phases import call
+from idm_env.kernels.tiles import ROW, exact, padded, workspace
+
+CHUNK = 256
+"""Vehicles for which the printed phase is called at once: its rows stay in the second-level cache."""
+
+ARRAY, LANE, AHEAD, BEHIND, LAPS_AHEAD, LAPS_BEHIND, OPENS, CLOSES, STOPS = range(9)
+"""What a row of the phase is filled with: an array's numbers, or what ``search`` finds."""
+
+KIND, SIDE, PLACE, ADDRESS, BY_ROW, BY_VEHICLE = range(6)
+"""Columns of the plan of rows. Sides are 0 for the own lane, 1 left and 2 right; places are (side, vehicles up)."""
+
+
+@exact
+def beside(place, begin, count, step, behind):
+    """Find, for every rank, the rank of whoever would be behind on the lane ``step`` to the left; its end for nobody.
+
+    Who is exactly beside counts as behind.
+    """
+    for k in range(count):
+        to = k + step
+        if not 0 <= to < count:
+            continue
+        q, end = begin[to], begin[to + 1]
+        for r in range(begin[k], begin[k + 1]):
+            while q < end and place[q] > place[r]:
+                q += 1
+            behind[r] = q
+
+
+@exact
+def round_ring(q, first, last):
+    """Return a rank of the lane from ``first`` to ``last``, on which somebody is, round a ring."""
+    while q < first:
+        q += last - first
+    while q >= last:
+        q -= last - first
+    return q
+
+
+@exact
+def whose(which, places, c, at, m, step, to, behind, begin, order, ring, base):
+    """Fill ``which`` with the slots of the ``c``-th place, as seen from ranks ``at`` to ``at + m``: own for nobody."""
+    first, last, up = begin[to], begin[to + 1], places[c, 1]
+    for j in range(m):
+        q = (at + j if step == 0 else behind[at + j]) - up
+        if ring > 0 and last > first:
+            q = round_ring(q, first, last)
+        there = first <= q < last
+        which[c * CHUNK + j] = base + order[q if there else at + j]
+
+
+@exact
+def laps(way, plain, ring):
+    """Return whole laps (m) by which ``plain`` falls short of the way that is known."""
+    return ring * np.rint((way - plain) / ring)
+
+
+@exact
+def find(w, target, kind, at, m, exists, to, behind, begin, place, order, position, base, ring, tables):
+    """Fill one row with what a search says of lane ``to``, as seen from ranks ``at`` to ``at + m``."""
+    first, last = begin[to], begin[to + 1]
+    around = ring > 0 and last > first
+    if kind == LANE:
+        fill(w, target, 1 if exists else 0, m)
+    elif kind >= OPENS:
+        fill(w, target, tables[kind - OPENS, to], m)
+    elif not exists:
+        fill(w, target, 0, m)
+    elif kind == AHEAD:
+        for j in range(m):
+            w[target + j] = around or behind[at + j] > first
+    elif kind == BEHIND:
+        for j in range(m):
+            w[target + j] = around or behind[at + j] < last
+    elif not around:
+        fill(w, target, 0, m)
+    else:
+        for j in range(m):
+            r, q = at + j, behind[at + j]
+            mine = np.float64(position[base + order[r]])
+            if kind == LAPS_AHEAD:
+                ahead = q - 1 if q > first else last - 1
+                way = place[ahead] - place[r] + (ring if q == first else 0.0)
+                w[target + j] = laps(way, np.float64(position[base + order[ahead]]) - mine, ring)
+            else:
+                after = q if q < last else first
+                way = place[r] - place[after] + (ring if q == last else 0.0)
+                w[target + j] = -laps(-way, np.float64(position[base + order[after]]) - mine, ring)
+
+
+@exact
+def fill_rows(
+    w, slots, plan, places, which, at, m, own_lane, begin, count, place, order, left, right, position, base, row, n,
+    ring, tables,
+):  # fmt: skip
+    """Fill the rows of the phase for ranks ``at`` to ``at + m``, all of one lane."""
+    for c in range(len(places)):
+        step = 0 if places[c, 0] == 0 else 1 if places[c, 0] == 1 else -1
+        to = own_lane + step
+        if 0 <= to < count:
+            whose(which, places, c, at, m, step, to, left if step > 0 else right, begin, order, ring, base)
+        else:
+            for j in range(m):
+                which[c * CHUNK + j] = base + order[at + j]
+    for i in range(slots):
+        kind, side = plan[i, KIND], plan[i, SIDE]
+        if kind != ARRAY:
+            step = 0 if side == 0 else 1 if side == 1 else -1
+            to = own_lane + step
+            exists = 0 <= to < count
+            find(
+                w, i * ROW, kind, at, m, exists, to if exists else own_lane, left if side == 1 else right, begin,
+                place, order, position, base, ring, tables,
+            )  # fmt: skip
+        elif plan[i, BY_VEHICLE] == 0:
+            fill(w, i * ROW, number(plan[i, ADDRESS], row * plan[i, BY_ROW], w), m)
+        else:
+            gather(w, i * ROW, plan[i, ADDRESS], row * plan[i, BY_ROW] - base, which, plan[i, PLACE] * CHUNK, m)
+
+
+@exact
+def key_of(r, to, behind, begin, ring):
+    """Return the number of the gap on lane ``to`` that rank r would enter: one more gap than vehicles on each lane."""
+    first, last = begin[to], begin[to + 1]
+    q = behind[r]
+    return to + (first if ring > 0 and q == last else q)
+
+
+@exact
+def better(utility, by_hand, slot, other, other_by_hand, other_slot):
+    """Whether a claim is to be granted rather than another one."""
+    if utility != other:
+        return utility > other
+    if by_hand != other_by_hand:
+        return by_hand
+    return slot < other_slot
+
+
+@exact
+def reordered(order, begin, place, count, ring, winner, granted, fresh_order, fresh_begin):
+    """Write the order after the granted changes."""
+    at = 0
+    for k in range(count):
+        fresh_begin[k] = at
+        first, last = begin[k], begin[k + 1]
+        late = np.int64(-1)
+        for q in range(first, last + 1):
+            r = winner[k + q]
+            if r >= 0:
+                if ring > 0 and q == first and last > first and place[r] <= place[first]:
+                    late = r  # the gap in front of the first is the one behind the last
+                else:
+                    fresh_order[at] = order[r]
+                    at += 1
+            if q < last and not granted[q]:
+                fresh_order[at] = order[q]
+                at += 1
+        if late >= 0:
+            fresh_order[at] = order[late]
+            at += 1
+    fresh_begin[count] = at
+
+
+@exact
+def relink(order, begin, count, ring, base, lane, leader, follower, fresh):
+    """Write links that follow an order; ``fresh`` marks who has another leader than before."""
+    for k in range(count):
+        first, last = begin[k], begin[k + 1]
+        for r in range(first, last):
+            i = order[r]
+            ahead = order[r - 1] if r > first else (order[last - 1] if ring > 0 else i)
+            after = order[r + 1] if r + 1 < last else (order[first] if ring > 0 else i)
+            if leader[base + i] != ahead:
+                leader[base + i] = ahead
+                fresh[base + i] = 1
+            follower[base + i], lane[base + i] = after, k
+
+
+@exact
+def settle(w, results, at, m, own_lane, left, right, begin, ring, left_hand, base, order, winner, utility, to_left,
+           refused, blocked):  # fmt: skip
+    """Grant the best claim on each gap so far, and count the others; return whether there was any."""
+    some = False
+    for j in range(m):
+        r = at + j
+        if w[results + 3 * ROW + j] > 0:
+            blocked[base + order[r]] += 1
+        if not w[results + 2 * ROW + j] > 0:
+            continue
+        some = True
+        utility[r], to_left[r] = w[results + j], w[results + ROW + j] > 0
+        to, behind = (own_lane + 1, left) if to_left[r] else (own_lane - 1, right)
+        key = key_of(r, to, behind, begin, ring)
+        q = winner[key]
+        if q < 0 or better(
+            utility[r], to_left[r] == left_hand, order[r], utility[q], to_left[q] == left_hand, order[q]
+        ):
+            if q >= 0:
+                refused[base + order[q]] += 1
+            winner[key] = r
+        else:
+            refused[base + order[r]] += 1
+    return some
+
+
+@exact
+def count_changes(winner, order, left, right, to_left, begin, ring, base, lane, follower, changed, unjudged):
+    """Count the changes that were granted, and those in front of another follower than the one who was judged."""
+    for key in range(len(winner)):
+        r = winner[key]
+        if r < 0:
+            continue
+        i = base + order[r]
+        changed[i] += 1
+        first, last = begin[lane[i]], begin[lane[i] + 1]
+        q = left[r] if to_left[r] else right[r]
+        if q == last and ring > 0:
+            q = first
+        if q < last and follower[i] != order[q]:
+            unjudged[i] += 1
+
+
+@exact
+def decide(
+    links, position, present, coming, rows, n, count, ring, left_hand, tables, plan, places, phase, k, slots, fresh
+):  # fmt: skip
+    """Decide in all rows: ``links`` (7, rows · n; as ``types.Links``) change in place, ``fresh`` marks new leaders.
+
+    ``plan`` says what the ``slots`` rows of the printed ``phase`` are filled with, ``places`` whose. Returns False,
+    with some rows decided, where links are not the order of positions.
+    """
+    lane, leader, follower, changed, refused, blocked, unjudged = links
+    w, which = workspace((slots + 4) * ROW, k), np.empty(len(places) * CHUNK, np.int64)
+    order, begin, place = np.empty(n, np.int64), np.empty(count + 1, np.int64), np.empty(n)
+    fresh_order, fresh_begin = np.empty(n, np.int64), np.empty(count + 1, np.int64)
+    left, right, winner = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n + count, np.int64)
+    utility, to_left, granted = np.empty(n, k.dtype), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    for row in range(rows):
+        base = row * n
+        if not walk(leader, follower, lane, position, present, coming, n, count, ring, base, order, begin, place):
+            return False
+        beside(place, begin, count, 1, left)
+        beside(place, begin, count, -1, right)
+        winner[:] = -1
+        some = False
+        for own in range(count):
+            for at in range(begin[own], begin[own + 1], CHUNK):
+                m = min(CHUNK, begin[own + 1] - at)
+                fill_rows(
+                    w, slots, plan, places, which, at, m, own, begin, count, place, order, left, right, position,
+                    base, row, n, ring, tables,
+                )  # fmt: skip
+                call(phase, w, padded(m), k)  # type: ignore[call-arg]
+                some |= settle(
+                    w, slots * ROW, at, m, own, left, right, begin, ring, left_hand, base, order, winner, utility,
+                    to_left, refused, blocked,
+                )  # fmt: skip
+        if some:
+            granted[:] = False
+            for r in winner:
+                if r >= 0:
+                    granted[r] = True
+            reordered(order, begin, place, count, ring, winner, granted, fresh_order, fresh_begin)
+            relink(fresh_order, fresh_begin, count, ring, base, lane, leader, follower, fresh)
+            count_changes(
+                winner, order, left, right, to_left, begin, ring, base, lane, follower, changed, unjudged
+            )  # fmt: skip
+    return True

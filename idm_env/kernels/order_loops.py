@@ -1,0 +1,105 @@
+"""Compiled order of several lanes: vehicles of each lane front first, and their layout as one row for a few steps.
+
+Rows of ``n`` slots lie one behind the other. ``order`` holds slots, lane 0 first, absent vehicles last; lane k has the
+ranks from ``begin[k]`` to ``begin[k + 1]``. On a ring a lane begins with whoever is furthest on his lap.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+from __future__ import annotations
+
+import numpy as np
+
+from idm_env.kernels.tiles import exact
+
+
+@exact
+def walk(leader, follower, lane, position, present, coming, n, count, ring, base, order, begin, place):
+    """Put one row in order by its links, and places (m, within one lap) by rank; False if places do not fall.
+
+    ``coming`` says that ``present`` tells who is there.
+    """
+    heads = np.full(count, -1, np.int64)
+    furthest = np.full(count, -1.0)
+    there = 0
+    for i in range(n):
+        if coming and present[base + i] <= 0:
+            continue
+        there += 1
+        k = lane[base + i]
+        if ring > 0:
+            x = np.float64(position[base + i])
+            x -= np.floor(x / ring) * ring
+            if heads[k] < 0 or x > furthest[k]:
+                heads[k], furthest[k] = i, x
+        elif leader[base + i] == i:
+            if heads[k] >= 0:
+                return False
+            heads[k] = i
+    at = 0
+    for k in range(count):
+        begin[k] = at
+        i = heads[k]
+        if i < 0:
+            continue
+        while at < there:
+            x = np.float64(position[base + i])
+            if ring > 0:
+                x -= np.floor(x / ring) * ring
+            if at > begin[k] and x > place[at - 1]:
+                return False
+            order[at], place[at] = i, x
+            at += 1
+            following = follower[base + i]
+            if following == i or following == heads[k]:
+                break
+            i = following
+    begin[count] = at
+    if at < there:
+        return False
+    if coming:
+        for i in range(n):
+            if present[base + i] <= 0:
+                order[at] = i
+                at += 1
+    return at == n
+
+
+@exact
+def lay(order, begin, n, count, halo, wide, base, to, slots, own, led, leads):
+    """Lay one row of ``wide`` places out, from place ``to`` on: lanes behind one another, with copies at both ends.
+
+    Who is absent is alone, and so are places to spare, which are copies of slot 0.
+    """
+    p = to
+    for k in range(count):
+        first, size = begin[k], begin[k + 1] - begin[k]
+        if size == 0:
+            continue
+        for at in range(-halo, size + halo):
+            slots[p] = order[first + at % size] if halo else order[first + at]
+            led[p] = at > -halo
+            leads[p] = at < size + halo - 1
+            if 0 <= at < size:
+                own[base + order[first + at]] = p - to
+            p += 1
+    for r in range(begin[count], n):
+        slots[p], led[p], leads[p], own[base + order[r]] = order[r], 0, 0, p - to
+        p += 1
+    while p < to + wide:
+        slots[p], led[p], leads[p] = 0, 0, 0
+        p += 1
+
+
+@exact
+def laid(
+    leader, follower, lane, position, present, coming, rows, n, count, ring, halo, wide, slots, own, led, leads
+):  # fmt: skip
+    """Lay all rows out by their links; False where links are not the order of positions."""
+    order, begin, place = np.empty(n, np.int64), np.empty(count + 1, np.int64), np.empty(n)
+    for row in range(rows):
+        if not walk(
+            leader, follower, lane, position, present, coming, n, count, ring, row * n, order, begin, place
+        ):  # fmt: skip
+            return False
+        lay(order, begin, n, count, halo, wide, row * n, row * wide, slots, own, led, leads)
+    return True

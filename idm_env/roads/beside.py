@@ -1,0 +1,128 @@
+"""The lanes beside a vehicle: who would be ahead and behind there, and which side is better.
+
+What stands here is arithmetic of one vehicle and its neighbours. ``roads.linked`` runs it on tensors and gathers;
+``scalar.wishes`` records it, with places in lanes instead of slots, and prints it.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from idm_env.roads.ends import Ending, nearer
+from idm_env.types import FAR, Neighbour, State, Wish
+
+
+class Side(NamedTuple):
+    """The lane on one side of every vehicle: whether it may be entered, and who is there.
+
+    ``gap`` (m) would be the vehicle's own, ``back_gap`` the follower's; both are ``FAR`` where nobody is. ``ends`` is
+    how far the vehicle could go on there (m); ``leader`` and ``follower`` are slots.
+    """
+
+    exists: Tensor
+    leader: Any
+    follower: Any
+    led: Tensor
+    followed: Tensor
+    gap: Tensor
+    back_gap: Tensor
+    ends: Tensor
+
+
+class Preference(NamedTuple):
+    """The better side of every vehicle: its utility (m/s²), whether it is the left one, and bool tensors.
+
+    ``wants`` is a wish for a side that is there, safe and free; ``blocked`` one that comes to nothing.
+    """
+
+    utility: Tensor
+    to_left: Tensor
+    wants: Tensor
+    blocked: Tensor
+
+
+def within(position: Tensor, length: Tensor, opens: Tensor, closes: Tensor) -> Tensor:
+    """Return whether a vehicle is, with all of its length, where a lane may be entered and left sideways (bool)."""
+    return (position - length >= opens) & (position <= closes)
+
+
+def preferred(left: Side, right: Side, wish: Wish, left_hand: bool) -> Preference:
+    """Return the better side that is there, safe and free; of equal ones that of the road's hand.
+
+    What overlaps would be no room, whatever a margin says.
+    """
+    may = [
+        side.exists & (margin >= 0) & (side.gap > 0) & (side.back_gap > 0)
+        for side, margin in ((left, wish.left_margin), (right, wish.right_margin))
+    ]
+    never = torch.full_like(wish.left, -torch.inf)
+    utility = [torch.where(ok, u, never) for ok, u in zip(may, (wish.left, wish.right), strict=True)]
+    to_left = utility[0] >= utility[1] if left_hand else utility[0] > utility[1]
+    best = torch.where(to_left, utility[0], utility[1])
+    wants = best > 0
+    return Preference(best, to_left, wants, ~wants & (torch.maximum(wish.left, wish.right) > 0))
+
+
+class Sideways(Ending):
+    """A road on which one can look beside."""
+
+    @abc.abstractmethod
+    def at(self, x: Any, slot: Any) -> Any:
+        """Return the x of the vehicles in some slots; what is the same for all vehicles stays."""
+
+    @abc.abstractmethod
+    def beyond(self) -> Any:
+        """Return the slot of each leader's leader."""
+
+    @abc.abstractmethod
+    def goes_on(self) -> Tensor:
+        """Return how far each vehicle could go on on its lane (m)."""
+
+    def look(
+        self, state: State, exists: Tensor, leader: Any, follower: Any, led: Tensor, followed: Tensor,
+        to_leader: Tensor, to_follower: Tensor, ends: Tensor,
+    ) -> Side:  # fmt: skip
+        """Return a lane beside, from who is there; ``to_leader`` and ``to_follower`` are laps to add on a ring (m)."""
+        position, length = state.position, state.length
+        ahead = self.at(position, leader) - self.at(length, leader) - position + to_leader
+        back = position - length - self.at(position, follower) + to_follower
+        if state.present is not None:
+            exists = exists & (state.present > 0)
+        return Side(
+            exists, leader, follower, led, followed,
+            torch.where(led, ahead, FAR), torch.where(followed, back, FAR), ends,
+        )  # fmt: skip
+
+    def before_end(self, leader: Neighbour, ends: Tensor) -> Neighbour:
+        """Return whichever is nearer to each vehicle: its leader on a lane, or a standing one at the end of it."""
+        return nearer(leader, ends if self.room() is not None else None)
+
+    def follow(
+        self, state: State, leaders: Neighbour, slot: Any, gap: Tensor, there: Tensor
+    ) -> tuple[Neighbour, Neighbour]:
+        """Return the vehicle in a slot as a leader at a gap (m), and its own leader as the second one.
+
+        ``leaders`` is everybody's leader; ``there`` is 0 where the slot is nobody's.
+        """
+        speed = state.speed
+        present = there.to(speed.dtype)
+        some = present > 0
+        leader = Neighbour(
+            torch.where(some, gap, FAR),
+            torch.where(some, self.at(speed, slot), speed),
+            torch.where(some, self.at(state.accel, slot), 0.0),
+            present,
+        )
+        its = Neighbour(*(self.at(x, slot) for x in leaders))
+        both = (its.present * present) > 0
+        second = Neighbour(
+            torch.where(both, gap + self.at(state.length, slot) + its.gap, FAR),
+            torch.where(both, its.speed, speed),
+            torch.where(both, its.accel, 0.0),
+            its.present * present,
+        )
+        return leader, second

@@ -1,0 +1,220 @@
+"""Lanes as they are in one state: neighbours by its links, and the changes that a decision makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from idm_env.roads.beside import Preference, Side, Sideways
+from idm_env.roads.order import Order, laps
+from idm_env.types import FAR, Links, State
+
+if TYPE_CHECKING:
+    from idm_env.roads.lanes import Lanes
+
+
+class Claim(NamedTuple):
+    """What becomes of every vehicle's wish: the lane it is granted (or its own), and bool tensors of why not.
+
+    ``follower`` is the slot of whom the change was judged by, ``judged`` whether there is one.
+    """
+
+    lane: Tensor
+    granted: Tensor
+    refused: Tensor
+    blocked: Tensor
+    follower: Tensor
+    judged: Tensor
+
+
+class _Look(torch.autograd.Function):
+    """``x[to]`` where ``to`` and ``fro`` are inverse: the adjoint is a gather, too, always in the same order."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor, to: Tensor, fro: Tensor) -> Tensor:
+        return x.gather(-1, to)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        _, to, fro = inputs
+        ctx.save_for_backward(to, fro)
+        ctx.save_for_forward(to, fro)
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        to, fro = ctx.saved_tensors
+        own = torch.arange(to.shape[-1], device=to.device)
+        zero = torch.zeros_like(g)
+        # What nobody but oneself has read comes back by `to`; whom nobody follows has himself as follower.
+        return torch.where(to == own, g, zero) + torch.where(fro == own, zero, g.gather(-1, fro)), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, g: Tensor, *_: Any) -> Tensor:
+        to, _fro = ctx.saved_tensors
+        return g.gather(-1, to)
+
+
+@dataclass(frozen=True, eq=False)
+class Linked(Sideways):
+    """Lanes as they are in one state: neighbours by its links, ends of lanes merged into the leader."""
+
+    road: Lanes
+    links_now: Links
+    position: Tensor
+
+    def _look(self, x: Tensor, to: Tensor, fro: Tensor) -> Tensor:
+        if x.shape != to.shape:
+            shape = torch.broadcast_shapes(x.shape, to.shape)
+            x, to, fro = x.expand(shape), to.expand(shape), fro.expand(shape)
+        return _Look.apply(x, to, fro) if x.requires_grad else x.gather(-1, to)
+
+    def ahead(self, x: Tensor) -> Tensor:
+        """Return the leader's x; one's own without a leader."""
+        return self._look(x, self.links_now.leader, self.links_now.follower)
+
+    def back(self, x: Tensor) -> Tensor:
+        """Return the follower's x; one's own without a follower."""
+        return self._look(x, self.links_now.follower, self.links_now.leader)
+
+    def _there(self, slot: Tensor, x: Tensor) -> Tensor:
+        if self.road.ring is not None:
+            return torch.ones_like(slot, dtype=x.dtype)
+        return (slot != torch.arange(slot.shape[-1], device=slot.device)).to(x.dtype)
+
+    def led(self, x: Tensor) -> Tensor:
+        """Return 1 for every vehicle with a leader: on a ring for all, be it oneself."""
+        return self._there(self.links_now.leader, x)
+
+    def leads(self, x: Tensor) -> Tensor:
+        """Return 1 for every vehicle with a follower: on a ring for all, be it oneself."""
+        return self._there(self.links_now.follower, x)
+
+    def gaps(self, position: Tensor, length: Tensor, circumference: Tensor | float | None = None) -> Tensor:
+        """Return ``position[leader] − length[leader] − position`` (m), laps added on a ring; FAR without a leader.
+
+        ValueError for a circumference that is given here.
+        """
+        if circumference is not None:
+            raise ValueError(f"the circumference of lanes stands in Lanes(ring=…), and {circumference} was given.")
+        gap = self.ahead(position) - self.ahead(length) - position
+        if self.road.ring is None:
+            return torch.where(self.led(position) > 0, gap, FAR)
+        return gap + laps(position, self.links_now.leader, self.road.ring)
+
+    def gaps_of(self, which: Tensor, position: Tensor, length: Tensor) -> Tensor:
+        """Return the gaps of some vehicles, by their places in all rows together (m)."""
+        n = position.shape[-1]
+        mine = self.links_now.leader.reshape(-1)[which]
+        ahead = which - which.remainder(n) + mine
+        two = torch.stack([position.reshape(-1)[i] for i in (ahead, which)], -1)
+        gap = two[:, 0] - length.reshape(-1)[ahead] - two[:, 1]
+        alone = ahead == which
+        if self.road.ring is None:
+            return torch.where(alone, FAR, gap)
+        return gap + laps(two, torch.stack((torch.zeros_like(which), alone.long()), -1), self.road.ring)[:, 1]
+
+    def room(self) -> Tensor | None:
+        """Return how far each vehicle's lane goes on (m), None where no lane ends."""
+        return self.goes_on() if self.road.closed else None
+
+    def remaining(self, present: Tensor | None, position: Tensor) -> Tensor | None:
+        """Return who is still on the road at these positions (m)."""
+        if present is None or not self.road.leaving:
+            return present
+        return present * (position < self.road.left_at(self.links_now.lane, position)).to(present.dtype)
+
+    # -- changes -------------------------------------------------------------------------------------------------
+
+    def at(self, x: Tensor, slot: Tensor) -> Tensor:
+        """Return the x of the vehicles in some slots; what is the same for all vehicles stays."""
+        shape = slot.shape
+        if x.dim() == 0 or x.shape[-1] != shape[-1] or shape[-1] == 1 or x.dim() > len(shape):
+            return x
+        return x.expand(shape).gather(-1, slot)
+
+    def beyond(self) -> Tensor:
+        """Return the slot of each leader's leader."""
+        return self.ahead(self.links_now.leader)
+
+    def goes_on(self) -> Tensor:
+        """Return how far each vehicle could go on on its lane (m)."""
+        return self.road.closed_at(self.links_now.lane, self.position) - self.position
+
+    def order(self, present: Tensor | None) -> Order:
+        """Return the vehicles in order."""
+        return Order.of(self.position, self.links_now.lane, present, self.road.count, self.road.ring)
+
+    def to(self, step: int) -> Tensor:
+        """Return the lane ``step`` to the left of every vehicle, its own where there is none."""
+        return (self.links_now.lane + step).clamp(0, self.road.count - 1)
+
+    def side(self, order: Order, step: int, state: State) -> Side:
+        """Return the lane ``step`` to the left of every vehicle."""
+        position, lane = self.position, self.links_now.lane
+        to = self.to(step)
+        around = order.around(to, position)
+        return self.look(
+            state, self.road.open_between(lane, lane + step, position, state.length), around.leader, around.follower,
+            around.led, around.followed, around.to_leader, around.to_follower,
+            self.road.closed_at(to, position) - position,
+        )  # fmt: skip
+
+    def chosen(self, sides: tuple[Side, Side], prefers: Preference, due: Tensor) -> Claim:
+        """Return what becomes of every wish: per gap the best claim is granted.
+
+        A gap of a lane is known by the vehicle at its front. Of claims of equal utility the one towards the road's
+        hand is granted, then the one of the first slot.
+        """
+        left, right = sides
+        hand = self.road.handed == "left"
+        best, to_left, wants, blocked = prefers
+        wants, blocked = wants & due, blocked & due
+        never = torch.full_like(best, -torch.inf)
+        to = torch.where(to_left, self.to(1), self.to(-1))
+        led = torch.where(to_left, left.led, right.led)
+        count = best.shape[-1]
+        gap = torch.where(led, torch.where(to_left, left.leader, right.leader), count + to)
+        room = (*best.shape[:-1], count + self.road.count)
+        granted = wants & (best == _most(room, gap, torch.where(wants, best, never), "amax"))
+        hands = granted & (to_left == hand)
+        granted = granted & (hands | ~_most(room, gap, hands.to(best.dtype), "amax").bool())
+        own = torch.arange(count, device=best.device).expand_as(gap)
+        granted = granted & (own == _most(room, gap, torch.where(granted, own, count), "amin"))
+        follower = torch.where(to_left, left.follower, right.follower)
+        judged = torch.where(to_left, left.followed, right.followed)
+        return Claim(
+            torch.where(granted, to, self.links_now.lane), granted, wants & ~granted, blocked, follower, judged
+        )
+
+    def changed(self, state: State, claim: Claim) -> State:
+        """Return the state after the granted changes: new links, and gaps measured where somebody has a new leader."""
+        links = self.links_now
+        links = links._replace(
+            changed=links.changed + claim.granted,
+            refused=links.refused + claim.refused,
+            blocked=links.blocked + claim.blocked,
+        )
+        if not bool(claim.granted.any()):
+            return state._replace(links=links)
+        order = Order.of(self.position, claim.lane, state.present, self.road.count, self.road.ring)
+        leader, follower = order.links()
+        other = claim.granted & claim.judged & (follower != claim.follower)
+        links = links._replace(lane=claim.lane, leader=leader, follower=follower, unjudged=links.unjudged + other)
+        fresh = Linked(self.road, links, self.position).gaps(self.position, state.length)
+        return state._replace(links=links, gap=torch.where(leader != self.links_now.leader, fresh, state.gap))
+
+
+def _most(room: tuple[int, ...], key: Tensor, value: Tensor, how: Literal["amax", "amin"]) -> Tensor:
+    """Return, for every vehicle, the largest or smallest value among those of its key."""
+    worst = torch.zeros((), dtype=value.dtype, device=value.device)
+    if how == "amin":
+        worst = worst + value.max()
+    elif value.is_floating_point():
+        worst = worst + value.min()
+    found = worst.expand(room).clone().scatter_reduce(-1, key, value, how)
+    return found.gather(-1, key)
