@@ -1,7 +1,7 @@
 """Several lanes with MOBIL: how fast, beside SUMO, and how often lanes change at which flow.
 
 ``python -m benchmarks.lanes speed [vehicles]`` prints million vehicle updates per CPU second of one thread: rings of
-1000 vehicles on four lanes at 20 /km/lane, Δt 0.1 s, MOBIL at 1 Hz, desired speeds of 25 to 35 m/s.
+1000 vehicles on four lanes at 15 /km/lane, Δt 0.1 s, MOBIL at 1 Hz, desired speeds of 25 to 35 m/s.
 ``python -m benchmarks.lanes sumo`` drives the same ring in SUMO (IDM, LC2013, ``libsumo``), in the same minute.
 ``python -m benchmarks.lanes flow`` prints flow and changes over density, beside SUMO's where ``libsumo`` is there.
 """
@@ -47,7 +47,7 @@ def speed(vehicles: int) -> None:
     """Print million updates per CPU second, forward, and forward with the gradient by every driver's desired speed."""
     steps, warm = 100, 300
     for dtype in (torch.float32, torch.float64):
-        simulator, state, params = traffic(max(1, vehicles // EACH), 20.0, dtype)
+        simulator, state, params = traffic(max(1, vehicles // EACH), 15.0, dtype)
         state, _ = simulator.rollout(state, {}, params, warm, keep=None)
         begin, changed = time.process_time(), _changes(state)
         end, _ = simulator.rollout(state, {}, params, steps, keep=None)
@@ -88,7 +88,7 @@ def flow(densities: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0)) -> 
 
 def sumo() -> None:
     """Print SUMO's million updates per CPU second on a ring of 1000 vehicles."""
-    theirs = _sumo(EACH, 20.0, 30.0)
+    theirs = _sumo(EACH, 15.0, 30.0)
     print("libsumo is not installed" if theirs is None else f"SUMO: {theirs[2]:.2f} M updates per CPU second")
 
 

@@ -14,7 +14,7 @@ from idm_env.changes import decided
 from idm_env.effects.base import Effect
 from idm_env.kernels import decision_loops, lanes, order_loops
 from idm_env.kernels.memory import addresses
-from idm_env.kernels.operands import operand
+from idm_env.kernels.operands import dense, operand
 from idm_env.kernels.printed import FUNCTIONS, HEADER
 from idm_env.kernels.tiles import ROW, Array
 from idm_env.roads import Lanes
@@ -29,6 +29,10 @@ from idm_env.types import Inputs, Links, Params, State
 
 if TYPE_CHECKING:
     from idm_env.simulator import Simulator
+
+
+_Lasting = tuple[Array, Array, list[tuple[int, str]], list[Array]]
+"""The plan of rows, the places in it, the rows whose arrays move with every decision, and what must be kept alive."""
 
 
 class Decision:
@@ -77,6 +81,7 @@ class Traffic:
         self.n = self.shape[-1]
         self.rows = state.speed.numel() // self.n
         self._links = np.stack([x.expand(self.shape).reshape(-1).numpy() for x in state.links])
+        self._lasting: _Lasting | None = None
 
     @property
     def links(self) -> Links:
@@ -90,13 +95,13 @@ class Traffic:
     def _present(self, state: State) -> tuple[Array, bool]:
         if state.present is None:
             return np.empty(0, state.speed.detach().numpy().dtype), False
-        return lanes.dense(state.present, self.shape), True
+        return dense(state.present, self.shape), True
 
     def places(self, state: State, halo: int) -> Places | None:
         """Return where vehicles lie in a row for as many steps as the halo is for; None where links are no order."""
         around = halo if self.road.ring is not None else 0
         wide = self.n + 2 * around * self.road.count
-        position = lanes.dense(state.position, self.shape)
+        position = dense(state.position, self.shape)
         slots, own = np.empty(self.rows * wide, np.int64), np.empty(self.rows * self.n, np.int64)
         led, leads = (np.empty(self.rows * wide, position.dtype) for _ in range(2))
         if not order_loops.laid(
@@ -125,7 +130,7 @@ class Traffic:
         fresh = np.zeros(self.rows * self.n, np.uint8)
         tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], kind)
         done = decision_loops.decide(
-            self._links, lanes.dense(state.position, self.shape), *self._present(state), self.rows, self.n,
+            self._links, dense(state.position, self.shape), *self._present(state), self.rows, self.n,
             self.road.count, self._ring, self.road.handed == "left", tables, plan, places, phase, constants,
             len(found.slots), fresh,
         )  # fmt: skip
@@ -141,21 +146,47 @@ class Traffic:
         return state._replace(links=links)
 
     def _plan(self, found: Decision, state: State, inputs: Inputs, params: Params) -> tuple[Array, Array, list[Array]]:
-        """Return what rows are filled with, whose numbers these are, and the arrays that the plan points to."""
-        rows, held = [], []
+        """Return what rows are filled with, whose numbers these are, and the arrays that the plan points to.
+
+        What does not change in a rollout is looked up once.
+        """
+        if self._lasting is None:
+            self._lasting = self._begun(found, state, inputs, params)
+        plan, places, moving, held = self._lasting
+        more = []
+        for i, name in moving:
+            array, _, _ = self._operand(name, state, inputs, params)
+            plan[i, decision_loops.ADDRESS] = addresses([array])[0]
+            more.append(array)
+        return plan, places, [*held, *more]
+
+    def _begun(self, found: Decision, state: State, inputs: Inputs, params: Params) -> _Lasting:
+        rows, held, moving = [], [], []
         places: dict[tuple[int, int], int] = {}
-        for slot in found.slots:
+        for i, slot in enumerate(found.slots):
             side, name = _side(slot)
             if name in KINDS:
                 rows.append((KINDS[name], side, 0, 0, 0, 0))
                 continue
-            array, (_, by_row, by_vehicle) = operand(
-                self._array(name, state, inputs, params).to(state.speed.dtype), self.shape[:-1], self.n
-            )
-            held.append(array)
+            array, by_row, by_vehicle = self._operand(name, state, inputs, params)
             place = places.setdefault((side, slot.shift), len(places)) if by_vehicle else 0
             rows.append((decision_loops.ARRAY, side, place, int(addresses([array])[0]), by_row, by_vehicle))
-        return np.array(rows, np.int64), np.array(list(places), np.int64).reshape(-1, 2), held
+            held.append(array)
+            if not self._lasts(name):
+                moving.append((i, name))
+        return np.array(rows, np.int64), np.array(list(places), np.int64).reshape(-1, 2), moving, held
+
+    def _operand(self, name: str, state: State, inputs: Inputs, params: Params) -> tuple[Array, int, int]:
+        """Return an array and its strides by row and vehicle."""
+        x = self._array(name, state, inputs, params).to(state.speed.dtype)
+        if not self._lasts(name):
+            x = x.expand(self.shape).contiguous()  # strides that hold at every decision
+        array, (_, by_row, by_vehicle) = operand(x, self.shape[:-1], self.n)
+        return array, by_row, by_vehicle
+
+    def _lasts(self, name: str) -> bool:
+        """Whether this does not change in a rollout."""
+        return "." in name or name == "length" or (name in ("led", "leads") and self.road.ring is not None)
 
     def _array(self, name: str, state: State, inputs: Inputs, params: Params) -> Tensor:
         if name in ("led", "leads"):

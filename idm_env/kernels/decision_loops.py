@@ -66,7 +66,7 @@ def whose(which, places, c, at, m, step, to, behind, begin, order, ring, base):
 @exact
 def laps(way, plain, ring):
     """Return whole laps (m) by which ``plain`` falls short of the way that is known."""
-    return ring * np.rint((way - plain) / ring)
+    return ring * np.floor((way - plain) / ring + 0.5)
 
 
 @exact
@@ -103,6 +103,14 @@ def find(w, target, kind, at, m, exists, to, behind, begin, place, order, positi
 
 
 @exact
+def fill_alike(w, slots, plan, row):
+    """Fill the rows that are the same for all vehicles of a batch row, and for row 0 those that are for all rows."""
+    for i in range(slots):
+        if plan[i, KIND] == ARRAY and plan[i, BY_VEHICLE] == 0 and (row == 0 or plan[i, BY_ROW] != 0):
+            fill(w, i * ROW, number(plan[i, ADDRESS], row * plan[i, BY_ROW], w), CHUNK)
+
+
+@exact
 def fill_rows(
     w, slots, plan, places, which, at, m, own_lane, begin, count, place, order, left, right, position, base, row, n,
     ring, tables,
@@ -126,9 +134,7 @@ def fill_rows(
                 w, i * ROW, kind, at, m, exists, to if exists else own_lane, left if side == 1 else right, begin,
                 place, order, position, base, ring, tables,
             )  # fmt: skip
-        elif plan[i, BY_VEHICLE] == 0:
-            fill(w, i * ROW, number(plan[i, ADDRESS], row * plan[i, BY_ROW], w), m)
-        else:
+        elif plan[i, BY_VEHICLE] != 0:
             gather(w, i * ROW, plan[i, ADDRESS], row * plan[i, BY_ROW] - base, which, plan[i, PLACE] * CHUNK, m)
 
 
@@ -255,6 +261,7 @@ def decide(
             return False
         beside(place, begin, count, 1, left)
         beside(place, begin, count, -1, right)
+        fill_alike(w, slots, plan, row)
         winner[:] = -1
         some = False
         for own in range(count):

@@ -1,4 +1,4 @@
-"""Rollouts of several lanes by the kernels of one: decisions in torch, and compiled steps between them.
+"""Rollouts of several lanes by the kernels of one: compiled decisions, and compiled steps between them.
 
 Slots are copied into the order of their lanes (``roads.chains``), run as one lane whose vehicles are led or not, and
 copied back; so values and gradients are those of the kernels, and no loop is written for lanes.

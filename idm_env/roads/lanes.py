@@ -18,7 +18,6 @@ from idm_env.roads.linked import Linked
 from idm_env.roads.order import Order
 from idm_env.types import Links, State
 
-
 ENDLESS = 1e9
 """Where a lane ends that does not (m): finite, as all that vehicles see."""
 

@@ -87,28 +87,34 @@ class SeenRoad(Ending):
     graph: Graph
 
     def ahead(self, x: Any) -> Any:
+        """Return the leader's expression."""
         return Scalar(self.graph, self.graph.shifted(x.node, 1))
 
     def back(self, x: Any) -> Any:
+        """Return the follower's expression."""
         return Scalar(self.graph, self.graph.shifted(x.node, -1))
 
     def led(self, x: Any) -> Any:
+        """Return whether there is a leader."""
         if isinstance(self.road, Ring):
             return Scalar(self.graph, self.graph.constant(1.0))
         return Scalar(self.graph, self.graph.input("led"))
 
     def leads(self, x: Any) -> Any:
+        """Return whether there is a follower."""
         if isinstance(self.road, Ring):
             return Scalar(self.graph, self.graph.constant(1.0))
         return Scalar(self.graph, self.graph.input("leads"))
 
     def room(self) -> Any:
+        """Return how far the lane goes on, where lanes end."""
         if not (isinstance(self.road, Chains) and self.road.closed):
             return None
         ends: Any = Scalar(self.graph, self.graph.input("ends"))
         return ends - Scalar(self.graph, self.graph.input("position"))
 
     def gaps(self, position: Any, length: Any, circumference: Any = None) -> Any:
+        """Return gaps from positions."""
         if isinstance(self.road, Ring):
             raise Untraceable("vehicles that come and go on a ring")
         return type(self.road).gaps(self, position, length)  # type: ignore[arg-type]

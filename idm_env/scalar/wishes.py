@@ -73,7 +73,7 @@ class _Sides(SeenRoad, Sideways):
 
 
 class Wishes:
-    """A recorded decision: the slots that it reads, and its text; ``Untraceable`` where an effect cannot be recorded."""
+    """A recorded decision: slots that it reads, and its text; ``Untraceable`` where an effect cannot be recorded."""
 
     def __init__(self, simulator: Stepping, form: Form) -> None:
         road = simulator.road

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Effect, MandatoryChange, Mobil, make
+from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
 from idm_env.kernels import dispatch
 from idm_env.roads import Lanes, lane_drop
 from idm_env.simulator import Simulator, Trajectory
@@ -47,6 +47,40 @@ def rolled(
     weights = [torch.randn(x.shape, generator=generator).to(dtype) for x in kept]
     loss = sum((x.clamp_max(500.0) * w).sum() for x, w in zip(kept, weights, strict=True))
     return end, kept, list(torch.autograd.grad(loss, [position, desired]))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("road", "dtype"),
+    [(Lanes(3, ring=8100.0), torch.float64), (Lanes(3, ends=(lane_drop(0, at=8300.0),)), torch.float32)],
+    ids=["ring", "drop"],
+)
+def test_compiled_decisions_are_those_of_the_torch_path(road: Lanes, dtype: torch.dtype) -> None:
+    """Every link and every count, over more vehicles than one call of the printed phase takes; commands among wishes.
+
+    What is compared is one decision after another from the same states, so that rounding cannot add up.
+    """
+    generator = torch.Generator().manual_seed(2)
+    n = 900
+    simulator = Simulator(road, (IDM(), make("second_leader"), make("gap_bias"), Mobil(), LaneCommand(), Brakes()))
+    params = simulator.defaults(dtype=dtype)
+    params["idm"]["desired_speed"] = (15.0 + 20.0 * torch.rand((2, n), generator=generator)).to(dtype)
+    position = (torch.randperm(n, generator=generator) * 9.0).to(dtype).expand(2, n)
+    lane = torch.randint(3, (2, n), generator=generator)
+    state = simulator.state(position, torch.full_like(position, 8.0), params, lane=lane)
+    command = torch.full((10, 2, n), torch.nan, dtype=dtype)
+    command[:, 0, ::7], command[:, 1, ::5] = 1.0, -1.0
+    counts = torch.zeros(4)
+    for _ in range(12):
+        inputs = {"lane_command": command}
+        with dispatch.off():
+            expected, _ = simulator.rollout(state, inputs, params, 10, keep=None)
+        before, (state, _) = state, simulator.rollout(state, inputs, params, 10, keep=None)
+        assert before.links is not None and state.links is not None and expected.links is not None
+        for one, other in zip(expected.links, state.links, strict=True):
+            assert torch.equal(one, other)
+        torch.testing.assert_close(state.gap, expected.gap)
+        counts += torch.stack([(a - b).sum() for a, b in zip(state.links[3:], before.links[3:], strict=True)])
+    assert (counts[:3] > 100).all() and counts[3] > 0
 
 
 @pytest.mark.parametrize("case", CASES)
