@@ -21,8 +21,9 @@ from idm_env.changes import decided
 from idm_env.effects.base import HOOKS, CarFollowing, Effect, Hook
 from idm_env.effects.limits import unspoken
 from idm_env.history import PAST, History
+from idm_env.population import departed, entered
 from idm_env.roads.base import Road
-from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
+from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State, Trips
 
 Integration = Literal["ballistic", "euler", "midpoint"]
 S = TypeVar("S", bound="Stepping")
@@ -32,8 +33,8 @@ S = TypeVar("S", bound="Stepping")
 class Stepping:
     """A road, a tuple of effects and a time step (s): all of a simulator that is one step.
 
-    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps. Where lanes are
-    changed, that comes first (``changes.py``).
+    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps. Where vehicles
+    enter or lanes are changed, that comes first (``population.py``, ``changes.py``).
 
     ``integration`` is ``"ballistic"`` (``x += v Δt + a Δt²/2``, and a car that would reverse stops inside the step) or
     ``"euler"`` (the paper's: ``x += v Δt`` with the old speed). ``"midpoint"`` is ballistic with speeds and gaps of the
@@ -205,7 +206,11 @@ class Stepping:
         if present is not None:
             gap = torch.where(road.leader_present(present, position) > 0, gap, FAR)
         start = start._replace(gap=gap)
-        scene = self.scene(start, {})
+        return start._replace(memory=self.remembered(start, params, seed))
+
+    def remembered(self, state: State, params: Params, seed: int | None = None) -> dict[str, Tensor]:
+        """Return the memories of drivers who have just begun to drive."""
+        scene = self.scene(state._replace(memory={}), {})
         driver = self._following.driver(dict(params[self._following.name]))
         memory: dict[str, Tensor] = {}
         for effect in self.effects:
@@ -215,7 +220,7 @@ class Stepping:
                 memory[effect.name] = normals(f"{effect.name} at the start", seed or 0, held) if drawn else held
         if self.looks_back:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
-        return start._replace(memory=memory)
+        return memory
 
     def scene(self, state: State, inputs: Inputs) -> Scene:
         """Return what this step looks like to every vehicle."""
@@ -284,6 +289,8 @@ class Stepping:
         ``inputs`` maps effect names to what they take at this step; ``params`` maps effect and parameter names to
         tensors that broadcast against ``(..., vehicles)``.
         """
+        if state.trips is not None:
+            state = entered(self, state, params)
         if state.links is not None and self.changes:
             state = decided(self, state, inputs, params)
         accel, scene, driver = self._respond(state, inputs, params)
@@ -308,7 +315,13 @@ class Stepping:
             step=state.step + 1,
             present=motion.present,
             memory=memory,
+            trips=self._trips(state, motion.present),
         )
+
+    def _trips(self, state: State, present: Tensor | None) -> Trips | None:
+        if state.trips is None or state.present is None or present is None:
+            return state.trips
+        return departed(state.trips, state.present, present)
 
     def _gaps(self, state: State, motion: Motion) -> Tensor:
         road = self.road.view(state)

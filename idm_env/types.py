@@ -51,13 +51,29 @@ class Links(NamedTuple):
     unjudged: Tensor
 
 
+class Trips(NamedTuple):
+    """When every slot's vehicle wants to drive, and how often it has: tensors that broadcast to ``(..., vehicles)``.
+
+    ``departs`` is when the first trip is due (s), ``again`` after how long the next one is (s; infinity for never),
+    ``lane`` where it enters, ``speed`` at which, if there is room (m/s). ``entered`` and ``left`` count what was done.
+    """
+
+    departs: Tensor
+    again: Tensor
+    lane: Tensor
+    speed: Tensor
+    entered: Tensor
+    left: Tensor
+
+
 class State(NamedTuple):
     """Everything that a step carries over.
 
     ``gap`` is state although positions imply it: in float32 the difference of two positions cancels, and the
     gradients with it. A step adds ``displacement[leader] - displacement`` instead. ``step`` is an integer
     tensor (scalar or one per batch row), so that time never forces a device to synchronise. ``links`` is None on roads
-    whose order never changes; where lanes change, vehicles keep their slots and links say who leads whom.
+    whose order never changes; where lanes change, vehicles keep their slots and links say who leads whom. ``trips`` is
+    None where nobody comes: otherwise who is not present waits for his trip, or has made it.
     """
 
     position: Tensor
@@ -69,6 +85,7 @@ class State(NamedTuple):
     present: Tensor | None
     memory: Memory
     links: Links | None = None
+    trips: Trips | None = None
 
 
 class Motion(NamedTuple):

@@ -22,6 +22,9 @@ ENDLESS = 1e9
 """Where a lane ends that does not (m): finite, as all that vehicles see."""
 
 
+Where = Literal["begins", "opens", "closes", "stops", "leaves"]
+
+
 @dataclass(frozen=True)
 class End:
     """Where one lane begins and ends (m), and where it may be entered and left sideways; made by the three below.
@@ -103,18 +106,20 @@ class Lanes(Road):
 
     # -- tables over lanes ---------------------------------------------------------------------------------------
 
-    def table(self, name: Literal["opens", "closes", "stops", "leaves"]) -> tuple[float, ...]:
-        """Return a place of every lane (m): where it may be entered sideways, is stopped at, or leaves the road."""
-        far = -ENDLESS if name == "opens" else ENDLESS
-        values = [self.length or ENDLESS if name == "leaves" else far] * self.count
+    def table(self, name: Where) -> tuple[float, ...]:
+        """Return a place of every lane (m): where one enters it, may change to or from it, must stop, or leaves."""
+        none = {"begins": 0.0, "opens": -ENDLESS, "leaves": self.length or ENDLESS}
+        values = [none.get(name, ENDLESS)] * self.count
         for end in self.ends:
-            if name == "opens" or name == "closes":
+            if name == "begins":
+                values[end.lane] = max(end.begin, 0.0)
+            elif name == "opens" or name == "closes":
                 values[end.lane] = getattr(end, name)
             elif end.closed == (name == "stops"):
                 values[end.lane] = end.end
         return tuple(values)
 
-    def at_lane(self, lane: Tensor, like: Tensor, name: Literal["opens", "closes", "stops", "leaves"]) -> Tensor:
+    def at_lane(self, lane: Tensor, like: Tensor, name: Where) -> Tensor:
         """Return, for each vehicle, a number of its lane."""
         return torch.tensor(self.table(name), dtype=like.dtype, device=like.device)[lane]
 

@@ -1,0 +1,233 @@
+"""Vehicles that come and go: trips wait in a counted queue where they enter, and enter only where there is room.
+
+One slot per trip, or, where a trip is made ``again``, one slot for many of them in turn. Nobody vanishes and nobody is
+moved: at any time ``due = inside + left + queued``, and a queue that grows is an inflow beyond capacity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from idm_env.roads.lanes import Lanes
+from idm_env.roads.linked import Linked
+from idm_env.types import FAR, Links, Params, State, Trips
+
+if TYPE_CHECKING:
+    from idm_env.step import Stepping
+
+
+class Counts(NamedTuple):
+    """Trips of every batch row: due by now; of these inside, left, and queued at the entry for want of room or slot."""
+
+    due: Tensor
+    inside: Tensor
+    left: Tensor
+    queued: Tensor
+
+
+def trips(
+    per_hour: Mapping[int, float], seconds: float, *, speed: float = 20.0, slots: int | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Trips:  # fmt: skip
+    """Return trips that begin evenly in time, so many an hour on each lane, as long as ``seconds``.
+
+    Every lane's first trip is due after one interval. Without ``slots`` every trip has a slot of its own; with it,
+    lanes share that many by their inflow, and every slot makes trips again and again, without an end. ``speed`` (m/s)
+    is asked for at the entry.
+
+    ValueError for an inflow that is no number above 0, or for no slot for some lane.
+    """
+    if not per_hour or not all(0.0 < flow < math.inf for flow in per_hour.values()):
+        raise ValueError(f"per_hour = {dict(per_hour)} must give every lane that is entered vehicles an hour above 0.")
+    if not (0.0 < seconds < math.inf and 0.0 <= speed < math.inf):
+        raise ValueError(f"seconds = {seconds:g} and speed = {speed:g} m/s must be numbers above 0.")
+    departs, again, lane = [], [], []
+    total = sum(per_hour.values())
+    for k, flow in sorted(per_hour.items()):
+        each = 3600.0 / flow
+        count = int(seconds / each + 1e-9) if slots is None else int(slots * flow / total)
+        if count < 1:
+            raise ValueError(f"no slot for lane {k}: {flow:g} vehicles an hour. Give more seconds, or more slots.")
+        departs += [each * (i + 1) for i in range(count)]
+        again += [math.inf if slots is None else each * count] * count
+        lane += [k] * count
+    none = torch.zeros(len(lane), dtype=torch.int64)
+    return Trips(
+        torch.tensor(departs, dtype=dtype), torch.tensor(again, dtype=dtype), torch.tensor(lane),
+        torch.full((len(lane),), speed, dtype=dtype), none, none.clone(),
+    )  # fmt: skip
+
+
+def spread(given: Trips, shape: tuple[int, ...]) -> Trips:
+    """Return the trips with this shape ``(…, vehicles)``."""
+    return Trips(*(x.expand(shape).contiguous() for x in given))
+
+
+def waiting(stepping: Stepping, given: Trips, params: Params, *, length: Tensor | float = 5.0) -> State:
+    """Return a road on which nobody is yet: everybody waits for his trip.
+
+    ValueError for a road without a beginning, or a lane that does not exist.
+    """
+    road = stepping.road
+    if not isinstance(road, Lanes) or road.ring is not None:
+        raise ValueError("trips need a road that begins somewhere: Lanes(count), or Lanes(count, length=…).")
+    begin = road.at_lane(given.lane.clamp(0, road.count - 1), given.speed, "begins")
+    state = stepping.state(
+        begin, given.speed, params, length=length, lane=given.lane, present=torch.zeros_like(begin)
+    )  # fmt: skip
+    return state._replace(trips=given)
+
+
+def due(given: Trips, time: Tensor) -> Tensor:
+    """Return how many trips of every slot should have begun by a time (s)."""
+    more = torch.where(given.again.isinf(), 0.0, (time - given.departs) / given.again).floor().clamp_min(0.0)
+    return torch.where(time >= given.departs, 1 + more.long(), 0)
+
+
+def counts(stepping: Stepping, state: State) -> Counts:
+    """Return what became of all trips; ValueError for a state without any."""
+    if state.trips is None or state.present is None:
+        raise ValueError("this state has no trips. Make it with population.waiting(…).")
+    now = due(state.trips, stepping.time(state)).expand(state.speed.shape)
+    begun, left = (x.expand(state.speed.shape) for x in (state.trips.entered, state.trips.left))
+    inside = state.present.expand(state.speed.shape) > 0
+    return Counts(*(x.sum(-1) for x in (now, inside.long(), left, now - begun)))
+
+
+def departed(given: Trips, before: Tensor, after: Tensor) -> Trips:
+    """Return the trips after a step in which those have left who are no longer present."""
+    return given._replace(left=given.left + ((before > 0) & (after <= 0)))
+
+
+def entered(stepping: Stepping, state: State, params: Params) -> State:
+    """Return the state after those have entered for whom it is time and who have room, one on each lane.
+
+    Of a lane's queue the first enters at the beginning of the lane, where the gap s to the last vehicle there allows::
+
+        s ≥ s0 + v T    and    (v² − v_l²) / 2b ≤ s − s0
+
+    with v the speed that he asks for, or if it must be that of the vehicle ahead (v_l) if that is less. Entries are
+    made when lanes are decided about. Gradients flow through speed and gap, not through who enters when.
+    """
+    assert state.trips is not None and state.links is not None and state.present is not None
+    road, given = stepping.road, state.trips
+    assert isinstance(road, Lanes)
+    now = state.step.remainder(stepping.decides_after) == 0
+    waits = (state.present <= 0) & (due(given, stepping.time(state)) > given.entered)
+    waits = waits & (now if now.dim() == 0 else now.unsqueeze(-1))
+    if not bool(waits.any()):
+        return state
+    view = road.view(state)
+    assert isinstance(view, Linked)
+    lanes = torch.arange(road.count, device=state.speed.device)
+    first, some = _first(waits, given, lanes)
+    last, followed = _last(view, state, lanes)
+    begins = torch.tensor(road.table("begins"), dtype=state.speed.dtype, device=state.speed.device).expand(some.shape)
+    gap = torch.where(followed, _of(state.position, last) - _of(state.length, last) - begins, FAR)
+    ahead, asked = _of(state.speed, last), _of(given.speed.expand_as(state.speed), first)
+    driver = stepping.base.driver(dict(params[stepping.base.name]))
+    least, time_gap, brake = (
+        _of(x.expand_as(state.speed), first) for x in (driver.min_gap, driver.time_gap, driver.comfort_decel)
+    )
+
+    def fits(v: Tensor) -> Tensor:
+        return (gap >= least + v * time_gap) & ((v.square() - ahead.square()) <= 2.0 * brake * (gap - least))
+
+    fast = fits(asked) | ~followed
+    slow = torch.minimum(asked, ahead)
+    entry = _Entry(some & (fast | fits(slow)), first, last, followed, begins, gap, torch.where(fast, asked, slow))
+    return _placed(stepping, state, params, entry)
+
+
+class _Entry(NamedTuple):
+    """Who enters each lane, ``(…, lanes)``: whether anybody, who behind whom (slots), where, at what gap and speed."""
+
+    goes: Tensor
+    first: Tensor
+    last: Tensor
+    followed: Tensor
+    begins: Tensor
+    gap: Tensor
+    speed: Tensor
+
+
+def _of(x: Tensor, slots: Tensor) -> Tensor:
+    return x.gather(-1, slots)
+
+
+def _first(waits: Tensor, given: Trips, lanes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the slot of each lane's first in the queue, and whether there is one; of equals the lowest slot."""
+    more = torch.where(given.entered > 0, given.entered * given.again, 0.0)
+    when = torch.where(waits, given.departs + more, torch.inf)
+    mine = waits.unsqueeze(-2) & (given.lane.expand_as(waits).unsqueeze(-2) == lanes.unsqueeze(-1))
+    each = torch.where(mine, when.unsqueeze(-2), torch.inf)
+    own = torch.arange(waits.shape[-1], device=lanes.device)
+    best = torch.where(mine & (each == each.amin(-1, keepdim=True)), own, waits.shape[-1]).amin(-1)
+    return best.clamp_max(waits.shape[-1] - 1), mine.any(-1)
+
+
+def _last(view: Linked, state: State, lanes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the slot of each lane's last vehicle, and whether there is one."""
+    present = state.present
+    assert present is not None
+    there = present > 0
+    follower = view.links_now.follower
+    own = torch.arange(there.shape[-1], device=lanes.device)
+    alone = there & ((follower == own) | ~there.gather(-1, follower))
+    mine = alone.unsqueeze(-2) & (view.links_now.lane.unsqueeze(-2) == lanes.unsqueeze(-1))
+    return torch.where(mine, own, 0).amax(-1), mine.any(-1)
+
+
+def _without_absent(links: Links, present: Tensor) -> Links:
+    """Return links in which nobody follows who has left: his slot may be another vehicle's before long."""
+    own = torch.arange(present.shape[-1], device=present.device).expand_as(present)
+    there = present > 0
+    leader, follower = (
+        torch.where(there & there.gather(-1, slot), slot, own) for slot in (links.leader, links.follower)
+    )
+    return links._replace(leader=leader, follower=follower)
+
+
+def _placed(stepping: Stepping, state: State, params: Params, entry: _Entry) -> State:
+    """Return the state with those on the road who enter."""
+    assert state.trips is not None and state.present is not None and state.links is not None
+    goes, first, last, followed, begins, gap, speed = entry
+    links, lanes = _without_absent(state.links, state.present), torch.arange(goes.shape[-1], device=goes.device)
+    lanes = lanes.expand(goes.shape)
+    n = state.speed.shape[-1]
+
+    def put(x: Tensor, value: Tensor, where: Tensor, slots: Tensor) -> Tensor:
+        """Return x with values in some slots; what goes nowhere goes into a place of its own, which is cut off."""
+        wide = torch.cat((x.expand(state.speed.shape), x.new_zeros(*state.speed.shape[:-1], 1)), -1)
+        return wide.scatter(-1, torch.where(where, slots, n), value.to(x.dtype).expand(slots.shape))[..., :n]
+
+    after = links._replace(
+        lane=put(links.lane, lanes, goes, first),
+        leader=put(links.leader, torch.where(followed, last, first), goes, first),
+        follower=put(put(links.follower, first, goes, first), first, goes & followed, last),
+    )
+    one = torch.ones_like(gap)
+    new = put(torch.zeros_like(state.speed), one, goes, first) > 0
+    begun = state._replace(
+        position=put(state.position, begins, goes, first),
+        speed=put(state.speed, speed, goes, first),
+        accel=torch.where(new, 0.0, state.accel),
+        gap=put(state.gap, gap, goes, first),
+        present=put(state.present, one, goes, first),
+        links=after,
+        trips=state.trips._replace(entered=state.trips.entered + new),
+    )
+    fresh = stepping.remembered(begun, params)
+    memory = {
+        name: torch.where(new if x.dim() <= new.dim() else new[..., None, None], fresh[name], x)
+        for name, x in state.memory.items()
+    }
+    return begun._replace(memory=memory)
+
+
+__all__ = ["Counts", "counts", "departed", "due", "entered", "spread", "trips", "waiting"]
