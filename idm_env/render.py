@@ -109,14 +109,24 @@ class Viewer:
         there = values["present"] > 0
         lanes = (canvas.get_height() - _LANE_HEIGHT) // 40 + 1
         top = 0.55 * _LANE_HEIGHT
-        for lane in range(lanes):
-            self._pygame.draw.rect(canvas, _ASPHALT, (0, top + 40 * lane - 13, SIZE, 26))
         height = top + 40 * (lanes - 1)
-        if not there.any():
-            return
-        front = float(values["position"][there].max())
-        shown = max(front - float((values["position"] - values["length"])[there].min()), 150.0)
+        road = task.road if isinstance(task.road, Lanes) and task.road.ring is None else None
+        front, back = 150.0, 0.0
+        if road is not None and road.length is not None:
+            front = road.length
+        elif there.any():
+            front = float(values["position"][there].max())
+            back = float((values["position"] - values["length"])[there].min())
+        shown = max(front - back, 150.0)
         scale = 0.94 * SIZE / shown
+        for lane in range(lanes):
+            left, right = 0.0, float(SIZE)
+            if road is not None:
+                k = road.count - 1 - lane
+                ends = min(road.table("stops")[k], road.table("leaves")[k])
+                left = 0.97 * SIZE - (front - road.table("begins")[k]) * scale
+                right = min(0.97 * SIZE - (front - ends) * scale, right)
+            self._pygame.draw.rect(canvas, _ASPHALT, (left, top + 40 * lane - 13, right - left, 26))
         # Posts stand still on the ground, so that motion can be seen.
         for post in range(math.ceil((front - shown) / 50.0), math.floor(front / 50.0) + 1):
             x = 0.97 * SIZE - (front - 50.0 * post) * scale

@@ -11,13 +11,14 @@ from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, Worl
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.highway import HighwayTask
+from idm_env.tasks.open_lanes import BottleneckTask, MergeTask
 from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.replay import ReplayTask
 from idm_env.tasks.ring import RingTask
 
 TASKS: dict[str, type[Task]] = {
-    task.name: task for task in (RingTask, FollowTask, PlatoonTask, ReplayTask, HighwayTask)
+    task.name: task for task in (RingTask, FollowTask, PlatoonTask, ReplayTask, HighwayTask, MergeTask, BottleneckTask)
 }
 
 
@@ -41,6 +42,7 @@ def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any)
 __all__ = [
     "TASKS",
     "Advance",
+    "BottleneckTask",
     "Bounds",
     "Draw",
     "Ended",
@@ -48,6 +50,7 @@ __all__ = [
     "FollowTask",
     "HighwayTask",
     "KeywordError",
+    "MergeTask",
     "Pay",
     "PlatoonTask",
     "ReplayTask",

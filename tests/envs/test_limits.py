@@ -10,7 +10,15 @@ from idm_env.envs.gym import DiffIDMEnv
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.envs.vector import DiffIDMVectorEnv
 
-USUAL = {"ring": 3000, "follow": 1000, "platoon": 3000, "replay": 300, "highway": 3000}
+USUAL = {
+    "ring": 3000,
+    "follow": 1000,
+    "platoon": 3000,
+    "replay": 300,
+    "highway": 3000,
+    "merge": 3000,
+    "bottleneck": 3000,
+}
 QUICK = {"ring": {"warmup": 3}}
 
 

@@ -17,6 +17,8 @@ CASES = {
     "platoon": {"task": "platoon", "controlled": 2},
     "replay": {"task": "replay"},
     "highway": {"task": "highway", "vehicles": 30, "length": 300.0, "max_command": 4.0, "controlled": 3},
+    "merge": {"task": "merge", "vehicles": 40, "max_command": 4.0, "controlled": 3},
+    "bottleneck": {"task": "bottleneck", "vehicles": 40, "max_command": 4.0, "controlled": 3},
     "replay, follow": {"task": "replay", "controlled": 3, "reward_terms": "follow"},
 }
 STEPS, COUNT = 150, 24

@@ -1,0 +1,169 @@
+"""What tasks on several lanes share: drivers who change lanes, agents who may command them, and what agents see."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from idm_env.effects import Control, Effect, LaneCommand
+from idm_env.roads import Lanes
+from idm_env.tasks.base import Features, Pay, Task, World
+from idm_env.tasks.checks import at_least, whole
+from idm_env.types import Inputs, State
+
+FASTEST = 40.0
+"""Speed (m/s) up to which an agent is paid and observed."""
+FAR_AWAY = 200.0
+"""Distance (m) up to which vehicles are observed."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LanesTask(Task):
+    """Vehicles on several lanes, whose drivers follow IDM and change lanes by MOBIL; agents accelerate.
+
+    An agent commands its acceleration; its vehicle changes lanes as its driver would. With ``lane_commands`` it
+    commands that, too, by a second number of the action: above 1/3 to the left, below −1/3 to the right, otherwise to
+    stay. A command counts at the next decision, of which there is one a second; what is off the road or unsafe is not
+    done (``state.links.blocked`` counts it). An action of several agents holds all accelerations, then all lanes.
+
+    Args:
+        spread: Spread of desired speeds between drivers, as a share.
+        seen: How many vehicles an agent observes.
+        lane_commands: Whether agents command lanes as well.
+    """
+
+    spread: float = 0.2
+    seen: int = 4
+    lane_commands: bool = False
+
+    def __post_init__(self) -> None:
+        whole("seen", self.seen, 1)
+        at_least("spread", self.spread, 0.0)
+        if self.spread >= 1.0:
+            raise ValueError(f"spread = {self.spread:g} must be below 1: desired speeds are positive.")
+        super().__post_init__()
+
+    @property
+    @abc.abstractmethod
+    def several(self) -> Lanes:
+        """The road."""
+
+    @property
+    def road(self) -> Lanes:  # type: ignore[override]
+        """The road of several lanes."""
+        return self.several
+
+    @property
+    def machinery(self) -> tuple[Effect, ...]:  # type: ignore[override]
+        """Effects through which agents act."""
+        return (Control(), LaneCommand()) if self.lane_commands else (Control(),)
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Acceleration, and the lane where that is asked for."""
+        return ("accel", "lane") if self.lane_commands else ("accel",)
+
+    def command(self, action: Tensor) -> Tensor:
+        """Return the commanded accelerations (m/s²)."""
+        return super().command(action[..., : len(self.agents)])
+
+    def inputs(
+        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+    ) -> Inputs:
+        """Return the inputs of one step, in which lanes are left to the drivers."""
+        found = super().inputs(world, command, normals, live)
+        if self.lane_commands:
+            found = {**found, "lane_command": torch.full_like(world.state.speed, torch.nan)}
+        return found
+
+    def wishes(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
+        """Return the inputs with the lanes that agents command."""
+        if not self.lane_commands or action is None:
+            return inputs
+        wish = action.detach()[..., len(self.agents) :]
+        side = (wish > 1 / 3).to(action.dtype) - (wish < -1 / 3).to(action.dtype)
+        if live is not None:
+            side = torch.where(live, side, torch.nan)
+        slots = self.constant("agents", self.agents, action.device, torch.int64).expand(side.shape)
+        return {**inputs, "lane_command": inputs["lane_command"].scatter(-1, slots, side)}
+
+    def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
+        """Return checked parameters as tensors, desired speeds spread over drivers."""
+        values = super().params(dtype, device)
+        # Multiples of the golden ratio: evenly spread, whatever their number, and neighbours differ.
+        share = (0.618033988749895 * torch.arange(self.vehicles, dtype=torch.float64)) % 1.0
+        factor = (1.0 + self.spread * (2.0 * share - 1.0)).to(dtype=dtype, device=device)
+        idm = values["idm"]
+        return {**values, "idm": {**idm, "desired_speed": idm["desired_speed"] * factor}}
+
+    @property
+    def own_features(self) -> tuple[tuple[str, float, float, float], ...]:
+        """What an agent observes of itself: name, scale, lowest and highest value."""
+        return ("speed", 20.0, 0.0, FASTEST), ("lane", 1.0, 0.0, float(self.several.count - 1))
+
+    @property
+    def features(self) -> Features:
+        """What is seen of oneself, and of each vehicle nearby."""
+        n, last, own = self.seen, float(self.several.count - 1), tuple(zip(*self.own_features, strict=True))
+        each = [f"{what}_{k}" for k in range(n) for what in ("there", "ahead", "left", "speed")]
+        return Features(
+            (*own[0], *each),
+            (*own[1], *(1.0, 100.0, 1.0, 10.0) * n),
+            (*own[2], *(0.0, -FAR_AWAY, -last, -FASTEST) * n),
+            (*own[3], *(1.0, FAR_AWAY, last, FASTEST) * n),
+        )
+
+    @property
+    def pay(self) -> Pay:
+        """Rewards of a step lie between −0.1 and 1."""
+        return Pay(-0.1, 1.0)
+
+    @cached_property
+    def _others(self) -> list[list[int]]:
+        return [[j for j in range(self.vehicles) if j != i] for i in self.agents]
+
+    def seen_of_self(self, state: State) -> list[Tensor]:
+        """Return ``own_features``, each ``(…, agents)``."""
+        assert state.links is not None
+        return [self.pick(state.speed), self.pick(state.links.lane.to(state.speed.dtype))]
+
+    def apart(self, ahead: Tensor) -> Tensor:
+        """Return differences of positions (m) as distances on this road."""
+        return ahead
+
+    def observe(self, world: World) -> Tensor:
+        """Return what is seen of oneself, and of the nearest vehicles."""
+        state = world.state
+        assert state.links is not None
+        others = self.constant("others", self._others, state.speed.device, torch.int64)
+        shape = (len(state.speed), *others.shape)
+
+        def of(x: Tensor) -> Tensor:
+            return x[:, others.reshape(-1)].view(shape)
+
+        def beside(x: Tensor) -> Tensor:
+            return of(x) - self.pick(x).unsqueeze(-1)
+
+        ahead = self.apart(beside(state.position))
+        left, speed = beside(state.links.lane.to(state.speed.dtype)), beside(state.speed)
+        away = ahead.detach().abs()
+        if state.present is not None:
+            both = of(state.present) * self.pick(state.present).unsqueeze(-1)
+            away = torch.where(both > 0, away, torch.inf)
+        near = away.argsort(dim=-1, stable=True)[..., : self.seen]
+        features = self.seen_of_self(state)
+        nobody = torch.zeros_like(features[0])
+        for k in range(self.seen):
+            if k >= near.shape[-1]:
+                features += [nobody] * 4
+                continue
+            which = near[..., k : k + 1]
+            way, aside, pace, far = (x.gather(-1, which).squeeze(-1) for x in (ahead, left, speed, away))
+            there = (far <= FAR_AWAY).to(way.dtype)
+            features += [there, way * there, aside * there, pace * there]
+        return self.clip(features)

@@ -1,0 +1,196 @@
+"""Tasks ``merge`` and ``bottleneck``: traffic that flows in, has to change lanes before a lane ends, and leaves."""
+
+from __future__ import annotations
+
+import abc
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env import population
+from idm_env.effects import IDM, Brakes, Effect, MandatoryChange, Mobil
+from idm_env.roads import Lanes, lane_drop, on_ramp
+from idm_env.tasks.base import World
+from idm_env.tasks.checks import at_least
+from idm_env.tasks.lanes import FASTEST, LanesTask
+from idm_env.tasks.random import Draw
+from idm_env.types import Params, State, Trips
+
+_PLACE_STREAM = 37
+_SIGHT = 500.0
+"""How far ahead an agent sees that its lane ends (m)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OpenLanesTask(LanesTask):
+    """Trips begin evenly in time, lane by lane, and slots make them again and again, so that an episode has no end.
+
+    An episode begins with free traffic up to ``filled``, where lanes are still all there. Whoever finds no room at his
+    entry waits and is counted (``idm_env.population.counts``). Agents act as ``LanesTask`` says; while an agent's
+    vehicle waits or has left, its observation is zeros and its command does nothing.
+
+    Observation, per agent: own speed, lane, 1 if it is on the road, how far its lane goes on (m, at most 500); then the
+    nearest vehicles as in ``highway``. Reward, per agent: ``V/40 − 0.1 (u/u_max)²``, V the sum of the speeds of all on
+    the road over the number of these and of those queued: keeping others out pays nothing. Terminated where vehicles
+    touch, or an agent drives over the end of a lane, which pays ``−crash_cost`` instead (``idm_env.tasks.crash``). Cut
+    off after 3000 steps.
+    """
+
+    own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Mobil(), MandatoryChange(), Brakes())
+    own_parameters: ClassVar = {
+        "idm": {"max_accel": 1.5, "comfort_decel": 2.0, "time_gap": 1.2, "min_gap": 2.0, "desired_speed": 30.0}
+    }
+
+    vehicles: int = 80
+    entry_speed: float = 20.0
+
+    def __post_init__(self) -> None:
+        at_least("entry_speed", self.entry_speed, 1.0, "m/s")
+        for lane, flow in self.inflows.items():
+            at_least(f"inflow of lane {lane}", flow, 1.0, "vehicles an hour")
+        super().__post_init__()
+        population.trips(self.inflows, 1.0, slots=self.vehicles)
+
+    @property
+    @abc.abstractmethod
+    def inflows(self) -> Mapping[int, float]:
+        """Vehicles an hour that want to enter each lane."""
+
+    @property
+    @abc.abstractmethod
+    def filled(self) -> float:
+        """Up to where vehicles are when an episode begins (m)."""
+
+    def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
+        """Return trips, of which the first ones began before the episode did; each up to a quarter aside in time."""
+        flows, total = self.inflows, sum(self.inflows.values())
+        lane, departs, again = [], [], []
+        for k, flow in flows.items():
+            count, each = max(1, round(self.vehicles * flow / total)), 3600.0 / flow
+            lane += [k] * count
+            departs += [each * i for i in range(count)]
+            again += [each * count] * count
+        by_time = sorted(range(len(departs)), key=lambda i: departs[i])[: self.vehicles]
+        while len(by_time) < self.vehicles:  # shares that are rounded down leave a slot to spare: it never drives
+            by_time.append(-1)
+        columns = [[*x, y] for x, y in ((departs, math.inf), (again, math.inf), (lane, 0))]
+        device = draw.key.device
+        first, more, at = (torch.tensor([c[i] for i in by_time], dtype=torch.float64, device=device) for c in columns)
+        interval = torch.tensor([3600.0 / flows.get(int(k), math.inf) for k in at], dtype=torch.float64, device=device)
+        aside = 0.5 * (draw.uniforms(_PLACE_STREAM, self.vehicles, torch.float64) - 0.5)
+        shape = tuple(aside.shape)
+        departs_at = first + interval * (aside + 0.25) - self.filled / self.entry_speed
+        none = torch.zeros(shape, dtype=torch.int64, device=device)
+        return Trips(
+            departs_at.to(dtype), more.to(dtype).expand(shape), at.long().expand(shape),
+            torch.full(shape, self.entry_speed, dtype=dtype, device=device), none, none.clone(),
+        )  # fmt: skip
+
+    def begin(self, draw: Draw, params: Params) -> World:
+        """Return free traffic up to ``filled``, and everybody else waiting."""
+        like = params["idm"]["max_accel"]
+        trips = self._trips(draw, like.dtype)
+        inside = trips.departs < 0
+        begins = self.several.at_lane(trips.lane, trips.departs, "begins")
+        place = torch.where(inside, begins - trips.departs * self.entry_speed, begins)
+        inside = inside & (place < self.filled)
+        state = self.simulator.state(
+            torch.where(inside, place, begins), trips.speed, params, length=self.vehicle_length,
+            present=inside.to(like.dtype), lane=trips.lane,
+            step=torch.full((len(place),), -self.warmup, device=like.device),
+        )  # fmt: skip
+        return World(state._replace(trips=trips._replace(entered=inside.long())), {})
+
+    @property
+    def own_features(self) -> tuple[tuple[str, float, float, float], ...]:
+        """As in ``LanesTask``, and whether one is on the road, and how far one's lane goes on."""
+        return (*super().own_features, ("present", 1.0, 0.0, 1.0), ("ends", 100.0, 0.0, _SIGHT))
+
+    def seen_of_self(self, state: State) -> list[Tensor]:
+        """Return ``own_features``, 0 for those not on the road."""
+        assert state.links is not None and state.present is not None
+        ends = (self.several.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT)
+        there = self.pick(state.present)
+        return [x * there for x in (*super().seen_of_self(state), torch.ones_like(there), self.pick(ends))]
+
+    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return ``V/40 − 0.1 (u/u_max)²``."""
+        state = after.state
+        assert state.present is not None
+        found = population.counts(self.simulator, state)
+        pace = (state.speed.clamp_max(FASTEST) * state.present).sum(-1) / (found.inside + found.queued).clamp_min(1)
+        hardest = max(abs(limit) for limit in self.command_limits)
+        return pace.unsqueeze(-1) / FASTEST - 0.1 * (command / hardest).square().clamp_max(1.0)
+
+    def crashed(self, world: World) -> Tensor:
+        """Return whose episodes end in a crash: of all, where vehicles touch or one drives over the end of its lane."""
+        state = world.state
+        assert state.links is not None and state.present is not None
+        over = (state.position > self.several.closed_at(state.links.lane, state.position)) & (state.present > 0)
+        crashed = super().crashed(world)
+        return crashed | over.any(-1, keepdim=True).expand_as(crashed)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MergeTask(OpenLanesTask):
+    """Two lanes, and a ramp on their right from which one must merge within 200 m; it begins at 100 m.
+
+    Args:
+        inflow: Vehicles an hour on the two lanes together.
+        ramp_inflow: Vehicles an hour on the ramp.
+    """
+
+    name: ClassVar[str] = "merge"
+
+    inflow: float = 2400.0
+    ramp_inflow: float = 500.0
+
+    @property
+    def several(self) -> Lanes:
+        """Two lanes of 900 m, and the ramp, which is lane 0."""
+        return Lanes(3, length=900.0, ends=(on_ramp(0, begin=400.0, end=600.0, entry=100.0),))
+
+    @property
+    def inflows(self) -> Mapping[int, float]:
+        """The ramp's, and half of the other for each lane."""
+        return {0: self.ramp_inflow, 1: 0.5 * self.inflow, 2: 0.5 * self.inflow}
+
+    @property
+    def filled(self) -> float:
+        """Up to where vehicles are when an episode begins (m)."""
+        return 350.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BottleneckTask(OpenLanesTask):
+    """Four lanes, of which the outer two end at 400 m and the left one of the others at 600 m: 4 → 2 → 1.
+
+    After the bottleneck of Flow (Vinitsky et al. 2018, CoRL, "Benchmarks for reinforcement learning in mixed-autonomy
+    traffic").
+
+    Args:
+        inflow: Vehicles an hour on all lanes together.
+    """
+
+    name: ClassVar[str] = "bottleneck"
+
+    inflow: float = 2600.0
+
+    @property
+    def several(self) -> Lanes:
+        """The road, 800 m long."""
+        return Lanes(4, length=800.0, ends=(lane_drop(0, at=400.0), lane_drop(3, at=400.0), lane_drop(2, at=600.0)))
+
+    @property
+    def inflows(self) -> Mapping[int, float]:
+        """A quarter for each lane."""
+        return dict.fromkeys(range(4), 0.25 * self.inflow)
+
+    @property
+    def filled(self) -> float:
+        """Up to where vehicles are when an episode begins (m)."""
+        return 300.0

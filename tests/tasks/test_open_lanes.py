@@ -1,0 +1,99 @@
+"""Tasks ``merge`` and ``bottleneck``: nobody is lost, agents may be away, faces agree, gradients are right."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import idm_env  # noqa: F401
+from idm_env import population
+from idm_env.envs.pettingzoo import parallel_env
+from idm_env.tasks import Draw, make_task
+
+OPEN = ("merge", "bottleneck")
+
+
+@pytest.mark.parametrize("name", OPEN)
+def test_whoever_is_due_is_inside_left_or_queued_for_a_minute(name: str) -> None:
+    """With agents who brake at random; vehicles leave, and lanes that end are left by all but a few."""
+    task = make_task(name, vehicles=40, controlled=3, failsafe=3.0)
+    params = task.params(torch.float64, "cpu")
+    draw = Draw.of(torch.arange(2), torch.zeros(2, dtype=torch.int64))
+    world = task.reset(draw, params)
+    assert world.state.present is not None and 0 < world.state.present.sum() < 80
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for _ in range(600):
+            push = 0.5 * torch.rand((2, 3), generator=generator, dtype=torch.float64) - 0.25
+            world = task.step(world, task.command(push), None, params)
+            found = population.counts(task.simulator, world.state)
+            assert torch.equal(found.due, found.inside + found.left + found.queued) and (found.queued >= 0).all()
+            assert not task.crashed(world).any()
+            seen, there = task.observe(world), task.pick(world.state.present)
+            assert (seen[there <= 0] == 0).all()
+            assert torch.equal(seen[..., 2], there)
+    assert (found.left > 5).all()
+
+
+def test_faces_drive_the_same_traffic() -> None:
+    """Single, vector and PettingZoo, lanes commanded."""
+    choices = {"task": "bottleneck", "vehicles": 40, "controlled": [5], "lane_commands": True}
+    action = np.array([0.1, 1.0], np.float32)
+    single = gym.make("DiffIDM-v0", **choices)
+    vector = gym.make_vec("DiffIDM-v0", num_envs=2, **choices)
+    each = parallel_env(**choices)
+    single.reset(seed=4)
+    vector.reset(seed=[4, 9])
+    each.reset(seed=4)
+    (agent,) = each.agents
+    for _ in range(30):
+        one, reward = single.step(action)[:2]
+        many, rewards = vector.step(np.stack([action, action]))[:2]
+        own = each.step({agent: action})
+        np.testing.assert_array_equal(one, many[0])
+        np.testing.assert_array_equal(one, own[0][agent])
+        assert reward == pytest.approx(float(rewards[0])) == pytest.approx(own[1][agent])
+    assert not np.array_equal(many[0], many[1])
+
+
+def test_an_agent_that_drives_over_the_end_of_its_lane_has_crashed() -> None:
+    """The end of a lane is a standing leader that nobody may pass."""
+    env = gym.make("DiffIDM-v0", task="bottleneck", inflow=400.0, vehicles=8, controlled=[0], max_command=3.0,
+                   lane_commands=True)  # fmt: skip
+    env.reset(seed=1)
+    for step in range(400):  # noqa: B007
+        _, reward, terminated, _, _ = env.step(np.array([1.0, 0.0], np.float32))
+        if terminated:
+            break
+    assert terminated and reward < -100 and 50 < step < 350
+
+
+def test_gradients_of_the_reward_are_finite_differences() -> None:
+    """Through entries, changes and lanes that end, choices frozen."""
+    task = make_task("merge", vehicles=30, controlled=[3])
+    params = task.params(torch.float64, "cpu")
+    world = task.reset(Draw.of(torch.arange(1), torch.zeros(1, dtype=torch.int64)), params)
+
+    def total(push: torch.Tensor) -> torch.Tensor:
+        now, rewards = world, []
+        for _ in range(60):
+            after = task.step(now, task.command(push.view(1, 1)), None, params)
+            rewards.append(task.reward(now, push.view(1, 1), after))
+            now = after
+        return torch.stack(rewards).sum()
+
+    push = torch.tensor(-0.3, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(total(push), push)
+    h = 1e-5
+    expected = (total(push.detach() + h) - total(push.detach() - h)) / (2 * h)
+    torch.testing.assert_close(slope, expected, rtol=1e-5, atol=1e-8)
+
+
+def test_bad_choices_are_one_line() -> None:
+    """An inflow of none."""
+    with pytest.raises(ValueError, match="inflow of lane 0 = 0"):
+        make_task("merge", ramp_inflow=0.0)
+    with pytest.raises(ValueError, match="entry_speed = 0"):
+        make_task("bottleneck", entry_speed=0.0)
