@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from idm_env.roads.beside import Side, Sideways, preferred
-from idm_env.roads.linked import Linked
+from idm_env.roads.linked import Linked, without_absent
 from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
     due = state.step.remainder(stepping.decides_after) == 0
     if not bool(due.any()):
         return state
+    assert state.links is not None
+    state = state._replace(links=without_absent(state.links, state.present))
     view = stepping.road.view(state)
     assert isinstance(view, Linked)
     with torch.no_grad():
@@ -47,7 +49,8 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
         scene = beside(stepping, view, sides, state, inputs, params)
         wish = wished(stepping, scene, params)
         prefers = preferred(*sides, wish, stepping.road.handed == "left")  # type: ignore[attr-defined]
-        claim = view.chosen(sides, prefers, due if due.dim() == 0 else due.unsqueeze(-1))
+        due = due if due.dim() == 0 else due.unsqueeze(-1)
+        claim = view.chosen(sides, prefers, due if state.present is None else due & (state.present > 0))
     return view.changed(state, claim)
 
 

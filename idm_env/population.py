@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from idm_env.roads.lanes import Lanes
-from idm_env.roads.linked import Linked
-from idm_env.types import FAR, Links, Params, State, Trips
+from idm_env.roads.linked import Linked, without_absent
+from idm_env.types import FAR, Params, State, Trips
 
 if TYPE_CHECKING:
     from idm_env.step import Stepping
@@ -99,27 +99,51 @@ def counts(stepping: Stepping, state: State) -> Counts:
     return Counts(*(x.sum(-1) for x in (now, inside.long(), left, now - begun)))
 
 
-def departed(given: Trips, before: Tensor, after: Tensor) -> Trips:
-    """Return the trips after a step in which those have left who are no longer present."""
-    return given._replace(left=given.left + ((before > 0) & (after <= 0)))
+def turnover(stepping: Stepping, state: State, params: Params) -> State:
+    """Return the state after those have left who are at the end of their road, and those entered for whom it is time.
+
+    This, too, is done when lanes are decided about: until then whoever is beyond the end drives on, and is followed.
+    """
+    if state.present is None or state.links is None:
+        return state
+    now = state.step.remainder(stepping.decides_after) == 0
+    if not bool(now.any()):
+        return state
+    now = now if now.dim() == 0 else now.unsqueeze(-1)
+    if stepping.road.leaving:
+        state = _departed(stepping, state, now)
+    return state if state.trips is None else _entered(stepping, state, params, now)
 
 
-def entered(stepping: Stepping, state: State, params: Params) -> State:
+def _departed(stepping: Stepping, state: State, now: Tensor) -> State:
+    """Return the state after those have left who have come to the end of the road: nobody follows them any more."""
+    view = stepping.road.view(state)
+    stay = view.remaining(state.present, state.position)
+    assert stay is not None and state.present is not None and state.links is not None
+    stay = torch.where(now, stay, state.present)
+    trips = state.trips
+    if trips is not None:
+        trips = trips._replace(left=trips.left + ((state.present > 0) & (stay <= 0)))
+    followed = view.leader_present(stay, state.speed) > 0
+    return state._replace(
+        present=stay, trips=trips, gap=torch.where(followed, state.gap, FAR), links=without_absent(state.links, stay)
+    )
+
+
+def _entered(stepping: Stepping, state: State, params: Params, now: Tensor) -> State:
     """Return the state after those have entered for whom it is time and who have room, one on each lane.
 
     Of a lane's queue the first enters at the beginning of the lane, where the gap s to the last vehicle there allows::
 
         s ≥ s0 + v T    and    (v² − v_l²) / 2b ≤ s − s0
 
-    with v the speed that he asks for, or if it must be that of the vehicle ahead (v_l) if that is less. Entries are
-    made when lanes are decided about. Gradients flow through speed and gap, not through who enters when.
+    with v the speed that he asks for, or if it must be that of the vehicle ahead (v_l) if that is less. Gradients flow
+    through speed and gap, not through who enters when.
     """
     assert state.trips is not None and state.links is not None and state.present is not None
     road, given = stepping.road, state.trips
     assert isinstance(road, Lanes)
-    now = state.step.remainder(stepping.decides_after) == 0
-    waits = (state.present <= 0) & (due(given, stepping.time(state)) > given.entered)
-    waits = waits & (now if now.dim() == 0 else now.unsqueeze(-1))
+    waits = (state.present <= 0) & (due(given, stepping.time(state)) > given.entered) & now
     if not bool(waits.any()):
         return state
     view = road.view(state)
@@ -183,22 +207,12 @@ def _last(view: Linked, state: State, lanes: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(mine, own, 0).amax(-1), mine.any(-1)
 
 
-def _without_absent(links: Links, present: Tensor) -> Links:
-    """Return links in which nobody follows who has left: his slot may be another vehicle's before long."""
-    own = torch.arange(present.shape[-1], device=present.device).expand_as(present)
-    there = present > 0
-    leader, follower = (
-        torch.where(there & there.gather(-1, slot), slot, own) for slot in (links.leader, links.follower)
-    )
-    return links._replace(leader=leader, follower=follower)
-
-
 def _placed(stepping: Stepping, state: State, params: Params, entry: _Entry) -> State:
     """Return the state with those on the road who enter."""
     assert state.trips is not None and state.present is not None and state.links is not None
     goes, first, last, followed, begins, gap, speed = entry
-    links, lanes = _without_absent(state.links, state.present), torch.arange(goes.shape[-1], device=goes.device)
-    lanes = lanes.expand(goes.shape)
+    links = without_absent(state.links, state.present)
+    lanes = torch.arange(goes.shape[-1], device=goes.device).expand(goes.shape)
     n = state.speed.shape[-1]
 
     def put(x: Tensor, value: Tensor, where: Tensor, slots: Tensor) -> Tensor:
@@ -230,4 +244,4 @@ def _placed(stepping: Stepping, state: State, params: Params, entry: _Entry) -> 
     return begun._replace(memory=memory)
 
 
-__all__ = ["Counts", "counts", "departed", "due", "entered", "spread", "trips", "waiting"]
+__all__ = ["Counts", "counts", "due", "spread", "trips", "turnover", "waiting"]

@@ -21,9 +21,9 @@ from idm_env.changes import decided
 from idm_env.effects.base import HOOKS, CarFollowing, Effect, Hook
 from idm_env.effects.limits import unspoken
 from idm_env.history import PAST, History
-from idm_env.population import departed, entered
+from idm_env.population import turnover
 from idm_env.roads.base import Road
-from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State, Trips
+from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
 
 Integration = Literal["ballistic", "euler", "midpoint"]
 S = TypeVar("S", bound="Stepping")
@@ -289,8 +289,8 @@ class Stepping:
         ``inputs`` maps effect names to what they take at this step; ``params`` maps effect and parameter names to
         tensors that broadcast against ``(..., vehicles)``.
         """
-        if state.trips is not None:
-            state = entered(self, state, params)
+        if state.links is not None and state.present is not None:
+            state = turnover(self, state, params)
         if state.links is not None and self.changes:
             state = decided(self, state, inputs, params)
         accel, scene, driver = self._respond(state, inputs, params)
@@ -298,8 +298,6 @@ class Stepping:
         motion = Motion(displacement, state.position + displacement, speed, accel, state.present)
         for effect in self._hooks["place"]:
             motion = effect.place(motion, scene, params[effect.name])  # type: ignore[arg-type]
-        if self.road.leaving:
-            motion = motion._replace(present=self.road.view(state).remaining(motion.present, motion.position))
         memory = {
             e.name: e.remember(scene, driver, params[e.name])  # type: ignore[arg-type]
             for e in self.effects
@@ -315,13 +313,7 @@ class Stepping:
             step=state.step + 1,
             present=motion.present,
             memory=memory,
-            trips=self._trips(state, motion.present),
         )
-
-    def _trips(self, state: State, present: Tensor | None) -> Trips | None:
-        if state.trips is None or state.present is None or present is None:
-            return state.trips
-        return departed(state.trips, state.present, present)
 
     def _gaps(self, state: State, motion: Motion) -> Tensor:
         road = self.road.view(state)

@@ -17,6 +17,7 @@ from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import dense, operand
 from idm_env.kernels.printed import FUNCTIONS, HEADER
 from idm_env.kernels.tiles import ROW, Array
+from idm_env.population import turnover
 from idm_env.roads import Lanes
 from idm_env.roads.chains import Places
 from idm_env.roads.linked import Linked
@@ -80,13 +81,24 @@ class Traffic:
         self.shape = tuple(state.speed.shape)
         self.n = self.shape[-1]
         self.rows = state.speed.numel() // self.n
-        self._links = np.stack([x.expand(self.shape).reshape(-1).numpy() for x in state.links])
+        self._take(state.links)
         self._lasting: _Lasting | None = None
 
     @property
     def links(self) -> Links:
         """The links as they are now, in memory that decisions change."""
         return Links(*(torch.from_numpy(x).view(self.shape) for x in self._links))
+
+    def _take(self, links: Links | None) -> None:
+        assert links is not None
+        self._links = np.stack([x.expand(self.shape).reshape(-1).numpy() for x in links])
+
+    def begin(self, state: State, params: Params) -> State:
+        """Return the state after those have left and entered for whom it is time."""
+        if state.present is not None:
+            state = turnover(self.simulator, state._replace(links=self.links), params)
+            self._take(state.links)
+        return state
 
     @cached_property
     def _ring(self) -> float:
@@ -121,8 +133,7 @@ class Traffic:
         """Return the state after a decision that is due, its links these; None where links are no order."""
         if isinstance(found, str):
             after = decided(self.simulator, state._replace(links=self.links), inputs, params)
-            assert after.links is not None
-            self._links = np.stack([x.reshape(-1).numpy() for x in after.links])
+            self._take(after.links)
             return after
         kind = state.speed.detach().numpy().dtype
         phase, constants = found.compiled(kind.name)

@@ -31,7 +31,7 @@ def walk(leader, follower, lane, position, present, coming, n, count, ring, base
             x -= np.floor(x / ring) * ring
             if heads[k] < 0 or x > furthest[k]:
                 heads[k], furthest[k] = i, x
-        elif leader[base + i] == i:
+        elif leader[base + i] == i or (coming and present[base + leader[base + i]] <= 0):
             if heads[k] >= 0:
                 return False
             heads[k] = i

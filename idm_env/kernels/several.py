@@ -35,8 +35,6 @@ def between(simulator: Simulator) -> Simulator:
 
 def kernel_of(simulator: Simulator, state: State, inputs: Inputs) -> TileKernel | str:
     """Return the kernel of the steps between two decisions, or why there is none."""
-    if state.present is not None:
-        return "vehicles come and go on several lanes"
     if state.step.numel() > 1 and bool((state.step != state.step.reshape(-1)[0]).any()):
         return "rows decide at different steps"
     inner = between(simulator)
@@ -51,19 +49,22 @@ def rollout(
     inner, road = between(simulator), simulator.road
     assert isinstance(road, Lanes)
     own = {name: params[name] for name in inner.by_name}
-    every = simulator.decides_after if simulator.changes else max(steps, 1)
+    stops = bool(simulator.changes) or state.present is not None
+    every = simulator.decides_after if stops else max(steps, 1)
     block = lanes.BLOCK if road.ring is not None else every
     wishes = decision(simulator, Form.of(state._replace(links=None), inputs)) if simulator.changes else ""
     traffic = Traffic(simulator, state)
     kept: list[tuple[Tensor, ...]] = []
     done, clock = 0, int(state.step.reshape(-1)[0])
     while done < steps:
+        if stops and (clock + done) % every == 0:
+            state = traffic.begin(state, params)
         if simulator.changes and (clock + done) % every == 0:
             after = traffic.decide(wishes, state, _cut(inputs, done, None), params)
             if after is None:
                 return None
             state = after
-        until = every - (clock + done) % every if simulator.changes else steps - done
+        until = every - (clock + done) % every if stops else steps - done
         count = min(until, block, steps - done)
         places = traffic.places(state, tiles.halo(count, kernel.program.reach))
         if places is None:
@@ -121,6 +122,7 @@ def _row(state: State, places: Places) -> State:
     index = places.slots
     return state._replace(
         **{n: getattr(state, n).gather(-1, index) for n in ("position", "speed", "accel", "gap", "length")},
+        present=None if state.present is None else state.present.gather(-1, index),
         memory=_moved(state.memory, index, state.speed.shape[-1]),
         links=places,  # type: ignore[arg-type]
     )

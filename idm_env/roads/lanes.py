@@ -60,8 +60,9 @@ def off_ramp(lane: int, begin: float, end: float, leaves: float) -> End:
 class Lanes(Road):
     """``count`` lanes in one direction, lane 0 on the right: endless, of a ``length`` (m), or a ``ring`` (m).
 
-    At the end of a length vehicles leave the road: ``present`` becomes 0, and they do not come back. ``ends`` are lanes
-    that begin or end elsewhere. ``handed`` settles claims of equal utility: to the left is preferred, or to the right.
+    At the end of a length vehicles leave the road, when lanes are next decided about: ``present`` becomes 0. ``ends``
+    are lanes that begin or end elsewhere. ``handed`` settles claims of equal utility: to the left is preferred, or to
+    the right.
 
     Positions on a ring are unwrapped, as on ``Ring``. A vehicle alone in its lane of a ring follows itself.
 

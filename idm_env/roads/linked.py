@@ -30,6 +30,18 @@ class Claim(NamedTuple):
     judged: Tensor
 
 
+def without_absent(links: Links, present: Tensor | None) -> Links:
+    """Return links in which nobody follows who has left: his slot may be another vehicle's before long."""
+    if present is None:
+        return links
+    own = torch.arange(present.shape[-1], device=present.device).expand_as(present)
+    there = present > 0
+    leader, follower = (
+        torch.where(there & there.gather(-1, slot), slot, own) for slot in (links.leader, links.follower)
+    )
+    return links._replace(leader=leader, follower=follower)
+
+
 class _Look(torch.autograd.Function):
     """``x[to]`` where ``to`` and ``fro`` are inverse: the adjoint is a gather, too, always in the same order."""
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from idm_env import population
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
 from idm_env.kernels import dispatch
-from idm_env.roads import Lanes, lane_drop
+from idm_env.roads import Lanes, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator, Trajectory
 from idm_env.types import State
 
@@ -117,6 +118,45 @@ def test_the_past_goes_with_its_vehicle() -> None:
     assert end.links is not None and fast.links is not None and torch.equal(end.links.lane, fast.links.lane)
     for a, b in zip([*kept, end.memory["past"]], [*quick, fast.memory["past"]], strict=True):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("again", [None, 24], ids=["one slot per trip", "slots used again"])
+def test_vehicles_come_and_go_in_compiled_rollouts(again: int | None) -> None:
+    """Entries, exits, ramps and ends of lanes: links, counts, values and gradients of the torch path."""
+    road = Lanes(3, length=700.0, ends=(on_ramp(0, 150.0, 400.0, entry=50.0), off_ramp(2, 200.0, 400.0, leaves=500.0)))
+    simulator = Simulator(road, (IDM(), make("second_leader"), make("memory"), Mobil(), MandatoryChange(), Brakes()))
+    params = simulator.defaults(dtype=torch.float64)
+    trips = population.trips({0: 900.0, 1: 1500.0, 2: 1500.0}, 60.0, slots=again, dtype=torch.float64)
+    n = len(trips.departs)
+    desired = 15.0 + 20.0 * torch.rand((2, n), generator=torch.Generator().manual_seed(1)).double()
+    begin = population.waiting(simulator, population.spread(trips, (2, n)), params)
+
+    def run() -> tuple[State, Trajectory, Tensor]:
+        free = desired.clone().requires_grad_()
+        given = {**params, "idm": {**params["idm"], "desired_speed": free}}
+        state, _ = simulator.rollout(begin, {}, given, 733, keep=None)
+        end, kept = simulator.rollout(state, {}, given, 40)
+        assert end.present is not None
+        total = (end.position * end.present).sum() + (kept.speed * end.present).sum()
+        return end, kept, torch.autograd.grad(total, free)[0]
+
+    with dispatch.off():
+        end, kept, gradient = run()
+    assert dispatch.refusal(simulator, begin, {}, params) is None
+    fast, quick, fast_gradient = run()
+    assert end.links is not None and fast.links is not None and end.trips is not None and fast.trips is not None
+    assert (end.trips.left > 0).any() and end.links.changed.sum() > 10 and (end.present == 1).any()
+    there = end.present > 0  # type: ignore[operator]
+    for one, other in zip([*end.links[3:], *end.trips], [*fast.links[3:], *fast.trips], strict=True):
+        assert torch.equal(one, other)
+    for one, other in zip(end.links[:3], fast.links[:3], strict=True):
+        assert torch.equal(one[there], other[there])
+    assert torch.equal(end.present, fast.present)  # type: ignore[arg-type]
+    for a, b in zip(
+        [*kept, gradient, end.memory["memory"]], [*quick, fast_gradient, fast.memory["memory"]], strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8)
+    assert gradient.abs().sum() > 0
 
 
 def test_vehicles_that_have_passed_through_each_other_take_the_torch_path() -> None:
