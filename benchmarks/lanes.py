@@ -3,8 +3,6 @@
 ``python -m benchmarks.lanes speed [vehicles]`` prints million vehicle updates per CPU second of one thread: rings of
 1000 vehicles on four lanes at 15 /km/lane, Δt 0.1 s, MOBIL at 1 Hz, desired speeds of 25 to 35 m/s.
 ``python -m benchmarks.lanes sumo`` drives the same ring in SUMO (IDM, LC2013, ``libsumo``), in the same minute.
-``python -m benchmarks.lanes drop`` prints the flow out of a road of 4 → 2 → 1 lanes that 2600 vehicles an hour want to
-enter, beside that published for SUMO (IDM, LC2013).
 ``python -m benchmarks.lanes flow`` prints flow and changes over density, beside SUMO's where ``libsumo`` is there.
 """
 
@@ -19,9 +17,8 @@ from typing import Any
 
 import torch
 
-from idm_env import population
-from idm_env.effects import IDM, Brakes, MandatoryChange, Mobil, Noise
-from idm_env.roads import Lanes, lane_drop
+from idm_env.effects import IDM, Brakes, Mobil
+from idm_env.roads import Lanes
 from idm_env.simulator import Simulator
 from idm_env.types import State
 
@@ -72,47 +69,6 @@ def speed(vehicles: int) -> None:
 def _changes(state: State) -> int:
     assert state.links is not None
     return int(state.links.changed.sum())
-
-
-PUBLISHED: dict[str, float] = {
-    "as published": 1476, "time_gap 0.5": 1696, "time_gap 0.75": 1540, "time_gap 1.25": 1456, "desired_speed 15": 1463,
-    "desired_speed 20": 1474, "min_gap 2": 1514, "min_gap 3": 1440,
-}  # fmt: skip
-"""Vehicles per hour out of the bottleneck with human drivers: IDM with a 2.6, b 4.5, T 1, s0 2.5, v0 30, σ 0.2."""
-
-
-def drop(seeds: int = 4, minutes: int = 30) -> None:
-    """Print the outflow of 4 → 2 → 1 lanes, which end at 500 and 750 m, in the last two thirds of the time."""
-    ends = (lane_drop(0, at=500.0), lane_drop(3, at=500.0), lane_drop(2, at=750.0))
-    own = (IDM(), Noise(), Mobil(), MandatoryChange(), Brakes())
-    simulator = Simulator(Lanes(4, length=1000.0, ends=ends), own, dt=0.25)
-    given = population.trips(dict.fromkeys(range(4), 650.0), 3600.0, speed=15.0, slots=400)
-    rows, n = len(PUBLISHED) * seeds, len(given.departs)
-    params = simulator.defaults(dtype=torch.float32)
-    base = {"max_accel": 2.6, "comfort_decel": 4.5, "time_gap": 1.0, "min_gap": 2.5, "desired_speed": 30.0}
-    for name, value in base.items():
-        column = torch.full((rows, 1), value)
-        for i, label in enumerate(PUBLISHED):
-            which, _, other = label.partition(" ")
-            if which == name:
-                column[i * seeds : (i + 1) * seeds] = float(other)
-        params["idm"][name] = column
-    params["noise"]["sigma"] = torch.tensor(0.2)
-    state = population.waiting(simulator, population.spread(given, (rows, n)), params)
-    steps = int(20.0 / simulator.dt)
-    begin = state
-    for third in range(3 * minutes):
-        state, _ = simulator.rollout(state, {}, params, steps, keep=None, seed=third)
-        if third + 1 == minutes:
-            begin = state
-    assert begin.trips is not None and state.trips is not None and state.links is not None
-    hours = minutes * 40.0 / 3600.0
-    out = (state.trips.left - begin.trips.left).sum(-1).view(-1, seeds) / hours
-    queued = population.counts(simulator, state).queued.view(-1, seeds).double().mean(-1)
-    print("IDM                published   ours         ratio   queued at the end")
-    for label, theirs, mine, waits in zip(PUBLISHED, PUBLISHED.values(), out, queued, strict=True):
-        mean, error = float(mine.mean()), float(mine.std()) / math.sqrt(seeds)
-        print(f"{label:18s} {theirs:9.0f}   {mean:5.0f} ± {error:3.0f} {mean / theirs:7.2f} {waits:19.0f}")
 
 
 def flow(densities: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0)) -> None:
@@ -232,12 +188,10 @@ def main() -> None:
         speed(int(sys.argv[2]) if len(sys.argv) > 2 else 200_000)
     elif what == "sumo":
         sumo()
-    elif what == "drop":
-        drop()
     elif what == "flow":
         flow()
     else:
-        sys.exit(f"unknown benchmark '{what}'. Take speed, sumo, drop or flow.")
+        sys.exit(f"unknown benchmark '{what}'. Take speed, sumo or flow.")
 
 
 if __name__ == "__main__":

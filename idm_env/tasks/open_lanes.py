@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -29,9 +29,9 @@ _SIGHT = 500.0
 class OpenLanesTask(LanesTask):
     """Trips begin evenly in time, lane by lane, and slots make them again and again, so that an episode has no end.
 
-    An episode begins with free traffic up to ``filled``, where lanes are still all there. Whoever finds no room at his
-    entry waits and is counted (``idm_env.population.counts``). Agents act as ``LanesTask`` says; while an agent's
-    vehicle waits or has left, its observation is zeros and its command does nothing.
+    An episode begins with free traffic up to ``filled``, where lanes are still all there; the first slots are in front.
+    Whoever finds no room at his entry waits and is counted (``idm_env.population.counts``). Agents act as ``LanesTask``
+    says; while an agent's vehicle waits or has left, its observation is zeros and its command does nothing.
 
     Observation, per agent: own speed, lane, 1 if it is on the road, how far its lane goes on (m, at most 500); then the
     nearest vehicles as in ``highway``. Reward, per agent: ``V/40 − 0.1 (u/u_max)²``, V the sum of the speeds of all on
@@ -46,6 +46,7 @@ class OpenLanesTask(LanesTask):
     }
 
     vehicles: int = 80
+    controlled: int | float | str | Sequence[int] = (4,)
     entry_speed: float = 20.0
 
     def __post_init__(self) -> None:
