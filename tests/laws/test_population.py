@@ -140,11 +140,13 @@ def test_gradients_flow_through_entries() -> None:
         Lanes(2, length=700.0, ends=(lane_drop(1, at=400.0),)), {0: 1800.0, 1: 1500.0}, 20.0
     )
 
+    weights = torch.rand(state.speed.shape, generator=torch.Generator().manual_seed(1), dtype=DTYPE)
+
     def run(time_gap: Tensor) -> Tensor:
         p = {**params, "idm": {**params["idm"], "time_gap": time_gap}}
         end, _ = simulator.rollout(state, {}, p, 205)
         assert end.present is not None and end.present.sum() > 10
-        return end.position[end.present > 0]
+        return (end.position * end.present * weights).sum()
 
     assert torch.autograd.gradcheck(run, torch.full((), 1.31, dtype=DTYPE, requires_grad=True), eps=1e-6, atol=1e-4)
 
