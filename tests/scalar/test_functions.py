@@ -128,6 +128,7 @@ ONE: dict[str, Callable[..., Any]] = {
     "softplus": torch.nn.functional.softplus,
     "softplus, sharp": lambda x: torch.nn.functional.softplus(x, beta=3.0, threshold=2.0),
     "relu, functional": torch.nn.functional.relu,
+    "isfinite": lambda x: torch.where(torch.isfinite(x / x.floor()), x, -x),
     "clamp": lambda x: x.clamp(-0.5, 1.0),
     "clip": lambda x: torch.clip(x, min=0.5),
     "clamp_min": lambda x: x.clamp_min(0.5),
