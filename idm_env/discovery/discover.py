@@ -25,7 +25,7 @@ from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
 from idm_env.discovery.solve import Solution, Task
-from idm_env.discovery.verdict import Reason, Refusal, Verdict, improves
+from idm_env.discovery.verdict import Reason, Refusal, Verdict, holds, improves
 from idm_env.effects import (
     ALL,
     CANDIDATES,
@@ -306,6 +306,16 @@ def _finish(
             if improves(fewer.errors):
                 judgement, compared, last, after = fewer, s, theta, there
                 break
+    if compared is not None and judgement.errors and not judgement.added and not holds(judgement.errors) and added:
+        # The right effect with a strength fitted in windows may be off over minutes: it is fitted by these once more.
+        again, intervals = free.refitted(fit_records, compared)
+        theta, there = judged(again)
+        other = replace(
+            judgement, compared=free.in_windows(searching.task, again), added=True, refusal=None, after=there,
+            intervals=intervals,
+        )  # fmt: skip
+        if improves(other.errors):
+            judgement, last, after, compared = other, theta, there, other.compared
     if decided.joined is not None and before is not None:
         # What was found in free simulation takes the place of what windows found where it does better there.
         theta, there = judged(decided.joined.solution)

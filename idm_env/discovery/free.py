@@ -14,7 +14,7 @@ import numpy as np
 from idm_env.discovery import judge
 from idm_env.discovery.model import Frozen, Model, Term
 from idm_env.discovery.records import Records, whole
-from idm_env.discovery.score import log_gain, without_own_run
+from idm_env.discovery.score import interval_of, log_gain, without_own_run
 from idm_env.discovery.solve import Linear, Prior, Solution, Task, finish, linearise, solve
 from idm_env.discovery.units import MANY_RUNS, Units, units
 
@@ -149,6 +149,13 @@ def nested(at: Stand, term: Term, start: np.ndarray) -> Solution:
 def joint(at: Stand, model: Model, values: np.ndarray) -> Solution:
     """Fit all terms of a model at once in free simulation over all time, from φ ``values``."""
     return solve(at.task, model, at.theta, values, iterations=8, tolerance=1e-3)
+
+
+def refitted(records: Records, solution: Solution) -> tuple[Solution, np.ndarray]:
+    """Fit φ of a model of windows once more, in free simulation over all time; also return intervals [Q, 3]."""
+    at = stand(records, solution.model, solution.values, solution.prior, solution.theta)
+    again = joint(at, solution.model, solution.values)
+    return again, interval_of(again, at.task)
 
 
 def gains(before: Stand, solution: Solution) -> np.ndarray:

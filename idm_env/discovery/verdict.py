@@ -63,9 +63,9 @@ def improves(errors: Mapping[str, Comparison]) -> bool:
 
 
 def holds(errors: Mapping[str, Comparison]) -> bool:
-    """Tell whether the gap in free simulation holds, where it was compared: in sum, or for most followers."""
+    """Tell whether the gap in free simulation holds, where it was compared."""
     gap = errors.get("gap_rmse_m")
-    return gap is None or not gap.ratio > HOLDS or gap.improved > 0.5
+    return gap is None or not gap.ratio > HOLDS
 
 
 def conclude(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,15 @@ def test_a_term_that_is_not_there_is_taken_back(start: free.Stand) -> None:
     both = free.joint(start, model, np.array([-0.3, 1e-4]))
     kept = together._backward(start, both, 0)
     assert [t.label for t in kept.model.terms] == ["speed_time_gap"]
+
+
+def test_what_windows_found_is_fitted_in_free_simulation_once_more(searching: Search, start: free.Stand) -> None:
+    """A strength that is a quarter of the true one comes back."""
+    model = Model((terms.simple("speed_time_gap"),))
+    off = free.in_windows(searching.task, replace(free.joint(start, model, np.array([-0.3])), values=np.array([-0.1])))
+    again, intervals = free.refitted(start.task.rows.records, off)
+    assert again.values[0] == pytest.approx(-0.4, rel=0.3)
+    assert intervals[0, 1] < again.values[0] < intervals[0, 2]
 
 
 def test_theta_follows_on_time_that_is_not_scored(start: free.Stand) -> None:

@@ -36,7 +36,7 @@ def errors(*three: Comparison) -> dict[str, Comparison]:
         ((BETTER, WORSE, SAME), False),
         ((UP, BETTER, SAME), True),
         ((FAR_UP, BETTER, SAME), False),
-        ((dataclasses.replace(FAR_UP, improved=0.75), BETTER, SAME), True),
+        ((dataclasses.replace(FAR_UP, improved=0.75), BETTER, SAME), False),
         ((UP, UP, UP), False),
         ((UP, UP, SAME), True),
         ((WORSE, SAME, SAME), False),
