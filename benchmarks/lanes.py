@@ -3,6 +3,7 @@
 ``python -m benchmarks.lanes speed [vehicles]`` prints million vehicle updates per CPU second of one thread: rings of
 1000 vehicles on four lanes at 15 /km/lane, Δt 0.1 s, MOBIL at 1 Hz, desired speeds of 25 to 35 m/s.
 ``python -m benchmarks.lanes sumo`` drives the same ring in SUMO (IDM, LC2013, ``libsumo``), in the same minute.
+``python -m benchmarks.lanes laws [vehicle-steps]`` counts what breaks a law in random traffic (``lanes_laws.py``).
 ``python -m benchmarks.lanes flow`` prints flow and changes over density, beside SUMO's where ``libsumo`` is there.
 """
 
@@ -16,7 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.console import Console
 
+from benchmarks import lanes_laws
+from idm_env import progress
 from idm_env.effects import IDM, Brakes, Mobil
 from idm_env.roads import Lanes
 from idm_env.simulator import Simulator
@@ -180,6 +184,13 @@ def _driven(libsumo: Any, seconds: float) -> tuple[float, float, float]:
     return way / math.ceil(steps / 10), changes / len(names) / seconds * 3600.0, len(names) * steps / cpu * 1e-6
 
 
+def laws(steps: float) -> None:
+    """Print how often random traffic broke a law, and what else it did."""
+    with progress.shown(Console(stderr=True)) as on_progress:
+        found = lanes_laws.check(steps, on_progress)
+    print(lanes_laws.table(found))
+
+
 def main() -> None:
     """Run what is asked for."""
     torch.set_num_threads(1)
@@ -190,8 +201,10 @@ def main() -> None:
         sumo()
     elif what == "flow":
         flow()
+    elif what == "laws":
+        laws(float(sys.argv[2]) if len(sys.argv) > 2 else 1e9)
     else:
-        sys.exit(f"unknown benchmark '{what}'. Take speed, sumo or flow.")
+        sys.exit(f"unknown benchmark '{what}'. Take speed, sumo, flow or laws.")
 
 
 if __name__ == "__main__":

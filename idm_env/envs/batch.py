@@ -318,7 +318,7 @@ class Batch:
                 found["failsafe"] = given < command
         if "crash" in asked:
             found["crash"] = crashed
-        return found
+        return found | {name: x for name, x in task.told(after).items() if name in asked}
 
     def detach(self) -> None:
         """Cut the graph behind the present state, for truncated back-propagation."""

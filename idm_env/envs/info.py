@@ -10,6 +10,11 @@
     Whether the episode ended in a crash (bool), and, only then, who touched whom (a text).
 ``vehicle_id``
     Recorded ids of the agents' vehicles (a tuple of texts), in ``reset`` too; only in tasks that replay a recording.
+``lane_changes``, ``lane_refusals``
+    How often in this episode each agent's vehicle has changed lanes, and how often it wished or was commanded to and
+    could not: there was no lane or no safe room, or another claim won. Only in tasks on several lanes.
+``queued``
+    How many vehicles wait at the entries for want of room; only in tasks that vehicles enter.
 
 ``info="none"``, or some of these names, leaves the rest out. With torch output accelerations are tensors, with their
 graph.

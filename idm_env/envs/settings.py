@@ -18,7 +18,7 @@ from idm_env.tasks import KeywordError, Task, make_task
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 RENDER_MODES = ("rgb_array", "human")
-INFO = ("accel", "command", "failsafe", "crash", "vehicle_id")
+INFO = ("accel", "command", "failsafe", "crash", "vehicle_id", "lane_changes", "lane_refusals", "queued")
 KEYWORDS = (
     "task",
     "config",
@@ -72,7 +72,7 @@ def settings(
 
     ``config`` is a YAML file that says ``configures: environment`` and gives any of these keywords; a keyword that is
     given here as well wins. ``max_episode_steps`` None leaves the limit to the task, −1 is no limit. ``info`` is one or
-    several of ``"accel", "command", "failsafe", "crash", "vehicle_id"``, ``"all"`` (which None is) or ``"none"``.
+    several of ``INFO``, ``"all"`` (which None is) or ``"none"``.
 
     Raises:
         KeywordError: A TypeError in one line, with a suggestion, for a keyword that does not exist.

@@ -69,7 +69,7 @@ def rollout(
         places = traffic.places(state, tiles.halo(count, kernel.program.reach))
         if places is None:
             return None
-        given = {n: _placed(_cut(x, done, count), places, state) for n, x in inputs.items() if n in inner.by_name}
+        given = {n: _placed(_cut(x, done, count), places, state, 1) for n, x in inputs.items() if n in inner.by_name}
         end, some = lanes.rollout(
             kernel, inner, _row(state, places), given, _placed(own, places, state), count, keep=keep
         )
@@ -90,17 +90,22 @@ def _cut(tree: Any, begin: int, count: int | None) -> Any:
     return tree if tree is None else type(tree)(*(_cut(x, begin, count) for x in tree))
 
 
-def _placed(tree: Any, places: Places, state: State) -> Any:
-    """Return what belongs to vehicles in the order of places; what is the same for all of them stays."""
+def _placed(tree: Any, places: Places, state: State, leading: int = 0) -> Any:
+    """Return what belongs to vehicles in the order of places; what is the same for all of them stays.
+
+    ``leading`` dimensions are neither rows nor vehicles: an input's first one is time.
+    """
     if isinstance(tree, Tensor):
         n = state.speed.shape[-1]
         if tree.dim() == 0 or tree.shape[-1] != n or n == 1:
             return tree
-        shape = (*tree.shape[: tree.dim() - state.speed.dim()], *state.speed.shape)
+        more = (1,) * (leading + state.speed.dim() - tree.dim())
+        shape = (*tree.shape[:leading], *state.speed.shape)
+        tree = tree.reshape(*tree.shape[:leading], *more, *tree.shape[leading:])
         return tree.expand(shape).gather(-1, places.slots.expand(*shape[:-1], -1))
     if isinstance(tree, Mapping):
-        return {name: _placed(x, places, state) for name, x in tree.items()}
-    return tree if tree is None else type(tree)(*(_placed(x, places, state) for x in tree))
+        return {name: _placed(x, places, state, leading) for name, x in tree.items()}
+    return tree if tree is None else type(tree)(*(_placed(x, places, state, leading) for x in tree))
 
 
 def _moved(memory: Mapping[str, Tensor], index: Tensor, n: int) -> dict[str, Tensor]:

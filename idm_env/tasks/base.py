@@ -392,6 +392,10 @@ class Task(abc.ABC):
         crashed = world.state.gap.amin(-1, keepdim=True) <= 0.0
         return crashed.expand(-1, len(self.agents)) if len(self.agents) > 1 else crashed
 
+    def told(self, world: World) -> dict[str, Tensor]:
+        """Return what infos tell beyond what every task does (``idm_env.envs.info``), ``(environments, agents)``."""
+        return {}
+
     def ended(self, world: World) -> Ended:
         """Return whether it is over: terminated by a crash, truncated where records end (never, without any)."""
         crashed = self.crashed(world)

@@ -14,7 +14,8 @@ from idm_env.effects import Control, Effect, LaneCommand
 from idm_env.roads import Lanes
 from idm_env.tasks.base import Features, Pay, Task, World
 from idm_env.tasks.checks import at_least, whole
-from idm_env.types import Inputs, State
+from idm_env.tasks.random import Draw
+from idm_env.types import Inputs, Params, State
 
 FASTEST = 40.0
 """Speed (m/s) up to which an agent is paid and observed."""
@@ -29,7 +30,8 @@ class LanesTask(Task):
     An agent commands its acceleration; its vehicle changes lanes as its driver would. With ``lane_commands`` it
     commands that, too, by a second number of the action: above 1/3 to the left, below −1/3 to the right, otherwise to
     stay. A command counts at the next decision, of which there is one a second; what is off the road or unsafe is not
-    done (``state.links.blocked`` counts it). An action of several agents holds all accelerations, then all lanes.
+    done but counted (``lane_refusals`` of the info). An action of several agents holds all accelerations, then all
+    lanes.
 
     Args:
         spread: Spread of desired speeds between drivers, as a share.
@@ -62,6 +64,20 @@ class LanesTask(Task):
     def machinery(self) -> tuple[Effect, ...]:  # type: ignore[override]
         """Effects through which agents act."""
         return (Control(), LaneCommand()) if self.lane_commands else (Control(),)
+
+    def reset(self, draw: Draw, params: Params) -> World:
+        """Return the worlds at the beginning of an episode, in which nobody has changed lanes yet."""
+        world = super().reset(draw, params)
+        links = world.state.links
+        assert links is not None
+        none = {name: torch.zeros_like(links.lane) for name in ("changed", "refused", "blocked", "unjudged")}
+        return world._replace(state=world.state._replace(links=links._replace(**none)))
+
+    def told(self, world: World) -> dict[str, Tensor]:
+        """Return how often agents' vehicles changed lanes in this episode, and how often they could not."""
+        links = world.state.links
+        assert links is not None
+        return {"lane_changes": self.pick(links.changed), "lane_refusals": self.pick(links.blocked + links.refused)}
 
     @property
     def commands(self) -> tuple[str, ...]:

@@ -118,6 +118,11 @@ class OpenLanesTask(LanesTask):
         there = self.pick(state.present)
         return [x * there for x in (*super().seen_of_self(state), torch.ones_like(there), self.pick(ends))]
 
+    def told(self, world: World) -> dict[str, Tensor]:
+        """As in ``LanesTask``, and how many wait at the entries: a queue that grows is an inflow beyond capacity."""
+        queued = population.counts(self.simulator, world.state).queued
+        return {**super().told(world), "queued": queued.unsqueeze(-1).expand(-1, len(self.agents)).contiguous()}
+
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``V/40 − 0.1 (u/u_max)²``."""
         state = after.state

@@ -228,6 +228,27 @@ def test_commands_are_done_at_the_next_decision_or_counted() -> None:
     assert after.blocked.tolist() == [0, 1, 1, 0, 0, 0]
 
 
+def test_a_change_in_front_of_another_follower_than_the_one_judged_is_counted() -> None:
+    """Safety is judged against the follower at the time of proposal: if he leaves in the same decision, that is said.
+
+    Vehicle 0 enters the middle lane in front of 1, who is judged; 1 leaves it at the same time, and 2 is behind then.
+    """
+    simulator = Simulator(Lanes(3), (IDM(), Mobil(), LaneCommand(), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    position = torch.tensor([60.0, 0.0, -40.0], dtype=DTYPE)
+    state = simulator.state(position, torch.full_like(position, 20.0), params, lane=torch.tensor([0, 1, 1]))
+    for leaves in (0.0, 1.0):
+        command = torch.tensor([1.0, leaves, 0.0], dtype=DTYPE)
+        after = simulator.step(state, {"lane_command": command}, params)
+        links = after.links
+        assert links is not None and links.lane.tolist() == [1, 1 + int(leaves), 1]
+        assert links.unjudged.tolist() == [int(leaves), 0, 0]
+        assert links.follower[0] == (2 if leaves else 1) and (after.gap > 0).all()
+    fast = state._replace(speed=torch.tensor([20.0, 20.0, 60.0], dtype=DTYPE))  # nobody asks 2, who cannot brake softly
+    after = simulator.step(fast, {"lane_command": command}, params)
+    assert after.links is not None and after.links.changed.tolist() == [1, 1, 0]
+
+
 def test_gradients_with_choices_frozen_are_exact() -> None:
     """Finite differences that flip no choice agree with back-propagation through changes, ends of lanes included."""
     road = Lanes(3, ends=(lane_drop(2, at=330.0),))

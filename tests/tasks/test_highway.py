@@ -47,6 +47,27 @@ def test_agents_command_lanes_where_that_is_asked_for() -> None:
     assert each.batch.world.state.links.lane[0, 1] == 2
 
 
+def test_infos_count_changes_and_refusals_from_the_beginning_of_the_episode() -> None:
+    """What an agent commands off the road or into another vehicle is refused, and said, in every face."""
+    env = gym.make("DiffIDM-v0", lane_commands=True, **EMPTY)
+    for _ in range(2):
+        env.reset(seed=1)
+        for _ in range(31):
+            info = env.step(np.array([0.0, 1.0], np.float32))[-1]
+        assert info["lane_changes"].tolist() == [1] and info["lane_refusals"].tolist() == [3]
+    vector = gym.make_vec("DiffIDM-v0", num_envs=2, lane_commands=True, info=["lane_refusals"], **EMPTY)
+    vector.reset(seed=1)
+    for _ in range(11):
+        info = vector.step(np.array([[0.0, 1.0], [0.0, 0.0]], np.float32))[-1]
+    assert info["lane_refusals"].tolist() == [[1], [0]] and "lane_changes" not in info
+    each = parallel_env(lane_commands=True, **EMPTY)
+    each.reset(seed=1)
+    (agent,) = each.agents
+    for _ in range(11):
+        info = each.step({agent: np.array([0.0, 1.0], np.float32)})[-1]
+    assert info[agent]["lane_changes"] == 1 and info[agent]["lane_refusals"] == 1
+
+
 def test_gradients_flow_through_steps_and_changes() -> None:
     """Of a later reward by an earlier action, which finite differences confirm."""
     env = gym.make("DiffIDM-v0", task="highway", vehicles=16, length=300.0, output="torch", dtype="float64")

@@ -58,6 +58,14 @@ def test_faces_drive_the_same_traffic() -> None:
     assert not np.array_equal(many[0], many[1])
 
 
+def test_infos_tell_an_inflow_beyond_capacity() -> None:
+    """The queue grows, and is said; beyond the slots of the task, too."""
+    env = gym.make("DiffIDM-v0", task="bottleneck", inflow=9000.0, vehicles=40, controlled=[0], warmup=20)
+    env.reset(seed=1)
+    queues = [env.step(np.zeros(1, np.float32))[-1]["queued"].tolist() for _ in range(301)]
+    assert queues[300][0] > queues[150][0] > queues[0][0] >= 0 and queues[300][0] > 5
+
+
 def test_an_agent_that_drives_over_the_end_of_its_lane_has_crashed() -> None:
     """The end of a lane is a standing leader that nobody may pass."""
     env = gym.make("DiffIDM-v0", task="bottleneck", inflow=400.0, vehicles=8, controlled=[0], max_command=3.0,
