@@ -40,9 +40,10 @@ def find(responses: Responses, seed: int) -> Shared | None:
     """Return the interval of a run in which its vehicles miss the model alike, or None where chance does as much.
 
     The score of a run is the sum, over pairs of its vehicles and windows of 5 s on one clock, of products of whitened
-    residuals. Chance: each vehicle's residuals turned by a random time, which keeps what lasts in a driver; p from the
-    scores' mean and spread, times the number of runs. The interval is the one of time in which an added acceleration
-    explains most of that run, drivers re-calibrated.
+    residuals. Chance: each vehicle's residuals turned by a random time, which keeps what lasts in a driver, and, as
+    vehicles behind each other are unsteady at the same times (all move, or all stand), no less than the root of the
+    sum of these products squared; p of a normal score, times the number of runs. The interval is the one of time in
+    which an added acceleration explains most of that run, drivers re-calibrated.
     """
     rows, records = responses.rows, responses.rows.records
     number = np.round(records.signals[rows.start, 17] / (rows.steps * records.dt)).astype(int)
@@ -52,8 +53,7 @@ def find(responses: Responses, seed: int) -> Shared | None:
         tables = _tables(responses, run, number)
         vehicles[run] = len(tables)
         if len(tables) > 1 and tables.shape[1] > 3:
-            scores = _scores(tables, random)
-            score[run] = (scores[0] - scores[1:].mean()) / (scores[1:].std() + 1e-12)
+            score[run] = standing_out(tables, random)
     tested = int(np.isfinite(score).sum())
     if tested < FEWEST_RUNS:
         return None
@@ -83,12 +83,16 @@ def _tables(responses: Responses, run: int, number: np.ndarray) -> np.ndarray:
     return np.clip(table, -LARGEST, LARGEST)
 
 
-def _scores(table: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Return the score as it is, and with every vehicle's residuals turned by a random time [1 + TURNS]."""
+def standing_out(table: np.ndarray, random: np.random.Generator) -> float:
+    """Return the sum of products of residuals [vehicles, windows, m] in units of chance: normal without a cause."""
     vehicles, count, _ = table.shape
+    # As it is, and with every vehicle's residuals turned by a random time.
     by = np.concatenate([np.zeros((1, vehicles), int), random.integers(0, count, (TURNS, vehicles))])
     at = (np.arange(count) + by[..., None]) % count
     total = np.zeros(len(by))
+    unsteady = 0.0
     for i, j in combinations(range(vehicles), 2):
-        total += np.einsum("ntm,ntm->n", table[i][at[:, i]], table[j][at[:, j]])
-    return total
+        product = np.einsum("ntm,ntm->nt", table[i][at[:, i]], table[j][at[:, j]])
+        total += product.sum(1)
+        unsteady += float((product[0] ** 2).sum())
+    return float((total[0] - total[1:].mean()) / (max(total[1:].std(), np.sqrt(unsteady)) + 1e-12))
