@@ -118,11 +118,18 @@ def bins_of(values: np.ndarray, width: float, most: int = 60) -> tuple[np.ndarra
 
 
 def scan(
-    responses: Responses, what: str, coordinate: str, width: float, *, open_end: bool = False, shortest: int = 1
+    responses: Responses,
+    what: str,
+    coordinate: str,
+    width: float,
+    *,
+    open_end: bool = False,
+    shortest: int = 1,
+    longest: float = np.inf,
 ) -> Found | None:
     """Return the interval of a coordinate in which a change of ``what`` explains most, or None without enough data.
 
-    ``open_end`` takes only intervals that last to the end: steps.
+    ``open_end`` takes only intervals that last to the end: steps; ``shortest`` bins, ``longest`` in its own unit.
     """
     values = responses.coordinates[coordinate]
     edges, width = bins_of(values, width)
@@ -134,6 +141,7 @@ def scan(
     np.put_along_axis(basis, index[..., None], 1.0, axis=-1)
     matrix, vector = responses.design(what, basis)
     allowed = _allowed(count, open_end, shortest, coordinate == "time" and not open_end)
+    allowed &= np.subtract.outer(edges[:-1], edges[1:]) >= -longest
     if not allowed.any():
         return None
     total = _best(matrix.sum(0), vector.sum(0), allowed)

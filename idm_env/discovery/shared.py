@@ -63,7 +63,9 @@ def find(responses: Responses, seed: int) -> Shared | None:
         return None
     mine = rows.run == run
     alone = replace(responses, change=responses.change * mine[:, None], residual=responses.residual * mine[:, None])
-    found = scan(alone, "acceleration", "time", 5.0)
+    # Of an interval and the rest of the run drivers' parameters make one and the same: it is the shorter one.
+    time = responses.coordinates["time"][mine]
+    found = scan(alone, "acceleration", "time", 5.0, longest=0.5 * float(time.max() - time.min()))
     if found is None:
         return None
     return Shared(records.runs[run], found.begin, found.end, found.amount, int(vehicles[run]), p_value)
