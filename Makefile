@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?=
 OUT ?= out/demo
 
-.PHONY: setup demo test lint bench docs clean
+.PHONY: setup demo test test-gymnasium test-lowest lint bench docs clean
 
 setup: $(VENV)/.installed
 
@@ -20,6 +20,25 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -n 2
+
+# The environments on the Gymnasium that RLlib pins: that one alone, before the one of .venv.
+GYMNASIUM := build/gymnasium-1.2.2
+test-gymnasium: setup
+	test -d $(GYMNASIUM)/gymnasium || \
+	  $(BIN)/python -m pip install --quiet --no-deps --target $(GYMNASIUM) gymnasium==1.2.2
+	PYTHONPATH=$(GYMNASIUM) $(BIN)/python -m pytest -n 2 tests/envs
+
+# What users touch, on the lowest versions that pyproject.toml allows (torch: that of constraints.txt), in an environment of
+# its own; without what takes further libraries from .venv.
+LOWEST := build/lowest
+test-lowest: setup
+	$(PYTHON) -m venv $(LOWEST)
+	$(BIN)/python .ci/lowest.py > $(LOWEST)/versions.txt
+	$(LOWEST)/bin/python -m pip install --quiet --constraint $(LOWEST)/versions.txt --editable '.[all,ray]' \
+	  pytest pytest-xdist hypothesis packaging 'setuptools>=77'
+	$(LOWEST)/bin/python -m pytest -n 2 --ignore tests/envs/test_torchrl.py -k 'not supersuit and not record_video' \
+	  tests/envs tests/tasks tests/data tests/fitting tests/prediction tests/trajectories/test_files.py \
+	  tests/test_cli.py tests/test_keep.py tests/test_executor.py tests/test_report.py tests/test_wheel.py
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy

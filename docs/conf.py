@@ -52,7 +52,7 @@ sphinx_gallery_conf = {
     "examples_dirs": "../build/examples",
     "gallery_dirs": "gallery",
     # Those of seconds; tests/test_examples.py runs all. Others are shown without their output.
-    "filename_pattern": r"/(?:add_|drifting_|filter_|fit_a_|ring_gradient|step_and)[^/]*\.py$",
+    "filename_pattern": r"/(?:add_|drifting_|filter_|first_hour|fit_a_|ring_gradient|step_and)[^/]*\.py$",
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
     "show_signature": False,

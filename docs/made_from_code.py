@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
+import json
 import re
 import shutil
 import textwrap
@@ -265,7 +266,11 @@ def commands() -> str:
     from idm_env.cli import app
 
     group: Any = get_command(app)
-    lines = ["# Commands", "", "`idm-env COMMAND --help` says the same.", ""]
+    lines = [
+        "# Commands", "",
+        "`idm-env COMMAND --help` says the same. `idm-env --install-completion` makes bash, zsh, fish or PowerShell "
+        "complete commands and options (a new shell has it); `idm-env --show-completion` prints what it would add.", "",
+    ]  # fmt: skip
     for name, command in group.commands.items():
         lines += [f"## idm-env {name}", "", " ".join((command.help or "").split("\n\n")[0].split()), ""]
         lines += [" ".join(p.split()) + "\n" for p in (command.help or "").split("\n\n")[1:]]
@@ -316,6 +321,25 @@ def examples() -> None:
         words = " ".join(found[1].split())
         head = f'"""\n{title}\n{"=" * len(title)}\n\n{words}\n"""\n'
         (out / path.name).write_text(head + text[found.end() :], encoding="utf-8")
+    (out / "first_hour.py").write_text(_script(ROOT / "examples" / "first_hour.ipynb"), encoding="utf-8")
+
+
+def _script(notebook: Path) -> str:
+    """Return a notebook as the gallery takes it: words as comments in reStructuredText, code as it is."""
+    cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(notebook.read_text("utf-8"))["cells"]]
+    made = []
+    for kind, text in cells:
+        if kind == "code":
+            made.append(text)
+            continue
+        text = re.sub(r"`([^`]+)`", r"``\1``", text)
+        text = re.sub(r"^# (.*)$", lambda m: f"{m[1]}\n{'=' * len(m[1])}", text, flags=re.MULTILINE)
+        text = re.sub(r"^## (.*)$", lambda m: f"{m[1]}\n{'-' * len(m[1])}", text, flags=re.MULTILINE)
+        if made:
+            made.append("# %%\n" + "\n".join(f"# {line}".rstrip() for line in text.splitlines()) + "\n")
+        else:
+            made.append(f'"""\n{text}\n"""\n')
+    return "\n\n".join(made) + "\n"
 
 
 def reports(pictures: Path) -> None:

@@ -1,13 +1,14 @@
 """Every python block of README and of docs/ runs as it stands; blocks of one document share their names.
 
 A block, python or yaml, whose first line is ``# file: NAME`` is also a file of that name in the folder in which the
-document runs. Comments before a block: ``<!-- needs NAME -->`` leaves it out as long as the package has no such name,
-``<!-- not run: REASON -->`` always.
+document runs; every yaml block is one. Comments before a block: ``<!-- needs NAME -->`` leaves it out as long as
+the package has no such name, ``<!-- not run: REASON -->`` always. Commands: see ``test_docs_commands.py``.
 """
 
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import sys
 import types
@@ -24,6 +25,7 @@ from idm_env.config import Model, save_model
 from idm_env.data import synthetic
 from idm_env.effects import ALL
 from idm_env.types import Record
+from tests.prediction import scenes
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs" / "jobs").glob("*.md"))]
@@ -121,7 +123,21 @@ def result_model(folder: Path) -> None:
     save_model(folder / "result" / "model.yaml", model)
 
 
-FILES = {"my.csv": my_csv, "result/model.yaml": result_model, "tired.csv": tired_csv}
+def sparse_csv(folder: Path) -> None:
+    """Two vehicles, a point a second."""
+    table = synthetic.generate(seed=4, runs=1, followers=1, seconds=30.0)[0].table
+    table.select("vehicle_id", "time_s", "position_m").gather_every(10).write_csv(folder / "sparse.csv")
+
+
+def scene_json(folder: Path) -> None:
+    """A scenario with two agents to predict."""
+    (folder / "scene.json").write_text(json.dumps(scenes.as_json([0, 1])))
+
+
+FILES = {
+    "my.csv": my_csv, "result/model.yaml": result_model, "tired.csv": tired_csv, "sparse.csv": sparse_csv,
+    "scene.json": scene_json,
+}  # fmt: skip
 """What blocks read, by the text that names it."""
 
 
@@ -161,12 +177,27 @@ def test_every_block_runs(path: Path, folder: Path, monkeypatch: pytest.MonkeyPa
         exec(compile("\n" * (line - 1) + code, str(path), "exec"), space.__dict__)
 
 
+def test_the_first_hour_runs(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The notebook, cell by cell, from another folder; it is kept without output."""
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    notebook = json.loads((ROOT / "examples" / "first_hour.ipynb").read_text(encoding="utf-8"))
+    space = types.ModuleType("first_hour")
+    monkeypatch.setitem(sys.modules, "first_hour", space)
+    for number, cell in enumerate(notebook["cells"]):
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == [] and cell["execution_count"] is None
+            exec(compile("".join(cell["source"]), f"cell {number}", "exec"), space.__dict__)
+    told = capsys.readouterr().out
+    assert "verdict: named, delay" in told and "d(return)/d(gain)" in told
+
+
 def test_blocks_are_found_and_markers_give_a_reason() -> None:
     """No document's code escapes the test by how its fence is written."""
     assert blocks(ROOT / "docs" / "architecture.md")
     for path in DOCUMENTS:
         text = path.read_text(encoding="utf-8")
         assert text.count("```python") + text.count("```yaml") == len(blocks(path)), path.name
+        assert all(b.code.startswith("# file: ") for b in blocks(path) if b.kind == "yaml"), path.name
         assert len(re.findall(r"^```", text, re.MULTILINE)) % 2 == 0, path.name
         assert len(re.findall("<!-- (?:needs|not run)", text)) == sum(bool(b.marker) for b in blocks(path)), path.name
 

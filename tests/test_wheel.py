@@ -106,5 +106,6 @@ def test_it_works_where_there_is_no_checkout(wheel: zipfile.ZipFile, tmp_path: P
     (tmp_path / "my.csv").write_text("\n".join(["vehicle_id,time_s,position_m,lane", *rows]) + "\n")
     call(command, "plot", "my.csv", "--html", "--out", "drawn.png")  # its page is a file of the package
     assert "<svg" in (tmp_path / "drawn.html").read_text() or "canvas" in (tmp_path / "drawn.html").read_text()
-    found = call(command, _IDM_ENV_COMPLETE="complete_bash", COMP_WORDS="idm-env fi", COMP_CWORD="1")
-    assert found.split() == ["fit", "filter"]
+    for typed, at, wanted in (("idm-env fi", "1", ["fit", "filter"]), ("idm-env fit --held", "2", ["--held-out"])):
+        found = call(command, _IDM_ENV_COMPLETE="complete_bash", COMP_WORDS=typed, COMP_CWORD=at)
+        assert found.split() == wanted

@@ -46,6 +46,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
     }
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **keywords: Any) -> None:
+        self._viewers: list[Any] = []  # before anything can fail: Gymnasium 1.1 closes what was never made, too
         made = settings(render_mode=render_mode, **keywords)
         self.settings = made
         self.task = made.task
@@ -68,7 +69,6 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         self._shape = (num_envs, agents * len(self.task.commands))
         self._numpy = made.output == "numpy"
         self._ended = np.zeros(num_envs, dtype=bool)
-        self._viewers: list[Any] = []
 
     # -- reset and step ------------------------------------------------------------------------------------------
 
