@@ -4,6 +4,7 @@
 1000 vehicles on four lanes at 15 /km/lane, Δt 0.1 s, MOBIL at 1 Hz, desired speeds of 25 to 35 m/s.
 ``python -m benchmarks.lanes sumo`` drives the same ring in SUMO (IDM, LC2013, ``libsumo``), in the same minute.
 ``python -m benchmarks.lanes laws [vehicle-steps]`` counts what breaks a law in random traffic (``lanes_laws.py``).
+``python -m benchmarks.lanes gradients [scenes]`` tells how good gradients through choices are (``lanes_gradients``).
 ``python -m benchmarks.lanes flow`` prints flow and changes over density, beside SUMO's where ``libsumo`` is there.
 """
 
@@ -19,7 +20,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from benchmarks import lanes_laws
+from benchmarks import lanes_gradients, lanes_laws
 from idm_env import progress
 from idm_env.effects import IDM, Brakes, Mobil
 from idm_env.roads import Lanes
@@ -203,8 +204,11 @@ def main() -> None:
         flow()
     elif what == "laws":
         laws(float(sys.argv[2]) if len(sys.argv) > 2 else 1e9)
+    elif what == "gradients":
+        with progress.shown(Console(stderr=True)) as on_progress:
+            lanes_gradients.table(int(sys.argv[2]) if len(sys.argv) > 2 else 50, on_progress)
     else:
-        sys.exit(f"unknown benchmark '{what}'. Take speed, sumo, flow or laws.")
+        sys.exit(f"unknown benchmark '{what}'. Take speed, sumo, flow, laws or gradients.")
 
 
 if __name__ == "__main__":

@@ -28,10 +28,10 @@ Counts = collections.Counter[str]
 Params = dict[str, dict[str, Tensor]]
 
 
-def road_of(kind: str, count: int) -> Lanes:
+def road_of(kind: str, count: int, ring: float) -> Lanes:
     """Return a road; on those that vehicles enter, the outer lanes end or begin within it."""
     if kind == "ring":
-        return Lanes(count, ring=1200.0)
+        return Lanes(count, ring=ring)
     if kind == "drop":
         return Lanes(count, length=1000.0, ends=(lane_drop(count - 1, at=600.0),))
     ends = on_ramp(0, begin=200.0, end=500.0, entry=50.0), off_ramp(count - 1, 300.0, 700.0, leaves=800.0)
@@ -42,7 +42,9 @@ def world(kind: str, seed: int, rows: int, each: int, dtype: torch.dtype) -> tup
     """Return random traffic: on a ring anywhere, elsewhere an empty road that trips wait for."""
     draw = torch.Generator().manual_seed(seed)
     count = 2 + int(torch.randint(4, (), generator=draw))
-    simulator = Simulator(road_of(kind, count), (IDM(), Mobil(), MandatoryChange(), LaneCommand(), Brakes()), dt=DT)
+    density = 12.0 + 48.0 * float(torch.rand((), generator=draw))  # per km and lane, of a ring
+    road = road_of(kind, count, 1000.0 * each / count / density)
+    simulator = Simulator(road, (IDM(), Mobil(), MandatoryChange(), LaneCommand(), Brakes()), dt=DT)
     params = simulator.defaults(dtype=dtype)
 
     def between(low: float, high: float, *shape: int) -> Tensor:
@@ -56,7 +58,7 @@ def world(kind: str, seed: int, rows: int, each: int, dtype: torch.dtype) -> tup
     params["idm"]["desired_speed"] = between(12.0, 38.0, rows, each)
     if kind == "ring":
         index = torch.arange(each)
-        spacing = 1200.0 * count / each
+        spacing = 1000.0 / density
         place = torch.div(index, count, rounding_mode="floor") * spacing + between(0.0, 0.4, rows, each) * spacing
         pace = torch.full_like(place, 6.0)
         return simulator, simulator.state(place.to(dtype), pace, params, lane=index % count, length=4.0), params

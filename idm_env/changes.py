@@ -1,4 +1,4 @@
-"""Lane changes, the first part of a step: what drivers would want beside, what they wish, and what the road does.
+"""Lane changes: what drivers would want beside, and what they wish.
 
 Effects see a scene with ``here``, ``left`` and ``right`` and know no topology; the road chooses, resolves conflicts and
 executes. Hypothetical pairs are answered by the simulator's own effects, perception and adaptation included, up to what
@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from idm_env.roads.beside import Side, Sideways, preferred
-from idm_env.roads.linked import Linked, without_absent
+from idm_env.roads.beside import Side, Sideways
 from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish
 
 if TYPE_CHECKING:
@@ -31,27 +30,7 @@ class _Now:
         raise NotImplementedError
 
 
-def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) -> State:
-    """Return the state after the decisions that are due at this step, with gaps of those concerned measured anew.
-
-    Choices are frozen: gradients flow through the gaps, not through who chose what.
-    """
-    due = state.step.remainder(stepping.decides_after) == 0
-    if not bool(due.any()):
-        return state
-    assert state.links is not None
-    state = state._replace(links=without_absent(state.links, state.present))
-    view = stepping.road.view(state)
-    assert isinstance(view, Linked)
-    with torch.no_grad():
-        order = view.order(state.present)
-        sides = view.side(order, 1, state), view.side(order, -1, state)
-        scene = beside(stepping, view, sides, state, inputs, params)
-        wish = wished(stepping, scene, params)
-        prefers = preferred(*sides, wish, stepping.road.handed == "left")  # type: ignore[attr-defined]
-        due = due if due.dim() == 0 else due.unsqueeze(-1)
-        claim = view.chosen(sides, prefers, due if state.present is None else due & (state.present > 0))
-    return view.changed(state, claim)
+NOW = _Now()
 
 
 def wished(stepping: Stepping, scene: Scene, params: Params) -> Wish:
@@ -76,7 +55,7 @@ def beside(
     stepping: Stepping, view: Sideways, sides: tuple[Side, Side], state: State, inputs: Inputs, params: Params
 ) -> Scene:
     """Return the scene with the driver's own lane, and those on his left and right."""
-    scene = stepping.scene(state, inputs)._replace(history=_Now())
+    scene = stepping.scene(state, inputs)._replace(history=NOW)
     second = view.second_leader(scene.leader, state.length, scene.speed)
     third = view.follow(state, scene.leader, view.beyond(), second.gap, second.present)[1]
     now = stepping.wanted(scene, params)[0]
@@ -145,4 +124,4 @@ def _of(view: Sideways, tree: Any, slots: Any) -> Any:
     return tree
 
 
-__all__ = ["beside", "decided", "wished"]
+__all__ = ["NOW", "beside", "wished"]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from idm_env.choices import settled
 from idm_env.roads.lanes import Lanes
 from idm_env.roads.linked import Linked, without_absent
 from idm_env.types import FAR, Params, State, Trips
@@ -241,6 +242,10 @@ def _placed(stepping: Stepping, state: State, params: Params, entry: _Entry) -> 
         name: torch.where(new if x.dim() <= new.dim() else new[..., None, None], fresh[name], x)
         for name, x in state.memory.items()
     }
+    if begun.choices is not None:
+        fresh_choices = settled(after.lane, stepping.road.count, state.speed)  # type: ignore[attr-defined]
+        shares = torch.where(new.unsqueeze(-1), fresh_choices.shares, begun.choices.shares)
+        begun = begun._replace(choices=begun.choices._replace(shares=shares))
     return begun._replace(memory=memory)
 
 

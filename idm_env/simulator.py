@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -43,11 +43,12 @@ class Simulator(Stepping):
 
     def compile(self, *, backend: str = "inductor", dynamic: bool | None = False) -> Simulator:
         """Return this simulator with a compiled step; where nothing can compile it, with one warning, as it is."""
-        return Compiled(self.road, self.effects, self.dt, self.integration, backend, dynamic)
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Compiled(**{**own, "backend": backend, "dynamic": dynamic})
 
     def _covered(self, inputs: Inputs, steps: int) -> None:
         for name, value in inputs.items():
-            if name not in self.by_name:
+            if name not in self.by_name and name not in self.draws:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
             have = min(len(x) for x in _leaves(value) if x is not None)
             if have < steps:
@@ -157,7 +158,7 @@ class Compiled(Simulator):
 
     @cached_property
     def _compiled(self) -> Callable[[State, Inputs, Params], State]:
-        plain = Simulator(self.road, self.effects, self.dt, self.integration)
+        plain = Simulator(self.road, self.effects, self.dt, self.integration, self.decisions, self.temperature)
         # Filled here, because the tracer does not enter the lock of a cached property.
         _ = plain.by_name, plain._following, plain._hooks, plain._needs, plain._unspoken
         made: Callable[[State, Inputs, Params], State] = torch.compile(

@@ -16,8 +16,9 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from idm_env import parameters
-from idm_env.changes import decided
+from idm_env import parameters, shares
+from idm_env.choices import DECISIONS, NOISE, Decisions
+from idm_env.decisions import decided
 from idm_env.effects.base import HOOKS, CarFollowing, Effect, Hook
 from idm_env.effects.limits import unspoken
 from idm_env.history import PAST, History
@@ -41,6 +42,9 @@ class Stepping:
     scene taken half a step ahead, by the accelerations of the step before: second order for one evaluation a step. The
     other two act on the past half step, a hidden delay of Δt/2 that a search for missing effects would find.
 
+    ``decisions`` says how gradients go through choices of lanes (``decisions.py``): ``"pathwise"``, ``"surrogate"``,
+    ``"score"`` or ``"soft"``; the last three make them a logit of temperature ``temperature`` (m/s²).
+
     Where an effect can add to what the driver wants, the sum is held to what tyres can (``effects.Traction``, by its
     default unless it is named).
 
@@ -51,6 +55,8 @@ class Stepping:
     effects: tuple[Effect, ...]
     dt: float = 0.1
     integration: Integration = "ballistic"
+    decisions: Decisions = "pathwise"
+    temperature: float = 0.1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "effects", tuple(self.effects))
@@ -66,6 +72,11 @@ class Stepping:
         if self.integration not in INTEGRATORS:
             hint = parameters.nearest(self.integration, INTEGRATORS)
             raise ValueError(f"integration = '{self.integration}' is unknown.{hint}")
+        if self.decisions not in DECISIONS:
+            hint = parameters.nearest(self.decisions, DECISIONS)
+            raise ValueError(f"decisions = '{self.decisions}' is unknown.{hint}")
+        if not 0.0 < self.temperature < float("inf"):
+            raise ValueError(f"temperature = {self.temperature:g} m/s² must be above 0, and finite.")
         longest = next((p.high for p in self._following.parameters if p.name == "time_gap"), float("inf"))
         if not 0.0 < self.dt <= longest:
             raise ValueError(
@@ -129,8 +140,9 @@ class Stepping:
 
     @cached_property
     def draws(self) -> tuple[str, ...]:
-        """Names of the effects whose input is one standard normal per vehicle and step."""
-        return tuple(e.name for e in self.effects if e.draws)
+        """Names of the effects, and of decisions, whose input is one standard normal per vehicle and step."""
+        chosen = (NOISE,) if self.decisions == "score" and self.changes else ()
+        return (*(e.name for e in self.effects if e.draws), *chosen)
 
     @cached_property
     def _needs(self) -> frozenset[str]:
@@ -154,7 +166,7 @@ class Stepping:
                 f"{shortest:g} s: a driver must react within it. Take dt = {shortest:g} s or less."
             )
         for name in inputs or {}:
-            if name not in self.by_name:
+            if name not in self.by_name and name not in self.draws:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
 
     # -- the function --------------------------------------------------------------------------------------------
@@ -272,12 +284,19 @@ class Stepping:
 
     def _respond(self, state: State, inputs: Inputs, params: Params) -> tuple[Tensor, Scene, Driver]:
         scene = self.scene(state, inputs)
+        accel, driver = self.answered(scene, params)
+        if state.choices is not None and self.decisions in ("soft", "surrogate"):
+            accel = shares.mixed(self, state, scene, params, accel)
+        return accel, scene, driver
+
+    def answered(self, scene: Scene, params: Params) -> tuple[Tensor, Driver]:
+        """Return what vehicles do in a scene (m/s²), within limits, and the drivers' parameters in force."""
         accel, seen, driver = self.wanted(scene, params)
         for effect in self._hooks["limit"]:
             view = scene if effect.sees_truth else seen
             given = self._unspoken.get(effect.name) or params[effect.name]
             accel = effect.limit(accel, view, driver, given)  # type: ignore[arg-type]
-        return accel, scene, driver
+        return accel, driver
 
     def acceleration(self, state: State, inputs: Inputs, params: Params) -> Tensor:
         """Return the acceleration of every vehicle in this state (m/s²), before any record is replayed."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.changes import decided
+from idm_env.decisions import decided
 from idm_env.effects.base import Effect
 from idm_env.kernels import decision_loops, lanes, order_loops
 from idm_env.kernels.memory import addresses

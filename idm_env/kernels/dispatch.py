@@ -31,6 +31,8 @@ def found(simulator: Stepping, state: State, inputs: Inputs, params: Params) -> 
     if why is not None:
         return why
     if isinstance(simulator.road, Lanes):
+        if simulator.changes and simulator.decisions != "pathwise":
+            return f"decisions = '{simulator.decisions}': compiled decisions are pathwise"
         from idm_env.kernels.several import kernel_of
 
         return kernel_of(simulator, state, inputs)  # type: ignore[arg-type]

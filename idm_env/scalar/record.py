@@ -201,7 +201,11 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
     graph = Graph() if graph is None else graph
     recording = Recording(graph)
     recorder = _Recorder(
-        SeenRoad(simulator.road, graph), simulator.effects, TimeStep(simulator.dt), simulator.integration, recording
+        SeenRoad(simulator.road, graph),
+        simulator.effects,
+        TimeStep(simulator.dt),
+        simulator.integration,
+        recording=recording,
     )
 
     state = state_of(form, graph)

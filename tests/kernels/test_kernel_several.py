@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from idm_env import population
+from idm_env.choices import DECISIONS, Decisions
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
 from idm_env.kernels import dispatch
 from idm_env.roads import Lanes, lane_drop, off_ramp, on_ramp
@@ -157,6 +158,18 @@ def test_vehicles_come_and_go_in_compiled_rollouts(again: int | None) -> None:
     ):
         torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8)
     assert gradient.abs().sum() > 0
+
+
+@pytest.mark.parametrize("how", DECISIONS)
+def test_compiled_decisions_are_pathwise(how: Decisions) -> None:
+    """Other ways to decide take the torch path, which is said; without effects that change lanes nothing is decided."""
+    simulator = Simulator(Lanes(2), (IDM(), Mobil(), Brakes()), decisions=how)
+    params = simulator.defaults(dtype=torch.float64)
+    here = torch.zeros(1, dtype=torch.float64)
+    state = simulator.state(here, here, params, lane=0)
+    why = dispatch.refusal(simulator, state, {}, params)
+    assert why == (None if how == "pathwise" else f"decisions = '{how}': compiled decisions are pathwise")
+    assert dispatch.refusal(simulator.without("mobil"), state, {}, params) is None
 
 
 def test_vehicles_that_have_passed_through_each_other_take_the_torch_path() -> None:

@@ -96,8 +96,9 @@ def test_random_traffic_breaks_no_law() -> None:
         found = lanes_laws.check(3e4, progress.silent, rows=3, each=90, decisions=60)
         for kind, counts in found.items():
             assert not any(counts[law] for law in lanes_laws.LAWS), (kind, counts)
-            assert counts["changed"] > 20 and counts["blocked"] > 50
+            assert counts["changed"] > 0 and counts["blocked"] > 50
             assert (counts["entered"] > 20) == (kind != "ring")
+        assert sum(counts["changed"] for counts in found.values()) > 100
         simulator, state, params = lanes_laws.world("ring", 1, 1, 40, DTYPE)
         after, kept = simulator.without("lane_command").rollout(state, {}, params, 10)
     assert after.links is not None

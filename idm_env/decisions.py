@@ -1,0 +1,94 @@
+"""Decisions about lanes, the first part of a step: what drivers wish is granted, refused or counted.
+
+How gradients go through choices is said by ``decisions`` of the simulator:
+
+=============  =========================================================================================================
+``pathwise``   hard choices, which are frozen: gradients flow through gaps alone, and are exact where no choice flips
+``surrogate``  the same values, to the last bit; and gradients by chances of doing otherwise until the next decision
+``score``      choices drawn by their chances (``choices.py``), from normals drawn beforehand; gradients as in
+               ``pathwise``; ``state.choices.log_probability`` sums the logarithms of the chances of what was drawn
+``soft``       nobody chooses: shares of vehicles on all lanes (``shares.py``)
+=============  =========================================================================================================
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from idm_env import choices, shares
+from idm_env.changes import NOW, beside, wished
+from idm_env.roads.beside import preferred
+from idm_env.roads.linked import Claim, Linked, without_absent
+from idm_env.types import Inputs, Params, State
+
+if TYPE_CHECKING:
+    from idm_env.step import Stepping
+
+
+def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) -> State:
+    """Return the state after the decisions that are due at this step, with gaps of those concerned measured anew."""
+    due = state.step.remainder(stepping.decides_after) == 0
+    if not bool(due.any()):
+        return state
+    assert state.links is not None
+    state = state._replace(links=without_absent(state.links, state.present))
+    view = stepping.road.view(state)
+    assert isinstance(view, Linked)
+    due = due if due.dim() == 0 else due.unsqueeze(-1)
+    due = due if state.present is None else due & (state.present > 0)
+    how = stepping.decisions
+    if how == "pathwise":
+        return view.changed(state, _claimed(stepping, view, state, inputs, params, due)[0])
+    before = state.choices or choices.settled(state.links.lane, view.road.count, state.speed)
+    if how == "score":
+        claim, logs = _claimed(stepping, view, state, inputs, params, due)
+        total = before.log_probability + torch.where(due, logs, 0.0)
+        return view.changed(state, claim)._replace(choices=before._replace(log_probability=total))
+    if how == "surrogate" and not torch.is_grad_enabled():
+        return view.changed(state, _claimed(stepping, view, state, inputs, params, due)[0])
+    scene = stepping.scene(state, inputs)._replace(history=NOW)
+    if how == "surrogate":
+        # What is not done is weighed until the next decision: carried on through alternatives it grows without bound.
+        before = choices.settled(state.links.lane, view.road.count, state.speed)
+    after = shares.gone_over(stepping, before, state, scene, params)
+    after = torch.where(due.unsqueeze(-1), after, before.shares)
+    if how == "soft":
+        state = view.changed(state, _mostly(state, after))
+        return state._replace(choices=before._replace(shares=after))
+    state = view.changed(state, _claimed(stepping, view, state, inputs, params, due)[0])
+    assert state.links is not None
+    hard = choices.settled(state.links.lane, view.road.count, state.speed)
+    return state._replace(choices=hard._replace(shares=hard.shares + (after - after.detach())))
+
+
+def _claimed(
+    stepping: Stepping, view: Linked, state: State, inputs: Inputs, params: Params, due: Tensor
+) -> tuple[Claim, Tensor]:
+    """Return what becomes of every wish, and the logarithms of the chances of what was drawn, if it was."""
+    score = stepping.decisions == "score"
+    with contextlib.nullcontext() if score else torch.no_grad():
+        order = view.order(state.present)
+        sides = view.side(order, 1, state), view.side(order, -1, state)
+        wish = wished(stepping, beside(stepping, view, sides, state, inputs, params), params)
+        if not score:
+            prefers = preferred(*sides, wish, view.road.handed == "left")
+            return view.chosen(sides, prefers, due), prefers.utility
+        left, right = (side.exists & (side.gap > 0) & (side.back_gap > 0) for side in sides)
+        normal: Tensor = stepping.scene(state, inputs).input(choices.NOISE)
+        prefers, logs = choices.drawn(wish, left, right, stepping.temperature, normal)
+        return view.chosen(sides, prefers, due), logs
+
+
+def _mostly(state: State, after: Tensor) -> Claim:
+    """Return the lane that has most of each vehicle: who leads whom where nobody has chosen."""
+    assert state.links is not None
+    lane = after.argmax(-1)
+    none = torch.zeros_like(lane, dtype=torch.bool)
+    return Claim(lane, lane != state.links.lane, none, none, state.links.follower, none)
+
+
+__all__ = ["decided"]
