@@ -35,7 +35,8 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
     if not bool(due.any()):
         return state
     assert state.links is not None
-    state = state._replace(links=without_absent(state.links, state.present))
+    links = without_absent(state.links, state.present)
+    state = state._replace(links=links)
     view = stepping.road.view(state)
     assert isinstance(view, Linked)
     due = due if due.dim() == 0 else due.unsqueeze(-1)
@@ -43,7 +44,7 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
     how = stepping.decisions
     if how == "pathwise":
         return view.changed(state, _claimed(stepping, view, state, inputs, params, due)[0])
-    before = state.choices or choices.settled(state.links.lane, view.road.count, state.speed)
+    before = state.choices or choices.settled(links.lane, view.road.count, state.speed)
     if how == "score":
         claim, logs = _claimed(stepping, view, state, inputs, params, due)
         total = before.log_probability + torch.where(due, logs, 0.0)
@@ -53,7 +54,7 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
     scene = stepping.scene(state, inputs)._replace(history=NOW)
     if how == "surrogate":
         # What is not done is weighed until the next decision: carried on through alternatives it grows without bound.
-        before = choices.settled(state.links.lane, view.road.count, state.speed)
+        before = choices.settled(links.lane, view.road.count, state.speed)
     after = shares.gone_over(stepping, before, state, scene, params)
     after = torch.where(due.unsqueeze(-1), after, before.shares)
     if how == "soft":

@@ -205,7 +205,7 @@ def gone_over(stepping: Stepping, choices: Choices, state: State, scene: Scene, 
     entering = _from(now * to_left, 1), _from(now * to_right, -1)
     claim = _worth(wish, entering)
     better = torch.sigmoid((claim.movedim(-1, 1).unsqueeze(-1) - claim.unsqueeze(1)) / stepping.temperature)
-    others = sum(entering).movedim(-1, 1).unsqueeze(-1)
+    others = (entering[0] + entering[1]).movedim(-1, 1).unsqueeze(-1)
     granted = (1.0 - others * better * lanes.one_gap()).prod(1)
     come = tuple(x * granted for x in entering)
     return (now + come[0] + come[1] - _from(come[0], -1) - _from(come[1], 1)).movedim(0, -1)
