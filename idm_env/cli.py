@@ -136,6 +136,7 @@ def _show(title: str, rows: list[dict[str, Any]]) -> None:
 
 @app.command()
 def fit(
+    context: typer.Context,
     data: DataOrFolder,
     out: Out = Path("out/fit"),
     by: Annotated[str, typer.Option(help="driver, all, or a column such as vehicle_name.")] = "driver",
@@ -164,11 +165,29 @@ def fit(
     executor: Workers = "serial",
     jobs: Jobs = None,
     ray_address: RayAddress = None,
+    lane_changes: Annotated[
+        bool, typer.Option("--lane-changes", help="Fit MOBIL to the lane changes of the file, by their likelihood.")
+    ] = False,
+    every: Annotated[
+        float, _ranged(help="--lane-changes: seconds between decisions.", low=0.1, high=60.0, unit="s")
+    ] = 1.0,
+    ahead: Annotated[
+        float, _ranged(help="--lane-changes: seconds from a decision to the new lane number.", low=0.0, high=10.0)
+    ] = 0.0,
+    first_lane: Annotated[str, typer.Option(help="--lane-changes: where the lowest lane is, left or right.")] = "left",
 ) -> None:
     """Calibrate IDM, or another law, by gradients through the simulator, per driver, group or pooled.
 
-    Writes parameters.parquet, model.yaml, report.json and report.html.
+    Writes parameters.parquet, model.yaml, report.json and report.html. With --lane-changes MOBIL's are fitted,
+    and judged on drivers held out; hypothetical accelerations are those of --model or --base.
     """
+    if lane_changes:
+        source_of_changes = {"data", "out", "model", "base", "seed", "ring_length", "layout", "where", "lane_changes",
+                             "every", "ahead", "first_lane"}  # fmt: skip
+        _only(context, "--lane-changes", source_of_changes)
+        _fit_lane_changes(data, out, model, base, seed, ring_length, layout, where, every, ahead, first_lane)
+        return
+    _only(context, "", set(context.params) - {"every", "ahead", "first_lane"})
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
@@ -191,6 +210,36 @@ def fit(
     names = ("", "episodes", "gap_rmse_m", "gap_rmse_median_m", "gap_mae_m", "speed_rmse_mps", "collisions")
     _show("Errors in free simulation", [{n: row[n] for n in names} for row in rows])
     console.print(result["at_bounds"], soft_wrap=True, highlight=False)
+    _done(out, result["data"]["account"])
+
+
+def _only(context: typer.Context, mode: str, known: set[str]) -> None:
+    """Raise ValueError for an option on the command line that says nothing here."""
+    for name in context.params:
+        given = context.get_parameter_source(name)
+        if name not in known and given is not None and given.name == "COMMANDLINE":
+            flag = f"--{name.replace('_', '-')}"
+            told = f"says nothing with {mode}" if mode else "is for --lane-changes"
+            raise ValueError(f"{flag} {told}. Leave it out.")
+
+
+def _fit_lane_changes(
+    data: Path, out: Path, model: str | None, base: str | None, seed: int, ring_length: float | None, layout: str,
+    where: list[str] | None, every: float, ahead: float, first_lane: str,
+) -> None:  # fmt: skip
+    with shown(console) as report:
+        from idm_env.fitting.lane_changes import ChangeOptions, fit_lane_changes
+        from idm_env.fitting.options import Source
+
+        _work_begins()
+        options = ChangeOptions(model, base, every, ahead, first_lane, None, int(seed))
+        source = Source(data, ring_length, None, layout, where=where)
+        result = fit_lane_changes(source, options, out, on_progress=report)
+    columns = ("parameter", "symbol", "unit", "estimate", "standard_error", "identified")
+    _show("MOBIL by the likelihood of lane changes", [{n: row[n] for n in columns} for row in result["parameters"]])
+    names = ("model", "parameters", "fitted", "held_out", "mobil_gains", "standard_error")
+    _show("Log-likelihood, of all drivers and of those held out", [{n: r[n] for n in names} for r in result["models"]])
+    console.print(result["sentence"], soft_wrap=True, highlight=False, markup=False)
     _done(out, result["data"]["account"])
 
 

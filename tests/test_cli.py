@@ -95,6 +95,9 @@ def test_bad_paths_and_options(frame: pl.DataFrame, tmp_path: Path) -> None:
         (("fit", good, "--method", "newton"), "lm"),
         (("simulate", good, "--model", tmp_path / "none.yaml"), "none.yaml"),
         (("fit", good, "--out", good), "is a file"),
+        (("fit", good, "--ahead", 1), "--ahead is for --lane-changes"),
+        (("fit", good, "--lane-changes", "--starts", 2), "--starts says nothing with --lane-changes"),
+        (("fit", good, "--lane-changes"), "Lane changes need the lane of every row"),
     ):
         options = () if "--out" in arguments else ("--out", tmp_path / "out")
         done = call(*arguments, *options)

@@ -45,7 +45,7 @@ ALLOWED = {
     "data": set(),
     "fitting": {
         "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "report", "metrics",
-        "checks", "keep", "progress", "diagrams", "executor", "parts",
+        "checks", "keep", "progress", "diagrams", "executor", "parts", "changes",
     },
     "drift": {
         "types", "parameters", "effects", "roads", "simulator", "data", "config", "fitting", "keep", "report",

@@ -1,0 +1,270 @@
+"""The command ``fit --lane-changes``: a file with lanes in, MOBIL's parameters and what they are worth out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from idm_env import keep
+from idm_env import report as page
+from idm_env.config import Model, load_model, save_model
+from idm_env.data import DataError, Trajectories
+from idm_env.effects import IDM, Brakes, Mobil, base_named
+from idm_env.fitting.choices import (
+    Choice,
+    Chosen,
+    ConstantRate,
+    GapAcceptance,
+    HeldOut,
+    Wishes,
+    fit_choice,
+    folds,
+    held_out,
+    per_vehicle,
+)
+from idm_env.fitting.decisions import Decisions, recorded_decisions
+from idm_env.fitting.options import Source
+from idm_env.progress import OnProgress, silent
+from idm_env.roads import Lanes
+from idm_env.types import Params
+
+WRITTEN = ("model.yaml", "report.json", "report.html")
+"""What ``fit_lane_changes`` writes."""
+FOLDS = 5
+FEW = 30
+"""With fewer changes than these no number of a fit is worth much, and the report says so."""
+
+
+@dataclass(frozen=True)
+class ChangeOptions:
+    """What lane changes are fitted with.
+
+    ``model`` is a saved model, whose car-following law (and other effects) judge the hypothetical pairs; without it
+    ``base`` does with its defaults. ``every`` (s), ``ahead`` (s) and ``first_lane`` are those of
+    ``recorded_decisions``. ``free`` are the parameters that are fitted; None takes all of MOBIL's.
+    """
+
+    model: str | None = None
+    base: str | None = None
+    every: float = 1.0
+    ahead: float = 0.0
+    first_lane: str = "left"
+    free: tuple[str, ...] | None = None
+    seed: int = 0
+
+
+class LaneChanges(NamedTuple):
+    """Decisions, the models fitted to them (MOBIL first), and what each of them says of drivers it has not seen."""
+
+    decisions: Decisions
+    fitted: tuple[Chosen, ...]
+    held_out: tuple[HeldOut, ...]
+    model: Model
+
+    @property
+    def mobil(self) -> Chosen:
+        """The fit of the effects."""
+        return self.fitted[0]
+
+    def compared(self) -> list[dict[str, Any]]:
+        """Return one row per model: log-likelihoods, and by how much MOBIL's is larger on unseen drivers."""
+        rows = []
+        for chosen, seen in zip(self.fitted, self.held_out, strict=True):
+            ahead = per_vehicle(self.decisions, self.held_out[0].log_likelihood - seen.log_likelihood)
+            rows.append({
+                "model": chosen.model.title, "parameters": len(chosen.theta), "fitted": chosen.log_likelihood,
+                "held_out": float(seen.log_likelihood.sum()), "mobil_gains": float(ahead.sum()),
+                "standard_error": float(ahead.std() * len(ahead) ** 0.5),
+                "expected_changes": float(seen.probabilities[:, 1:].sum()),
+            })  # fmt: skip
+        return rows
+
+    def calibration(self, which: int = 0) -> list[dict[str, Any]]:
+        """Return how often unseen drivers changed where a model said so: bins of about the same expected changes."""
+        risk = self.held_out[which].probabilities[:, 1:].sum(-1)
+        changed = (self.decisions.chosen > 0).double()
+        bins = min(5, max(2, self.decisions.changes // 5))
+        order = risk.argsort()
+        share = risk[order].cumsum(0) / risk.sum()
+        at = torch.bucketize(share, torch.linspace(0, 1, bins + 1, dtype=torch.float64)[1:-1])
+        rows = []
+        for k in range(bins):
+            mine = order[at == k]
+            if len(mine):
+                rows.append({
+                    "decisions": len(mine), "lowest": float(risk[mine].min()), "highest": float(risk[mine].max()),
+                    "expected": float(risk[mine].sum()), "observed": int(changed[mine].sum()),
+                })  # fmt: skip
+        return rows
+
+
+def lane_changes(
+    trajectories: Trajectories, options: ChangeOptions | None = None, on_progress: OnProgress | None = None
+) -> LaneChanges:
+    """Fit MOBIL's parameters to the lane changes of a file, and judge them on drivers that the fit has not seen.
+
+    Every driver is judged by fits to the drivers of the other four of five folds; so are a constant rate and a logit of
+    gap acceptance. DataError and ValueError for what cannot be fitted.
+    """
+    options, progress = options or ChangeOptions(), on_progress or silent
+    model = _model(options)
+    progress("decisions", 0, 0, trajectories.source)
+    decisions = recorded_decisions(
+        trajectories, model.simulator, _params_of(model), every=options.every, ahead=options.ahead,
+        first_lane=options.first_lane,
+    )  # fmt: skip
+    free = options.free or tuple(f"{Mobil.kind}.{p.name}" for p in Mobil.declared)
+    models: list[Choice] = [Wishes(model.simulator(Lanes(2)), free), ConstantRate(), GapAcceptance()]
+    fitted = []
+    for k, each in enumerate(models):
+        progress("fitting", k, len(models), each.title)
+        fitted.append(fit_choice(each, decisions))
+    progress("drivers held out", 0, 0, f"{FOLDS} folds")
+    fold = folds(decisions, FOLDS, options.seed)
+    if int(torch.unique(fold[decisions.vehicle[decisions.chosen > 0]]).numel()) < 2:
+        raise DataError(f"{trajectories.source}: only one driver changes lanes. Nobody could be held out; take more.")
+    seen = held_out(fitted, decisions, fold)
+    numbers = {effect: dict(values) for effect, values in model.parameters.items()}
+    for name, value in zip(free, fitted[0].theta.tolist(), strict=False):
+        effect, parameter = name.split(".")
+        numbers.setdefault(effect, {})[parameter] = float(value)
+    return LaneChanges(decisions, tuple(fitted), tuple(seen), replace(model, parameters=numbers, fitted_on={}))
+
+
+def _model(options: ChangeOptions) -> Model:
+    """Return the model that judges, with MOBIL where it has no effect that changes lanes."""
+    if options.model is not None and options.base is not None:
+        raise ValueError(f"base = '{options.base}', and the model {options.model} has one. Leave one of them out.")
+    if options.model is not None:
+        model = load_model(Path(options.model))
+    else:
+        model = Model((base_named(options.base) if options.base else IDM(), Brakes()))
+    kept = tuple(e for e in model.effects if e.name not in ("control", "replay", Mobil.kind))
+    return replace(model, effects=(*kept, Mobil(every=options.every)))
+
+
+def _params_of(model: Model) -> Any:
+    """Return a function of ``"run/vehicle"``: the driver's own parameters where the model knows him."""
+    known: dict[str | None, Params] = {}
+
+    def of(vehicle: str) -> Params:
+        key = vehicle if model.by == "driver" and vehicle in model.drivers else None
+        if key not in known:
+            known[key] = model.params(key, dtype=torch.float64)
+        return known[key]
+
+    return of
+
+
+def fit_lane_changes(
+    source: Source, options: ChangeOptions, out: Path, *, on_progress: OnProgress | None = None
+) -> dict[str, Any]:
+    """Fit the lane changes of a file and return the report; write it, and ``model.yaml``."""
+    progress = on_progress or silent
+    with keep.results(out, WRITTEN, (source.path, options.model)):
+        progress("reading", 0, 0, source.path.name)
+        trajectories = source.trajectories()
+        found = lane_changes(trajectories, options, progress)
+        progress("writing", 0, 0, "the report")
+        result = _result(found, trajectories, options)
+        save_model(out / "model.yaml", found.model)
+        page.write_json(out / "report.json", result)
+        page.write_page(out / "report.html", f"Lane changes of {trajectories.source}", _page(found, result))
+        return result
+
+
+def _result(found: LaneChanges, trajectories: Trajectories, options: ChangeOptions) -> dict[str, Any]:
+    decisions, compared = found.decisions, found.compared()
+    account = page.account(
+        ((r.kind, r.count) for r in trajectories.repairs), ((r.kind, r.count) for r in decisions.left_out)
+    )
+    left = int((decisions.chosen == 1).sum())
+    return {
+        "schema": 1,
+        "command": page.command_line(),
+        "data": {**trajectories.summary(), "left_out": [str(r) for r in decisions.left_out], "account": account},
+        "options": vars(options),
+        "decisions": {
+            "count": len(decisions), "changes": decisions.changes, "left": left, "right": decisions.changes - left,
+            "vehicles": int(decisions.vehicle.unique().numel()),
+        },
+        "parameters": found.mobil.table(),
+        "models": compared,
+        "calibration": found.calibration(),
+        "sentence": _sentence(found, compared),
+        "versions": page.versions(),
+    }  # fmt: skip
+
+
+def _sentence(found: LaneChanges, compared: list[dict[str, Any]]) -> str:
+    """Return what was found, in words that follow the figures."""
+    decisions = found.decisions
+    said = []
+    for row in compared[1:]:
+        gain, error = row["mobil_gains"], row["standard_error"]
+        word = "better than" if gain > 1.96 * error else "worse than" if gain < -1.96 * error else "not told from"
+        said.append(f"{word} {row['model']} ({gain:+.1f} ± {error:.1f})")
+    unknown = [row["parameter"] for row in found.mobil.table() if not row["identified"]]
+    doubt = f" Not identified by these data: {', '.join(map(str, unknown))}." if unknown else ""
+    few = (
+        f" {decisions.changes} changes are few: take these numbers as a description." if decisions.changes < FEW else ""
+    )
+    return (
+        f"{decisions.changes} lane changes in {len(decisions)} decisions. On drivers whom the fit has not seen, by "
+        f"log-likelihood, MOBIL is {' and '.join(said)}.{doubt}{few}"
+    )
+
+
+def _page(found: LaneChanges, result: dict[str, Any]) -> list[page.Block]:
+    names = {
+        "model": "model", "parameters": "parameters", "fitted": "log-likelihood, fitted",
+        "held_out": "log-likelihood, held out", "mobil_gains": "MOBIL gains", "standard_error": "± (over drivers)",
+        "expected_changes": "changes expected",
+    }  # fmt: skip
+    return [
+        page.lead(result["sentence"]),
+        page.heading("Parameters"),
+        page.table(result["parameters"]),
+        page.note(
+            "P(change to a side) = λ/2 + (1 − λ) r Q, Q ∝ exp(h/τ) σ(m/τ): utility h and safety margin m as the "
+            "simulator computes them. Standard errors are the larger of the curvature's and of what drivers "
+            "differ by. What is on its bound, or has an interval wider than half of its bounds, is not identified. "
+            "A simulator with these parameters changes where h > 0 and m ≥ 0, at every decision: it knows no r, τ or λ."
+        ),
+        page.heading("Drivers that were held out"),
+        page.table([{title: row[name] for name, title in names.items()} for row in result["models"]]),
+        _calibration_picture(found),
+        page.table(result["calibration"]),
+        page.heading("Data"),
+        page.text(
+            f"{result['decisions']['count']} decisions of {result['decisions']['vehicles']} vehicles, one every "
+            f"{result['options']['every']:g} s: {result['decisions']['left']} changes to the left, "
+            f"{result['decisions']['right']} to the right. Decisions without any room beside are not counted."
+        ),
+        page.text(result["data"]["account"]),
+        page.bullets([*(r["text"] for r in result["data"]["repairs"]), *result["data"]["left_out"]]),
+    ]
+
+
+def _calibration_picture(found: LaneChanges) -> page.Block:
+    """Draw observed over expected changes, by bins, for all models."""
+    figure, axes = page.figure(1, 1, size=(5.6, 3.6))
+    axis, most = axes[0, 0], 1.0
+    for k, (chosen, colour) in enumerate(zip(found.fitted, ("#1e5adc", "#999999", "#d1495b"), strict=True)):
+        rows = found.calibration(k)
+        rate, seen = (np.array([row[n] / row["decisions"] * 100 for row in rows]) for n in ("expected", "observed"))
+        error = np.array([np.sqrt(max(row["observed"], 1)) / row["decisions"] * 100 for row in rows])
+        axis.errorbar(rate, seen, error, fmt="o-", ms=4, lw=1, color=colour, label=chosen.model.title)
+        most = max(most, rate.max(), (seen + error).max())
+    axis.plot([0, most], [0, most], color="#20242c", lw=0.8)
+    axis.set(xlabel="changes expected (% of decisions)", ylabel="changes observed (%)", xlim=(0, None), ylim=(0, None))
+    axis.legend(frameon=False, fontsize=8)
+    axis.grid(alpha=0.25)
+    return page.picture(figure, "Drivers that were held out: bins of about the same expected changes; bars: √n.")
+
+
+__all__ = ["WRITTEN", "ChangeOptions", "LaneChanges", "fit_lane_changes", "lane_changes"]
