@@ -182,7 +182,8 @@ class Strength:
     """What data say of an absent effect's strength: estimate, its 95 % interval, and what would have been found.
 
     ``seen`` is the smallest distance from the null that the test over the whole list finds four times in five, from the
-    interval's width; ``typical`` the distance of the catalogue's default.
+    interval's width; ``typical`` the distance of the catalogue's default. Of an unknown profile, with a strength at
+    each of its ``knots``, ``estimate`` is that furthest from the null, with the interval of all; ``seen`` the median.
     """
 
     parameter: Parameter
@@ -191,20 +192,32 @@ class Strength:
     high: float
     seen: float
     typical: float
+    knots: int = 1
+
+    @property
+    def beyond(self) -> float:
+        """Distance from the null that the data exclude (95 %)."""
+        null = self.parameter.null or 0.0
+        return max(abs(self.low - null), abs(self.high - null))
 
 
 def strength_of(solution: Solution, task: Task, label: str, tests: int) -> Strength | None:
-    """Return the strength of a term that has just one, or None; ``tests`` is how many candidates were tested."""
+    """Return the strength of a term that has one, or only such, else None; ``tests`` candidates were tested."""
     where = solution.model.where(label)
     parameters = solution.model.parameters[where]
     strengths = [i for i, p in enumerate(parameters) if p.null is not None and p.role == "strength"]
-    if len(strengths) != 1:
+    if not strengths or 1 < len(strengths) < len(parameters):
         return None
-    p, at = parameters[strengths[0]], where.start + strengths[0]
-    width, estimate = float(half_width(solution, task)[at]), float(solution.values[at])
-    seen = width / 1.96 * float(normal.ppf(1.0 - ALPHA / max(tests, 1)) + normal.ppf(POWER))
+    at = where.start + np.array(strengths)
+    width, estimate = half_width(solution, task)[at], solution.values[at]
+    p = parameters[strengths[0]]
     assert p.null is not None
-    return Strength(p, estimate, estimate - width, estimate + width, seen, abs(p.default - p.null))
+    seen = float(np.median(width)) / 1.96 * float(normal.ppf(1.0 - ALPHA / max(tests, 1)) + normal.ppf(POWER))
+    furthest = float(estimate[np.abs(estimate - p.null).argmax()])
+    low, high = float((estimate - width).min()), float((estimate + width).max())
+    term = next(t for t in solution.model.terms if t.label == label)
+    typical = abs(p.default - p.null) if len(strengths) == 1 else term.smoothness
+    return Strength(p, furthest, low, high, seen, typical, len(strengths))
 
 
 PROMISING = 0.02

@@ -100,7 +100,9 @@ def report(
     structured = any(r.significant for r in (first, *(r for r in rounds if r.free)))
     strengths = _strengths(first, task)
     smallest = smallest_p(units(task.rows.records).run)
-    power = len(fit_runs) >= MANY_RUNS or powerful(list(strengths.values()), first.tested, smallest)
+    power = len(fit_runs) >= MANY_RUNS or powerful(
+        [s for s in strengths.values() if s.knots == 1], first.tested, smallest
+    )
     refusal = judged.refusal
     common = judged.shared
     others = [name for f in found if f["effect"] for name in f["equivalent"] if name in ALL]
@@ -117,7 +119,7 @@ def report(
         "verdict": verdict.value,
         "reason": None if refusal is None else refusal.reason.value,
         "sentence": words.headline(
-            verdict, [f["clause"] for f in found], refusal, judged.tried, errors, common, others
+            verdict, [f["clause"] for f in found], refusal, judged.tried, errors, common, others, strengths
         ),
         "details": [*words.details(verdict, found, [] if judged.added else entries, left),
                     *words.excluded(verdict, strengths)],

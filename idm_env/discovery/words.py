@@ -37,6 +37,8 @@ ALONG = {
     "position": "place", "time": "time", "speed": "speed", "gap": "gap", "closing_speed": "closing speed",
     "lead_accel": "leader's acceleration",
 }  # fmt: skip
+SHOWN = 3
+"""Effects named in the sentence of ``none``, of those known best and of those that show least."""
 MANY = 4
 """A term with more parameters than this is a curve: its range is told instead."""
 
@@ -127,7 +129,7 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
 
 def headline(
     verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison],
-    shared: Shared | None = None, others: Sequence[str] = (),
+    shared: Shared | None = None, others: Sequence[str] = (), strengths: Mapping[str, Strength] | None = None,
 ) -> str:  # fmt: skip
     """Say in one sentence what is missing, or why nothing can be said.
 
@@ -139,6 +141,7 @@ def headline(
         errors: How errors on runs kept back changed with what was added or came nearest.
         shared: What vehicles of one run do alike, told where nothing was added.
         others: Effects that these data do not tell from what was added.
+        strengths: What the data say of the strengths of absent effects, by name.
     """
     if shared is not None and not clauses:
         return common(shared)
@@ -151,7 +154,7 @@ def headline(
     if verdict is Verdict.NONE:
         return (
             "Nothing is missing that these data could show: no candidate lowers the error on runs that it was not "
-            "fitted to."
+            f"fitted to{_limits(strengths or {})}."
         )
     if verdict is Verdict.CANNOT_TELL:
         return (
@@ -225,6 +228,23 @@ def details(
     if verdict is Verdict.UNEXPLAINED:
         parts.append("The ranking and the maps of the residual below say where to look.")
     return parts
+
+
+def _limits(strengths: Mapping[str, Strength]) -> str:
+    """Say of the effects that these data know best what is excluded, and what the least visible ones would hide."""
+    if not strengths:
+        return ""
+    best = sorted(strengths, key=lambda name: strengths[name].beyond / strengths[name].typical)[:SHOWN]
+    worst = sorted(strengths, key=lambda name: -strengths[name].seen / strengths[name].typical)[:SHOWN]
+    known = ", ".join(f"no {plain(n)} beyond {_strength(strengths[n], strengths[n].beyond)}" for n in best)
+    hidden = ", ".join(f"a {plain(n)} below {_strength(strengths[n], strengths[n].seen)}" for n in worst)
+    return f"; there is {known} (95 %), and {hidden} would not have been seen"
+
+
+def _strength(s: Strength, distance: float) -> str:
+    """Return a distance from the null, shares in percent."""
+    unit = s.parameter.unit
+    return f"{number(100.0 * distance, 2)} %" if unit == "1" else f"{number(distance, 2)} {unit}"
 
 
 def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:

@@ -16,6 +16,7 @@ from idm_env.discovery import model as terms
 from idm_env.discovery.compare import ERRORS, Comparison, Light
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import gather
+from idm_env.discovery.score import Strength
 from idm_env.discovery.search import first_prior
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
 from idm_env.effects import ALL, CANDIDATES
@@ -213,3 +214,20 @@ def test_words_of_none_claim_no_cause() -> None:
     text = words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {})
     assert "drivers' own noise" not in text + " ".join(words.details(Verdict.NONE, [], [], 0.01))
     assert verdict.Verdict("none") is Verdict.NONE
+
+
+def test_none_says_what_is_excluded_and_what_would_not_have_been_seen() -> None:
+    """The strengths that these data know best against the usual ones, and those that show least."""
+    lag, drag, slope = (ALL[n]().parameters[0] for n in ("lag", "drag", "grade"))
+    strengths = {
+        "drag": Strength(drag, 1e-5, -2e-4, 2.2e-4, 3e-4, 4e-4),
+        "lag": Strength(lag, 0.01, -0.08, 0.12, 0.2, 0.5),
+        "grade": Strength(slope, 0.002, -0.02, 0.024, 0.01, 0.03, knots=9),
+    }
+    text = words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {}, strengths=strengths)
+    known, hidden = text.split(" (95 %), and ")
+    assert (
+        "there is no response lag beyond 0.12 s, no drag beyond 0.00022 1/m, no slope of the road beyond 2.4 %" in known
+    )
+    assert hidden.startswith("a drag below 0.0003 1/m, a response lag below 0.2 s, a slope of the road below 1 %")
+    assert hidden.endswith("would not have been seen.")
