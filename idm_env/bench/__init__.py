@@ -122,6 +122,8 @@ def _lanes(vehicles: int, rounds: int, compiled: bool, verbose: bool, say: Say) 
             cases[f"kernel {kind}"] = made.ours(made.simulator, True, backward)
     if why is None:
         cases["kernel forward, one step per call"] = made.calls()
+        if torch.get_num_threads() == 1:
+            cases["reads and writes of one step alone"] = made.moves()
     cases["triad"], moved = traffic.triad()
     times = measure(cases, rounds)
     clock = "cpu" if torch.get_num_threads() == 1 else "wall"

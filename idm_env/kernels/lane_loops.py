@@ -8,7 +8,9 @@ states within a block live only in the workspace of a tile, so that the tape is 
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-from idm_env.kernels.memory import copy, number, prefetch
+import numpy as np
+
+from idm_env.kernels.memory import LINE, copy, number, prefetch, stream
 from idm_env.kernels.phases import call
 from idm_env.kernels.tiles import (
     ROW,
@@ -32,6 +34,12 @@ from idm_env.kernels.tiles import (
 
 HOIST, SENSE, RECALL, RESPOND, CLOSE = range(5)
 """Places of the phases' addresses."""
+
+PIECE = 128
+"""Vehicles between two fetches: their lines of a dozen arrays are what a core can wait for at a time."""
+
+LARGE = 1 << 22
+"""Bytes from which an array is written past the caches: a step's arrays together are then larger than any cache."""
 
 BEFORE = 0
 """First column of ``looks``: 0 for the whole rollout, or the phase before which they are needed."""
@@ -108,11 +116,16 @@ def step(w, h, pitch, n, size, measures, phases, looks, recalls, k, now):
 
     The past of the tile begins at address ``h``, oldest step first, and has a row of ``pitch`` numbers for each signal.
     """
-    m = padded(n)
     perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now)
-    call(phases[RESPOND], w, m, k)  # type: ignore[call-arg]
+    call(phases[RESPOND], w, padded(n), k)  # type: ignore[call-arg]
+    close(w, n, size, measures, phases, looks, k)
+
+
+@exact
+def close(w, n, size, measures, phases, looks, k):
+    """Move gaps on, once everybody has responded."""
     look(w, n, size, measures, looks, CLOSE)
-    call(phases[CLOSE], w, m, k)  # type: ignore[call-arg]
+    call(phases[CLOSE], w, padded(n), k)  # type: ignore[call-arg]
 
 
 @exact
@@ -136,6 +149,53 @@ def store_past(h, past, newest, slots, signals, at, skip, own, count):
     for s in range(slots):
         for i in range(signals):
             copy(past, (s * signals + i) * count + at, h, ((newest - s) * signals + i) * ROW + skip, own)
+
+
+@exact
+def respond_and_fetch(w, m, phases, k, sources, following, size):
+    """Respond, a piece of the tile at a time, and start fetching as much of the next tile each time.
+
+    Fetched all at once, the next tile would hold up this one: a core waits for a few dozen cache lines at a time.
+    """
+    row, first, n, _, _ = following
+    for j in range(0, m, PIECE):
+        for i in range(len(sources)):
+            prefetch(sources[i], row * size + first + j, min(PIECE, n - j), w)
+        call(phases[RESPOND], w[j:], min(PIECE, m - j), k)  # type: ignore[call-arg]
+
+
+@exact
+def dense_arrays(start, read, operands, strides, many, size):
+    """Return the addresses of what a tile is filled from and that has a number for every vehicle."""
+    found, count = np.empty(len(read) + many, np.int64), 0
+    for i in read:
+        found[count] = start[i]
+        count += 1
+    for i in range(many):
+        if strides[i, 2] == 1 and strides[i, 1] == size:
+            found[count] = operands[i]
+            count += 1
+    return found[:count]
+
+
+@exact
+def store(ends, at, w, rows, count, n):
+    """Store the first ``n`` numbers of rows that lie ``ROW`` apart, at ``at`` of as many addresses that are not 0.
+
+    Lines of all are written in turn and past the caches: whatever is so large is not read again before it has left
+    them, and a line that is written whole need not be read before.
+    """
+    line = LINE // w.itemsize
+    skip = min(-at % line, n)
+    whole = (n - skip) // line * line
+    for j in range(skip, skip + whole, line):
+        for i in range(count):
+            if ends[i]:
+                stream(ends[i], at + j, w, rows + i * ROW + j)
+    for i in range(count):
+        if ends[i]:
+            copy(ends[i], at, w, rows + i * ROW, skip)
+            copy(ends[i], at + skip + whole, w, rows + i * ROW + skip + whole, n - whole - skip)
 
 
 @exact
@@ -172,13 +232,10 @@ def forward(
     h = workspace(((slots + steps) * signals + 1) * ROW, k)
     dense, count, is_ring = len(strides) - 1, rows * size, measures[IS_RING] != 0
     many, has_inputs = measures[STATICS] + measures[PARAMETERS], measures[NUMBERS] + measures[FLAGS] > 0
+    sources, past_caches = dense_arrays(start, read, operands, strides, many, size), count * k.itemsize > LARGE
     filled = 0
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
-        if tile + 1 < end:
-            following = place(tile + 1, rows, size, wide, around, is_ring)
-            fetch_states(start, read, following, size, k)
-            fetch_next(operands, strides[:many], following, size, k)
         for i in read:
             load(w, measures[STATE_ROWS] + i * ROW, start[i], strides, dense, 0, row, first, n, size, False)
         load_past(h, past, alike, 0, slots, signals, strides, row, first, n, size, count)
@@ -188,13 +245,23 @@ def forward(
         for t in range(begin_step, begin_step + steps):
             if has_inputs:
                 load_inputs(w, operands, strides, t, row, first, n, size, measures)
-            step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots + t - begin_step)
+            now = slots + t - begin_step
+            if t < begin_step + steps - 1 or tile + 1 == end:
+                step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, now)
+            else:
+                perceive(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, now)
+                following = place(tile + 1, rows, size, wide, around, is_ring)
+                respond_and_fetch(w, padded(n), phases, k, sources, following, size)
+                close(w, n, size, measures, phases, looks, k)
             if every:
                 copy(kept, t * count + at, w, measures[POSITION] + skip, own)
                 copy(kept, (every + t) * count + at, w, measures[SPEED] + skip, own)
                 copy(kept, (2 * every + t) * count + at, w, measures[ACCEL] + skip, own)
                 copy(kept, (3 * every + t) * count + at, w, measures[GAP] + skip, own)
-        for i in range(measures[STATES]):
-            if ends[i]:
-                copy(ends[i], at, w, measures[STATE_ROWS] + i * ROW + skip, own)
+        if past_caches:
+            store(ends, at, w, measures[STATE_ROWS] + skip, measures[STATES], own)
+        else:
+            for i in range(measures[STATES]):
+                if ends[i]:
+                    copy(ends[i], at, w, measures[STATE_ROWS] + i * ROW + skip, own)
         store_past(h, past_end, slots + steps - 1, slots, signals, at, skip, own, count)

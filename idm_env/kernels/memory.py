@@ -74,6 +74,22 @@ def copy(typing_context: Any, target: Any, to: Any, source: Any, at: Any, n: Any
 
 
 @intrinsic
+def stream(typing_context: Any, target: Any, to: Any, source: Any, at: Any) -> Any:
+    """Copy a cache line past the caches to an address where one begins, from an array."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        first = _pointer(context, builder, target, arguments[0], arguments[1], source.dtype)
+        second = _pointer(context, builder, source, arguments[2], arguments[3], source.dtype)
+        line = ir.VectorType(ir.IntType(32), LINE // 4).as_pointer()
+        made = builder.load(builder.bitcast(second, line), align=4)
+        done = builder.store(made, builder.bitcast(first, line), align=LINE)
+        done.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
+        return context.get_dummy_value()
+
+    return types.void(target, types.int64, source, types.int64), generate
+
+
+@intrinsic
 def add(typing_context: Any, target: Any, to: Any, source: Any, at: Any, n: Any) -> Any:
     """Add ``n`` numbers from index ``at`` of one place to those from index ``to`` of another."""
     kind = _number(target, source)

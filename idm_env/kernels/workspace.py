@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from idm_env.kernels.memory import LINE
 from idm_env.kernels.tiles import Array
 
 SMALLEST = 1 << 17
@@ -41,14 +42,15 @@ _UNHELD = _references_of_an_unheld_array()
 
 
 def take(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
-    """Return an uninitialised array, in memory that has been used before where some is free."""
+    """Return an uninitialised array that begins on a cache line, where possible in memory used before."""
     size = math.prod(shape) * dtype.itemsize
     if size < SMALLEST:
         return np.empty(shape, dtype)
     with _lock:
-        base = _free(size, _kept, _UNHELD)
+        base = _free(size + LINE, _kept, _UNHELD)
         if base is None:
-            base = np.empty(size, np.uint8)
+            base = np.empty(size + LINE, np.uint8)
             _kept.append(base)
             del _kept[:-MOST]
-        return base.view(dtype).reshape(shape)
+        begin = -base.ctypes.data % LINE
+        return base[begin : begin + size].view(dtype).reshape(shape)

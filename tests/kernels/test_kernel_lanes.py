@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from idm_env.effects import IDM, Brakes, Control, Noise, Replay, make
-from idm_env.kernels import dispatch, lanes, tiles
+from idm_env.kernels import dispatch, lane_loops, lanes, tiles
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.types import Command, Record
@@ -163,6 +163,28 @@ def test_halos_are_as_wide_as_effects_look_far(road, steps):
 @pytest.mark.parametrize("options", [{"checkpoint_every": 3}, {"keep": None}, {"keep": None, "checkpoint_every": 30}])
 def test_options_change_nothing_but_memory(options):
     compare(build(PROGRAMS[5], seed=6, batch=(4,), size=22, steps=40), **options)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [47, 2003])
+def test_values_do_not_depend_on_how_many_rows_there_are(size, dtype):
+    """Large arrays are written past the caches, in whole lines wherever rows begin."""
+    rows = -(-(lane_loops.LARGE // torch.finfo(dtype).bits * 8 + 1) // size)
+    generator = torch.Generator().manual_seed(size)
+
+    def draw(low, high):
+        return low + (high - low) * torch.rand(rows, size, generator=generator, dtype=dtype)
+
+    simulator = Simulator(Lane(), (IDM(), Brakes()), 0.1)
+    idm = {name: draw(*bound) for name, bound in BOUNDS.items()}
+    params = {"idm": idm, "brakes": {"max_decel": draw(3, 9)}}
+    state = simulator.state(-torch.arange(size, dtype=dtype) * 30.0 + draw(0, 20), draw(0, 25), params)
+    last, _ = simulator.rollout(state, {}, params, 2, keep=None)
+    for part in (slice(0, 3), slice(rows // 2, rows // 2 + 3), slice(rows - 3, rows)):
+        cut = state._replace(**{n: getattr(state, n)[part] for n in ("position", "speed", "accel", "gap", "length")})
+        few, _ = simulator.rollout(cut, {}, {e: {n: x[part] for n, x in p.items()} for e, p in params.items()}, 2)
+        for name in ("position", "speed", "accel", "gap"):
+            assert torch.equal(getattr(last, name)[part], getattr(few, name)), name
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
