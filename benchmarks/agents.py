@@ -1,14 +1,15 @@
 """Agents side by side: equal searches, ten seeds of the best, held-out rings and drivers.
 
     python benchmarks/agents.py reference [--rings failsafe-shock] [--out runs/benchmark]
-    python benchmarks/agents.py run [--only ring-ppo] [--trial 0] [--seeds 3] [--out runs/benchmark]
+    python benchmarks/agents.py run [--only ring-ppo] [--trial 0] [--seeds 3] [--executor processes --jobs 8]
     python benchmarks/agents.py table [--out runs/benchmark]
     python benchmarks/agents.py takeover [--out runs/benchmark]
 
 ``reference`` has what learns nothing, ``run`` the searches and the seeds of each best trial (or of the one that is
 given, without a search). Every training is one process with one thread and one file of results; what is done is
 skipped, what another process works on is left to it, so the command may be interrupted, repeated, and started several
-times. CPU seconds are those of training; evaluations every 3 s are not counted.
+times; ``--executor ray --ray-address HOST:PORT`` trains on a cluster with shared storage. CPU seconds are those of
+training; evaluations every 3 s are not counted.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,10 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+
+from benchmarks import workers  # noqa: E402 (found by the path above)
+from idm_env.executor import Executor, Serial  # noqa: E402
+from idm_env.progress import OnProgress  # noqa: E402
 
 BUDGET = {"ring-shac": 90.0}
 """CPU seconds of a training, 45 where nothing else is said; the three that are compared have the same."""
@@ -93,6 +99,17 @@ class Job:
             option = "--" + key.replace("_", "-")
             words += [option] if value is True else [option, str(value)]
         return words
+
+
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """A job, and the folder of all results: a part for an executor."""
+
+    job: Job
+    out: Path
+
+    def __str__(self) -> str:
+        return self.job.name
 
 
 def once(folder: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any] | None:
@@ -172,6 +189,18 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
     return result
 
 
+def train(part: Training, on_progress: OnProgress) -> None:
+    """Do what is missing of a job; its result is a file."""
+    perform(part.job, part.out)
+
+
+def trials(config: str) -> list[Job]:
+    """Return the jobs of a search; none where there is nothing to choose from."""
+    if len(SEARCH[config]) == 1:
+        return []
+    return [Job(config, trial, options, seed) for trial, options in enumerate(SEARCH[config]) for seed in SEARCH_SEEDS]
+
+
 def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
     """Return the best trial of a search (-1 while it is not finished) and the results of all its runs.
 
@@ -179,30 +208,33 @@ def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
     """
     from agents.evaluate import score
 
-    rows: list[dict[str, Any]] = []
+    jobs = trials(config)
+    found = [perform(job, out) for job in jobs]
+    done = [row for row in found if row is not None]
+    if len(done) < len(found):
+        return -1, done
     ranks: list[tuple[int, float]] = []
-    if len(SEARCH[config]) == 1:
-        return 0, []
-    for trial, options in enumerate(SEARCH[config]):
-        found = [perform(Job(config, trial, options, seed), out) for seed in SEARCH_SEEDS]
-        done = [row for row in found if row is not None]
-        if len(done) < len(found):
-            return -1, rows
-        rows += done
-        ends = [score(row["last"]) if row["history"] else -1e9 for row in done]
-        ranks.append((sum(row["summary"]["solved"] for row in done), sum(ends) / len(ends)))
-    return ranks.index(max(ranks)), rows
+    for trial in range(len(SEARCH[config])):
+        rows = [row for job, row in zip(jobs, done, strict=True) if job.trial == trial]
+        ends = [score(row["last"]) if row["history"] else -1e9 for row in rows]
+        ranks.append((sum(row["summary"]["solved"] for row in rows), sum(ends) / max(len(ends), 1)))
+    return ranks.index(max(ranks)), done
 
 
-def run(configs: list[str], out: Path, seeds: int, given: int | None = None) -> None:
+def run(configs: list[str], out: Path, seeds: int, given: int | None = None, executor: Executor | None = None) -> None:
     """Do every search and the first ``seeds`` seeds of its best trial, or those of a given one without any search."""
+    executor = executor or Serial()
+    searched = [job for config in configs for job in trials(config)] if given is None else []
+    deque(executor.map(train, [Training(job, out) for job in searched]), 0)
+    wanted = []
     for config in configs:
         trial = chosen(config, out)[0] if given is None else given
         if trial < 0:
             print(f"{config}: another process is still searching.")
             continue
-        for seed in (SEEDS if config.startswith("ring") else FEW)[:seeds]:
-            perform(Job(config, trial, SEARCH[config][trial], seed), out)
+        best = SEARCH[config][trial]
+        wanted += [Job(config, trial, best, s) for s in (SEEDS if config.startswith("ring") else FEW)[:seeds]]
+    deque(executor.map(train, [Training(job, out) for job in wanted]), 0)
 
 
 def main() -> None:
@@ -216,6 +248,7 @@ def main() -> None:
     parser.add_argument("--trial", type=int, help="train the seeds of this trial, without a search")
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train no more seeds than that")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
+    workers.add(parser)
     options = parser.parse_args()
     if options.what == "table":
         from agents.imitation import default_data
@@ -231,7 +264,8 @@ def main() -> None:
 
         agents_reference.show(options.out.resolve(), options.rings, once)
     else:
-        run(options.only, options.out.resolve(), options.seeds, options.trial)
+        with workers.of(options) as executor:
+            run(options.only, options.out.resolve(), options.seeds, options.trial, executor)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Does closing the loop pay in control? Policies trained on a plain and on a corrected model, judged in the truth.
 
-    python benchmarks/agents_transfer.py [--out runs/transfer] [--seeds 10]
+    python benchmarks/agents_transfer.py [--out runs/transfer] [--seeds 10] [--executor processes --jobs 8]
 
 Platoons are generated whose drivers react with a hidden delay. From the same data come plain IDM, calibrated, and the
 model of ``discover``, which has the effect that it found; both are saved as ``model.yaml``. One APG policy per model
@@ -14,6 +14,8 @@ import argparse
 import json
 import os
 import sys
+from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,8 @@ from agents import apg, common  # noqa: E402
 from agents.classical import PISaturation, no_command  # noqa: E402
 from agents.evaluate import evaluate_ring  # noqa: E402
 from agents.rollout import FRESH, LENGTHS, Act  # noqa: E402
+from benchmarks import workers  # noqa: E402
+from idm_env.progress import OnProgress  # noqa: E402
 from idm_env.tasks import make_task  # noqa: E402
 
 Row = dict[str, Any]
@@ -72,13 +76,27 @@ def models(out: Path) -> dict[str, Any]:
     }
 
 
-def trained(environment: dict[str, Any], out: Path, seed: int) -> common.Policy:
-    """Return a policy that was trained there, now if it is not there."""
-    chosen = apg.Arguments(environment=environment, out=out, seed=seed, updates=16, evaluate_every=1e9, explore=0.0)
-    if not (out / "done").exists():
-        apg.train(chosen)
-        (out / "done").touch()
-    return common.load(out / "last.pt", "ring", "apg")[0]
+@dataclass(frozen=True)
+class Training:
+    """A policy to be trained: in which environment, with which seed, into which folder."""
+
+    environment: Row
+    seed: int
+    out: Path
+
+    def __str__(self) -> str:
+        return str(self.out)
+
+
+def train(part: Training, on_progress: OnProgress) -> None:
+    """Train a policy, unless it is there."""
+    if not (part.out / "done").exists():
+        apg.train(
+            apg.Arguments(
+                environment=part.environment, out=part.out, seed=part.seed, updates=16, evaluate_every=1e9, explore=0.0
+            )
+        )
+        (part.out / "done").touch()
 
 
 def judge(act: Act | None, environment: dict[str, Any]) -> Row:
@@ -91,9 +109,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/transfer"))
     parser.add_argument("--seeds", type=int, default=10)
+    workers.add(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    environments = models(options.out.resolve())
+    out = options.out.resolve()
+    environments = models(out)
+    parts = {
+        name: [Training(where, seed, out / name.replace(" ", "-") / f"seed{seed}") for seed in range(options.seeds)]
+        for name, where in environments.items()
+    }
+    with workers.of(options) as executor:
+        deque(executor.map(train, [part for some in parts.values() for part in some]), 0)
     truth = environments["the truth"]
     guarded = {**truth, "failsafe": FAILSAFE}
     print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD))
@@ -103,10 +129,10 @@ def main() -> None:
     show("PI with saturation", "", *by_hand, None)
     touched: dict[str, list[int]] = {}
     for name, environment in environments.items():
-        for seed in range(options.seeds):
-            policy = trained(environment, options.out / name.replace(" ", "-") / f"seed{seed}", seed)
+        for part in parts[name]:
+            policy = common.load(part.out / "last.pt", "ring", "apg")[0]
             judged = [judge(policy, where) for where in (truth, guarded, environment)]
-            show(name, str(seed), *judged)
+            show(name, str(part.seed), *judged)
             touched.setdefault(name, []).append(judged[0]["collisions"])
     for name, counts in touched.items():
         p = mannwhitneyu(touched["plain IDM"], counts).pvalue

@@ -21,7 +21,11 @@ from typing import Any
 for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
     os.environ.setdefault(variable, "1")
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
+
+from benchmarks import workers  # noqa: E402
 
 RESPONSE = {"delay", "lag"}
 TRUE = {
@@ -298,7 +302,7 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=1, help="sets of every kind with an effect")
     parser.add_argument("--clean", type=int, default=6, help="sets without an effect, of every kind of noise")
     parser.add_argument("--few", type=int, default=0, help="sets without an effect, of 4 to 9 runs")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    workers.add(parser, "processes")
     parser.add_argument("--first-seed", type=int, default=70_000)
     parser.add_argument("--only", default="", help="part of the keys of the sets to run, such as 'one|delay'")
     parser.add_argument("--out", type=Path, default=Path("discovery_benchmark.jsonl"))
@@ -310,9 +314,7 @@ def main() -> None:
         j for j in jobs(arguments.sets, arguments.clean, arguments.first_seed, arguments.few) if arguments.only in j.key
     ]
     missing = [j for j in wanted if j.key not in done]
-    from idm_env.executor import opened
-
-    with opened("processes", arguments.jobs) as executor, arguments.out.open("a") as file:
+    with workers.of(arguments) as executor, arguments.out.open("a") as file:
         for number, (_, row) in enumerate(executor.map(measure, missing), 1):
             done[row["key"]] = row
             file.write(json.dumps(row) + "\n")

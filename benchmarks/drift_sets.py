@@ -1,6 +1,6 @@
 """Known drift found again: generated drivers of whom nothing is known, and drivers who do not drift.
 
-    python -m benchmarks.drift_sets [--sets 50] [--out drift_sets.jsonl] [--first-seed 1000]
+    python -m benchmarks.drift_sets [--sets 50] [--out drift_sets.jsonl] [--first-seed 1000] [--executor processes]
 
 A set is 20 drivers of 90 s, sampled every 0.2 s with errors of 0.1 m and 0.05 m/s, whose parameters differ by 20 %
 about others than those that the estimate takes for usual; leaders change their speed every 12 s or so. The sorts of
@@ -25,10 +25,12 @@ import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import polars as pl  # noqa: E402
 import torch  # noqa: E402
 
+from benchmarks import workers  # noqa: E402
 from idm_env.data import Trajectories, episodes  # noqa: E402
 from idm_env.drift.kinds import behind_a_record, tell  # noqa: E402
 from idm_env.effects import DRIFTS, AccelNoise, Effect, PerceptionNoise, Wander  # noqa: E402
 from idm_env.fitting.problem import IDM_NAMES  # noqa: E402
+from idm_env.progress import OnProgress, silent  # noqa: E402
 from idm_env.types import Record  # noqa: E402
 
 DT, SECONDS, DRIVERS = 0.2, 90.0, 20
@@ -92,7 +94,7 @@ def made(seed: int, drift: Effect, sigma: float, memory_time: float) -> Trajecto
     return Trajectories.from_frame(table, source=f"set {seed}")
 
 
-def scored(seed: int) -> dict[str, Any]:
+def scored(seed: int, on_progress: OnProgress = silent) -> dict[str, Any]:
     """Return what ``tell`` says of a set, beside what is hidden in it."""
     drift, sigma, memory_time = HIDDEN[seed % len(HIDDEN)]
     sigma *= float(np.exp(np.random.default_rng(seed).uniform(-0.4, 0.4)))
@@ -134,17 +136,18 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=60)
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--out", type=Path, default=Path("drift_sets.jsonl"))
+    workers.add(parser)
     arguments = parser.parse_args()
     done = {}
     if arguments.out.exists():
         done = {s["seed"]: s for s in map(json.loads, arguments.out.read_text().splitlines())}
     wanted = range(arguments.first_seed, arguments.first_seed + arguments.sets)
-    for seed in wanted:
-        if seed not in done:
-            done[seed] = json.loads(json.dumps(scored(seed)))
+    with workers.of(arguments) as executor:
+        for _, row in executor.map(scored, [seed for seed in wanted if seed not in done]):
+            done[row["seed"]] = json.loads(json.dumps(row))
             with arguments.out.open("a") as file:
-                file.write(json.dumps(done[seed]) + "\n")
-            print(f"{seed}: {done[seed]['hidden']}, told {done[seed]['one_of']}", file=sys.stderr, flush=True)
+                file.write(json.dumps(row) + "\n")
+            print(f"{row['seed']}: {row['hidden']}, told {row['one_of']}", file=sys.stderr, flush=True)
     print(table([done[seed] for seed in wanted]))
 
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import fcntl
 import json
+import pickle
 import subprocess
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from idm_env.progress import silent
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,6 +48,21 @@ def test_every_trial_is_trained_once(benchmark, tmp_path):
     assert seeds == [100, 101] * 5 + [0, 1, 2]
     benchmark.run(["ring-apg"], tmp_path, 4)
     assert len(benchmark.trained) == 5 * 2 + 4
+
+
+def test_trainings_are_parts_of_an_executor(benchmark, tmp_path):
+    """All trials of all searches at once, then all seeds: so many workers as there are have something to do."""
+    given = []
+
+    class Recording:
+        def map(self, function, parts, on_progress=silent):
+            given.append([str(part) for part in pickle.loads(pickle.dumps(parts))])
+            yield from ((i, function(part, silent)) for i, part in enumerate(parts))
+
+    benchmark.run(["ring-apg", "ring-shac", "ring-ppo"], tmp_path, 2, executor=Recording())
+    searches, seeds = given
+    assert len(searches) == len(set(searches)) == 2 * 5 * 2 and not any("shac" in name for name in searches)
+    assert len(seeds) == 3 * 2 and len(benchmark.trained) == 26
 
 
 def test_what_another_process_works_on_is_left_to_it(benchmark, tmp_path):

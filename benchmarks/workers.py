@@ -1,0 +1,20 @@
+"""Where the parts of a benchmark run: the options that all benchmarks with parts share, and the executor they name."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import AbstractContextManager
+
+from idm_env.executor import KINDS, Executor, opened
+
+
+def add(parser: argparse.ArgumentParser, usual: str = "serial") -> None:
+    """Add ``--executor``, ``--jobs`` and ``--ray-address``."""
+    parser.add_argument("--executor", choices=KINDS, default=usual, help="where parts run; no result depends on it")
+    parser.add_argument("--jobs", type=int, help="parts that run at a time; default: one per processor")
+    parser.add_argument("--ray-address", help="of a Ray cluster, host:port or auto; default: Ray on this machine")
+
+
+def of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
+    """Give the executor that the arguments name."""
+    return opened(arguments.executor, arguments.jobs, arguments.ray_address)
