@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?=
 OUT ?= out/demo
 
-.PHONY: setup demo test test-gymnasium test-lowest lint bench docs clean
+.PHONY: setup demo test test-gymnasium test-lowest rllib lint bench docs clean
 
 setup: $(VENV)/.installed
 
@@ -39,6 +39,13 @@ test-lowest: setup
 	$(LOWEST)/bin/python -m pytest -n 2 --ignore tests/envs/test_torchrl.py -k 'not supersuit and not record_video' \
 	  tests/envs tests/tasks tests/data tests/fitting tests/prediction tests/trajectories/test_files.py \
 	  tests/test_cli.py tests/test_keep.py tests/test_executor.py tests/test_report.py tests/test_wheel.py
+
+# RLlib's example, in the environment that RLlib wants (2 GB).
+RLLIB := build/rllib
+rllib:
+	$(PYTHON) -m venv $(RLLIB)
+	$(RLLIB)/bin/python -m pip install --quiet --requirement examples/rllib.txt --editable '.[data,kernels]'
+	$(RLLIB)/bin/python examples/train_rllib.py
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy

@@ -7,6 +7,7 @@ import pytest
 from idm_env import bench
 from idm_env.bench import memory, peers, tables
 from idm_env.bench.measure import Case, measure
+from tests.browser import check, there_is_one
 
 
 def test_cases_take_turns():
@@ -43,6 +44,8 @@ def test_a_small_run_writes_json_and_picture(tmp_path, monkeypatch):
     assert any("kernels run" in line or "kernels do not run:" in line for line in lines)
     assert any("eager" in row["path"] for row in tables.of(result)[0][1])
     assert result["gradient_error"]["kernel float64"] < 1e-10
+    if there_is_one():
+        assert check.wrong([tmp_path / "report.html"]) == []
 
 
 def test_the_torch_path_says_why_no_kernel_runs(monkeypatch):

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from tests.browser import check, there_is_one
 from tests.test_docs import DOCUMENTS, ROOT, folder, my_csv, scene_json, sparse_csv
 
 __all__ = ["folder"]  # a fixture
@@ -115,6 +116,8 @@ def test_the_commands_of_the_readme_run(folder: Path, capsys: pytest.CaptureFixt
     pages = {p.parent.name for p in folder.glob("*/report.html")}
     assert pages >= {"result", "fit", "simulated", "filtered", "dense", "predicted"}
     assert "idm" in capsys.readouterr().out
+    if there_is_one():  # whatever these commands write for people is looked at, the page of `plot --html` too
+        assert check.wrong([*sorted(folder.glob("*/report.html")), folder / "space-time.html"]) == []
 
 
 def test_a_command_that_is_none_is_seen(folder: Path) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+import re
 import warnings
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import polars as pl
@@ -17,31 +15,13 @@ from idm_env.data import synthetic
 from idm_env.fitting.job import fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
 from idm_env.trajectories.files import filter_file, reconstruct_file
+from tests.browser import after, check, chromium
+
+__all__ = ["chromium"]  # a fixture
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "build" / "site"
 FIVE = ("index", "jobs/explain", "generated/effects", "generated/environments", "architecture")
-
-
-def loaded() -> ModuleType:
-    """Return docs/check.py, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("idm_env_docs_check", ROOT / "docs" / "check.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-check = loaded()
-
-
-@pytest.fixture(scope="module")
-def chromium() -> None:
-    """Skip, loudly, where there is no browser."""
-    if check.browser() is None:
-        warnings.warn("no Chromium here (apt-get install chromium): pages are not looked at", stacklevel=1)
-        pytest.skip("no Chromium")
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +66,17 @@ def test_reports_are_well(chromium: None, tmp_path: Path) -> None:
     rows = [{f"column {i} of a table that is wide": f"{i}" * 12 for i in range(14)} for _ in range(3)]
     report.write_page(tmp_path / "wide.html", "wide", [report.lead("x"), report.table(rows)])
     assert check.wrong([*pages, tmp_path / "diagram.html", tmp_path / "wide.html"]) == []
+
+
+def test_a_click_on_a_heading_sorts(chromium: None, tmp_path: Path) -> None:
+    """By number, not by text, what is not there last; a second click turns the order round."""
+    rows = [{"name": name, "gap": gap} for name, gap in (("b", 10.0), ("c", float("nan")), ("a", 9.0), ("d", -1.0))]
+    report.write_page(tmp_path / "page.html", "page", [report.table(rows)])
+    order = "[...document.querySelectorAll('tbody tr')].map(r => r.cells[0].textContent.trim()).join('')"
+    for clicks, wanted in (((), "bcad"), ((1,), "dabc"), ((1, 1), "badc"), ((1, 0), "abcd")):
+        script = "".join(f"document.querySelectorAll('th')[{i}].click();" for i in clicks)
+        seen = after(tmp_path / "page.html", f"{script}document.title = 'ORDER ' + {order};")
+        assert re.findall(r"ORDER (\w+)</title>", seen) == [wanted]
 
 
 def test_links_of_the_site_lead_somewhere(site: Path) -> None:

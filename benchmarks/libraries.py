@@ -1,0 +1,113 @@
+"""What agents of other libraries learn in these environments: the examples, run for longer, and their curves.
+
+    python -m benchmarks.libraries torchrl tune                  # in .venv; tune takes ray[tune]
+    build/rllib/bin/python -m benchmarks.libraries rllib agents  # in the environment that `make rllib` sets up
+    python -m benchmarks.libraries picture                       # docs/libraries.png, and a table, of what was run
+
+Each is one training of one seed, with options nobody searched for: that it learns is shown, not which library is
+better. ``torchrl`` and ``rllib`` are PPO with one agent, ``agents`` RLlib's with two, on the ring behind a failsafe, 16
+rings, 500 steps an episode; ``tune`` is Ray Tune's search over analytic policy gradients.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "examples")]
+KEPT = ROOT / "runs" / "libraries"
+NAMES = {"torchrl": "TorchRL, PPO", "rllib": "RLlib, PPO", "agents": "RLlib, PPO, two agents"}
+
+
+def run(name: str, updates: int) -> Any:
+    """Return what an example gives: (steps, mean reward) of every update, or every evaluation of every trial."""
+    if name == "torchrl":
+        return importlib.import_module("train_torchrl").train(updates)
+    import ray
+
+    ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR", num_cpus=2)
+    try:
+        if name == "tune":
+            example = importlib.import_module("tune_an_agent")
+            found = example.search(KEPT / "tune", example.SPACE, cpu_seconds=20.0)
+            return [{"options": one.config, "rows": one.metrics_dataframe.to_dict("records")} for one in found]
+        example = importlib.import_module("train_rllib")
+        return example.train(example.one_agent() if name == "rllib" else example.two_agents(), updates)
+    finally:
+        ray.shutdown()
+
+
+def humans() -> float:
+    """Return the mean reward of a step where all vehicles are left to their drivers."""
+    import gymnasium
+
+    import idm_env  # noqa: F401
+
+    env = gymnasium.make_vec(
+        "DiffIDM-v0", num_envs=64, task="ring", warmup=1000, failsafe=3.0, max_episode_steps=500, info=()
+    )
+    env.reset(seed=1)
+    rewards = [float(env.step(None)[1].mean()) for _ in range(500)]  # type: ignore[arg-type]
+    return sum(rewards) / len(rewards)
+
+
+def picture(path: Path) -> None:
+    """Draw the curves of what was run, and print a table."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.axhline(alone := humans(), color="#9a9a9a", ls="--", lw=1.2, label="humans only")
+    print(f"| library | updates | steps | CPU s | reward, first | reward, last |\n{'| --- ' * 6}|")
+    for name, label in NAMES.items():
+        if not (KEPT / f"{name}.json").exists():
+            continue
+        kept = json.loads((KEPT / f"{name}.json").read_text())
+        steps, rewards = zip(*kept["rows"], strict=True)
+        left.plot([s / 1000 for s in steps], rewards, lw=1.6, label=label)
+        print(f"| {label} | {len(steps)} | {steps[-1]} | {kept['cpu_s']:.0f} | {rewards[0]:.3f} | {rewards[-1]:.3f} |")
+    print(f"Humans only: {alone:.3f}.")
+    left.set(xlabel="steps of all rings (thousands)", ylabel="mean reward of a step")
+    if (KEPT / "tune.json").exists():
+        print(f"\n| learning rate | window | evaluations | best score | last score |\n{'| --- ' * 5}|")
+        for trial in json.loads((KEPT / "tune.json").read_text())["rows"]:
+            options, rows = trial["options"], trial["rows"]
+            scores = [row["score"] for row in rows]
+            label = f"learning rate {options['learning_rate']:g}, window {options['window']}"
+            right.plot([row["cpu_seconds"] for row in rows], scores, lw=1.6, marker=".", label=label)
+            cells = (f"{options['learning_rate']:g}", options["window"], len(rows), max(scores), scores[-1])
+            print("| " + " | ".join(f"{c:.3f}" if isinstance(c, float) else str(c) for c in cells) + " |")
+    right.set(xlabel="CPU seconds of the trial", ylabel="score of the agents' test", title="Ray Tune, APG")
+    for axis in (left, right):
+        axis.grid(alpha=0.25)
+        axis.legend(frameon=False, fontsize=7.5)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Run, or show."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="+", choices=[*NAMES, "tune", "picture"])
+    parser.add_argument("--updates", type=int, default=30)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "libraries.png")
+    arguments = parser.parse_args()
+    KEPT.mkdir(parents=True, exist_ok=True)
+    for name in arguments.what:
+        if name == "picture":
+            picture(arguments.out)
+            continue
+        began = time.process_time()
+        rows = run(name, arguments.updates)
+        kept = {"rows": rows, "cpu_s": time.process_time() - began}
+        (KEPT / f"{name}.json").write_text(json.dumps(kept, default=float))
+        print(f"{name}: {kept['cpu_s']:.0f} CPU s in this process", flush=True)
+
+
+if __name__ == "__main__":
+    main()
