@@ -53,10 +53,11 @@ lint: setup
 bench: setup
 	$(BIN)/idm-env bench
 
-# The site, into build/site: warnings are errors, and no network is needed once the libraries are there.
+# The site, into build/site: warnings are errors, and no network is needed once the libraries are there. GALLERY=0 shows the
+# examples without running them, as continuous integration does, whose tests run them all.
 docs: setup
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
-	$(BIN)/python -m sphinx -W --keep-going -q -b html -d build/doctrees docs build/site
+	$(BIN)/python -m sphinx -W --keep-going -q -b html -d build/doctrees $(if $(filter 0,$(GALLERY)),-D plot_gallery=0) docs build/site
 	@echo "Site: build/site/index.html"
 
 clean:

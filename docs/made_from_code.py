@@ -9,6 +9,7 @@ import json
 import re
 import shutil
 import textwrap
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -203,51 +204,67 @@ def _effect(name: str, cls: Any, pictures: Path) -> list[str]:
     return lines
 
 
-def response(effect: Any, path: Path) -> bool:
-    """Draw gap and speed of a driver with the effect and without it; False where there is nothing to see."""
-    from matplotlib.figure import Figure
+DT, STEPS = 0.1, 450
 
+
+@lru_cache(maxsize=1)  # that without an effect is every picture's
+def _plain() -> Any:
+    return _rolled(None)
+
+
+def _platoon(added: Any) -> Any:
+    """Return the motion of a platoon behind a leader who brakes; None where an effect takes what a lane has not."""
+    try:
+        return _plain() if added is None else _rolled(added)
+    except (ValueError, KeyError, RuntimeError, TypeError):
+        return None
+
+
+def _rolled(added: Any) -> Any:
     from idm_env import IDM, Brakes, Lane, Replay, Simulator
     from idm_env.effects import CarFollowing
     from idm_env.kernels import dispatch
     from idm_env.types import Record
 
+    vehicles = 4
+    time = DT * torch.arange(STEPS + 1, dtype=torch.float64)
+    speed = 18.0 - 9.0 * torch.exp(-(((time - 20.0) / 5.0) ** 2)) + 2.0 * torch.sin(time / 9.0)
+    front = 300.0 + torch.cumulative_trapezoid(speed, dx=DT)
+    accel = torch.gradient(speed, spacing=DT)[0]
+    position = 300.0 - 32.0 * torch.arange(vehicles, dtype=torch.float64)
+    first = (torch.arange(vehicles) == 0).expand(STEPS, vehicles)
+    record = Record(*(x.unsqueeze(-1).expand(STEPS, vehicles) for x in (front, speed[1:], accel[1:])), first)
+    following = added if isinstance(added, CarFollowing) else IDM()
+    more = () if added is None or following is added else (added,)
+    simulator = Simulator(Lane(), (following, *more, Brakes(), Replay()), dt=DT)
+    params = simulator.defaults(dtype=torch.float64)
+    for p in () if added is None else added.parameters:
+        if p.null is not None and p.default == p.null:
+            value = (*p.starts, 0.5 * (p.null + (p.high if abs(p.high) < 1e6 else p.null + 1.0)))[0]
+            params[added.name][p.name] = torch.tensor(float(value), dtype=torch.float64)
+    start = simulator.state(position, torch.full_like(position, float(speed[0])), params)
+    inputs = simulator.drawn(start.gap, {"replay": record}, STEPS, seed=3)
+    with dispatch.off():  # compiling each set of effects would take longer than all these steps
+        return simulator.rollout(start, inputs, params, STEPS)[1]
+
+
+def response(effect: Any, path: Path) -> bool:
+    """Draw gap and speed of a driver with the effect and without it; False where there is nothing to see."""
+    from matplotlib.figure import Figure
+
     if path.exists() and path.stat().st_mtime > Path(inspect.getfile(type(effect))).stat().st_mtime:
         return True
     if effect.hook == "change" or effect.name in ("replay", "brakes", "idm", "control", "imagined"):
         return False
-    dt, steps, vehicles = 0.1, 450, 4
-    time = dt * torch.arange(steps + 1, dtype=torch.float64)
-    speed = 18.0 - 9.0 * torch.exp(-(((time - 20.0) / 5.0) ** 2)) + 2.0 * torch.sin(time / 9.0)
-    front = 300.0 + torch.cumulative_trapezoid(speed, dx=dt)
-    accel = torch.gradient(speed, spacing=dt)[0]
-    position = 300.0 - 32.0 * torch.arange(vehicles, dtype=torch.float64)
-    first = (torch.arange(vehicles) == 0).expand(steps, vehicles)
-    record = Record(*(x.unsqueeze(-1).expand(steps, vehicles) for x in (front, speed[1:], accel[1:])), first)
-    kept = []
-    for added in (None, effect):
-        following = added if isinstance(added, CarFollowing) else IDM()
-        more = () if added is None or isinstance(added, CarFollowing) else (added,)
-        try:
-            simulator = Simulator(Lane(), (following, *more, Brakes(), Replay()), dt=dt)
-            params = simulator.defaults(dtype=torch.float64)
-            for p in () if added is None else added.parameters:
-                if p.null is not None and p.default == p.null:
-                    value = (*p.starts, 0.5 * (p.null + (p.high if abs(p.high) < 1e6 else p.null + 1.0)))[0]
-                    params[added.name][p.name] = torch.tensor(float(value), dtype=torch.float64)
-            start = simulator.state(position, torch.full_like(position, float(speed[0])), params)
-            inputs = simulator.drawn(start.gap, {"replay": record}, steps, seed=3)
-            with dispatch.off():  # compiling each set of effects would take longer than all these steps
-                _, rolled = simulator.rollout(start, inputs, params, steps)
-        except (ValueError, KeyError, RuntimeError, TypeError):
-            return False  # it takes something that a lane of drivers does not have
-        kept.append(rolled)
+    kept = [_platoon(None), _platoon(effect)]
+    if kept[1] is None:
+        return False
     if torch.equal(kept[0].gap[:, 2], kept[1].gap[:, 2]):
         return False
     figure = Figure(figsize=(8.0, 2.6), layout="constrained")
     for axis, name, unit in zip(figure.subplots(1, 2), ("gap", "speed"), ("gap (m)", "speed (m/s)"), strict=True):
         for rolled, colour, label in ((kept[0], "#9a9a9a", "plain"), (kept[1], "#0b5fa5", effect.name)):
-            axis.plot(time[1:], getattr(rolled, name)[:, 2], color=colour, lw=1.4, label=label)
+            axis.plot(DT * torch.arange(1, STEPS + 1), getattr(rolled, name)[:, 2], color=colour, lw=1.4, label=label)
         axis.set(xlabel="time (s)", ylabel=unit)
         axis.grid(alpha=0.25)
     figure.axes[0].legend(frameon=False, fontsize=8)

@@ -211,3 +211,11 @@ def test_files_that_documents_name_are_there(path: Path) -> None:
     made = re.compile(r"docs/(?:jobs/\.\./)?(?:generated|gallery)/")  # by `make docs`; see test_pages.py
     missing = sorted(n for n in named if not made.match(n) and not (ROOT / n).exists())
     assert not missing, f"{path.name} names {missing}"
+
+
+def test_every_document_has_its_place_on_the_site() -> None:
+    """Sphinx takes one that has none for an error, and so does this, at once."""
+    text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    listed = {line for tree in re.findall(r"```\{toctree\}(.*?)```", text, re.DOTALL) for line in tree.split()}
+    pages = {p.relative_to(ROOT / "docs").with_suffix("").as_posix() for p in DOCUMENTS if "docs" in p.parts}
+    assert pages - {"index"} <= listed
