@@ -31,7 +31,7 @@ def run(name: str, updates: int) -> Any:
         return importlib.import_module("train_torchrl").train(updates)
     import ray
 
-    ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR", num_cpus=2)
+    ray.init("local", include_dashboard=False, log_to_driver=False, logging_level="ERROR", num_cpus=2)
     try:
         if name == "tune":
             example = importlib.import_module("tune_an_agent")
@@ -50,7 +50,7 @@ def humans() -> float:
     import idm_env  # noqa: F401
 
     env = gymnasium.make_vec(
-        "DiffIDM-v0", num_envs=64, task="ring", warmup=1000, failsafe=3.0, max_episode_steps=500, info=()
+        "DiffIDM-v0", num_envs=64, task="ring", warmup=1000, failsafe=3.0, max_episode_steps=500, info="none"
     )
     env.reset(seed=1)
     rewards = [float(env.step(None)[1].mean()) for _ in range(500)]  # type: ignore[arg-type]

@@ -81,7 +81,7 @@ def train(config: PPOConfig, updates: int) -> list[tuple[int, float]]:
 
 
 if __name__ == "__main__":
-    ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    ray.init("local", include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     for name, config in (("one agent", one_agent()), ("two agents", two_agents())):
         for steps, reward in train(config, 2):
             print(f"{name}, {steps} steps: mean reward {reward:.3f}")

@@ -12,7 +12,7 @@ from torchrl.objectives.value import GAE
 
 import idm_env  # noqa: F401 (registers DiffIDM-v0)
 
-RING = {"task": "ring", "warmup": 1000, "failsafe": 3.0, "max_episode_steps": 500}
+RING = {"task": "ring", "warmup": 1000, "failsafe": 3.0, "max_episode_steps": 500, "info": "none"}
 COUNT, STEPS, EPOCHS, PIECES = 16, 500, 5, 8
 
 
@@ -52,7 +52,10 @@ def train(updates: int, seed: int = 0) -> list[tuple[int, float]]:
     rows: list[tuple[int, float]] = []
     # No worker processes: a step of the native vector is a step of all rings.
     batch = COUNT * STEPS
-    for seen in Collector(env, actor, frames_per_batch=batch, total_frames=updates * batch):
+    collector = Collector(
+        env, actor, frames_per_batch=batch, total_frames=updates * batch, auto_register_policy_transforms=False
+    )
+    for seen in collector:
         for _ in range(EPOCHS):
             with torch.no_grad():
                 advantage(seen)

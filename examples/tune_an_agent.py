@@ -1,6 +1,6 @@
 """Search an agent's options with Ray Tune: trials of analytic policy gradients, judged by the agents' own test.
 
-Run from a checkout, as `agents/` is no part of the package. `ray.init(address=…)` runs the same trials on a cluster.
+Run from a checkout, as `agents/` is no part of the package. `ray.init("HOST:PORT")` runs the same trials on a cluster.
 """
 
 import os
@@ -48,7 +48,7 @@ def search(folder: Path, space: dict[str, Any], **every: Any) -> tune.ResultGrid
 
 
 if __name__ == "__main__":
-    ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR", num_cpus=2)
+    ray.init("local", include_dashboard=False, log_to_driver=False, logging_level="ERROR", num_cpus=2)
     with tempfile.TemporaryDirectory() as place:
         # Two updates of few rings: enough to see it work. Leave `every` out for a search that finds something.
         found = search(Path(place), {"learning_rate": SPACE["learning_rate"]}, updates=2, count=8, window=100)

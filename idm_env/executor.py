@@ -58,7 +58,7 @@ def opened(kind: str = "serial", jobs: int | None = None, address: str | None = 
     """Give an executor while this lasts: ``serial``, ``processes`` (``jobs`` of them) or ``ray`` (at ``address``).
 
     ``jobs`` is one per processor where it is None; with Ray it bounds how many parts run at a time. Without an
-    ``address`` Ray runs on this machine. ValueError for other kinds, ImportError without ray.
+    ``address`` Ray uses RAY_ADDRESS, or begins on this machine, beside whoever runs it here already. ValueError for other kinds, ImportError without ray.
     """
     if kind not in KINDS:
         raise ValueError(f"executor = '{kind}' is unknown. Use one of {', '.join(KINDS)}.")
@@ -328,10 +328,12 @@ def _connected(address: str | None) -> Iterator[None]:
     except ImportError:
         raise ImportError("executor = 'ray' needs ray. Install it with: pip install 'idm-env[ray]'") from None
     ours = not ray.is_initialized()
+    # Left to itself Ray joins whatever cluster somebody runs on this machine.
+    address = address or os.environ.get("RAY_ADDRESS")
     if ours:
         more = {"include_dashboard": False} if address is None else {}
         try:
-            ray.init(address=address, log_to_driver=False, logging_level="ERROR", **more)
+            ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR", **more)
         except (ConnectionError, RuntimeError, ValueError) as error:
             words = " ".join(str(error).split())[:200]
             raise ValueError(

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,6 +137,23 @@ def test_one_part_alone_raises_its_own_error_and_whoever_watches_may_stop(tmp_pa
 
     with executor.opened() as run, pytest.raises(LookupError):
         list(run.map(square, [Part(i, tmp_path) for i in range(3)], stop))
+
+
+def test_ray_joins_no_cluster_that_nobody_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody else's, on the same machine, sees other files; RAY_ADDRESS names one, and so does an address."""
+    begun: list[str] = []
+    fake = types.ModuleType("ray")
+    fake.is_initialized = lambda: False  # type: ignore[attr-defined]
+    fake.init = lambda address, **more: begun.append(address)  # type: ignore[attr-defined]
+    fake.shutdown = lambda: begun.append("over")  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    for named, variable in ((None, None), (None, "10.0.0.1:6379"), ("10.0.0.2:6379", "10.0.0.1:6379")):
+        if variable:
+            monkeypatch.setenv("RAY_ADDRESS", variable)
+        with executor.opened("ray", address=named):
+            pass
+    assert begun == ["local", "over", "10.0.0.1:6379", "over", "10.0.0.2:6379", "over"]
 
 
 def test_bad_choices_are_one_line() -> None:

@@ -148,8 +148,8 @@ def test_no_gradient_leaks_across_episodes_or_environments(mode):
 
 
 def test_vector_wrappers_keep_the_graph_and_count_as_gymnasium_does():
-    # Of vectors that reset within the step Gymnasium counts the first reward of an episode from 1.2 on.
-    modes = ("SameStep", "NextStep") if Version(gym.__version__) >= Version("1.2") else ("NextStep",)
+    # Of vectors that reset within the step Gymnasium counts the first reward of an episode from 1.4 on.
+    modes = ("SameStep", "NextStep") if Version(gym.__version__) >= Version("1.4") else ("NextStep",)
     for mode in modes:
         ours = VectorRecordEpisodeStatistics(vector(mode))
         theirs = gym.wrappers.vector.RecordEpisodeStatistics(vector(mode, output="numpy"))
