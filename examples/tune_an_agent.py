@@ -50,8 +50,10 @@ def search(folder: Path, space: dict[str, Any], **every: Any) -> tune.ResultGrid
 if __name__ == "__main__":
     ray.init("local", include_dashboard=False, log_to_driver=False, logging_level="ERROR", num_cpus=2)
     with tempfile.TemporaryDirectory() as place:
-        # Two updates of few rings: enough to see it work. Leave `every` out for a search that finds something.
-        found = search(Path(place), {"learning_rate": SPACE["learning_rate"]}, updates=2, count=8, window=100)
+        # Two updates of few, young rings: enough to see it work. Without `small` a search finds something.
+        young = {"task": "ring", "warmup": 100, "failsafe": 3.0}
+        small = {"updates": 2, "count": 8, "window": 100, "environment": young}
+        found = search(Path(place), {"learning_rate": SPACE["learning_rate"]}, **small)
     ray.shutdown()
     for one in found:
         assert one.error is None, one.error
