@@ -58,7 +58,8 @@ def opened(kind: str = "serial", jobs: int | None = None, address: str | None = 
     """Give an executor while this lasts: ``serial``, ``processes`` (``jobs`` of them) or ``ray`` (at ``address``).
 
     ``jobs`` is one per processor where it is None; with Ray it bounds how many parts run at a time. Without an
-    ``address`` Ray uses RAY_ADDRESS, or begins on this machine, beside whoever runs it here already. ValueError for other kinds, ImportError without ray.
+    ``address`` Ray uses RAY_ADDRESS, or begins on this machine, beside whoever runs it here already. ValueError for
+    other kinds, ImportError without ray.
     """
     if kind not in KINDS:
         raise ValueError(f"executor = '{kind}' is unknown. Use one of {', '.join(KINDS)}.")
