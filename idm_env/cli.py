@@ -313,7 +313,7 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
         console.print(result["interval"], style="dim", highlight=False)
     console.print(weight(result["prior"]), style="dim", highlight=False)
     if before is not None:
-        told = ceilings(result["ceilings"], before["gap_rmse_m"])
+        told = ceilings(result["ceilings"], before["gap_rmse_m"], result["error"]["floor"]["gap_rmse_m"])
         console.print(f"What could be explained at all: {told}", style="dim", highlight=False)
     if result["bases"]:
         console.print(laws(result["bases"]), soft_wrap=True, highlight=False)

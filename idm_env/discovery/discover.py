@@ -154,7 +154,7 @@ def discover(
         "alike_s_after": discovery.final.prior.alike_s,
     }  # fmt: skip
     kept = prepared.of_runs(kept_runs) if kept_runs else prepared
-    report["ceilings"] = ceilings.told(decided.stand, kept, decided.null)
+    report["ceilings"] = ceilings.told(decided.stand, kept, decided.null, decided.rounds[0].left)
     report["error"]["floor"] = ceilings.floor(kept, ceilings.drift(trajectories))
     report["bases"] = [] if not kept_runs else bases.compared(
         decided.null, prepared.of_runs(fit_runs), prepared.of_runs(kept_runs), adapt=by == "driver", seed=seed,

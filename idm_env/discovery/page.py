@@ -155,7 +155,7 @@ def _errors(d: Discovery) -> Iterator[Block]:
         f"Models: {files}.{best} Both are calibrated the same way. Runs kept back: "
         + ", ".join(pages.shortened(r["error"]["held_out_runs"], 20))
     )
-    told = words.ceilings(r["ceilings"], r["error"]["before"]["gap_rmse_m"])
+    told = words.ceilings(r["ceilings"], r["error"]["before"]["gap_rmse_m"], r["error"]["floor"]["gap_rmse_m"])
     drift = r["error"]["floor"]["drift_m_per_sqrt_s"]
     if drift > 0.0:
         told += (

@@ -231,3 +231,14 @@ def test_none_says_what_is_excluded_and_what_would_not_have_been_seen() -> None:
     )
     assert hidden.startswith("a drag below 0.0003 1/m, a response lag below 0.2 s, a slope of the road below 1 %")
     assert hidden.endswith("would not have been seen.")
+
+
+def test_ceilings_are_told_with_the_smooth_function_and_the_sensors(lag: Discovery) -> None:
+    """A hidden lag of 0.5 s is much of the error of IDM's predictions, so a smooth function takes much of it, too."""
+    told = lag.report["ceilings"]
+    assert 0.05 < told["smooth_function_gain"] < 1.0
+    text = words.ceilings(told, lag.report["error"]["before"]["gap_rmse_m"], lag.report["error"]["floor"]["gap_rmse_m"])
+    assert (
+        f"predictions of 5 s by {100 * told['smooth_function_gain']:.1f} %" in text
+        and "sensors alone leave 0.0" in text
+    )
