@@ -36,7 +36,7 @@ test-lowest: setup
 	$(PYTHON) -m venv $(LOWEST)
 	$(BIN)/python .ci/lowest.py > $(LOWEST)/versions.txt
 	$(LOWEST)/bin/python -m pip install --quiet --constraint $(LOWEST)/versions.txt --editable '.[all,ray]' \
-	  pytest pytest-xdist hypothesis packaging 'setuptools>=77'
+	  pytest pytest-xdist pytest-timeout hypothesis packaging 'setuptools>=77'
 	$(LOWEST)/bin/python -m pytest -n 2 --ignore tests/envs/test_torchrl.py -k 'not supersuit and not record_video' \
 	  tests/envs tests/tasks tests/data tests/fitting tests/prediction tests/trajectories/test_files.py \
 	  tests/test_cli.py tests/test_keep.py tests/test_executor.py tests/test_report.py tests/test_wheel.py

@@ -35,7 +35,7 @@ def run(name: str, updates: int) -> Any:
     try:
         if name == "tune":
             example = importlib.import_module("tune_an_agent")
-            found = example.search(KEPT / "tune", example.SPACE, cpu_seconds=20.0)
+            found = example.search(KEPT / "tune", example.SPACE, cpu_seconds=15.0)
             return [{"options": one.config, "rows": one.metrics_dataframe.to_dict("records")} for one in found]
         example = importlib.import_module("train_rllib")
         return example.train(example.one_agent() if name == "rllib" else example.two_agents(), updates)
@@ -75,13 +75,14 @@ def picture(path: Path) -> None:
     print(f"Humans only: {alone:.3f}.")
     left.set(xlabel="steps of all rings (thousands)", ylabel="mean reward of a step")
     if (KEPT / "tune.json").exists():
-        print(f"\n| learning rate | window | evaluations | best score | last score |\n{'| --- ' * 5}|")
+        print(f"\n| learning rate | updates | CPU s | best score | last score |\n{'| --- ' * 5}|")
         for trial in json.loads((KEPT / "tune.json").read_text())["rows"]:
             options, rows = trial["options"], trial["rows"]
             scores = [row["score"] for row in rows]
-            label = f"learning rate {options['learning_rate']:g}, window {options['window']}"
+            label = f"learning rate {options['learning_rate']:g}"
             right.plot([row["cpu_seconds"] for row in rows], scores, lw=1.6, marker=".", label=label)
-            cells = (f"{options['learning_rate']:g}", options["window"], len(rows), max(scores), scores[-1])
+            last = rows[-1]
+            cells = (label[14:], round(last["updates"]), f"{last['cpu_seconds']:.0f}", max(scores), scores[-1])
             print("| " + " | ".join(f"{c:.3f}" if isinstance(c, float) else str(c) for c in cells) + " |")
     right.set(xlabel="CPU seconds of the trial", ylabel="score of the agents' test", title="Ray Tune, APG")
     for axis in (left, right):

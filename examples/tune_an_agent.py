@@ -15,7 +15,7 @@ import ray
 from ray import tune
 
 ROOT = Path(__file__).resolve().parents[1]
-SPACE = {"learning_rate": tune.grid_search([1e-3, 3e-3]), "window": tune.grid_search([300, 600])}
+SPACE = {"learning_rate": tune.grid_search([1e-3, 3e-3])}
 
 
 def trial(options: dict[str, Any]) -> None:
@@ -53,7 +53,7 @@ if __name__ == "__main__":
         # Two updates of few, young rings: enough to see it work. Without `small` a search finds something.
         young = {"task": "ring", "warmup": 100, "failsafe": 3.0}
         small = {"updates": 2, "count": 8, "window": 100, "environment": young}
-        found = search(Path(place), {"learning_rate": SPACE["learning_rate"]}, **small)
+        found = search(Path(place), SPACE, **small)
     ray.shutdown()
     for one in found:
         assert one.error is None, one.error

@@ -11,14 +11,20 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
+NEEDS = {
+    "train_rllib": {"tree": "RLlib pins another gymnasium and has an environment of its own: make rllib"},
+    "tune_an_agent": {"ray": "ray is not installed (pip install 'idm-env[ray]')"},
+}
+"""Modules without which an example is left out, and what to do."""
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
 def test_example(path: Path, tmp_path: Path) -> None:
     """Run as a user does, from another folder."""
-    if path.stem == "train_rllib" and importlib.util.find_spec("tree") is None:  # dm-tree, which only RLlib needs
-        warnings.warn("RLlib pins another gymnasium and has an environment of its own: make rllib", stacklevel=1)
-        pytest.skip("make rllib")
+    for module, why in NEEDS.get(path.stem, {}).items():
+        if importlib.util.find_spec(module) is None:
+            warnings.warn(f"{path.name} is not run: {why}", stacklevel=1)
+            pytest.skip(why)
     done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()
