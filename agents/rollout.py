@@ -77,17 +77,20 @@ def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws
     chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": warmup}
     task = task_of({**chosen, "length": [min(lengths), max(lengths)]})
     params = task.params(torch.float32, "cpu")
-    keys, states = [], []
+    keys, states, episodes = [], [], []
     for i, length in enumerate(lengths):
         draw = Draw.of(torch.tensor([SEED + 1000 * k + i for k in draws]), torch.zeros(len(draws), dtype=torch.int64))
         one = task_of({**chosen, "length": length})
-        states.append(one.reset(draw, params).state)
+        world = one.reset(draw, params)
+        states.append(world.state)
+        episodes.append(world.episode)
         keys.append(draw.key)
     memory = {name: torch.cat([s.memory[name] for s in states]) for name in states[0].memory}
     columns: Any = {
         k: torch.cat([getattr(s, k) for s in states]) for k in ("position", "speed", "accel", "gap", "length", "step")
     }
-    world = World(states[0]._replace(**columns, memory=memory), {})
+    episode = {name: torch.cat([e[name] for e in episodes]) for name in episodes[0]}
+    world = World(states[0]._replace(**columns, memory=memory), episode)
     return Start(task, world, Draw(torch.cat(keys)), params)
 
 
@@ -106,7 +109,7 @@ def uniform_speed(start: Start) -> Tensor:
 
     Solves ``Σ (s0 + v T)/√(1 − (v/v0)^4) = L − Σ l`` by bisection; drivers may differ.
     """
-    p = start.params["idm"]
+    p = start.task.driven(start.world.episode, start.params)["idm"]
     free = start.world.state.gap.sum(-1)
     low, high = torch.zeros_like(free), torch.full_like(free, 0.95) * p["desired_speed"].min()
     for _ in range(60):

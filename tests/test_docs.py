@@ -123,6 +123,13 @@ def result_model(folder: Path) -> None:
     save_model(folder / "result" / "model.yaml", model)
 
 
+def fit_model(folder: Path) -> None:
+    """Drivers one by one, as ``fit --by driver`` leaves them."""
+    (folder / "fit").mkdir()
+    model = Model((IDM(), Brakes()), drivers={f"1/{i}": {"idm": {"time_gap": 1.1 + 0.2 * i}} for i in range(3)})
+    save_model(folder / "fit" / "model.yaml", model)
+
+
 def sparse_csv(folder: Path) -> None:
     """Two vehicles, a point a second."""
     table = synthetic.generate(seed=4, runs=1, followers=1, seconds=30.0)[0].table
@@ -135,8 +142,8 @@ def scene_json(folder: Path) -> None:
 
 
 FILES = {
-    "my.csv": my_csv, "result/model.yaml": result_model, "tired.csv": tired_csv, "sparse.csv": sparse_csv,
-    "scene.json": scene_json,
+    "my.csv": my_csv, "result/model.yaml": result_model, "fit/model.yaml": fit_model, "tired.csv": tired_csv,
+    "sparse.csv": sparse_csv, "scene.json": scene_json,
 }  # fmt: skip
 """What blocks read, by the text that names it."""
 

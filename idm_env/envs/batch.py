@@ -80,6 +80,7 @@ class Batch:
         self._loaded = False
         self._seen: np.ndarray | None = None
         self._draw: Draw | None = None
+        self._driven: Params | None = None
         self._pool: World | None = None
         self._beginnings = Beginnings(self._begin, count)
         self._block: dict[str, Tensor] | None = None
@@ -138,7 +139,7 @@ class Batch:
         self.episodes[index] += 1
         device = self.settings.device
         draw = self._draws(index, self.episodes[index])
-        fresh = self._beginnings.take(index, self.episodes)
+        fresh, self._driven = self._beginnings.take(index, self.episodes), None
         if state is not None:
             fresh = fresh._replace(state=self._given(state, len(index)))
         if every or not self.begun or self._draw is None:
@@ -187,7 +188,7 @@ class Batch:
     def set_params(self, params: Params) -> None:
         """Replace the parameters (tensors, which may require grad); they hold from the next step on."""
         self.task.simulator.check(params)
-        self.params = params
+        self.params, self._driven = params, None
         self._pool = None
         self._beginnings.forget()
 
@@ -231,7 +232,7 @@ class Batch:
         # With torch output always the step itself, so that values are the same bits with and without a graph.
         simulator = task.simulator
         advance = simulator.step if self.settings.output == "torch" else simulator.advance
-        state = advance(before.state, inputs, self.params)
+        state = advance(before.state, inputs, task.driven(before.episode, self.params))
         after = before._replace(state=state)
         if command is None:
             command = state.speed.new_zeros(self.count, len(task.agents))
@@ -251,7 +252,9 @@ class Batch:
             normals = self._normals(values.clock)
             noise = None if normals is None else self._drawn
             who = None if live is None else live.numpy().reshape(-1)
-            told = values.step(given, who, noise, max(self._used - 1, 0), self.params)
+            if self._driven is None:
+                self._driven = self.task.driven(self.glance().episode, self.params)
+            told = values.step(given, who, noise, max(self._used - 1, 0), self._driven)
         except Untraceable:
             # Said once, as a warning, where an effect is why (``kernels.printed``).
             self._values, self._used, self._block = None, used, block

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,6 +51,9 @@ class Task(abc.ABC):
             drivers'.
         parameters: What differs from the task's parameters: ``{"idm": {"time_gap": 1.2}}`` or ``{"idm.time_gap":
             1.2}``; a number, one number per vehicle, or a tensor (which may require grad).
+        drivers: Path of a ``model.yaml`` with single drivers, such as ``idm-env fit --by driver`` writes; it is used as
+            in ``effects``, and in every episode every vehicle drives as one of them, drawn anew. What ``parameters``
+            names is everybody's.
         noise: Standard deviation of the drivers' noise N, added as ``accel += √Δt N(0, noise²)`` (m/s² per √s); 0 is
             none.
         warmup: Steps before an episode begins, in which nobody is controlled.
@@ -78,6 +82,7 @@ class Task(abc.ABC):
     integration: str | None = None
     effects: str | Sequence[str | Mapping[str, Any] | Effect] = ()
     parameters: Mapping[str, Any] | None = None
+    drivers: str | None = None
     noise: float = 0.0
     warmup: int = 0
     warmup_pool: int = 0
@@ -196,7 +201,9 @@ class Task(abc.ABC):
         own = {effect: dict(values) for effect, values in self.own_parameters.items()}
         if self.noise:
             extra += (Noise(),)
-        made = behaviour(self.own_effects, extra, own, self.effects, self.parameters, self.dt, self.integration)
+        made = behaviour(
+            self.own_effects, extra, own, self.effects, self.parameters, self.dt, self.integration, self.drivers
+        )
         if self.noise:
             made.parameters.setdefault("noise", {}).setdefault("sigma", self.noise * math.sqrt(made.dt))
         given = {effect.name for effect in self.machinery}
@@ -252,7 +259,10 @@ class Task(abc.ABC):
 
     def reset(self, draw: Draw, params: Params) -> World:
         """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control."""
-        world = self._unsteady(self.begin(draw, params), draw)
+        who = self._who(draw)
+        params = self.driven(who, params)
+        world = self.begin(draw, params)
+        world = self._unsteady(world._replace(episode={**world.episode, **who}), draw)
         speed = world.state.speed
         block = max(16, _NORMALS_AT_ONCE // max(speed.numel(), 1))
         for first in range(0, self.warmup, block):
@@ -260,6 +270,26 @@ class Task(abc.ABC):
             inputs = {**self._idle(world, steps), **self.normals(draw, world.state.step, steps, speed.dtype)}
             world = world._replace(state=self.simulator.rollout(world.state, inputs, params, steps, keep=None)[0])
         return world
+
+    def _who(self, draw: Draw) -> dict[str, Tensor]:
+        """Return which of the drivers every vehicle is in these episodes, where they are drawn."""
+        if not self._behaviour.drivers:
+            return {}
+        count = len(next(iter(self._behaviour.drivers.values())))
+        share = draw.stream("drivers").uniforms(0, self.vehicles, torch.float64)
+        return {"driver": (share * count).long()}
+
+    def driven(self, episode: Mapping[str, Tensor], params: Params) -> Params:
+        """Return the parameters of a step in these episodes: each vehicle's driver's, where drivers are drawn."""
+        who = episode.get("driver")
+        if who is None:
+            return params
+        made = {effect: dict(values) for effect, values in params.items()}
+        for (effect, name), values in self._behaviour.drivers.items():
+            dtype = next(iter(params[self.simulator.base.name].values())).dtype
+            table = self.constant(f"drivers' {effect}.{name}", np.array(values), who.device, dtype)
+            made[effect][name] = table[who]
+        return made
 
     def _unsteady(self, world: World, draw: Draw) -> World:
         """Return the worlds with drivers who drift as they are in the long run, rather than all at their mean."""
@@ -368,6 +398,7 @@ class Task(abc.ABC):
         """
         if command is not None and not limited:
             command = self.limit(world, command)
+        params = self.driven(world.episode, params)
         state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals, live), params)
         return world._replace(state=state)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,19 +11,23 @@ import torch
 from torch import Tensor
 
 from idm_env import parameters
-from idm_env.config import load_model, make_effects, nested, number
+from idm_env.config import Model, load_model, make_effects, nested, number
 from idm_env.effects import CarFollowing, Effect
 from idm_env.simulator import Integration
 
 
 @dataclass(frozen=True)
 class Behaviour:
-    """Effects, the values that differ from their defaults, and how they are integrated."""
+    """Effects, the values that differ from their defaults, and how they are integrated.
+
+    ``drivers`` has, of every parameter in which drivers differ (effect and name), the value of each of them.
+    """
 
     effects: tuple[Effect, ...]
     parameters: dict[str, dict[str, Any]]
     dt: float
     integration: Integration
+    drivers: dict[tuple[str, str], tuple[float, ...]] = field(default_factory=dict)
 
     def params(self, vehicles: int, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
         """Return tensors; a list must have one value per vehicle."""
@@ -54,16 +58,23 @@ def behaviour(
     changes: Mapping[str, Any] | None,
     dt: float | None,
     integration: str | None,
+    drivers: str | Path | None = None,
 ) -> Behaviour:
     """Return the behaviour of a task with keyword changes.
 
     ``required`` effects are the task's machinery (control, replay, noise). ``effects`` is a list to add to ``own``,
     or the path of a model file, which replaces ``own`` and its parameters and gives dt and integration unless they
-    are given.
+    are given. So does ``drivers``, the path of a model file with single drivers, of whom these are kept.
     """
-    values = own_parameters
-    if isinstance(effects, (str, Path)):
-        model = load_model(effects)
+    values, single = own_parameters, dict[tuple[str, str], tuple[float, ...]]()
+    if drivers is not None and effects:
+        raise ValueError(
+            f"drivers = {str(drivers)!r} has effects of its own, and effects = {effects!r} are given as well. Give one."
+        )
+    if drivers is not None or isinstance(effects, (str, Path)):
+        model = load_model(effects if drivers is None else drivers)  # type: ignore[arg-type]
+        if drivers is not None:
+            single = _single(model, drivers)
         chosen, values = list(model.effects), {e: dict(v) for e, v in model.parameters.items()}
         dt = model.dt if dt is None else dt
         integration = integration or model.integration
@@ -79,5 +90,15 @@ def behaviour(
     values = {effect: dict(part) for effect, part in values.items() if effect in known}
     for key, change in nested(changes or {}).items():
         values.setdefault(key, {}).update(change)
+        single = {name: x for name, x in single.items() if name[0] != key or name[1] not in change}
     step = number("dt", 0.1 if dt is None else dt)
-    return Behaviour(tuple(chosen), values, step, cast(Integration, integration or "ballistic"))
+    return Behaviour(tuple(chosen), values, step, cast(Integration, integration or "ballistic"), single)
+
+
+def _single(model: Model, path: str | Path) -> dict[tuple[str, str], tuple[float, ...]]:
+    """Return what the drivers of a model differ in."""
+    if not model.drivers:
+        raise ValueError(f"{path} has no single drivers to draw. Give a model.yaml of `idm-env fit --by driver`.")
+    names = dict.fromkeys((e, n) for layer in model.drivers.values() for e, values in layer.items() for n in values)
+    everybody = [model.params(driver, dtype=torch.float64) for driver in model.drivers]
+    return {(e, n): tuple(float(own[e][n]) for own in everybody) for e, n in names}
