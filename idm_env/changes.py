@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from idm_env.roads.beside import Side, Sideways
-from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish
+from idm_env.types import FAR, Beside, Inputs, Memory, Neighbour, Params, Scene, State, Wish
 
 if TYPE_CHECKING:
+    from idm_env.roads.linked import Linked
     from idm_env.step import Stepping
 
 
@@ -32,19 +33,62 @@ class _Now:
 
 NOW = _Now()
 
+MERGER_GAP, MERGER_SPEED = "merger_gap", "merger_speed"
+"""Memories of whoever drivers see signalling beside them: the gap to him (m) and his speed (m/s), as they last decided.
+
+Until they decide again he is taken to drive on at that speed.
+"""
+
+
+def nobody(like: Tensor) -> dict[str, Tensor]:
+    """Return the memories of drivers beside whom nobody signals."""
+    return {MERGER_GAP: torch.full_like(like, FAR), MERGER_SPEED: torch.zeros_like(like)}
+
+
+def merger(memory: Memory, speed: Tensor) -> Neighbour:
+    """Return whoever is remembered to signal, as a leader would be seen."""
+    if MERGER_GAP not in memory:
+        none = torch.zeros_like(speed)
+        return Neighbour(none + FAR, speed, none, none)
+    gap = memory[MERGER_GAP]
+    some = gap < 0.5 * FAR
+    none = torch.zeros_like(gap)
+    return Neighbour(gap, torch.where(some, memory[MERGER_SPEED], speed), none, torch.where(some, none + 1.0, none))
+
+
+def driven_on(memory: Memory, displacement: Tensor, dt: float) -> dict[str, Tensor]:
+    """Return the memories of whoever signals a step later, if there are any."""
+    if MERGER_GAP not in memory:
+        return {}
+    gap, speed = memory[MERGER_GAP], memory[MERGER_SPEED]
+    return {MERGER_GAP: torch.where(gap < 0.5 * FAR, gap + speed * dt - displacement, gap), MERGER_SPEED: speed}
+
+
+def seen_merging(view: Linked, state: State, who: Tensor, due: Tensor) -> State:
+    """Return the state in which drivers remember who signals (slots, own for nobody), where they have decided."""
+    gap, speed = view.to_merger(state, who), view.at(state.speed, who)
+    some = (gap > 0) & (gap < 0.5 * FAR)
+    fresh = {MERGER_GAP: torch.where(some, gap, FAR), MERGER_SPEED: torch.where(some, speed, 0.0)}
+    memory = {name: torch.where(due, x, state.memory[name]) for name, x in fresh.items()}
+    return state._replace(memory={**state.memory, **memory})
+
 
 def wished(stepping: Stepping, scene: Scene, params: Params) -> Wish:
-    """Return the sum of all utilities and the least of all margins."""
+    """Return the sum and the largest of all utilities, and the least of all margins."""
     driver = stepping.wanted(scene, params)[2]
     total: Wish | None = None
     for effect in stepping.changes:
         wish = effect.change(scene, driver, dict(params[effect.name]))
+        wish = wish._replace(left_most=wish.left, right_most=wish.right)
         if total is not None:
+            assert total.left_most is not None and total.right_most is not None
             wish = Wish(
                 total.left + wish.left,
                 total.right + wish.right,
                 torch.minimum(total.left_margin, wish.left_margin),
                 torch.minimum(total.right_margin, wish.right_margin),
+                torch.maximum(total.left_most, wish.left),
+                torch.maximum(total.right_most, wish.right),
             )
         total = wish
     assert total is not None
@@ -56,6 +100,8 @@ def beside(
 ) -> Scene:
     """Return the scene with the driver's own lane, and those on his left and right."""
     scene = stepping.scene(state, inputs)._replace(history=NOW)
+    if scene.merger is not None:  # whom to let in is no reason to change lanes
+        scene = scene._replace(merger=merger({}, scene.speed))
     second = view.second_leader(scene.leader, state.length, scene.speed)
     third = view.follow(state, scene.leader, view.beyond(), second.gap, second.present)[1]
     now = stepping.wanted(scene, params)[0]
@@ -124,4 +170,4 @@ def _of(view: Sideways, tree: Any, slots: Any) -> Any:
     return tree
 
 
-__all__ = ["NOW", "beside", "wished"]
+__all__ = ["NOW", "beside", "driven_on", "merger", "nobody", "seen_merging", "wished"]

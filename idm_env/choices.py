@@ -37,7 +37,7 @@ def chances(wish: Wish, left: Tensor, right: Tensor, temperature: float) -> Tens
     none = torch.zeros_like(wish.left)
     logits = torch.stack((wish.left, none, wish.right)) / temperature
     never = torch.full_like(logits[0], _NEVER)
-    free = [_gate(margin / temperature) * there for margin, there in zip(wish[2:], (left, right), strict=True)]
+    free = [_gate(margin / temperature) * there for margin, there in zip(wish[2:4], (left, right), strict=True)]
     both = logits.softmax(0)
     one = torch.stack((logits[0], none, never)).softmax(0), torch.stack((never, none, logits[2])).softmax(0)
     alone = torch.stack((none, none + 1.0, none))
@@ -52,7 +52,9 @@ def _gate(x: Tensor) -> Tensor:
     return x * x * (3.0 - 2.0 * x)
 
 
-def drawn(wish: Wish, left: Tensor, right: Tensor, temperature: float, normal: Tensor) -> tuple[Preference, Tensor]:
+def drawn(
+    wish: Wish, left: Tensor, right: Tensor, temperature: float, normal: Tensor, signals: Tensor
+) -> tuple[Preference, Tensor]:
     """Return choices that are drawn by their chances, and the logarithms of these chances.
 
     Claims are of equal utility: which of two is granted must not depend on what chances depend on.
@@ -64,4 +66,4 @@ def drawn(wish: Wish, left: Tensor, right: Tensor, temperature: float, normal: T
     wants = lefts | rights
     blocked = ~wants & (torch.maximum(wish.left, wish.right) > 0)
     tiny = torch.finfo(picked.dtype).tiny
-    return Preference(torch.ones_like(stay.detach()), lefts, wants, blocked), picked.clamp_min(tiny).log()
+    return Preference(torch.ones_like(stay.detach()), lefts, wants, blocked, signals), picked.clamp_min(tiny).log()

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from idm_env import choices, shares
-from idm_env.changes import NOW, beside, wished
-from idm_env.roads.beside import preferred
+from idm_env.changes import NOW, beside, seen_merging, wished
+from idm_env.roads.beside import preferred, signalled
 from idm_env.roads.linked import Claim, Linked, without_absent
 from idm_env.types import Inputs, Params, State
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) -> State:
     """Return the state after the decisions that are due at this step, with gaps of those concerned measured anew."""
-    due = state.step.remainder(stepping.decides_after) == 0
+    due = stepping.due(state)
     if not bool(due.any()):
         return state
     assert state.links is not None
@@ -39,18 +39,15 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
     state = state._replace(links=links)
     view = stepping.road.view(state)
     assert isinstance(view, Linked)
-    due = due if due.dim() == 0 else due.unsqueeze(-1)
     due = due if state.present is None else due & (state.present > 0)
     how = stepping.decisions
-    if how == "pathwise":
-        return view.changed(state, _claimed(stepping, view, state, inputs, params, due)[0])
+    if how == "pathwise" or (how == "surrogate" and not torch.is_grad_enabled()):
+        return _done(stepping, view, state, inputs, params, due)[0]
     before = state.choices or choices.settled(links.lane, view.road.count, state.speed)
     if how == "score":
-        claim, logs = _claimed(stepping, view, state, inputs, params, due)
+        state, logs = _done(stepping, view, state, inputs, params, due)
         total = before.log_probability + torch.where(due, logs, 0.0)
-        return view.changed(state, claim)._replace(choices=before._replace(log_probability=total))
-    if how == "surrogate" and not torch.is_grad_enabled():
-        return view.changed(state, _claimed(stepping, view, state, inputs, params, due)[0])
+        return state._replace(choices=before._replace(log_probability=total))
     scene = stepping.scene(state, inputs)._replace(history=NOW)
     if how == "surrogate":
         # What is not done is weighed until the next decision: carried on through alternatives it grows without bound.
@@ -60,28 +57,34 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
     if how == "soft":
         state = view.changed(state, _mostly(state, after))
         return state._replace(choices=before._replace(shares=after))
-    state = view.changed(state, _claimed(stepping, view, state, inputs, params, due)[0])
+    state, _ = _done(stepping, view, state, inputs, params, due)
     assert state.links is not None
     hard = choices.settled(state.links.lane, view.road.count, state.speed)
     return state._replace(choices=hard._replace(shares=hard.shares + (after - after.detach())))
 
 
-def _claimed(
+def _done(
     stepping: Stepping, view: Linked, state: State, inputs: Inputs, params: Params, due: Tensor
-) -> tuple[Claim, Tensor]:
-    """Return what becomes of every wish, and the logarithms of the chances of what was drawn, if it was."""
+) -> tuple[State, Tensor]:
+    """Return the state after what was granted, and the logarithms of the chances of what was drawn, if it was."""
     score = stepping.decisions == "score"
     with contextlib.nullcontext() if score else torch.no_grad():
-        order = view.order(state.present)
+        order, left_hand = view.order(state.present), view.road.handed == "left"
         sides = view.side(order, 1, state), view.side(order, -1, state)
         wish = wished(stepping, beside(stepping, view, sides, state, inputs, params), params)
         if not score:
-            prefers = preferred(*sides, wish, view.road.handed == "left")
-            return view.chosen(sides, prefers, due), prefers.utility
-        left, right = (side.exists & (side.gap > 0) & (side.back_gap > 0) for side in sides)
-        normal: Tensor = stepping.scene(state, inputs).input(choices.NOISE)
-        prefers, logs = choices.drawn(wish, left, right, stepping.temperature, normal)
-        return view.chosen(sides, prefers, due), logs
+            prefers = preferred(*sides, wish, left_hand)
+            logs = prefers.utility
+        else:
+            left, right = (side.exists & (side.gap > 0) & (side.back_gap > 0) for side in sides)
+            normal: Tensor = stepping.scene(state, inputs).input(choices.NOISE)
+            signals = signalled(sides[0].exists, sides[1].exists, wish, left_hand)
+            prefers, logs = choices.drawn(wish, left, right, stepping.temperature, normal, signals)
+        claim = view.chosen(sides, prefers, due)
+    after = view.changed(state, claim)
+    if stepping.sees_mergers:
+        after = seen_merging(view, after, view.mergers(state, sides, claim), due)
+    return after, logs
 
 
 def _mostly(state: State, after: Tensor) -> Claim:
@@ -89,7 +92,8 @@ def _mostly(state: State, after: Tensor) -> Claim:
     assert state.links is not None
     lane = after.argmax(-1)
     none = torch.zeros_like(lane, dtype=torch.bool)
-    return Claim(lane, lane != state.links.lane, none, none, state.links.follower, none)
+    signals = torch.zeros_like(after[..., 0])
+    return Claim(lane, lane != state.links.lane, none, none, state.links.follower, none, signals)
 
 
 __all__ = ["decided"]

@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from idm_env import parameters, shares
+from idm_env import changes, parameters, shares
 from idm_env.choices import DECISIONS, NOISE, Decisions
 from idm_env.decisions import decided
 from idm_env.effects.base import HOOKS, CarFollowing, Effect, Hook
@@ -75,6 +75,10 @@ class Stepping:
         if self.decisions not in DECISIONS:
             hint = parameters.nearest(self.decisions, DECISIONS)
             raise ValueError(f"decisions = '{self.decisions}' is unknown.{hint}")
+        if self.decisions == "soft" and self.sees_mergers:
+            raise ValueError("decisions = 'soft': nobody signals, so that nobody can be let in. Leave that effect out.")
+        if self.decides_in_blocks and self.sees_mergers:
+            raise ValueError("who takes turns to decide does not see who signals: leave stagger or that effect out.")
         if not 0.0 < self.temperature < float("inf"):
             raise ValueError(f"temperature = {self.temperature:g} m/s² must be above 0, and finite.")
         longest = next((p.high for p in self._following.parameters if p.name == "time_gap"), float("inf"))
@@ -124,10 +128,31 @@ class Stepping:
         """Effects that change lanes."""
         return self._hooks["change"]
 
+    @property
+    def sees_mergers(self) -> bool:
+        """Whether drivers look at who signals beside them."""
+        return "merger" in self._needs
+
     @cached_property
     def decides_after(self) -> int:
         """Steps between two decisions about lanes."""
         return max(1, round(min((e.decides_every for e in self.changes), default=1.0) / self.dt))
+
+    @cached_property
+    def decides_in_blocks(self) -> int:
+        """Slots of a block that decides together, blocks taking turns a step apart; 0: all at once."""
+        return max((e.decides_in_blocks for e in self.changes), default=0)
+
+    def turns(self, vehicles: int) -> Tensor:
+        """Return at which of the ``decides_after`` steps from one decision to the next every slot decides."""
+        block = self.decides_in_blocks or max(vehicles, 1)
+        return torch.arange(vehicles).div(block, rounding_mode="floor") % self.decides_after
+
+    def due(self, state: State) -> Tensor:
+        """Return who decides about lanes at this step (bool), to broadcast against ``(..., vehicles)``."""
+        step = state.step if state.step.dim() == 0 else state.step.unsqueeze(-1)
+        phase = step.remainder(self.decides_after)
+        return phase == (self.turns(state.speed.shape[-1]).to(step.device) if self.decides_in_blocks else 0)
 
     @cached_property
     def _unspoken(self) -> dict[str, dict[str, float]]:
@@ -232,7 +257,7 @@ class Stepping:
                 memory[effect.name] = normals(f"{effect.name} at the start", seed or 0, held) if drawn else held
         if self.looks_back:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
-        return memory
+        return {**memory, **changes.nobody(state.speed)} if self.sees_mergers else memory
 
     def scene(self, state: State, inputs: Inputs) -> Scene:
         """Return what this step looks like to every vehicle."""
@@ -254,6 +279,7 @@ class Stepping:
             inputs=inputs,
             memory=state.memory,
             history=self._history(state),
+            merger=changes.merger(state.memory, state.speed) if self.sees_mergers else None,
         )
         return half_ahead(scene) if self.integration == "midpoint" else scene
 
@@ -324,6 +350,7 @@ class Stepping:
         }
         if scene.history is not None:
             memory[PAST] = scene.history.pushed(scene)
+        memory |= changes.driven_on(state.memory, motion.displacement, self.dt)
         return state._replace(
             position=motion.position,
             speed=motion.speed,
@@ -391,6 +418,7 @@ def half_ahead(scene: Scene) -> Scene:
         leader=leader,
         second_leader=moved(scene.second_leader, 1.0),
         behind=moved(scene.behind, -1.0),
+        merger=moved(scene.merger, 1.0),
     )
 
 

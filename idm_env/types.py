@@ -148,13 +148,16 @@ class Wish(NamedTuple):
     """What an effect of the hook ``change`` says of a change to the left and to the right.
 
     Utility (m/s²): a change is wished where the sum over effects is above 0. Margin (m/s²): it is safe where the least
-    of all effects is at least 0.
+    of all effects is at least 0. The sum over effects also has the largest single utility of each side, for which a
+    driver signals: he may have to go where the sum, which knows of dangers, does not want him to.
     """
 
     left: Tensor
     right: Tensor
     left_margin: Tensor
     right_margin: Tensor
+    left_most: Tensor | None = None
+    right_most: Tensor | None = None
 
 
 class Past(Protocol):
@@ -170,7 +173,8 @@ class Past(Protocol):
 class Scene(NamedTuple):
     """What one step looks like to every vehicle; effects read this and know no topology.
 
-    ``second_leader`` and ``behind`` are filled only where an effect of the simulator needs them, ``here``, ``left`` and
+    ``second_leader``, ``behind`` and ``merger`` (who signals from a lane beside that he wants to be the leader) are
+    filled only where an effect of the simulator needs them, ``here``, ``left`` and
     ``right`` only for the hook ``change``; ``inputs`` and ``memory`` are keyed by effect name, ``time`` is in seconds,
     ``euler`` tells how speeds will be integrated.
     """
@@ -190,6 +194,7 @@ class Scene(NamedTuple):
     here: Beside | None = None
     left: Beside | None = None
     right: Beside | None = None
+    merger: Neighbour | None = None
 
     def past(self, seconds: Tensor) -> Scene:
         """Return the scene of some seconds ago, interpolated between steps; ``seconds`` broadcasts over vehicles.

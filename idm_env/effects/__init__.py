@@ -18,7 +18,7 @@ from idm_env.effects.changes import LaneCommand, MandatoryChange, Mobil
 from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
 from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
-from idm_env.effects.neighbours import BrakeLight, Follower, Lateral, LeaderAcceleration, SecondLeader
+from idm_env.effects.neighbours import BrakeLight, Courtesy, Follower, Lateral, LeaderAcceleration, SecondLeader
 from idm_env.effects.noise import DRIFTS, AccelNoise, Noise, PerceptionNoise, Wander
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
@@ -61,6 +61,7 @@ ALL: dict[str, type[Effect]] = {
         CurveSpeed,
         RegimeShift,
         Lateral,
+        Courtesy,
         GapBias,
         ImaginedLeader,
         Noise,
@@ -201,6 +202,7 @@ __all__ = [
     "CarFollowing",
     "ConstantTimeGap",
     "Control",
+    "Courtesy",
     "Curve",
     "CurveSpeed",
     "DeadZone",

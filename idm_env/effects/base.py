@@ -130,6 +130,11 @@ class Effect:
         """Seconds between two decisions of an effect that changes lanes; the least of a simulator's effects holds."""
         return 1.0
 
+    @property
+    def decides_in_blocks(self) -> int:
+        """Slots of a block that decides together, blocks taking turns; 0: all decide at once. The largest holds."""
+        return 0
+
     @classmethod
     def strength_of(cls, change: float) -> float:
         """Return the strength that changes what it ``changes`` by ``change``, to first order, from its null on.

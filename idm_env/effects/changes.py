@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,6 +16,9 @@ from idm_env.types import Beside, Driver, Scene, Wish
 
 COMMANDED = 1e12
 """Utility of an agent's command (m/s²): more than any driver's, who may think of a place inside another vehicle."""
+
+_BLOCK = 256
+"""The fewest slots that decide together."""
 
 _SAFE_DECEL = Parameter("safe_decel", "b_safe", "m/s²", 4.0, 0.5, 9.0, role="threshold")
 
@@ -42,7 +46,8 @@ class Mobil(Effect):
         utility = ã_c − a_c + p (ã_n − a_n + ã_o − a_o) − Δa_th ± a_bias,    safe where ã_n ≥ −b_safe
 
     c is the driver, n his follower on the other lane and o the one on his own; a tilde is after the change. ``a_bias``
-    is added to the right and taken from the left. Drivers decide every ``every`` seconds.
+    is added to the right and taken from the left. Drivers decide every ``every`` seconds: all at once, or, with
+    ``stagger``, that many slots at once (at least 256), blocks taking turns a step apart. ValueError for fewer.
     """
 
     kind: ClassVar[str] = "mobil"
@@ -54,11 +59,26 @@ class Mobil(Effect):
         Parameter("keep_right", "a_bias", "m/s²", 0.0, -2.0, 2.0, role="shape"),
     )
     every: float = 1.0
+    stagger: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.every < math.inf:
+            raise ValueError(f"mobil: every = {self.every:g} s must be a number above 0.")
+        if self.stagger != 0 and self.stagger < _BLOCK:
+            raise ValueError(
+                f"mobil: stagger = {self.stagger} slots must be 0 (all at once) or at least {_BLOCK}: smaller blocks "
+                "touch all of memory at every step."
+            )
 
     @property
     def decides_every(self) -> float:
         """As ``every`` says."""
         return self.every
+
+    @property
+    def decides_in_blocks(self) -> int:
+        """As ``stagger`` says."""
+        return self.stagger
 
     def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
         """Return the advantage less the threshold, and the follower's margin."""

@@ -133,6 +133,45 @@ class Follower(Effect):
 
 
 @dataclass(frozen=True)
+class Courtesy(Effect):
+    """Room for whoever signals beside one: he is followed, too, with a weight, and never braked for harder than b.
+
+    ::
+
+        − w min(b, a max(0, (s*_m / s_m)² − (s* / s)²))
+
+    s_m (m) is the gap to a vehicle in a lane beside that wished for this one at the last decision and was not granted
+    it, taken to drive on at the speed that it had then. With w = 1 a driver follows whichever is nearer, within b;
+    after the gap creation of LMRS (Schakel, Knoop, van Arem 2012). Whom to let in plays no part in his own wishes.
+    """
+
+    kind: ClassVar[str] = "courtesy"
+    sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2012,)
+    adds: ClassVar[bool] = True  # a weight below 0 keeps others out
+    title: ClassVar[str] = "courtesy"
+    equation: ClassVar[str] = "− w min(b, a max(0, (s*_m/s_m)² − (s*/s)²))"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers close up to keep out whoever signals beside them",
+        "drivers let in whoever signals beside them, which IDM does not see",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("second_leader", "lateral", "time_gap")
+    told_by: ClassVar[str] = "gaps that open beside a vehicle that wants in, while one's own leader keeps his speed"
+    beyond: ClassVar[Neighbour] = "vehicle in an adjacent lane"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("weight", "w", "1", 0.5, -0.5, 1.0, null=0.0, starts=(0.1,)),
+    )
+    needs: ClassVar[frozenset[str]] = frozenset({"merger"})
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the braking for whoever signals (m/s²)."""
+        other = scene.merger
+        assert other is not None
+        own = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed) * scene.leader.present
+        more = torch.relu(interaction(driver, scene.speed, other.gap, other.speed) - own)
+        return -p["weight"] * other.present * torch.minimum(driver.comfort_decel, driver.max_accel * more)
+
+
+@dataclass(frozen=True)
 class Lateral(Effect):
     """Friction with the adjacent lane: ``− c max(v − v_adjacent, 0) exp(−|dx| / reach)``.
 

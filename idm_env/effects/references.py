@@ -50,6 +50,10 @@ TREIBER_2003 = (
     "Treiber, M., Helbing, D. (2003). Memory effects in microscopic traffic models and wide scattering in flow-"
     "density data. Physical Review E 68, 046119. doi:10.1103/PhysRevE.68.046119"
 )
+SCHAKEL_2012 = (
+    "Schakel, W. J., Knoop, V. L., van Arem, B. (2012). Integrated lane change model with relaxation and "
+    "synchronization. Transportation Research Record 2316, 47–57. doi:10.3141/2316-06"
+)
 TREIBER_2006 = (
     "Treiber, M., Kesting, A., Helbing, D. (2006). Delays, inaccuracies and anticipation in microscopic traffic "
     "models. Physica A 360(1), 71–88. doi:10.1016/j.physa.2005.05.001"

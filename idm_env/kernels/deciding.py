@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.changes import seen_merging
 from idm_env.decisions import decided
 from idm_env.effects.base import Effect
 from idm_env.kernels import decision_loops, lanes, order_loops
@@ -129,8 +130,8 @@ class Traffic:
             ends = self.road.closed_at(lane, state.position)
         return Places(there, torch.from_numpy(own).view(self.shape), first.view(at), last.view(at), ends)
 
-    def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params) -> State | None:
-        """Return the state after a decision that is due, its links these; None where links are no order."""
+    def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params, turn: Tensor) -> State | None:
+        """Return the state after those have decided whose ``turn`` it is, or None where links are no order."""
         if isinstance(found, str):
             after = decided(self.simulator, state._replace(links=self.links), inputs, params)
             self._take(after.links)
@@ -139,11 +140,13 @@ class Traffic:
         phase, constants = found.compiled(kind.name)
         plan, places, held = self._plan(found, state, inputs, params)
         fresh = np.zeros(self.rows * self.n, np.uint8)
+        sees = self.simulator.sees_mergers
+        merger = np.tile(np.arange(self.n), self.rows if sees else 0)
         tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], kind)
         done = decision_loops.decide(
             self._links, dense(state.position, self.shape), *self._present(state), self.rows, self.n,
             self.road.count, self._ring, self.road.handed == "left", tables, plan, places, phase, constants,
-            len(found.slots), fresh,
+            len(found.slots), fresh, merger, turn.numpy(),
         )  # fmt: skip
         del held
         if not done:
@@ -154,7 +157,12 @@ class Traffic:
             gap = Linked(self.road, links, state.position).gaps_of(which, state.position, state.length)
             full = state.gap.expand(self.shape).reshape(-1)
             state = state._replace(gap=full.index_put((which,), gap).view(self.shape))
-        return state._replace(links=links)
+        state = state._replace(links=links)
+        if not sees:
+            return state
+        due = torch.ones((), dtype=torch.bool) if state.present is None else state.present > 0
+        view = Linked(self.road, links, state.position)
+        return seen_merging(view, state, torch.from_numpy(merger).view(self.shape), due)
 
     def _plan(self, found: Decision, state: State, inputs: Inputs, params: Params) -> tuple[Array, Array, list[Array]]:
         """Return what rows are filled with, whose numbers these are, and the arrays that the plan points to.

@@ -17,6 +17,9 @@ from idm_env.kernels.tiles import ROW, exact, padded, workspace
 CHUNK = 256
 """Vehicles for which the printed phase is called at once: its rows stay in the second-level cache."""
 
+RESULTS = 5
+"""Rows that the phase fills: what ``roads.beside.Preference`` holds."""
+
 ARRAY, LANE, AHEAD, BEHIND, LAPS_AHEAD, LAPS_BEHIND, OPENS, CLOSES, STOPS = range(9)
 """What a row of the phase is filled with: an array's numbers, or what ``search`` finds."""
 
@@ -198,11 +201,15 @@ def relink(order, begin, count, ring, base, lane, leader, follower, fresh):
 
 @exact
 def settle(w, results, at, m, own_lane, left, right, begin, ring, left_hand, base, order, winner, utility, to_left,
-           refused, blocked):  # fmt: skip
+           signals, refused, blocked, turn):  # fmt: skip
     """Grant the best claim on each gap so far, and count the others; return whether there was any."""
     some = False
     for j in range(m):
         r = at + j
+        signals[r] = 0
+        if not turn[order[r]]:
+            continue
+        signals[r] = w[results + 4 * ROW + j]
         if w[results + 3 * ROW + j] > 0:
             blocked[base + order[r]] += 1
         if not w[results + 2 * ROW + j] > 0:
@@ -241,20 +248,51 @@ def count_changes(winner, order, left, right, to_left, begin, ring, base, lane, 
 
 
 @exact
+def any_of(turn, order, at, m):
+    """Whether it is the turn of any of the ranks ``at`` to ``at + m``."""
+    some = False
+    for j in range(m):
+        some |= turn[order[at + j]]
+    return some
+
+
+@exact
+def find_mergers(order, begin, count, place, ring, left, right, signals, granted, base, nearest, merger):
+    """Write, for everybody who stays, the slot of the nearest of those who signal and would have him as follower."""
+    nearest[:] = np.inf
+    for k in range(count):
+        for r in range(begin[k], begin[k + 1]):
+            if signals[r] == 0 or granted[r]:
+                continue
+            to, q = (k + 1, left[r]) if signals[r] > 0 else (k - 1, right[r])
+            first, last = begin[to], begin[to + 1]
+            around = ring > 0 and q == last and last > first
+            q = first if around else q
+            if q >= last or granted[q]:
+                continue
+            way = place[r] - place[q] + (ring if around else 0.0)
+            if way < nearest[q] or (way == nearest[q] and order[r] < merger[base + order[q]]):
+                nearest[q], merger[base + order[q]] = way, order[r]
+
+
+@exact
 def decide(
-    links, position, present, coming, rows, n, count, ring, left_hand, tables, plan, places, phase, k, slots, fresh
+    links, position, present, coming, rows, n, count, ring, left_hand, tables, plan, places, phase, k, slots, fresh,
+    merger, turn,
 ):  # fmt: skip
     """Decide in all rows: ``links`` (7, rows · n; as ``types.Links``) change in place, ``fresh`` marks new leaders.
 
-    ``plan`` says what the ``slots`` rows of the printed ``phase`` are filled with, ``places`` whose. Returns False,
-    with some rows decided, where links are not the order of positions.
+    ``plan`` says what the ``slots`` rows of the printed ``phase`` are filled with, ``places`` whose. ``merger`` (rows ·
+    n own slots, or empty if nobody looks) gets who signals beside everybody; those slots decide whose ``turn``
+    it is. Returns False, with some rows decided, where links are not the order of positions.
     """
     lane, leader, follower, changed, refused, blocked, unjudged = links
-    w, which = workspace((slots + 4) * ROW, k), np.empty(len(places) * CHUNK, np.int64)
+    w, which = workspace((slots + RESULTS) * ROW, k), np.empty(len(places) * CHUNK, np.int64)
     order, begin, place = np.empty(n, np.int64), np.empty(count + 1, np.int64), np.empty(n)
     fresh_order, fresh_begin = np.empty(n, np.int64), np.empty(count + 1, np.int64)
     left, right, winner = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n + count, np.int64)
     utility, to_left, granted = np.empty(n, k.dtype), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    signals, nearest = np.zeros(n, np.int8), np.empty(n)
     for row in range(rows):
         base = row * n
         if not walk(leader, follower, lane, position, present, coming, n, count, ring, base, order, begin, place):
@@ -267,6 +305,8 @@ def decide(
         for own in range(count):
             for at in range(begin[own], begin[own + 1], CHUNK):
                 m = min(CHUNK, begin[own + 1] - at)
+                if not any_of(turn, order, at, m):
+                    continue
                 fill_rows(
                     w, slots, plan, places, which, at, m, own, begin, count, place, order, left, right, position,
                     base, row, n, ring, tables,
@@ -274,13 +314,15 @@ def decide(
                 call(phase, w, padded(m), k)  # type: ignore[call-arg]
                 some |= settle(
                     w, slots * ROW, at, m, own, left, right, begin, ring, left_hand, base, order, winner, utility,
-                    to_left, refused, blocked,
+                    to_left, signals, refused, blocked, turn,
                 )  # fmt: skip
+        granted[:] = False
+        for r in winner:
+            if r >= 0:
+                granted[r] = True
+        if len(merger):
+            find_mergers(order, begin, count, place, ring, left, right, signals, granted, base, nearest, merger)
         if some:
-            granted[:] = False
-            for r in winner:
-                if r >= 0:
-                    granted[r] = True
             reordered(order, begin, place, count, ring, winner, granted, fresh_order, fresh_begin)
             relink(fresh_order, fresh_begin, count, ring, base, lane, leader, follower, fresh)
             count_changes(

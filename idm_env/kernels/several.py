@@ -51,20 +51,23 @@ def rollout(
     own = {name: params[name] for name in inner.by_name}
     stops = bool(simulator.changes) or state.present is not None
     every = simulator.decides_after if stops else max(steps, 1)
+    turns = simulator.turns(state.speed.shape[-1])
+    stages = sorted({0, *turns.tolist()}) if stops else [0]
     block = lanes.BLOCK if road.ring is not None else every
     wishes = decision(simulator, Form.of(state._replace(links=None), inputs)) if simulator.changes else ""
     traffic = Traffic(simulator, state)
     kept: list[tuple[Tensor, ...]] = []
     done, clock = 0, int(state.step.reshape(-1)[0])
     while done < steps:
-        if stops and (clock + done) % every == 0:
+        phase = (clock + done) % every
+        if stops and phase == 0:
             state = traffic.begin(state, params)
-        if simulator.changes and (clock + done) % every == 0:
-            after = traffic.decide(wishes, state, _cut(inputs, done, None), params)
+        if simulator.changes and phase in stages:
+            after = traffic.decide(wishes, state, _cut(inputs, done, None), params, turns == phase)
             if after is None:
                 return None
             state = after
-        until = every - (clock + done) % every if stops else steps - done
+        until = min((stage - phase) % every or every for stage in stages) if stops else steps - done
         count = min(until, block, steps - done)
         places = traffic.places(state, tiles.halo(count, kernel.program.reach))
         if places is None:

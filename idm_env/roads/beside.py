@@ -36,13 +36,15 @@ class Side(NamedTuple):
 class Preference(NamedTuple):
     """The better side of every vehicle: its utility (m/s²), whether it is the left one, and bool tensors.
 
-    ``wants`` is a wish for a side that is there, safe and free; ``blocked`` one that comes to nothing.
+    ``wants`` is a wish for a side that is there, safe and free; ``blocked`` one that comes to nothing. ``signals`` is 1
+    where some effect wishes for the left, be it safe or not, −1 for the right, 0 for neither.
     """
 
     utility: Tensor
     to_left: Tensor
     wants: Tensor
     blocked: Tensor
+    signals: Tensor
 
 
 def within(position: Tensor, length: Tensor, opens: Tensor, closes: Tensor) -> Tensor:
@@ -64,7 +66,17 @@ def preferred(left: Side, right: Side, wish: Wish, left_hand: bool) -> Preferenc
     to_left = utility[0] >= utility[1] if left_hand else utility[0] > utility[1]
     best = torch.where(to_left, utility[0], utility[1])
     wants = best > 0
-    return Preference(best, to_left, wants, ~wants & (torch.maximum(wish.left, wish.right) > 0))
+    blocked = ~wants & (torch.maximum(wish.left, wish.right) > 0)
+    return Preference(best, to_left, wants, blocked, signalled(left.exists, right.exists, wish, left_hand))
+
+
+def signalled(left: Tensor, right: Tensor, wish: Wish, left_hand: bool) -> Tensor:
+    """Return the side that some effect wishes for most: 1 for the left, −1 for the right, 0 for neither."""
+    assert wish.left_most is not None and wish.right_most is not None
+    never, none = torch.full_like(wish.left, -torch.inf), torch.zeros_like(wish.left)
+    one, other = torch.where(left, wish.left_most, never), torch.where(right, wish.right_most, never)
+    to_left = one >= other if left_hand else one > other
+    return torch.where(torch.maximum(one, other) > 0, torch.where(to_left, none + 1.0, none - 1.0), none)
 
 
 class Sideways(Ending):

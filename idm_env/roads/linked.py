@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 class Claim(NamedTuple):
     """What becomes of every vehicle's wish: the lane it is granted (or its own), and bool tensors of why not.
 
-    ``follower`` is the slot of whom the change was judged by, ``judged`` whether there is one.
+    ``follower`` is the slot of whom the change was judged by, ``judged`` whether there is one. ``signals`` is where
+    those look who were not granted it (1 left, −1 right, 0 nowhere).
     """
 
     lane: Tensor
@@ -28,6 +29,7 @@ class Claim(NamedTuple):
     blocked: Tensor
     follower: Tensor
     judged: Tensor
+    signals: Tensor
 
 
 def without_absent(links: Links, present: Tensor | None) -> Links:
@@ -184,7 +186,7 @@ class Linked(Sideways):
         """
         left, right = sides
         hand = self.road.handed == "left"
-        best, to_left, wants, blocked = prefers
+        best, to_left, wants, blocked, signals = prefers
         wants, blocked = wants & due, blocked & due
         never = torch.full_like(best, -torch.inf)
         to = torch.where(to_left, self.to(1), self.to(-1))
@@ -200,8 +202,34 @@ class Linked(Sideways):
         follower = torch.where(to_left, left.follower, right.follower)
         judged = torch.where(to_left, left.followed, right.followed)
         return Claim(
-            torch.where(granted, to, self.links_now.lane), granted, wants & ~granted, blocked, follower, judged
-        )
+            torch.where(granted, to, self.links_now.lane), granted, wants & ~granted, blocked, follower, judged,
+            torch.where(due & ~granted, signals, 0.0),
+        )  # fmt: skip
+
+    def mergers(self, state: State, sides: tuple[Side, Side], claim: Claim) -> Tensor:
+        """Return, for everybody who stays, the slot of whoever signals that he wants to be his leader: own for nobody.
+
+        Of two the one whose front is nearer, then the first slot.
+        """
+        left, right = sides
+        own = torch.arange(claim.lane.shape[-1], device=claim.lane.device).expand_as(claim.lane)
+        to_left = claim.signals > 0
+        asks = (claim.signals != 0) & torch.where(to_left, left.followed, right.followed)
+        asked = torch.where(asks, torch.where(to_left, left.follower, right.follower), own)
+        way = torch.where(to_left, left.back_gap, right.back_gap) + state.length
+        shape = tuple(claim.lane.shape)
+        nearest = asks & (way == _most(shape, asked, torch.where(asks, way, FAR), "amin"))
+        count = own.shape[-1]
+        first = torch.full_like(own, count).scatter_reduce(-1, asked, torch.where(nearest, own, count), "amin")
+        return torch.where((first < count) & ~claim.granted, first, own)
+
+    def to_merger(self, state: State, merger: Tensor) -> Tensor:
+        """Return the gap to whoever signals (m), FAR for nobody; negative where he is beside."""
+        own = torch.arange(merger.shape[-1], device=merger.device)
+        gap = self.at(state.position, merger) - self.at(state.length, merger) - state.position
+        if self.road.ring is not None:
+            gap = gap + laps(state.position, merger, self.road.ring)
+        return torch.where(merger == own, FAR, gap)
 
     def changed(self, state: State, claim: Claim) -> State:
         """Return the state after the granted changes: new links, and gaps measured where somebody has a new leader."""

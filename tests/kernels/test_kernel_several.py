@@ -22,7 +22,10 @@ CASES: dict[str, tuple[Lanes, tuple[Effect, ...]]] = {
     "one lane empty": (Lanes(5, ring=500.0), (IDM(), make("memory"), make("noise"), Mobil(), Brakes())),
     "drop": (
         Lanes(3, ends=(lane_drop(2, at=460.0),)),
-        (IDM(), make("second_leader"), make("follower"), Mobil(every=0.5), MandatoryChange(), Brakes()),
+        (
+            *(IDM(), make("second_leader"), make("follower"), make("courtesy")),
+            *(Mobil(every=0.5), MandatoryChange(), Brakes()),
+        ),
     ),
 }
 
@@ -52,18 +55,24 @@ def rolled(
 
 
 @pytest.mark.parametrize(
-    ("road", "dtype"),
-    [(Lanes(3, ring=8100.0), torch.float64), (Lanes(3, ends=(lane_drop(0, at=8300.0),)), torch.float32)],
-    ids=["ring", "drop"],
+    ("road", "dtype", "more"),
+    [
+        (Lanes(3, ring=8100.0), torch.float64, (make("courtesy"), Mobil())),
+        (Lanes(3, ends=(lane_drop(0, at=8300.0),)), torch.float32, (make("courtesy"), Mobil())),
+        (Lanes(3, ring=8100.0), torch.float64, (Mobil(stagger=256),)),
+    ],
+    ids=["ring", "drop", "blocks in turn"],
 )
-def test_compiled_decisions_are_those_of_the_torch_path(road: Lanes, dtype: torch.dtype) -> None:
+def test_compiled_decisions_are_those_of_the_torch_path(
+    road: Lanes, dtype: torch.dtype, more: tuple[Effect, ...]
+) -> None:
     """Every link and every count, over more vehicles than one call of the printed phase takes; commands among wishes.
 
     What is compared is one decision after another from the same states, so that rounding cannot add up.
     """
     generator = torch.Generator().manual_seed(2)
     n = 900
-    simulator = Simulator(road, (IDM(), make("second_leader"), make("gap_bias"), Mobil(), LaneCommand(), Brakes()))
+    simulator = Simulator(road, (IDM(), make("gap_bias"), *more, LaneCommand(), Brakes()))
     params = simulator.defaults(dtype=dtype)
     params["idm"]["desired_speed"] = (15.0 + 20.0 * torch.rand((2, n), generator=generator)).to(dtype)
     position = (torch.randperm(n, generator=generator) * 9.0).to(dtype).expand(2, n)
@@ -71,7 +80,7 @@ def test_compiled_decisions_are_those_of_the_torch_path(road: Lanes, dtype: torc
     state = simulator.state(position, torch.full_like(position, 8.0), params, lane=lane)
     command = torch.full((10, 2, n), torch.nan, dtype=dtype)
     command[:, 0, ::7], command[:, 1, ::5] = 1.0, -1.0
-    counts = torch.zeros(4)
+    counts, seen = torch.zeros(4), 0
     for _ in range(12):
         inputs = {"lane_command": command}
         with dispatch.off():
@@ -81,8 +90,11 @@ def test_compiled_decisions_are_those_of_the_torch_path(road: Lanes, dtype: torc
         for one, other in zip(expected.links, state.links, strict=True):
             assert torch.equal(one, other)
         torch.testing.assert_close(state.gap, expected.gap)
+        for name, held in expected.memory.items():  # who signals beside whom
+            torch.testing.assert_close(state.memory[name], held)
+            seen += int((held < 5e3).sum())
         counts += torch.stack([(a - b).sum() for a, b in zip(state.links[3:], before.links[3:], strict=True)])
-    assert (counts[:3] > 100).all() and counts[3] > 0
+    assert (counts[:3] > 100).all() and counts[3] > 0 and (seen > 1000 or not state.memory)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from idm_env.changes import MERGER_GAP, MERGER_SPEED
 from idm_env.effects import ALL, IDM, Brakes, CarFollowing, Curve, DriverCurve, Effect, Grade, PerceptionNoise, Wander
 from idm_env.effects.free import FEATURES
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
-from idm_env.types import Adjacent, Command, Imagined, Params, Record, State
+from idm_env.types import FAR, Adjacent, Command, Imagined, Params, Record, State
 
 N = 5
 DTYPE = torch.float64
@@ -49,9 +50,20 @@ def start(simulator: Simulator, params: Params, dtype: torch.dtype = DTYPE, batc
     speed = 9.0 + 4.0 * torch.rand((*batch, N), generator=generator, dtype=DTYPE)
     accel = torch.rand((*batch, N), generator=generator, dtype=DTYPE) - 0.6
     around = 400.0 if isinstance(simulator.road, Ring) else None
-    return simulator.state(
-        position.to(dtype), speed.to(dtype), params, accel=accel.to(dtype), step=590, circumference=around
+    return signalled(
+        simulator.state(
+            position.to(dtype), speed.to(dtype), params, accel=accel.to(dtype), step=590, circumference=around
+        )
     )
+
+
+def signalled(state: State) -> State:
+    """Return a state in which somebody signals beside all but the first, where drivers look at that."""
+    if MERGER_GAP not in state.memory:
+        return state
+    first = torch.arange(state.speed.shape[-1]) == 0
+    seen = {MERGER_GAP: torch.where(first, FAR, 4.0 + state.position.remainder(9.0)), MERGER_SPEED: 0.8 * state.speed}
+    return state._replace(memory={**state.memory, **seen})
 
 
 def inputs_for(simulator: Simulator, steps: int, like: Tensor) -> dict[str, object]:

@@ -109,6 +109,30 @@ def test_mirrored_roads_give_mirrored_changes(ring: float | None) -> None:
     assert all(torch.equal(a, b) for a, b in zip(kept, same, strict=True))
 
 
+def test_blocks_of_slots_take_turns_to_decide() -> None:
+    """Once a second each, a step apart; nobody overlaps, links stay inverse; fewer than 256 slots are refused."""
+    mobil = Mobil(stagger=256)
+    simulator, state, params = mixed(Lanes(3, ring=7200.0), 700, 7100.0, batch=1, effects=(mobil,))
+    own, changed = torch.arange(700), torch.zeros(3)
+    for step in range(20):
+        before, state = state, simulator.step(state, {}, params)
+        assert before.links is not None and state.links is not None
+        decided = sum(b - a for a, b in zip(before.links[3:6], state.links[3:6], strict=True))[0] > 0
+        assert not decided[own // 256 != step % 10].any()
+        changed += torch.stack(
+            [(state.links.changed - before.links.changed)[0, own // 256 == k].sum() for k in range(3)]
+        )
+        assert (state.gap > 0).all()
+        assert torch.equal(state.links.follower.gather(-1, state.links.leader)[0], own)
+    assert (changed > 5).all()
+    with pytest.raises(ValueError, match=r"stagger = 10 slots must be 0 \(all at once\) or at least 256"):
+        Mobil(stagger=10)
+    with pytest.raises(ValueError, match="every = 0 s must be a number above 0"):
+        Mobil(every=0.0)
+    with pytest.raises(ValueError, match="who takes turns to decide does not see who signals"):
+        Simulator(Lanes(2), (IDM(), make("courtesy"), mobil))
+
+
 def test_claims_of_equal_utility_go_to_the_hand_of_the_road() -> None:
     """Two drivers beside one gap, alike in all: who goes to the road's hand is granted, the other is counted."""
     for handed, winner in (("left", 0), ("right", 1)):
@@ -249,10 +273,34 @@ def test_a_change_in_front_of_another_follower_than_the_one_judged_is_counted() 
     assert after.links is not None and after.links.changed.tolist() == [1, 1, 0]
 
 
+def test_courtesy_opens_a_gap_for_whoever_signals() -> None:
+    """A driver whose lane ends is let in by the one beside him, who never brakes harder than b for it."""
+    position = torch.cat((torch.zeros(1), 71.0 - 16.0 * torch.arange(12))).to(DTYPE)  # the fifth is 5 m behind his rear
+    lane = torch.tensor([1, *[0] * 12])
+    for weight in (0.0, 1.0):
+        road = Lanes(2, ends=(lane_drop(1, at=200.0),))
+        simulator = Simulator(road, (IDM(), make("courtesy"), MandatoryChange(), Brakes()))
+        params = simulator.defaults(dtype=DTYPE)
+        params["courtesy"]["weight"] = torch.tensor(weight, dtype=DTYPE)
+        params["mandatory_change"]["safe_decel"] = torch.tensor(2.0, dtype=DTYPE)
+        state = simulator.state(position, torch.full_like(position, 10.0), params, lane=lane)
+        plain = simulator.without("courtesy").acceleration(state, {}, params)
+        after = simulator.step(state, {}, params)
+        assert after.links is not None and after.links.changed.sum() == 0
+        less = plain - after.accel
+        assert 0.1 < less[6] <= float(params["idm"]["comfort_decel"]) if weight else less[6] == 0
+        assert (less[torch.arange(13) != 6] == 0).all()
+        for _ in range(18):
+            state, kept = simulator.rollout(state, {}, params, 10)
+            assert (kept.gap > 0).all()
+        assert state.links is not None
+        assert (int(state.links.changed[0]), int(state.links.follower[0])) == ((1, 4) if weight else (0, 0))
+
+
 def test_gradients_with_choices_frozen_are_exact() -> None:
     """Finite differences that flip no choice agree with back-propagation through changes, ends of lanes included."""
-    road = Lanes(3, ends=(lane_drop(2, at=330.0),))
-    simulator, state, params = mixed(road, 8, 200.0, batch=1, seed=5, effects=(Mobil(), MandatoryChange()))
+    road, courtesy = Lanes(3, ends=(lane_drop(2, at=330.0),)), make("courtesy")
+    simulator, state, params = mixed(road, 8, 200.0, batch=1, seed=5, effects=(courtesy, Mobil(), MandatoryChange()))
     assert state.links is not None
     lane = state.links.lane
 

@@ -13,7 +13,7 @@ from idm_env.effects import ALL, BASES, CANDIDATES, IDM, Brakes, CarFollowing, E
 from idm_env.roads import Lane, Ring
 from idm_env.simulator import Simulator
 from idm_env.types import Scene
-from tests.laws.members import DTYPE, MEMBERS, N, around, inputs_for, label, start, with_leaves
+from tests.laws.members import DTYPE, MEMBERS, N, around, inputs_for, label, signalled, start, with_leaves
 
 everything = pytest.mark.parametrize("effect", MEMBERS, ids=label)
 NULLABLE = [e for e in MEMBERS if any(p.null is not None for p in e.parameters)]
@@ -162,6 +162,7 @@ def test_a_batch_is_a_loop(effect: Effect) -> None:
     _, together = simulator.rollout(batch, inputs, params, 25)
     for row in range(3):
         alone = simulator.state(batch.position[row], batch.speed[row], params, accel=batch.accel[row], step=590)
+        alone = signalled(alone)
         mine = {
             name: value[:, row] if isinstance(value, torch.Tensor)
             else type(value)(*(None if x is None else x[:, row] for x in value))
