@@ -126,7 +126,7 @@ LAWS = (
 
 
 def check(
-    steps: float, on_progress: OnProgress, *, rows: int = 128, each: int = 400, decisions: int = 300
+    steps: float, on_progress: OnProgress, *, rows: int = 32, each: int = 400, decisions: int = 300
 ) -> dict[str, Counts]:
     """Return what happened in at least so many vehicle-steps, a third of them on each kind of road."""
     found, seed, share = {kind: Counts() for kind in ROADS}, 0, int(steps / len(ROADS))

@@ -66,7 +66,7 @@ def driven_on(memory: Memory, displacement: Tensor, dt: float) -> dict[str, Tens
 
 def seen_merging(view: Linked, state: State, who: Tensor, due: Tensor) -> State:
     """Return the state in which drivers remember who signals (slots, own for nobody), where they have decided."""
-    gap, speed = view.to_merger(state, who), view.at(state.speed, who)
+    gap, speed = view.to_slot(state.position, state.length, who), view.at(state.speed, who)
     some = (gap > 0) & (gap < 0.5 * FAR)
     fresh = {MERGER_GAP: torch.where(some, gap, FAR), MERGER_SPEED: torch.where(some, speed, 0.0)}
     memory = {name: torch.where(due, x, state.memory[name]) for name, x in fresh.items()}

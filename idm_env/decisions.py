@@ -40,6 +40,8 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
     view = stepping.road.view(state)
     assert isinstance(view, Linked)
     due = due if state.present is None else due & (state.present > 0)
+    if state.moving is not None:
+        due = due & (state.moving.until <= (state.step if state.step.dim() == 0 else state.step.unsqueeze(-1)))
     how = stepping.decisions
     if how == "pathwise" or (how == "surrogate" and not torch.is_grad_enabled()):
         return _done(stepping, view, state, inputs, params, due)[0]
@@ -71,17 +73,20 @@ def _done(
     with contextlib.nullcontext() if score else torch.no_grad():
         order, left_hand = view.order(state.present), view.road.handed == "left"
         sides = view.side(order, 1, state), view.side(order, -1, state)
-        wish = wished(stepping, beside(stepping, view, sides, state, inputs, params), params)
+        seen = sides if state.moving is None else view.with_leaving(state, sides)
+        wish = wished(stepping, beside(stepping, view, seen, state, inputs, params), params)
         if not score:
-            prefers = preferred(*sides, wish, left_hand)
+            prefers = preferred(*seen, wish, left_hand)
             logs = prefers.utility
         else:
-            left, right = (side.exists & (side.gap > 0) & (side.back_gap > 0) for side in sides)
+            left, right = (side.exists & (side.gap > 0) & (side.back_gap > 0) for side in seen)
             normal: Tensor = stepping.scene(state, inputs).input(choices.NOISE)
             signals = signalled(sides[0].exists, sides[1].exists, wish, left_hand)
             prefers, logs = choices.drawn(wish, left, right, stepping.temperature, normal, signals)
         claim = view.chosen(sides, prefers, due)
     after = view.changed(state, claim)
+    if view.road.duration:
+        after = view.on_the_way(state, after, claim, round(view.road.duration / stepping.dt))
     if stepping.sees_mergers:
         after = seen_merging(view, after, view.mergers(state, sides, claim), due)
     return after, logs

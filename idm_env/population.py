@@ -15,8 +15,8 @@ from torch import Tensor
 
 from idm_env.choices import settled
 from idm_env.roads.lanes import Lanes
-from idm_env.roads.linked import Linked, without_absent
-from idm_env.types import FAR, Params, State, Trips
+from idm_env.roads.linked import Linked, standing, without_absent
+from idm_env.types import FAR, Moving, Params, State, Trips
 
 if TYPE_CHECKING:
     from idm_env.step import Stepping
@@ -165,8 +165,21 @@ def _entered(stepping: Stepping, state: State, params: Params, now: Tensor) -> S
 
     fast = fits(asked) | ~followed
     slow = torch.minimum(asked, ahead)
-    entry = _Entry(some & (fast | fits(slow)), first, last, followed, begins, gap, torch.where(fast, asked, slow))
+    speed = torch.where(fast, asked, slow)
+    goes = some & (fast | fits(slow))
+    if state.moving is not None:  # whoever is still leaving a lane is in the way there
+        goes = goes & (_rear_of_leaving(state, lanes) - begins >= least + speed * time_gap)
+    entry = _Entry(goes, first, last, followed, begins, gap, speed)
     return _placed(stepping, state, params, entry)
+
+
+def _rear_of_leaving(state: State, lanes: Tensor) -> Tensor:
+    """Return where the last of those ends who are still leaving each lane (m)."""
+    assert state.moving is not None and state.present is not None
+    step = state.step if state.step.dim() == 0 else state.step.unsqueeze(-1)
+    there = (state.moving.until > step) & (state.present > 0)
+    mine = there.unsqueeze(-2) & (state.moving.origin.unsqueeze(-2) == lanes.unsqueeze(-1))
+    return torch.where(mine, (state.position - state.length).unsqueeze(-2), FAR).amin(-1)
 
 
 class _Entry(NamedTuple):
@@ -246,6 +259,10 @@ def _placed(stepping: Stepping, state: State, params: Params, entry: _Entry) -> 
         fresh_choices = settled(after.lane, stepping.road.count, state.speed)  # type: ignore[attr-defined]
         shares = torch.where(new.unsqueeze(-1), fresh_choices.shares, begun.choices.shares)
         begun = begun._replace(choices=begun.choices._replace(shares=shares))
+    if begun.moving is not None:
+        fresh_moving = standing(begun)
+        moving = (torch.where(new, x, y) for x, y in zip(fresh_moving, begun.moving, strict=True))
+        begun = begun._replace(moving=Moving(*moving))
     return begun._replace(memory=memory)
 
 

@@ -77,6 +77,8 @@ class Stepping:
             raise ValueError(f"decisions = '{self.decisions}' is unknown.{hint}")
         if self.decisions == "soft" and self.sees_mergers:
             raise ValueError("decisions = 'soft': nobody signals, so that nobody can be let in. Leave that effect out.")
+        if getattr(self.road, "duration", 0.0) and self.decisions in ("soft", "surrogate"):
+            raise ValueError(f"decisions = '{self.decisions}' knows changes at a point only. Take Lanes(duration=0).")
         if self.decides_in_blocks and self.sees_mergers:
             raise ValueError("who takes turns to decide does not see who signals: leave stagger or that effect out.")
         if not 0.0 < self.temperature < float("inf"):

@@ -66,6 +66,18 @@ class Trips(NamedTuple):
     left: Tensor
 
 
+class Moving(NamedTuple):
+    """Changes of lanes that take time: integer tensors of shape ``(..., vehicles)``.
+
+    Until step ``until`` a vehicle that has left lane ``origin`` is still a leader there. ``shadow`` is the slot of the
+    next such vehicle ahead on everybody's lane, one's own for nobody.
+    """
+
+    origin: Tensor
+    until: Tensor
+    shadow: Tensor
+
+
 class Choices(NamedTuple):
     """What is kept of choices of lanes for gradients through them (``decisions=`` of a simulator).
 
@@ -85,7 +97,7 @@ class State(NamedTuple):
     tensor (scalar or one per batch row), so that time never forces a device to synchronise. ``links`` is None on roads
     whose order never changes; where lanes change, vehicles keep their slots and links say who leads whom. ``trips`` is
     None where nobody comes: otherwise who is not present waits for his trip, or has made it. ``choices`` is None until
-    a decision about lanes is made whose choices are not frozen.
+    a decision about lanes is made whose choices are not frozen, ``moving`` until one is made that takes time to do.
     """
 
     position: Tensor
@@ -99,6 +111,7 @@ class State(NamedTuple):
     links: Links | None = None
     trips: Trips | None = None
     choices: Choices | None = None
+    moving: Moving | None = None
 
 
 class Motion(NamedTuple):

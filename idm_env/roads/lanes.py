@@ -62,7 +62,8 @@ class Lanes(Road):
 
     At the end of a length vehicles leave the road, when lanes are next decided about: ``present`` becomes 0. ``ends``
     are lanes that begin or end elsewhere. ``handed`` settles claims of equal utility: to the left is preferred, or to
-    the right.
+    the right. A change takes ``duration`` (s): a vehicle follows whom it finds on its new lane at once, and stays a
+    leader on the old one for so long, in which it decides nothing; 0 is a change at a point.
 
     Positions on a ring are unwrapped, as on ``Ring``. A vehicle alone in its lane of a ring follows itself.
 
@@ -74,6 +75,7 @@ class Lanes(Road):
     ring: float | None = None
     ends: tuple[End, ...] = ()
     handed: Literal["left", "right"] = "left"
+    duration: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ends", tuple(self.ends))
@@ -84,6 +86,8 @@ class Lanes(Road):
         for name, size in (("length", self.length), ("ring", self.ring)):
             if size is not None and not 0.0 < size < ENDLESS:
                 raise ValueError(f"Lanes: {name} = {size:g} m must lie between 0 and {ENDLESS:g} m.")
+        if not 0.0 <= self.duration < ENDLESS:
+            raise ValueError(f"Lanes: duration = {self.duration:g} s must be a number of at least 0.")
         if self.handed not in ("left", "right"):
             raise ValueError(f"Lanes: handed = {self.handed!r} must be 'left' or 'right'.")
         if self.ring is not None and self.ends:
@@ -186,7 +190,8 @@ class Lanes(Road):
         """Return the road as it is in this state; ValueError for a state without links."""
         if state.links is None:
             raise ValueError("this state has no links. Make it with simulator.state(…, lane=…).")
-        return Linked(self, state.links, state.position)
+        shadow = None if state.moving is None else state.moving.shadow
+        return Linked(self, state.links, state.position, shadow, state.length)
 
     def ahead(self, x: Tensor) -> Tensor:
         """Raise TypeError: who leads whom is known in a state only."""

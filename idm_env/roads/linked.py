@@ -10,7 +10,7 @@ from torch import Tensor
 
 from idm_env.roads.beside import Preference, Side, Sideways
 from idm_env.roads.order import Order, laps
-from idm_env.types import FAR, Links, State
+from idm_env.types import FAR, Links, Moving, Neighbour, State
 
 if TYPE_CHECKING:
     from idm_env.roads.lanes import Lanes
@@ -30,6 +30,17 @@ class Claim(NamedTuple):
     follower: Tensor
     judged: Tensor
     signals: Tensor
+
+
+def _step(state: State) -> Tensor:
+    return state.step if state.step.dim() == 0 else state.step.unsqueeze(-1)
+
+
+def standing(state: State) -> Moving:
+    """Return the changes of vehicles of which none is changing lanes."""
+    assert state.links is not None
+    own = torch.arange(state.speed.shape[-1], device=state.speed.device).expand_as(state.links.lane)
+    return Moving(state.links.lane, torch.full_like(own, torch.iinfo(own.dtype).min), own)
 
 
 def without_absent(links: Links, present: Tensor | None) -> Links:
@@ -75,11 +86,13 @@ class _Look(torch.autograd.Function):
 
 @dataclass(frozen=True, eq=False)
 class Linked(Sideways):
-    """Lanes as they are in one state: neighbours by its links, ends of lanes merged into the leader."""
+    """Lanes as they are in one state: neighbours by its links; ends of lanes and who is leaving merged into leaders."""
 
     road: Lanes
     links_now: Links
     position: Tensor
+    shadow: Tensor | None = None
+    length: Tensor | None = None
 
     def _look(self, x: Tensor, to: Tensor, fro: Tensor) -> Tensor:
         if x.shape != to.shape:
@@ -141,6 +154,82 @@ class Linked(Sideways):
         if present is None or not self.road.leaving:
             return present
         return present * (position < self.road.left_at(self.links_now.lane, position)).to(present.dtype)
+
+    # -- who is still leaving a lane ------------------------------------------------------------------------------
+
+    def leader(self, gap: Tensor, speed: Tensor, accel: Tensor, present: Tensor) -> Neighbour:
+        """Return the leader, the end of the lane or whoever is still leaving it: which is nearest."""
+        found = super().leader(gap, speed, accel, present)
+        if self.shadow is None:
+            return found
+        way = self._to_shadow()
+        first = way < found.gap
+        return Neighbour(
+            torch.where(first, way, found.gap),
+            torch.where(first, self.at(speed, self.shadow), found.speed),
+            torch.where(first, self.at(accel, self.shadow), found.accel),
+            torch.where(first, 1.0, found.present),
+        )
+
+    def second_leader(self, leader: Neighbour, length: Tensor, speed: Tensor) -> Neighbour:
+        """Return the leader's leader; beyond somebody who is leaving nobody is seen."""
+        second = super().second_leader(leader, length, speed)
+        if self.shadow is None:
+            return second
+        beyond = self._to_shadow() <= leader.gap
+        return Neighbour(
+            torch.where(beyond, FAR, second.gap),
+            torch.where(beyond, speed, second.speed),
+            torch.where(beyond, 0.0, second.accel),
+            torch.where(beyond, 0.0, second.present),
+        )
+
+    def _to_shadow(self) -> Tensor:
+        assert self.shadow is not None and self.length is not None
+        return self.to_slot(self.position, self.length, self.shadow)
+
+    def to_slot(self, position: Tensor, length: Tensor, slot: Tensor) -> Tensor:
+        """Return the gap to the vehicle of a slot, less than a lap ahead (m); FAR for one's own."""
+        gap = self.at(position, slot) - self.at(length, slot) - position
+        if self.road.ring is not None:
+            gap = gap + laps(position, slot, self.road.ring)
+        return torch.where(slot == torch.arange(slot.shape[-1], device=slot.device), FAR, gap)
+
+    def _leaving(self, state: State) -> Order:
+        """Return those who are still leaving a lane, in order."""
+        assert state.moving is not None
+        there = state.moving.until > _step(state)
+        if state.present is not None:
+            there = there & (state.present > 0)
+        origin, position = state.moving.origin, state.position
+        return Order.of(position, origin, there.to(position.dtype), self.road.count, self.road.ring)
+
+    def with_leaving(self, state: State, sides: tuple[Side, Side]) -> tuple[Side, Side]:
+        """Return the lanes beside with those who are still leaving them, wherever they are nearer."""
+        order, found = self._leaving(state), []
+        for side, step in zip(sides, (1, -1), strict=True):
+            a = order.around(self.to(step), state.position)
+            other = self.look(
+                state, side.exists, a.leader, a.follower, a.led, a.followed, a.to_leader, a.to_follower, side.ends
+            )
+            ahead, behind = other.gap < side.gap, other.back_gap < side.back_gap
+            found.append(side._replace(
+                leader=torch.where(ahead, other.leader, side.leader), led=side.led | ahead,
+                follower=torch.where(behind, other.follower, side.follower), followed=side.followed | behind,
+                gap=torch.where(ahead, other.gap, side.gap),
+                back_gap=torch.where(behind, other.back_gap, side.back_gap),
+            ))  # fmt: skip
+        return found[0], found[1]
+
+    def on_the_way(self, before: State, after: State, claim: Claim, steps: int) -> State:
+        """Return the state after a decision in which those who were granted a change take some steps for it."""
+        assert before.links is not None and after.links is not None
+        moving = before.moving or standing(before)
+        until = torch.where(claim.granted, _step(before) + steps, moving.until)
+        moving = Moving(torch.where(claim.granted, before.links.lane, moving.origin), until, moving.shadow)
+        lane, after = after.links.lane, after._replace(moving=moving)
+        around = self._leaving(after).around(lane, after.position)
+        return after._replace(moving=moving._replace(shadow=around.leader))
 
     # -- changes -------------------------------------------------------------------------------------------------
 
@@ -222,14 +311,6 @@ class Linked(Sideways):
         count = own.shape[-1]
         first = torch.full_like(own, count).scatter_reduce(-1, asked, torch.where(nearest, own, count), "amin")
         return torch.where((first < count) & ~claim.granted, first, own)
-
-    def to_merger(self, state: State, merger: Tensor) -> Tensor:
-        """Return the gap to whoever signals (m), FAR for nobody; negative where he is beside."""
-        own = torch.arange(merger.shape[-1], device=merger.device)
-        gap = self.at(state.position, merger) - self.at(state.length, merger) - state.position
-        if self.road.ring is not None:
-            gap = gap + laps(state.position, merger, self.road.ring)
-        return torch.where(merger == own, FAR, gap)
 
     def changed(self, state: State, claim: Claim) -> State:
         """Return the state after the granted changes: new links, and gaps measured where somebody has a new leader."""

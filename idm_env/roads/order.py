@@ -42,9 +42,7 @@ class Order(NamedTuple):
         """Return the order of vehicles at these positions (m), unwrapped on a ring."""
         place = places(position, ring)
         if present is not None:
-            there = present.expand_as(place) > 0
-            lane = torch.where(there, lane, count)
-            place = torch.where(there, place, place.amin(-1, keepdim=True))
+            lane = torch.where(present.expand_as(place) > 0, lane, count)
         if ring is None:
             place = place - place.amin(-1, keepdim=True)
         width = place.amax(-1, keepdim=True) + 1.0

@@ -182,6 +182,8 @@ def test_compiled_decisions_are_pathwise(how: Decisions) -> None:
     why = dispatch.refusal(simulator, state, {}, params)
     assert why == (None if how == "pathwise" else f"decisions = '{how}': compiled decisions are pathwise")
     assert dispatch.refusal(simulator.without("mobil"), state, {}, params) is None
+    timed = Simulator(Lanes(2, duration=2.0), simulator.effects)
+    assert dispatch.refusal(timed, state, {}, params) == "compiled changes take no time, and Lanes has a duration"
 
 
 def test_vehicles_that_have_passed_through_each_other_take_the_torch_path() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from idm_env import population
 from idm_env.changes import beside
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
 from idm_env.roads import Lane, Lanes, lane_drop, off_ramp, on_ramp
@@ -297,9 +300,10 @@ def test_courtesy_opens_a_gap_for_whoever_signals() -> None:
         assert (int(state.links.changed[0]), int(state.links.follower[0])) == ((1, 4) if weight else (0, 0))
 
 
-def test_gradients_with_choices_frozen_are_exact() -> None:
+@pytest.mark.parametrize("duration", [0.0, 2.0])
+def test_gradients_with_choices_frozen_are_exact(duration: float) -> None:
     """Finite differences that flip no choice agree with back-propagation through changes, ends of lanes included."""
-    road, courtesy = Lanes(3, ends=(lane_drop(2, at=330.0),)), make("courtesy")
+    road, courtesy = Lanes(3, ends=(lane_drop(2, at=330.0),), duration=duration), make("courtesy")
     simulator, state, params = mixed(road, 8, 200.0, batch=1, seed=5, effects=(courtesy, Mobil(), MandatoryChange()))
     assert state.links is not None
     lane = state.links.lane
@@ -312,3 +316,85 @@ def test_gradients_with_choices_frozen_are_exact() -> None:
 
     leaves = state.position, state.speed, torch.full((1, 8), 1.4, dtype=DTYPE)
     assert torch.autograd.gradcheck(run, [x.clone().requires_grad_() for x in leaves], eps=1e-6, atol=1e-5)
+
+
+def shadows(state: State, simulator: Simulator) -> Tensor:
+    """Return everybody's gap to whoever is still leaving his lane (m)."""
+    assert state.moving is not None
+    view = simulator.road.view(state)
+    return view.to_slot(state.position, state.length, state.moving.shadow)  # type: ignore[attr-defined, no-any-return]
+
+
+@pytest.mark.parametrize("road", sorted(ROADS))
+def test_whoever_takes_time_to_change_is_a_leader_in_both_lanes(road: str) -> None:
+    """Nobody runs into him on either lane; he decides nothing meanwhile; links stay inverse."""
+    timed = dataclasses.replace(ROADS[road](3), duration=3.0)
+    simulator, state, params = mixed(timed, 40, 580.0, seed=4, effects=(Mobil(), MandatoryChange()))
+    own, met = torch.arange(40).expand_as(state.speed), 0
+    last = torch.full_like(own, -1000)
+    for step in range(200):
+        before, state = state, simulator.step(state, {}, params)
+        links, was = state.links, before.links
+        assert links is not None and was is not None and state.moving is not None
+        went = links.changed > was.changed
+        assert (step - last[went] >= 30).all()
+        last = torch.where(went, step, last)
+        there = torch.ones_like(went) if state.present is None else state.present > 0
+        assert (state.gap[there] > 0).all() and (shadows(state, simulator)[there] > 0).all()
+        met += int((shadows(state, simulator)[there] < 100.0).sum())
+        back = links.follower.gather(-1, links.leader)
+        assert ((back == own) | (links.leader == own)).all()
+    assert (last >= 0).sum() > 10 and met > 50
+
+
+def test_a_change_that_takes_time_holds_the_old_follower_until_it_is_done() -> None:
+    """Two seconds as if he were there; then free, as at once where a change is at a point."""
+    kept, position = {}, torch.tensor([60.0, 30.0], dtype=DTYPE)
+    for duration in (0.0, 2.0):
+        simulator = Simulator(Lanes(2, duration=duration), (IDM(), LaneCommand(), Brakes()))
+        params = simulator.defaults(dtype=DTYPE)
+        state = simulator.state(position, torch.full_like(position, 15.0), params, lane=0)
+        command = torch.tensor([[1.0, 0.0]] + 39 * [[0.0, 0.0]], dtype=DTYPE)
+        end, kept[duration] = simulator.rollout(state, {"lane_command": command}, params, 40)
+        assert end.links is not None and end.links.lane.tolist() == [1, 0]
+    follows = simulator.without("lane_command")
+    _, behind = follows.rollout(
+        follows.state(position, torch.full_like(position, 15.0), params, lane=0), {}, params, 20
+    )
+    torch.testing.assert_close(kept[2.0].accel[:20, 1], behind.accel[:, 1])
+    assert (kept[2.0].accel[:20, 1] < kept[0.0].accel[:20, 1] - 0.1).all()
+    assert (kept[2.0].accel[21:, 1] > 0.9).all()
+
+
+def test_timed_changes_on_mirrored_roads_and_with_trips() -> None:
+    """Mirrored to the last bit; everybody who is due is inside, left or queued, and enters behind nobody's back."""
+    simulator, state, params = mixed(Lanes(4, ring=600.0, duration=2.0), 40, 580.0)
+    mirror = Simulator(Lanes(4, ring=600.0, handed="right", duration=2.0), simulator.effects)
+    assert state.links is not None
+    start = mirror.state(state.position, state.speed, params, lane=3 - state.links.lane)
+    one, _ = simulator.rollout(state, {}, params, 150)
+    two, _ = mirror.rollout(start, {}, params, 150)
+    assert one.links is not None and two.links is not None and one.links.changed.sum() > 20
+    assert torch.equal(one.links.lane, 3 - two.links.lane) and torch.equal(one.position, two.position)
+    road = Lanes(2, length=400.0, ends=(lane_drop(1, at=250.0),), duration=3.0)
+    simulator = Simulator(road, (IDM(), Mobil(), MandatoryChange(), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    params["idm"]["desired_speed"] = 12.0 + 20.0 * torch.rand(16, generator=torch.Generator().manual_seed(1)).double()
+    given = population.trips({0: 900.0, 1: 900.0}, 3600.0, slots=16, dtype=DTYPE)
+    state = population.waiting(simulator, given, params)
+    for _ in range(600):
+        state = simulator.step(state, {}, params)
+        found = population.counts(simulator, state)
+        assert found.due == found.inside + found.left + found.queued and state.present is not None
+        if state.moving is not None:
+            there = state.present > 0
+            assert (state.gap[there] > 0).all() and (shadows(state, simulator)[there] > 0).all()
+    assert found.left > 5 and state.links is not None and state.links.changed.sum() > 5
+
+
+def test_durations_that_cannot_be_are_one_line() -> None:
+    """Below 0, or with choices that are shared."""
+    with pytest.raises(ValueError, match="duration = -1 s must be a number of at least 0"):
+        Lanes(2, duration=-1.0)
+    with pytest.raises(ValueError, match="'soft' knows changes at a point only"):
+        Simulator(Lanes(2, duration=1.0), (IDM(), Mobil()), decisions="soft")
