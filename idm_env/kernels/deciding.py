@@ -141,12 +141,13 @@ class Traffic:
         plan, places, held = self._plan(found, state, inputs, params)
         fresh = np.zeros(self.rows * self.n, np.uint8)
         sees = self.simulator.sees_mergers
+        turns = turn.numpy() if self.simulator.decides_in_blocks else np.empty(0, np.bool_)
         merger = np.tile(np.arange(self.n), self.rows if sees else 0)
         tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], kind)
         done = decision_loops.decide(
             self._links, dense(state.position, self.shape), *self._present(state), self.rows, self.n,
             self.road.count, self._ring, self.road.handed == "left", tables, plan, places, phase, constants,
-            len(found.slots), fresh, merger, turn.numpy(),
+            len(found.slots), fresh, merger, turns,
         )  # fmt: skip
         del held
         if not done:

@@ -201,15 +201,15 @@ def relink(order, begin, count, ring, base, lane, leader, follower, fresh):
 
 @exact
 def settle(w, results, at, m, own_lane, left, right, begin, ring, left_hand, base, order, winner, utility, to_left,
-           signals, refused, blocked, turn):  # fmt: skip
+           looks, signals, refused, blocked, turn):  # fmt: skip
     """Grant the best claim on each gap so far, and count the others; return whether there was any."""
     some = False
     for j in range(m):
         r = at + j
-        signals[r] = 0
-        if not turn[order[r]]:
+        if looks:
+            signals[r] = w[results + 4 * ROW + j]
+        if len(turn) and not turn[order[r]]:
             continue
-        signals[r] = w[results + 4 * ROW + j]
         if w[results + 3 * ROW + j] > 0:
             blocked[base + order[r]] += 1
         if not w[results + 2 * ROW + j] > 0:
@@ -284,7 +284,7 @@ def decide(
 
     ``plan`` says what the ``slots`` rows of the printed ``phase`` are filled with, ``places`` whose. ``merger`` (rows ·
     n own slots, or empty if nobody looks) gets who signals beside everybody; those slots decide whose ``turn``
-    it is. Returns False, with some rows decided, where links are not the order of positions.
+    it is (empty: all). Returns False, with some rows decided, where links are not the order of positions.
     """
     lane, leader, follower, changed, refused, blocked, unjudged = links
     w, which = workspace((slots + RESULTS) * ROW, k), np.empty(len(places) * CHUNK, np.int64)
@@ -305,7 +305,7 @@ def decide(
         for own in range(count):
             for at in range(begin[own], begin[own + 1], CHUNK):
                 m = min(CHUNK, begin[own + 1] - at)
-                if not any_of(turn, order, at, m):
+                if len(turn) and not any_of(turn, order, at, m):
                     continue
                 fill_rows(
                     w, slots, plan, places, which, at, m, own, begin, count, place, order, left, right, position,
@@ -314,7 +314,7 @@ def decide(
                 call(phase, w, padded(m), k)  # type: ignore[call-arg]
                 some |= settle(
                     w, slots * ROW, at, m, own, left, right, begin, ring, left_hand, base, order, winner, utility,
-                    to_left, signals, refused, blocked, turn,
+                    to_left, len(merger) > 0, signals, refused, blocked, turn,
                 )  # fmt: skip
         granted[:] = False
         for r in winner:

@@ -87,7 +87,9 @@ class Wishes:
             left, right = (view.side(name, state) for name in SIDES)
             scene = beside(stepping, view, (left, right), state, inputs, given)  # type: ignore[arg-type]
             found = preferred(left, right, wished(stepping, scene, given), road.handed == "left")  # type: ignore[arg-type]
-            self.outputs: tuple[Node, ...] = tuple(value_of(graph, x) for x in found)
+            # Who signals is asked for only where somebody looks.
+            told = found if simulator.sees_mergers else found[:-1]
+            self.outputs: tuple[Node, ...] = tuple(value_of(graph, x) for x in told)
         except Untraceable:
             raise
         except Exception as error:  # as in ``record``
@@ -95,14 +97,14 @@ class Wishes:
                 f"effect '{graph.note}' does what cannot be recorded: {' '.join(str(error).split())}"
             ) from error
         self.slots: tuple[Slot, ...] = tuple(inputs_of(self.outputs))
-        self.rows = len(self.slots) + len(Preference._fields)
+        self.rows = len(self.slots) + len(self.outputs)
         self.constants = Constants()
 
     def text(self) -> str:
         """Return rows and the one phase as text; constants are complete afterwards."""
         at = {slot: f"{i} * ROW" for i, slot in enumerate(self.slots)}
         names = {slot: row(slot) for slot in self.slots}
-        results = [f"BEST_{name.upper()}" for name in Preference._fields]
+        results = [f"BEST_{name.upper()}" for name in Preference._fields[: len(self.outputs)]]
         lines = [f"{names[slot]} = {place}" for slot, place in at.items()]
         lines += [f"{name} = {len(at) + i} * ROW" for i, name in enumerate(results)]
         writes = [Write(f"w[{name} + j]", node) for name, node in zip(results, self.outputs, strict=True)]
