@@ -12,8 +12,8 @@ over all scenes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from idm_env.effects import IDM, Brakes, MandatoryChange, Mobil
 from idm_env.progress import OnProgress
 from idm_env.roads import Lanes, lane_drop
 from idm_env.simulator import Simulator
+from idm_env.types import State
 
 NAMES = (
     ("idm", "time_gap"), ("idm", "max_accel"), ("idm", "desired_speed"), ("mobil", "politeness"),
@@ -30,7 +31,6 @@ NAMES = (
 )  # fmt: skip
 EACH, LANES, STEPS, DT = 8, 3, 50, 0.2
 ROADS = {"ring": Lanes(LANES, ring=130.0), "drop": Lanes(LANES, ends=(lane_drop(2, at=160.0),))}
-Objective = Callable[[Tensor], Tensor]
 Params = dict[str, dict[str, Tensor]]
 
 
@@ -40,60 +40,65 @@ def simulator_of(kind: str, how: Decisions = "pathwise", temperature: float = 0.
     return Simulator(ROADS[kind], own, dt=DT, decisions=how, temperature=temperature)
 
 
-def begun(kind: str, scene: int, draws: int, at: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return position, speed and lane of one scene in every draw from ``at`` on, and its drivers' desired speeds."""
-    generator = torch.Generator().manual_seed(1000 * scene + len(kind))
+def begun(kind: str, scenes: Sequence[int], draws: int, at: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return position, speed, lane and desired speed of scenes ``(scenes, draws, vehicles)``, draws from ``at`` on."""
+    found = []
+    for scene in scenes:
+        generator = torch.Generator().manual_seed(1000 * scene + len(kind))
+        place = torch.randperm(EACH, generator=generator) + 0.5 * torch.rand(EACH, generator=generator)
+        lane = torch.cat((torch.arange(LANES), torch.randint(LANES, (EACH - LANES,), generator=generator)))
+        pace, wish = (
+            6.0 + 6.0 * torch.rand(EACH, generator=generator),
+            12.0 + 18.0 * torch.rand(EACH, generator=generator),
+        )
+        more = torch.Generator().manual_seed(7_000_003 * scene + at)
+        shift = 3.0 * torch.rand((draws, EACH), generator=more)
+        found.append((15.0 * place + shift, pace.expand(draws, EACH), lane.expand(draws, EACH), wish.expand(1, EACH)))
+    position, pace, lane, wish = (torch.stack(column) for column in zip(*found, strict=True))
+    return position.double(), pace.double(), lane, wish.double()
 
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(shape, generator=generator, dtype=torch.float64)
 
-    index = torch.arange(EACH)
-    place = 15.0 * (torch.randperm(EACH, generator=generator) + 0.5 * rand(EACH))
-    lane = torch.where(index < 3, index, torch.randint(LANES, (EACH,), generator=generator))
-    wish, pace = 12.0 + 18.0 * rand(EACH), 6.0 + 6.0 * rand(EACH)
-    more = torch.Generator().manual_seed(7_000_003 * scene + at)
-    shift = 3.0 * torch.rand((draws, EACH), generator=more, dtype=torch.float64)
-    return place + shift, pace.expand(draws, EACH), lane.expand(draws, EACH), wish
+def distances(
+    kind: str, simulator: Simulator, scenes: Sequence[int], draws: int, logs: Tensor, at: int = 0
+) -> tuple[State, Tensor]:
+    """Return the state at the end, and how far vehicles came on average (m), ``(scenes, draws)``.
 
-
-def distances(kind: str, simulator: Simulator, scene: int, draws: int, logs: Tensor, at: int = 0) -> tuple[Any, Tensor]:
-    """Return the state at the end of one scene in every draw, and how far vehicles came on average (m)."""
-    position, pace, lane, wish = begun(kind, scene, draws, at)
+    ``logs`` ``(scenes, parameters)`` are logarithms of factors of the parameters.
+    """
+    position, pace, lane, wish = begun(kind, scenes, draws, at)
     params: Params = simulator.defaults(dtype=torch.float64)
     params["idm"] = {**params["idm"], "desired_speed": wish, "time_gap": torch.tensor(1.2, dtype=torch.float64)}
-    for (effect, name), log in zip(NAMES, logs, strict=True):
-        params[effect] = {**params[effect], name: params[effect][name] * log.exp()}
+    for i, (effect, name) in enumerate(NAMES):
+        params[effect] = {**params[effect], name: params[effect][name] * logs[:, i, None, None].exp()}
     state = simulator.state(position, pace, params, lane=lane)
-    end, _ = simulator.rollout(state, {}, params, STEPS, keep=None, seed=1_000_003 * scene + at)
+    end, _ = simulator.rollout(state, {}, params, STEPS, keep=None, seed=1_000_003 * scenes[0] + at)
     return end, (end.position - position).mean(-1)
 
 
-def slopes(kind: str, simulator: Simulator, scene: int, draws: int) -> Tensor:
-    """Return the gradient of one scene by back-propagation, the mean over draws; with ``score`` its own estimator."""
-    total = torch.zeros(len(NAMES), dtype=torch.float64)
-    block = min(draws, 256)
-    for at in range(0, draws, block):
-        logs = torch.zeros(len(NAMES), dtype=torch.float64, requires_grad=True)
-        end, far = distances(kind, simulator, scene, block, logs, at)
-        loss = far.mean()
-        if simulator.decisions == "score":
-            # Everybody else's mean is a baseline that one's own choices do not change.
-            other = (far.detach().sum() - far.detach()) / (block - 1)
-            loss = loss + ((far.detach() - other) * end.choices.log_probability.sum(-1)).mean()
-        total += torch.autograd.grad(loss, logs)[0] * (block / draws)
-    return total
+def slopes(kind: str, simulator: Simulator, scenes: Sequence[int], draws: int, at: int = 0) -> Tensor:
+    """Return the gradient of each scene by back-propagation, the mean over draws; with ``score`` its own estimator."""
+    logs = torch.zeros((len(scenes), len(NAMES)), dtype=torch.float64, requires_grad=True)
+    end, far = distances(kind, simulator, scenes, draws, logs, at)
+    if simulator.decisions == "score":
+        assert end.choices is not None
+        # Everybody else's mean is a baseline that one's own choices do not change.
+        other = (far.detach().sum(-1, keepdim=True) - far.detach()) / (draws - 1)
+        far = far + (far.detach() - other) * end.choices.log_probability.sum(-1)
+    return torch.autograd.grad(far.mean(-1).sum(), logs)[0]
 
 
-def differences(kind: str, simulator: Simulator, scene: int, draws: int, step: float = 0.02, at: int = 0) -> Tensor:
-    """Return central differences of one scene's objective, with the same draws on both sides."""
+def differences(
+    kind: str, simulator: Simulator, scenes: Sequence[int], draws: int, at: int = 0, step: float = 0.02
+) -> Tensor:
+    """Return central differences of each scene's objective, with the same draws on both sides."""
     found = []
     with torch.no_grad():
         for i in range(len(NAMES)):
-            aside = torch.zeros(len(NAMES), dtype=torch.float64)
-            aside[i] = step
-            up, down = (distances(kind, simulator, scene, draws, way * aside, at)[1].mean() for way in (1, -1))
+            aside = torch.zeros((len(scenes), len(NAMES)), dtype=torch.float64)
+            aside[:, i] = step
+            up, down = (distances(kind, simulator, scenes, draws, way * aside, at)[1].mean(-1) for way in (1, -1))
             found.append((up - down) / (2 * step))
-    return torch.stack(found)
+    return torch.stack(found, -1)
 
 
 def beside(found: Tensor, expected: Tensor) -> str:
@@ -124,41 +129,38 @@ ESTIMATORS: tuple[tuple[Decisions, float, int], ...] = (
 )  # fmt: skip
 """How choices are made, at which temperature (m/s²), and how many draws of each scene."""
 
+ROWS = {"pathwise": 8192, "surrogate": 160, "soft": 160, "score": 2048}
+"""Worlds that are driven at once: what a graph of theirs takes is about a gigabyte."""
+
 
 def table(scenes: int, on_progress: OnProgress, draws: int = 1024) -> None:
-    """Print all estimators beside differences of hard choices; those that draw or share beside their own, too."""
-    cases = [(kind, i) for i in range((scenes + 1) // 2) for kind in ROADS][:scenes]
+    """Print all estimators beside differences of hard choices, and those that draw beside their own, too."""
+    cases = {kind: range(i, scenes, len(ROADS)) for i, kind in enumerate(ROADS)}
 
-    def over(what: str, one: Callable[[str, int], Tensor]) -> Tensor:
-        found = []
-        for done, (kind, i) in enumerate(cases):
-            on_progress(what, done, len(cases))
-            found.append(one(kind, i))
-        return torch.stack(found)
+    def over(what: str, how: Decisions, tau: float, many: int, one: Callable[..., Tensor]) -> Tensor:
+        found, each, done = [], max(1, ROWS[how] // many), 0
+        for kind, numbers in cases.items():
+            for first in range(0, len(numbers), each):
+                on_progress(what, done, scenes)
+                some = numbers[first : first + each]
+                found.append(one(kind, simulator_of(kind, how, tau), some, many))
+                done += len(some)
+        return torch.cat(found)
 
-    def hard(at: int) -> Tensor:
-        return over("differences", lambda kind, i: differences(kind, simulator_of(kind), i, draws, at=at))
-
-    expected, again = hard(0), hard(1)
+    expected = over("differences", "pathwise", 0.1, draws, differences)
+    again = over("other draws", "pathwise", 0.1, draws, partial(differences, at=1))
     head = "cosine (quartiles), ratio (quartiles), both of the mean over (n) scenes"
-    print(f"all parameters, then MOBIL's: {head}; CPU seconds per scene and draw")
+    print(f"all parameters, then MOBIL's: {head}; CPU ms per scene and draw")
     print(f"{'differences, other draws':30s}{beside(again, expected)}", flush=True)
-    for how, temperature, many in ESTIMATORS:
-        label = how if how == "pathwise" else f"{how}, τ {temperature:g}"
-
-        def slope(kind: str, i: int, how: Decisions = how, tau: float = temperature, many: int = many) -> Tensor:
-            return slopes(kind, simulator_of(kind, how, tau), i, many)
-
+    for how, tau, many in ESTIMATORS:
+        label = how if how == "pathwise" else f"{how}, τ {tau:g}"
         begin = time.process_time()
-        found = over(label, slope)
-        each = (time.process_time() - begin) / len(cases) / many
-        print(f"{label:30s}{beside(found, expected)} {each:8.1g}", flush=True)
+        found = over(label, how, tau, many, slopes)
+        each = 1000.0 * (time.process_time() - begin) / scenes / many
+        print(f"{label:30s}{beside(found, expected)} {each:8.2g}", flush=True)
         if how == "score":
-
-            def own(kind: str, i: int, how: Decisions = how, tau: float = temperature, many: int = many) -> Tensor:
-                return differences(kind, simulator_of(kind, how, tau), i, 2 * many, step=0.05)
-
-            print(f"{'  beside its own differences':30s}{beside(found, over('own differences', own))}", flush=True)
+            own = over("its own differences", how, tau, many, partial(differences, at=1, step=0.05))
+            print(f"{'  beside its own differences':30s}{beside(found, own)}", flush=True)
 
 
 __all__ = ["differences", "distances", "simulator_of", "slopes", "table"]
