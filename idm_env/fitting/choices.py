@@ -116,7 +116,7 @@ class Wishes(Choice):
             effect, parameter = name.split(".")
             params[effect][parameter] = value
         wish = wished(self.simulator, decisions.scene, params)
-        utility, margin = torch.stack(wish[:2], -1), torch.stack(wish[2:], -1)
+        utility, margin = torch.stack(wish[:2], -1), torch.stack(wish[2:4], -1)
         return utility / theta[-3] + torch.nn.functional.logsigmoid(margin / theta[-3])
 
     def log_probabilities(self, theta: Tensor, decisions: Decisions) -> Tensor:
