@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
@@ -70,10 +71,10 @@ def prepared(items: list[Event], last: int) -> list[Episode]:
     return [by_name[e.name] for e in items]
 
 
-def calibrated(items: list[Episode], last: int) -> np.ndarray:
+def calibrated(items: list[Episode], last: int, prior_idm: Sequence[float]) -> np.ndarray:
     """Return log θ [pairs, 5] of every driver, fitted to the history up to step ``last`` with a prior."""
     known = [e.part(0, last + 1) for e in items]
-    usual = dict(zip(NAMES, IDM_S, strict=True))
+    usual = dict(zip(NAMES, prior_idm, strict=True))
     centre = torch.tensor([max(usual[name.removeprefix("idm.")], LEAST) for name in IDM_NAMES]).double()
     prior = Prior(centre.expand(len(known), -1), torch.full((len(known), len(centre)), SPREAD).double(), ALIKE_M)
     own = fit(known, by="driver", loss="mse", starts=1, iterations=25, substeps=1, prior=prior)
@@ -82,11 +83,15 @@ def calibrated(items: list[Episode], last: int) -> np.ndarray:
 
 
 def forecasts(
-    items: list[Event], last: int, most: int | None = None, count: int = DRAWS
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return positions and speeds [samples, steps] of every follower after step ``last``, ``most`` steps at most."""
+    items: list[Event], last: int, most: int | None = None, count: int = DRAWS, *,
+    prior_idm: Sequence[float] = IDM_S, few: bool = True,
+) -> list[tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+    """Return positions and speeds [samples, steps] of every follower after step ``last``, ``most`` steps at most.
+
+    ``few`` picks ``SAMPLES`` of ``count`` draws.
+    """
     found = prepared(items, last)
-    theta = calibrated(found, last)
+    theta = calibrated(found, last, prior_idm)
     batch = Batch.of([e.part(0, last + 1) for e in found], substeps=1)
     drivers = Drivers(behind_a_record(DT, Wander(), Noise()), batch, batch, IDM_NAMES)
     settings = Settings(
@@ -103,7 +108,7 @@ def forecasts(
         steps = min(len(e.leader) - last - 1, longest)
         position = e.leader[last + 1 : last + 1 + steps] - gap[:steps, :, r].T
         result.append((position, speed[:steps, :, r].T))
-    return [_few(*one) for one in result]
+    return [_few(*one) for one in result] if few else result
 
 
 def _few(position: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
