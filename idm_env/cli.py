@@ -513,7 +513,8 @@ def plot(
 ) -> None:
     """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
 
-    One panel per run and lane; controlled vehicles (of a rollout, or a column "controlled") are underlined in blue.
+    One panel per run and lane, of a rollout the left lane first; controlled vehicles (of a rollout, or a column
+    "controlled") are underlined in blue.
     """
     from idm_env.report import account
 
@@ -530,7 +531,7 @@ def plot(
         from idm_env import diagrams, fonts
 
         if source.suffix in (".yaml", ".yml"):
-            drawn = [_rollout_panel(source, seconds, seed, report)]
+            drawn = _rollout_panels(source, seconds, seed, report)
         else:
             from idm_env.data import load
 
@@ -561,13 +562,14 @@ def plot(
         console.print(f"Picture: [bold]{path.resolve()}[/bold]", soft_wrap=True)
 
 
-def _rollout_panel(config: Path, seconds: float, seed: int, report: OnProgress) -> Any:
+def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress) -> list[Any]:
+    """Return the panel of a rollout, or one for each of several lanes."""
     import torch
 
     from idm_env.config import load_environment
-    from idm_env.diagrams import rollout_panel
+    from idm_env.diagrams import lane_panels, rollout_panel
     from idm_env.envs.gym import DiffIDMEnv
-    from idm_env.roads import Ring
+    from idm_env.roads import Lanes, Ring
     from idm_env.simulator import Trajectory
 
     _work_begins()
@@ -575,19 +577,26 @@ def _rollout_panel(config: Path, seconds: float, seed: int, report: OnProgress) 
     env: Any = DiffIDMEnv(**{**load_environment(config), "max_episode_steps": -1})
     env.reset(seed=seed)
     dt = env.task.simulator.dt
-    kept = []
+    kept, lanes, there = [], [], []
     steps = max(1, round(seconds / dt))
     for step in range(steps):
         _, _, terminated, truncated, _ = env.step(None)
         state = env.batch.world.state
         kept.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
+        if state.links is not None:
+            lanes.append(state.links.lane[0])
+            there.append(torch.ones_like(state.speed[0]) if state.present is None else state.present[0])
         report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
         if terminated or truncated:
             break
     # On a ring gaps and lengths add up to the circumference.
     length = float((state.gap[0] + state.length[0]).sum()) if isinstance(env.task.simulator.road, Ring) else None
     states = Trajectory(*(torch.stack(column) for column in zip(*kept, strict=True)))
-    return rollout_panel(states, dt=dt, ring_length=length, marked=env.task.agents)
+    road = env.task.simulator.road
+    if isinstance(road, Lanes):
+        lane, present = torch.stack(lanes), torch.stack(there)
+        return lane_panels(states, lane, present, dt=dt, ring_length=road.ring, marked=env.task.agents)
+    return [rollout_panel(states, dt=dt, ring_length=length, marked=env.task.agents)]
 
 
 Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]

@@ -106,6 +106,36 @@ def rollout_panel(
     return Panel(f"{len(lines)} vehicles", tuple(lines), ring_length)
 
 
+def lane_panels(
+    data: Any, lane: Any, present: Any, *, dt: float = 0.1, ring_length: float | None = None, marked: Sequence[int] = ()
+) -> list[Panel]:
+    """Return one panel per lane of a rollout on several, the left one first; whoever changes goes on in another panel.
+
+    ``data`` is what a rollout keeps, ``lane`` (0 on the right) and ``present`` (0 or 1) are of the same shape: time
+    first, vehicles last. A slot that makes another trip begins another line.
+    """
+    position, speed = (np.asarray(x.detach().cpu(), float) for x in (data.position, data.speed))
+    lanes, there = np.asarray(lane.detach().cpu()), np.asarray(present.detach().cpu()) > 0
+    time = dt * np.arange(1, len(position) + 1)
+    found: dict[int, list[Line]] = {}
+    for i in range(position.shape[1]):
+        # A piece ends where the lane changes, where nobody is there, and where a slot begins anew.
+        back = np.diff(position[:, i], prepend=position[:1, i]) < -1.0
+        cut = _changes(lanes[:, i]) | _changes(there[:, i]) | back
+        for at in np.split(np.arange(len(time)), np.flatnonzero(cut)[1:]):
+            if there[at[0], i]:
+                # One sample more, so that a change leaves no hole.
+                more = at if at[-1] + 1 == len(time) or back[at[-1] + 1] else np.append(at, at[-1] + 1)
+                more = more[there[more, i]]
+                line = Line(str(i), time[more], position[more, i], speed[more, i], i in marked)
+                found.setdefault(int(lanes[at[0], i]), []).append(line)
+    made = []
+    for k in sorted(found, reverse=True):
+        told = f"lane {k}, {len({line.name for line in found[k]})} vehicles"
+        made.append(Panel(told, tuple(found[k]), ring_length))
+    return made
+
+
 def space_time(
     data: Any,
     *,

@@ -26,6 +26,9 @@ _NEAR = 150.0
 _MOST_LANES = 8
 """Lanes beyond these are drawn over the first ones again."""
 _ASPHALT, _GROUND, _INK, _MARK = (70, 74, 82), (244, 243, 238), (30, 32, 36), (30, 90, 220)
+_CHANGE = (250, 250, 250)
+_CHANGE_SHOWN = 1.0
+"""How long an arrow shows that a vehicle has changed lanes (s)."""
 
 
 def colour(speed: float, fastest: float) -> tuple[int, int, int]:
@@ -66,6 +69,8 @@ class Viewer:
         self._fps = fps
         self._window: Any = None
         self._clock: Any = None
+        self._lanes: np.ndarray | None = None
+        self._changes: dict[int, tuple[int, float]] = {}
         self._pygame.font.init()
         self._font = self._pygame.font.Font(None, 22)
 
@@ -85,6 +90,7 @@ class Viewer:
         everybody = np.ones(task.vehicles)
         values["present"] = everybody if state.present is None else state.present[row].detach().cpu().numpy()
         values["lane"] = lane
+        self._watch(task, state, row, lane)
         if isinstance(task.road, Lanes) and task.road.ring is not None:
             _around(task, values, task.road.ring)
         fastest = 10.0 if ring else 30.0
@@ -94,6 +100,15 @@ class Viewer:
             self._display(canvas)
             return None
         return np.transpose(self._pygame.surfarray.array3d(canvas), (1, 0, 2)).copy()
+
+    def _watch(self, task: Task, state: State, row: int, lane: np.ndarray) -> None:
+        """Keep who has changed lanes in the last second, and from where."""
+        now = float(state.step.expand(len(state.speed))[row]) * task.simulator.dt
+        self._changes = {i: (old, at) for i, (old, at) in self._changes.items() if 0.0 <= now - at <= _CHANGE_SHOWN}
+        if self._lanes is not None and len(self._lanes) == len(lane):
+            for i in np.flatnonzero(np.abs(lane - self._lanes) == 1):
+                self._changes[int(i)] = int(self._lanes[i]), now
+        self._lanes = lane.copy()
 
     def _ring(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float) -> None:
         circumference = float((values["gap"] + values["length"]).sum())
@@ -135,6 +150,12 @@ class Viewer:
             length = values["length"][i]
             x = 0.97 * SIZE - (front - values["position"][i] + 0.5 * length) * scale
             y = top + 40 * (int(values["lane"][i]) % lanes)
+            if int(i) in self._changes:
+                # An arrow from the lane that it has left.
+                side = math.copysign(1.0, y - (top + 40 * self._changes[int(i)][0]))
+                self._pygame.draw.line(canvas, _CHANGE, (x, y - 34 * side), (x, y - 8 * side), 3)
+                tip = [(x, y - 7 * side), (x - 5, y - 16 * side), (x + 5, y - 16 * side)]
+                self._pygame.draw.polygon(canvas, _CHANGE, tip)
             self._vehicle(canvas, (x, y), 0.0, length * scale, values["speed"][i], fastest, i in task.agents)
 
     def _vehicle(

@@ -82,17 +82,24 @@ class Traffic:
         self.shape = tuple(state.speed.shape)
         self.n = self.shape[-1]
         self.rows = state.speed.numel() // self.n
-        self._take(state.links)
+        self._given: Links | None = state.links
         self._lasting: _Lasting | None = None
 
     @property
     def links(self) -> Links:
-        """The links as they are now, in memory that decisions change."""
-        return Links(*(torch.from_numpy(x).view(self.shape) for x in self._links))
+        """The links as they are now: those that were given, or after a decision in memory that decisions change."""
+        if self._given is None:
+            self._given = Links(*(torch.from_numpy(x).view(self.shape) for x in self._links))
+        return self._given
+
+    @cached_property
+    def _links(self) -> Array:
+        assert self._given is not None
+        return np.stack([x.expand(self.shape).reshape(-1).numpy() for x in self._given])
 
     def _take(self, links: Links | None) -> None:
-        assert links is not None
-        self._links = np.stack([x.expand(self.shape).reshape(-1).numpy() for x in links])
+        self._given = links
+        self.__dict__.pop("_links", None)
 
     def begin(self, state: State, params: Params) -> State:
         """Return the state after those have left and entered for whom it is time."""
@@ -117,8 +124,9 @@ class Traffic:
         position = dense(state.position, self.shape)
         slots, own = np.empty(self.rows * wide, np.int64), np.empty(self.rows * self.n, np.int64)
         led, leads = (np.empty(self.rows * wide, position.dtype) for _ in range(2))
+        lanes_of, leader, follower = (dense(x, self.shape) for x in self.links[:3])
         if not order_loops.laid(
-            self._links[1], self._links[2], self._links[0], position, *self._present(state), self.rows, self.n,
+            leader, follower, lanes_of, position, *self._present(state), self.rows, self.n,
             self.road.count, self._ring, around, wide, slots, own, led, leads,
         ):  # fmt: skip
             return None
@@ -126,7 +134,7 @@ class Traffic:
         there = there.view(at)
         ends = None
         if self.road.closed:
-            lane = torch.from_numpy(self._links[0]).view(self.shape).gather(-1, there)
+            lane = self.links.lane.expand(self.shape).gather(-1, there)
             ends = self.road.closed_at(lane, state.position)
         return Places(there, torch.from_numpy(own).view(self.shape), first.view(at), last.view(at), ends)
 
@@ -150,6 +158,7 @@ class Traffic:
             len(found.slots), fresh, merger, turns,
         )  # fmt: skip
         del held
+        self._given = None
         if not done:
             return None
         which = torch.from_numpy(np.flatnonzero(fresh))

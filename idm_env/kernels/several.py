@@ -7,9 +7,11 @@ copied back; so values and gradients are those of the kernels, and no loop is wr
 from __future__ import annotations
 
 import dataclasses
+import weakref
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,16 +29,60 @@ if TYPE_CHECKING:
 
 
 def between(simulator: Simulator) -> Simulator:
-    """Return the simulator of the steps between two decisions."""
-    assert isinstance(simulator.road, Lanes)
-    still = tuple(e for e in simulator.effects if e.hook != "change")
-    return dataclasses.replace(simulator, road=Chains(simulator.road.closed), effects=still)
+    """Return the simulator of the steps between two decisions, made once."""
+    found: Simulator | None = simulator.__dict__.get("_between")
+    if found is None:
+        assert isinstance(simulator.road, Lanes)
+        still = tuple(e for e in simulator.effects if e.hook != "change")
+        found = dataclasses.replace(simulator, road=Chains(simulator.road.closed), effects=still)
+        simulator.__dict__["_between"] = found
+    return found
+
+
+class _LaidOut:
+    """Where the vehicles of the last few states lie, so that single steps need not walk lanes that nobody has left.
+
+    Nothing here is kept alive by that; states are known by their tensors of links and presence, which nobody changes.
+    """
+
+    def __init__(self, most: int = 8) -> None:
+        self._kept: dict[int, tuple[tuple[weakref.ref[Tensor] | None, ...], tuple[int, ...], int, Places]] = {}
+        self._most = most
+
+    @staticmethod
+    def _parts(state: State) -> tuple[Tensor | None, ...]:
+        assert state.links is not None
+        return *state.links[:3], state.present
+
+    def of(self, state: State, halo: int) -> Places | None:
+        """Return the places of a state, or None where they are not known."""
+        parts = self._parts(state)
+        kept = self._kept.get(id(parts[1]))
+        if kept is None or kept[2] != halo:
+            return None
+        same = all((ref and ref()) is x for ref, x in zip(kept[0], parts, strict=True))
+        return kept[3] if same and kept[1] == _versions(parts) else None
+
+    def put(self, state: State, halo: int, places: Places) -> None:
+        """Keep the places of a state."""
+        parts = self._parts(state)
+        refs = tuple(None if x is None else weakref.ref(x) for x in parts)
+        while len(self._kept) >= self._most:
+            self._kept.pop(next(iter(self._kept)))
+        self._kept[id(parts[1])] = refs, _versions(parts), halo, places
+
+
+def _versions(parts: tuple[Tensor | None, ...]) -> tuple[int, ...]:
+    return tuple(-1 if x is None else x._version for x in parts)
+
+
+_LAID_OUT = _LaidOut()
 
 
 def kernel_of(simulator: Simulator, state: State, inputs: Inputs) -> TileKernel | str:
     """Return the kernel of the steps between two decisions, or why there is none."""
-    if state.step.numel() > 1 and bool((state.step != state.step.reshape(-1)[0]).any()):
-        return "rows decide at different steps"
+    if state.step.numel() > 1 and state.step.shape != state.speed.shape[:-1]:
+        return "steps are not counted by row"
     inner = between(simulator)
     kept = {name: x for name, x in inputs.items() if name in inner.by_name}
     return tile_kernel(inner, Form.of(state._replace(links=None), kept))
@@ -51,25 +97,38 @@ def rollout(
     own = {name: params[name] for name in inner.by_name}
     stops = bool(simulator.changes) or state.present is not None
     every = simulator.decides_after if stops else max(steps, 1)
-    turns = simulator.turns(state.speed.shape[-1])
-    stages = sorted({0, *turns.tolist()}) if stops else [0]
+    stages = sorted({0, *simulator.turns(state.speed.shape[-1]).tolist()}) if stops else [0]
     block = lanes.BLOCK if road.ring is not None else every
     wishes = decision(simulator, Form.of(state._replace(links=None), inputs)) if simulator.changes else ""
     traffic = Traffic(simulator, state)
     kept: list[tuple[Tensor, ...]] = []
-    done, clock = 0, int(state.step.reshape(-1)[0])
+    first, halo, places = state, 0, None
+    done, clocks = 0, state.step.reshape(-1).numpy()
+    if (clocks == clocks[0]).all():
+        clocks = clocks[:1]
     while done < steps:
-        phase = (clock + done) % every
-        if stops and phase == 0:
-            state = traffic.begin(state, params)
-        if simulator.changes and phase in stages:
-            after = traffic.decide(wishes, state, _cut(inputs, done, None), params, turns == phase)
+        phase = (clocks + done) % every
+        own_turn = np.isin(phase, stages) if stops else np.zeros(len(phase), bool)
+        alike = len(phase) == 1
+        if own_turn.all() and alike:
+            after = _decided(traffic, wishes, state, _cut(inputs, done, None), params, int(phase[0]))
             if after is None:
                 return None
             state = after
-        until = min((stage - phase) % every or every for stage in stages) if stops else steps - done
+        until = min(int(((stage - phase - 1) % every + 1).min()) for stage in stages) if stops else steps - done
         count = min(until, block, steps - done)
-        places = traffic.places(state, tiles.halo(count, kernel.program.reach))
+        halo = tiles.halo(count, kernel.program.reach)
+        # Within a rollout decisions change links in place, so only what comes in is looked up.
+        places = _LAID_OUT.of(state, halo) if state.links is first.links else None
+        for stage in () if alike else np.unique(phase[own_turn]).tolist():
+            which = torch.from_numpy(np.flatnonzero(phase == stage))
+            now = _cut(inputs, done, None)
+            mixed = _some_decided(simulator, wishes, state, now, params, which, stage, halo, places)
+            if mixed is None:
+                return None
+            state, places = mixed
+            traffic = Traffic(simulator, state)
+        places = traffic.places(state, halo) if places is None else places
         if places is None:
             return None
         given = {n: _placed(_cut(x, done, count), places, state, 1) for n, x in inputs.items() if n in inner.by_name}
@@ -81,7 +140,66 @@ def rollout(
             kept.append(tuple(x.gather(-1, places.own.expand(count, *places.own.shape)) for x in some))
         done += count
     state = state._replace(links=traffic.links)
+    if places is not None:
+        _LAID_OUT.put(state, halo, places)
     return state, tuple(torch.cat(column) for column in zip(*kept, strict=True)) if keep else None
+
+
+def _decided(
+    traffic: Traffic, wishes: Any, state: State, inputs: Inputs, params: Params, stage: int
+) -> State | None:
+    """Return the state after all rows have decided, ``stage`` steps into a period; None where links are no order."""
+    simulator = traffic.simulator
+    if stage == 0:
+        state = traffic.begin(state, params)
+    if not simulator.changes:
+        return state
+    return traffic.decide(wishes, state, inputs, params, simulator.turns(state.speed.shape[-1]) == stage)
+
+
+def _some_decided(
+    simulator: Simulator, wishes: Any, state: State, inputs: Inputs, params: Params, which: Tensor, stage: int, halo: int,
+    places: Places | None,
+) -> tuple[State, Places | None] | None:  # fmt: skip
+    """Return the state after some rows (indices) have decided, and where vehicles lie then, if that was known before.
+
+    Rows of a vector whose episodes began at different times decide at different steps. None where links are no order.
+    """
+    rows = len(state.speed)
+    part = _of_rows(state, which, rows)._replace(step=state.step[which])
+    own, given = (_of_rows(dict(x), which, rows) for x in (params, inputs))
+    traffic = Traffic(simulator, part)
+    after = _decided(traffic, wishes, part, given, own, stage)
+    if after is None:
+        return None
+    after = after._replace(links=traffic.links, step=state.step)
+    if places is not None:
+        fresh = traffic.places(after._replace(step=part.step), halo)
+        places = None if fresh is None else _put(places, None, fresh, which, rows)
+    return _put(state, part._replace(step=state.step), after, which, rows), places
+
+
+def _of_rows(tree: Any, which: Tensor, rows: int) -> Any:
+    """Return what belongs to some rows; what is the same for all of them stays."""
+    if isinstance(tree, Tensor):
+        return tree[which] if tree.dim() > 1 and len(tree) == rows else tree
+    if isinstance(tree, Mapping):
+        return {name: _of_rows(x, which, rows) for name, x in tree.items()}
+    return tree if tree is None else type(tree)(*(_of_rows(x, which, rows) for x in tree))
+
+
+def _put(tree: Any, before: Any, after: Any, which: Tensor, rows: int) -> Any:
+    """Return a tree in which some rows, that were ``before``, are ``after``; what is the same tensor stays."""
+    if isinstance(tree, Tensor):
+        if after is before:
+            return tree
+        return tree.expand(rows, *after.shape[1:]).index_put((which,), after)
+    if isinstance(tree, Mapping):
+        return {name: _put(x, before[name], after[name], which, rows) for name, x in tree.items()}
+    if tree is None:
+        return None
+    was = (None,) * len(tree) if before is None else before
+    return type(tree)(*(_put(*parts, which, rows) for parts in zip(tree, was, after, strict=True)))
 
 
 def _cut(tree: Any, begin: int, count: int | None) -> Any:

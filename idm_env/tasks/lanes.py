@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -139,10 +138,6 @@ class LanesTask(Task):
         """Rewards of a step lie between −0.1 and 1."""
         return Pay(-0.1, 1.0)
 
-    @cached_property
-    def _others(self) -> list[list[int]]:
-        return [[j for j in range(self.vehicles) if j != i] for i in self.agents]
-
     def seen_of_self(self, state: State) -> list[Tensor]:
         """Return ``own_features``, each ``(…, agents)``."""
         assert state.links is not None
@@ -156,30 +151,24 @@ class LanesTask(Task):
         """Return what is seen of oneself, and of the nearest vehicles."""
         state = world.state
         assert state.links is not None
-        others = self.constant("others", self._others, state.speed.device, torch.int64)
-        shape = (len(state.speed), *others.shape)
-
-        def of(x: Tensor) -> Tensor:
-            return x[:, others.reshape(-1)].view(shape)
-
-        def beside(x: Tensor) -> Tensor:
-            return of(x) - self.pick(x).unsqueeze(-1)
-
-        ahead = self.apart(beside(state.position))
-        left, speed = beside(state.links.lane.to(state.speed.dtype)), beside(state.speed)
+        own = self.constant("agents", self.agents, state.speed.device, torch.int64)
+        lane = state.links.lane.to(state.speed.dtype)
+        ahead = self.apart(state.position.unsqueeze(-2) - self.pick(state.position).unsqueeze(-1))
         away = ahead.detach().abs()
         if state.present is not None:
-            both = of(state.present) * self.pick(state.present).unsqueeze(-1)
+            both = state.present.unsqueeze(-2) * self.pick(state.present).unsqueeze(-1)
             away = torch.where(both > 0, away, torch.inf)
-        near = away.argsort(dim=-1, stable=True)[..., : self.seen]
+        away = away.scatter(-1, own.view(-1, 1).expand(*away.shape[:-1], 1), torch.inf)
+        count = min(self.seen, self.vehicles - 1)
+        near = away.topk(count, dim=-1, largest=False, sorted=True).indices
+
+        def beside(x: Tensor) -> Tensor:
+            return x.unsqueeze(-2).expand(away.shape).gather(-1, near) - self.pick(x).unsqueeze(-1)
+
+        there = (away.gather(-1, near) <= FAR_AWAY).to(lane.dtype)
+        told = [there, *(x * there for x in (ahead.gather(-1, near), beside(lane), beside(state.speed)))]
         features = self.seen_of_self(state)
         nobody = torch.zeros_like(features[0])
         for k in range(self.seen):
-            if k >= near.shape[-1]:
-                features += [nobody] * 4
-                continue
-            which = near[..., k : k + 1]
-            way, aside, pace, far = (x.gather(-1, which).squeeze(-1) for x in (ahead, left, speed, away))
-            there = (far <= FAR_AWAY).to(way.dtype)
-            features += [there, way * there, aside * there, pace * there]
+            features += [x[..., k] for x in told] if k < count else [nobody] * 4
         return self.clip(features)

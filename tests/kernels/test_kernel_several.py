@@ -133,8 +133,37 @@ def test_the_past_goes_with_its_vehicle() -> None:
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("again", [None, 24], ids=["one slot per trip", "slots used again"])
-def test_vehicles_come_and_go_in_compiled_rollouts(again: int | None) -> None:
+def test_rows_may_decide_at_different_steps_one_call_a_step_or_many() -> None:
+    """As rows of a vector whose episodes began at different times do: links and gaps of the torch path."""
+    generator = torch.Generator().manual_seed(3)
+    simulator = Simulator(Lanes(3, ring=500.0), (IDM(), Mobil(), Brakes()))
+    params = simulator.defaults(dtype=torch.float64)
+    params["idm"]["desired_speed"] = 15.0 + 20.0 * torch.rand((3, N), generator=generator).double()
+    place = torch.stack([torch.randperm(N, generator=generator) for _ in range(3)])
+    position, lane = place * (480.0 / N), torch.randint(3, (3, N), generator=generator)
+    speed = torch.full((3, N), 8.0, dtype=torch.float64)
+    begin = simulator.state(position.double(), speed, params, lane=lane, step=torch.tensor([0, 3, 10]))
+    assert dispatch.refusal(simulator, begin, {}, params) is None
+    with dispatch.off():
+        expected, _ = simulator.rollout(begin, {}, params, 60, keep=None)
+    many, _ = simulator.rollout(begin, {}, params, 60, keep=None)
+    single = begin
+    for _ in range(60):
+        single = simulator.advance(single, {}, params)
+    assert expected.links is not None and (expected.links.changed.sum(-1) > 0).all()
+    for found in (many, single):
+        assert found.links is not None
+        for one, other in zip(expected.links, found.links, strict=True):
+            assert torch.equal(one, other)
+        torch.testing.assert_close(found.gap, expected.gap, rtol=1e-9, atol=1e-9)
+    assert begin.links is not None and begin.links.changed.sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("again", "steps"), [(None, (0, 0)), (24, (0, 0)), (24, (0, 4))],
+    ids=["one slot per trip", "slots used again", "rows at different steps"],
+)  # fmt: skip
+def test_vehicles_come_and_go_in_compiled_rollouts(again: int | None, steps: tuple[int, int]) -> None:
     """Entries, exits, ramps and ends of lanes: links, counts, values and gradients of the torch path."""
     road = Lanes(3, length=700.0, ends=(on_ramp(0, 150.0, 400.0, entry=50.0), off_ramp(2, 200.0, 400.0, leaves=500.0)))
     simulator = Simulator(road, (IDM(), make("second_leader"), make("memory"), Mobil(), MandatoryChange(), Brakes()))
@@ -143,6 +172,7 @@ def test_vehicles_come_and_go_in_compiled_rollouts(again: int | None) -> None:
     n = len(trips.departs)
     desired = 15.0 + 20.0 * torch.rand((2, n), generator=torch.Generator().manual_seed(1)).double()
     begin = population.waiting(simulator, population.spread(trips, (2, n)), params)
+    begin = begin._replace(step=torch.tensor(steps) if steps[1] else begin.step)
 
     def run() -> tuple[State, Trajectory, Tensor]:
         free = desired.clone().requires_grad_()
