@@ -26,7 +26,7 @@ _NEAR = 150.0
 _MOST_LANES = 8
 """Lanes beyond these are drawn over the first ones again."""
 _ASPHALT, _GROUND, _INK, _MARK = (70, 74, 82), (244, 243, 238), (30, 32, 36), (30, 90, 220)
-_CHANGE = (250, 250, 250)
+_CHANGE = (208, 60, 150)
 _CHANGE_SHOWN = 1.0
 """How long an arrow shows that a vehicle has changed lanes (s)."""
 

@@ -11,7 +11,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
-from idm_env.diagrams import panels, write_html
+from idm_env.diagrams import lane_panels, panels, write_html
 from idm_env.render import colour, space_time
 from idm_env.simulator import Trajectory
 
@@ -142,3 +142,35 @@ def test_the_interactive_page_holds_what_was_drawn_and_needs_no_network(tmp_path
 def test_a_table_without_speed_is_an_error():
     with pytest.raises(ValueError, match="no column 'speed_mps'"):
         space_time(pl.DataFrame({"vehicle_id": [1], "time_s": [0.0], "position_m": [0.0]}))
+
+
+def test_arrows_show_who_has_changed_lanes():
+    env = gym.make(
+        "DiffIDM-v0", task="highway", vehicles=2, length=2000.0, controlled=[1], lanes_count=3, lane_commands=True,
+        render_mode="rgb_array",
+    )  # fmt: skip
+    env.reset(seed=1)
+    seen = []
+    for _ in range(25):
+        env.step(np.array([0.0, 1.0], np.float32))
+        seen.append(int((env.render() == np.array([208, 60, 150])).all(-1).sum()))
+    # The one change, a second after the first step that decides, is shown for a second.
+    assert env.unwrapped.state.links.changed[0, 1] == 1
+    shown = np.flatnonzero(seen)
+    assert 8 <= len(shown) <= 12 and (np.diff(shown) == 1).all()
+
+
+def test_lanes_have_a_panel_each_and_changes_go_on_in_another():
+    time = torch.arange(20)
+    position = torch.stack((10.0 * time, 5.0 * time, 1.0 * time), -1)
+    lane = torch.zeros(20, 3, dtype=torch.int64)
+    lane[8:, 1] = 1
+    there = torch.ones(20, 3)
+    there[12:, 2] = 0
+    position[15:, 0] -= 140.0  # the slot begins another trip
+    rollout = Trajectory(position, torch.ones(20, 3), torch.zeros(20, 3), position)
+    left, right = lane_panels(rollout, lane, there, dt=1.0, marked=[1])
+    assert left.title.startswith("lane 1") and right.title.startswith("lane 0")
+    assert [(x.name, len(x.time), x.marked) for x in left.lines] == [("1", 12, True)]
+    assert sorted((x.name, len(x.time)) for x in right.lines) == [("0", 5), ("0", 15), ("1", 9), ("2", 12)]
+    assert right.lines[2].time[-1] == left.lines[0].time[0] == 9.0  # a change leaves no hole
