@@ -14,7 +14,7 @@ from torch import Tensor
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
-from idm_env.envs.spaces import action_box, action_of, observation_box
+from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.tasks import Task
 from idm_env.types import Params, State
 
@@ -113,7 +113,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
         self.metadata = {**type(self).metadata, "render_fps": round(1.0 / self.task.simulator.dt)}
         self.observation_space = observation_box(self.task, made.dtype, agents)
         self._shape = (agents * len(self.task.commands),)
-        self.action_space = action_box(self._shape[0])
+        self.action_space = action_space(self.task, agents)
         self._numpy = made.output == "numpy"
         self._viewer: Any = None
 

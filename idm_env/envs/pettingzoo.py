@@ -22,7 +22,7 @@ from idm_env.checks import shown
 from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.info import ids
 from idm_env.envs.settings import RENDER_MODES, settings
-from idm_env.envs.spaces import action_box, numpy_dtype, observation_box
+from idm_env.envs.spaces import action_space, continuous, numpy_dtype, observation_box
 
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 
@@ -58,7 +58,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         self.possible_agents = [f"vehicle_{i}" for i in self.task.agents]
         self.agents: list[str] = []
         self.observation_spaces = {a: observation_box(self.task, made.dtype, 1) for a in self.possible_agents}
-        self.action_spaces = {a: action_box(len(self.task.commands)) for a in self.possible_agents}
+        self.action_spaces = {a: action_space(self.task, 1) for a in self.possible_agents}
         kind, n = numpy_dtype(made.dtype), self.task.vehicles
         low = np.repeat(np.array([0.0, -1.0], kind), n)
         high = np.repeat(np.array([10.0, _FARTHEST / _GAP_SCALE], kind), n)
@@ -134,7 +134,9 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         if agent not in actions:
             raise ValueError(f"there is no action for agent '{agent}'. Give one for each of env.agents.")
         action = np.asarray(actions[agent])
-        size = len(self.task.commands)
+        size, levels = len(self.task.commands), self.task.levels
+        if levels is not None:
+            return continuous(action, levels, (size,))
         if action.shape != (size,) or action.dtype.kind not in "fiu" or not np.isfinite(action).all():
             several = "one finite number" if size == 1 else f"{size} finite numbers"
             raise ValueError(

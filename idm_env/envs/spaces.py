@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, MultiDiscrete, Space
 from torch import Tensor
 
+from idm_env.checks import shown
 from idm_env.envs.settings import Settings
 from idm_env.tasks import Task
 
@@ -26,9 +28,25 @@ def observation_box(task: Task, dtype: torch.dtype, agents: int) -> Box:
     return Box(np.tile(low, agents), np.tile(high, agents), dtype=kind)
 
 
-def action_box(agents: int) -> Box:
-    """Return the space of the actions of ``agents`` agents: float32, exactly [−1, 1]."""
-    return Box(-1.0, 1.0, (agents,), np.float32)
+def action_space(task: Task, agents: int) -> Space[np.ndarray]:
+    """Return the space of the actions of ``agents`` agents: float32, exactly [−1, 1], or whole numbers of levels."""
+    if task.levels is not None:
+        return MultiDiscrete(np.repeat(task.levels, agents))
+    return Box(-1.0, 1.0, (agents * len(task.commands),), np.float32)
+
+
+def continuous(action: Any, levels: Sequence[int], shape: tuple[int, ...]) -> np.ndarray:
+    """Return actions of whole numbers as numbers in [−1, 1]; ``levels`` are those of the last dimension.
+
+    ValueError for a wrong shape, or for what is no level.
+    """
+    array = action.detach().cpu().numpy() if isinstance(action, Tensor) else np.asarray(action)
+    most = np.asarray(levels)
+    if array.shape != shape or array.dtype.kind not in "iu" or (array < 0).any() or (array >= most).any():
+        raise ValueError(
+            f"action {shown(action)} must hold whole numbers of shape {shape}, from 0 to below {most.tolist()}."
+        )
+    return 2.0 * array / (most - 1) - 1.0
 
 
 def action_of(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor | np.ndarray:
@@ -36,6 +54,9 @@ def action_of(action: Any, shape: tuple[int, ...], made: Settings) -> Tensor | n
 
     ValueError for a wrong shape, or values that are not finite; float32 and float64, numpy and torch are all accepted.
     """
+    levels = made.task.levels
+    if levels is not None:
+        action = continuous(action, np.repeat(levels, len(made.task.agents)).tolist(), shape)
     if (
         made.output == "numpy"
         and isinstance(action, np.ndarray)

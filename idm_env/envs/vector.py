@@ -18,7 +18,7 @@ from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import Face
 from idm_env.envs.info import Rows
 from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
-from idm_env.envs.spaces import action_box, action_of, observation_box
+from idm_env.envs.spaces import action_of, action_space, observation_box
 
 
 class DiffIDMVectorEnv(Face, VectorEnv):
@@ -61,7 +61,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         }
         agents = len(self.task.agents)
         self.single_observation_space = observation_box(self.task, made.dtype, agents)
-        self.single_action_space = action_box(agents * len(self.task.commands))
+        self.single_action_space = action_space(self.task, agents)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.batch = Batch(made, num_envs)

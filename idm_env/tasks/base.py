@@ -175,6 +175,11 @@ class Task(abc.ABC):
         return ("accel",)
 
     @property
+    def levels(self) -> tuple[int, ...] | None:
+        """How many values each command of an agent may have, evenly from −1 to 1; None: any number in between."""
+        return None
+
+    @property
     def lanes(self) -> tuple[int, ...]:
         """The lane of each vehicle, counted from 0: for pictures."""
         return (0,) * self.vehicles

@@ -36,14 +36,21 @@ class LanesTask(Task):
         spread: Spread of desired speeds between drivers, as a share.
         seen: How many vehicles an agent observes.
         lane_commands: Whether agents command lanes as well.
+        discrete: So many levels of acceleration, evenly spread, instead of any: actions are whole numbers from 0 on
+            (``MultiDiscrete``, as HighwayEnv's ``DiscreteAction``); of lanes 0 is to the right, 1 to stay, 2 to the
+            left. 0 is continuous.
     """
 
     spread: float = 0.2
     seen: int = 4
     lane_commands: bool = False
+    discrete: int = 0
 
     def __post_init__(self) -> None:
         whole("seen", self.seen, 1)
+        whole("discrete", self.discrete, 0)
+        if self.discrete == 1:
+            raise ValueError("discrete = 1 leaves agents no choice. Take at least 2 levels, or 0 for any acceleration.")
         at_least("spread", self.spread, 0.0)
         if self.spread >= 1.0:
             raise ValueError(f"spread = {self.spread:g} must be below 1: desired speeds are positive.")
@@ -82,6 +89,11 @@ class LanesTask(Task):
     def commands(self) -> tuple[str, ...]:
         """Acceleration, and the lane where that is asked for."""
         return ("accel", "lane") if self.lane_commands else ("accel",)
+
+    @property
+    def levels(self) -> tuple[int, ...] | None:
+        """Levels of acceleration, and the three of lanes."""
+        return (self.discrete, 3)[: len(self.commands)] if self.discrete else None
 
     def command(self, action: Tensor) -> Tensor:
         """Return the commanded accelerations (m/s²)."""

@@ -150,11 +150,12 @@ def test_arrows_show_who_has_changed_lanes():
         render_mode="rgb_array",
     )  # fmt: skip
     env.reset(seed=1)
+    env.render()
     seen = []
     for _ in range(25):
         env.step(np.array([0.0, 1.0], np.float32))
         seen.append(int((env.render() == np.array([208, 60, 150])).all(-1).sum()))
-    # The one change, a second after the first step that decides, is shown for a second.
+    # The one change, in the first step, is shown for a second.
     assert env.unwrapped.state.links.changed[0, 1] == 1
     shown = np.flatnonzero(seen)
     assert 8 <= len(shown) <= 12 and (np.diff(shown) == 1).all()

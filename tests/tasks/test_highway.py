@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
 from idm_env.envs.pettingzoo import parallel_env
@@ -45,6 +46,47 @@ def test_agents_command_lanes_where_that_is_asked_for() -> None:
     assert each.action_space(agent).shape == (2,)
     each.step({agent: np.array([0.0, 1.0], np.float32)})
     assert each.batch.world.state.links.lane[0, 1] == 2
+
+
+def test_actions_may_be_whole_numbers_in_every_face() -> None:
+    """Three levels of acceleration and of lanes: the middle one of each does nothing, and what is no level is said."""
+    made = {**EMPTY, "lane_commands": True, "discrete": 3, "vehicles": 3, "controlled": [1, 2]}
+    env, box = (gym.make("DiffIDM-v0", **{**made, "discrete": n}) for n in (3, 0))
+    assert env.action_space == gym.spaces.MultiDiscrete([3, 3, 3, 3])
+    check_env(gym.make("DiffIDM-v0", **made).unwrapped, skip_render_check=True)
+    for whole, number in (([0, 1, 2, 0], [-1, 0, 1, -1]), ([1, 2, 1, 2], [0, 1, 0, 1])):
+        env.reset(seed=1), box.reset(seed=1)
+        for _ in range(12):
+            first = env.step(np.array(whole))
+            other = box.step(np.array(number, np.float32))
+            np.testing.assert_array_equal(first[0], other[0])
+        assert env.unwrapped.state.links.lane.tolist() == box.unwrapped.state.links.lane.tolist()
+    with pytest.raises(ValueError, match="must hold whole numbers"):
+        env.step(np.array([0, 1, 2, 3]))
+    with pytest.raises(ValueError, match="must hold whole numbers"):
+        env.step(np.array([0.0, 1.0, 2.0, 0.0]))
+    with pytest.raises(ValueError, match="discrete = 1 leaves agents no choice"):
+        make_task("highway", discrete=1)
+    vector = gym.make_vec("DiffIDM-v0", num_envs=2, **made)
+    vector.reset(seed=1)
+    vector.step(vector.action_space.sample())
+    each = parallel_env(**made)
+    each.reset(seed=1)
+    assert each.action_space("vehicle_1") == gym.spaces.MultiDiscrete([3, 3])
+    each.step({agent: np.array([1, 2]) for agent in each.agents})
+    assert each.batch.world.state.links.lane[0].tolist() == [0, 2, 2]
+
+
+def test_stable_baselines3_takes_whole_numbers() -> None:
+    """PPO acts on a vector of highways with lane commands, and learns from what comes back."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    from idm_env.envs.sb3 import SB3VecEnv
+
+    choices = {"vehicles": 8, "length": 300.0, "lanes_count": 3, "lane_commands": True, "discrete": 3}
+    agent = sb3.PPO("MlpPolicy", SB3VecEnv(gym.make_vec("DiffIDM-v0", num_envs=2, task="highway", **choices)),
+                    n_steps=8, batch_size=16, n_epochs=1, seed=1)  # fmt: skip
+    agent.learn(32)
+    assert agent.num_timesteps == 32
 
 
 def test_infos_count_changes_and_refusals_from_the_beginning_of_the_episode() -> None:
