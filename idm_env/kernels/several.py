@@ -145,9 +145,7 @@ def rollout(
     return state, tuple(torch.cat(column) for column in zip(*kept, strict=True)) if keep else None
 
 
-def _decided(
-    traffic: Traffic, wishes: Any, state: State, inputs: Inputs, params: Params, stage: int
-) -> State | None:
+def _decided(traffic: Traffic, wishes: Any, state: State, inputs: Inputs, params: Params, stage: int) -> State | None:
     """Return the state after all rows have decided, ``stage`` steps into a period; None where links are no order."""
     simulator = traffic.simulator
     if stage == 0:
@@ -158,8 +156,8 @@ def _decided(
 
 
 def _some_decided(
-    simulator: Simulator, wishes: Any, state: State, inputs: Inputs, params: Params, which: Tensor, stage: int, halo: int,
-    places: Places | None,
+    simulator: Simulator, wishes: Any, state: State, inputs: Inputs, params: Params, which: Tensor, stage: int,
+    halo: int, places: Places | None,
 ) -> tuple[State, Places | None] | None:  # fmt: skip
     """Return the state after some rows (indices) have decided, and where vehicles lie then, if that was known before.
 
