@@ -15,13 +15,15 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "examples")]
+PATHS = [str(ROOT), str(ROOT / "examples")]
+sys.path[:0] = PATHS
 KEPT = ROOT / "runs" / "libraries"
 NAMES = {"torchrl": "TorchRL, PPO", "rllib": "RLlib, PPO", "agents": "RLlib, PPO, two agents"}
 
@@ -32,11 +34,15 @@ def run(name: str, updates: int) -> Any:
         return importlib.import_module("train_torchrl").train(updates)
     import ray
 
+    os.environ["PYTHONPATH"] = os.pathsep.join(PATHS)  # of workers, which import the example
     ray.init("local", include_dashboard=False, log_to_driver=False, logging_level="ERROR", num_cpus=2)
     try:
         if name == "tune":
             example = importlib.import_module("tune_an_agent")
             found = example.search(KEPT / "tune", example.SPACE, cpu_seconds=15.0)
+            for one in found:
+                if one.error is not None:
+                    raise one.error
             return [{"options": one.config, "rows": one.metrics_dataframe.to_dict("records")} for one in found]
         example = importlib.import_module("train_rllib")
         return example.train(example.one_agent() if name == "rllib" else example.two_agents(), updates)
