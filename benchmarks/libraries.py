@@ -81,7 +81,7 @@ def picture(path: Path) -> None:
         left.plot([s / 1000 for s in steps], rewards, lw=1.6, label=label)
         print(f"| {label} | {len(steps)} | {steps[-1]} | {kept['cpu_s']:.0f} | {rewards[0]:.3f} | {rewards[-1]:.3f} |")
     print(f"Left to its driver, who commands nothing: {alone:.3f}.")
-    left.set(xlabel="steps of all rings (thousands)", ylabel="mean reward of a step")
+    left.set(xlabel="steps of all rings (thousands)", ylabel="mean reward of a step", ylim=(0.45, 1.05))
     for right in others:
         right.set(xlabel="CPU seconds of the trial", ylabel="score of the agents' test", title="Ray Tune, APG")
         print(f"\n| learning rate | updates | CPU s | best score | last score |\n{'| --- ' * 5}|")
