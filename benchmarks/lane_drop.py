@@ -1,6 +1,6 @@
 """Outflow of a road of 4 → 2 → 1 lanes that 2600 vehicles an hour want to enter: published, ours, and SUMO's today.
 
-``python -m benchmarks.lane_drop`` drives it for 30 minutes and counts in the last 20: IDM with MOBIL and
+``python -m benchmarks.lanes drop`` drives it for 30 minutes and counts in the last 20: IDM with MOBIL and
 ``MandatoryChange`` here, IDM with LC2013 in SUMO (``libsumo``, where it is installed), on the same road. Lanes end at
 500 and 750 m of 1000 m; the road of the published figures is not known to the metre.
 """

@@ -99,5 +99,5 @@ def test_a_picture_is_as_long_as_it_was_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "_work_begins", lambda: None)
     path = tmp_path / "ring.yaml"
     path.write_text("configures: environment\ntask: ring\nvehicles: 3\nlength: 60.0\nwarmup: 1\n")
-    panel = cli._rollout_panel(path, 310.0, 0, progress.silent)
+    (panel,) = cli._rollout_panels(path, 310.0, 0, progress.silent)
     assert [len(line.time) for line in panel.lines] == [3100] * 3
