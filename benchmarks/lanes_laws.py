@@ -43,7 +43,8 @@ def world(kind: str, seed: int, rows: int, each: int, dtype: torch.dtype) -> tup
     draw = torch.Generator().manual_seed(seed)
     count = 2 + int(torch.randint(4, (), generator=draw))
     density = 12.0 + 48.0 * float(torch.rand((), generator=draw))  # per km and lane, of a ring
-    road = road_of(kind, count, 1000.0 * each / count / density)
+    spacing = 1000.0 / density
+    road = road_of(kind, count, -(-each // count) * spacing)  # room for the fullest lane
     simulator = Simulator(road, (IDM(), Mobil(), MandatoryChange(), LaneCommand(), Brakes()), dt=DT)
     params = simulator.defaults(dtype=dtype)
 
@@ -58,7 +59,6 @@ def world(kind: str, seed: int, rows: int, each: int, dtype: torch.dtype) -> tup
     params["idm"]["desired_speed"] = between(12.0, 38.0, rows, each)
     if kind == "ring":
         index = torch.arange(each)
-        spacing = 1000.0 / density
         place = torch.div(index, count, rounding_mode="floor") * spacing + between(0.0, 0.4, rows, each) * spacing
         pace = torch.full_like(place, 6.0)
         return simulator, simulator.state(place.to(dtype), pace, params, lane=index % count, length=4.0), params

@@ -98,29 +98,43 @@ def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
     }
 
 
+def said(r: dict[str, Any]) -> str:
+    """Return verdict, what was found or came nearest, and how a known grade acts."""
+    names = []
+    for f in r["found"]:
+        first = "" if f["parameters"] == "curve" else next(iter(f["parameters"].values()))
+        number = f" {first['estimate']:.2f} ({first['low']:.2f} … {first['high']:.2f})" if first else ""
+        names.append(" or ".join([f["name"] + number, *f["equivalent"]]))
+    words = r["verdict"].replace("_", " ") + (f" ({r['why']})" if r["why"] else "")
+    words += f": {', '.join(names)}" if names else f"; nearest {r['partial']['effect']}" if r["partial"] else ""
+    for k in r["known"]:
+        if k["effect"] == "grade":
+            at, low, high = (-9.81 * k[name] for name in ("estimate", "high", "low"))
+            words += f"; grade acts by {at:.1f} ({low:.1f} … {high:.1f}) m/s²"
+    return words
+
+
 def table(rows: list[dict[str, Any]]) -> str:
+    """Return all cases: what is said, what IDM leaves, after / before with intervals, and ceilings."""
     lines = [
-        "case | drivers | found | gap RMSE m: pooled, median driver, before → after | held-out drivers improved",
-        "--- | --- | --- | --- | ---",
+        "case | drivers | verdict | IDM: gap m pooled, median driver; 5 s ahead m; speed m/s | after / before: gap | "
+        "gap 5 s ahead | speed | repeats | refitted | CPU s",
+        "--- | --- | --- | --- | --- | --- | --- | --- | --- | ---",
     ]
     for r in rows:
-        names = []
-        for f in r["found"]:
-            first = "" if f["parameters"] == "curve" else next(iter(f["parameters"].values()))
-            number = f" {first['estimate']:.2f} ({first['low']:.2f} … {first['high']:.2f})" if first else ""
-            names.append(f"{f['name']}{number}")
-        said = ", ".join(names) or r["verdict"]
-        known = "".join(
-            f"; grade acts by {-9.81 * k['estimate']:.1f} ({-9.81 * k['high']:.1f} … {-9.81 * k['low']:.1f}) m/s²"
-            for k in r["known"] if k["effect"] == "grade"
-        )  # fmt: skip
-        b, a = r["before"], r["after"] if r["found"] else {}
-        errors = " – "
+        b, c = r["before"], r["ceilings"] or {}
+        errors = "–"
         if b:
-            errors = f"{b['gap_rmse_m']:.2f}, {b['gap_rmse_median_driver_m']:.2f}"
-            errors += f" → {a['gap_rmse_m']:.2f}, {a['gap_rmse_median_driver_m']:.2f}" if a else ""
-        improved = "–" if r["improved"] is None else f"{100 * r['improved']:.0f} % of {r['held_out_drivers']}"
-        lines.append(f"{r['case']} | {r['drivers']} | {said}{known} | {errors} | {improved}")
+            errors = f"{b['gap_rmse_m']:.2f}, {b['gap_rmse_median_driver_m']:.2f}; {b['horizon_rmse_m']:.2f}"
+            errors += f"; {b['speed_rmse_mps']:.2f}"
+        ratios = ["–"] * 3
+        for i, key in enumerate(("gap_rmse_m", "horizon_rmse_m", "speed_rmse_mps")):
+            if key in r["helps"]:
+                verdict, ratio, low, high = r["helps"][key]
+                ratios[i] = f"{ratio:.2f} ({low:.2f} … {high:.2f}), {verdict}"
+        repeats, refitted = c.get("repeats_share"), c.get("refitted_gap_rmse_m")
+        ends = ["–" if repeats is None else f"{100 * repeats:.0f} %", "–" if refitted is None else f"{refitted:.2f} m"]
+        lines.append(" | ".join([r["case"], str(r["drivers"]), said(r), errors, *ratios, *ends, f"{r['cpu_s']:.0f}"]))
     return "\n".join(lines)
 
 
