@@ -31,7 +31,7 @@ LONG = {
 def commands(path: Path, inline: bool = False) -> list[list[str]]:
     """Return the words of every command line of a document's blocks, without comments; those within sentences too."""
     text = path.read_text(encoding="utf-8")
-    without = re.sub(r"^```(?:python|yaml|\{).*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    without = re.sub(r"^```(?:python|yaml|text|\{).*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
     lines = [line for block in COMMANDS.findall(without) for line in block.splitlines() if line.strip()]
     if inline:
         lines += [" ".join(line.split()) for line in INLINE.findall(text)]

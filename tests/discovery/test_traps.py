@@ -71,8 +71,11 @@ class TestSumo:
     def test_drivers_that_decide_once_a_second_are_late(self) -> None:
         from benchmarks.sumo_sets import CASES, platoons
 
-        found = discover(platoons(5, CASES["IDM, decides every 1 s"], runs=8, followers=2, seconds=120.0))
-        first = found.report["found"][0]
+        report = discover(platoons(5, CASES["IDM, decides every 1 s"], runs=8, followers=2, seconds=120.0)).report
+        # With it, one of the four drivers kept back is worse in free simulation, in sum over all: then nothing is named.
+        (first, *_) = report["found"] or report["partial"]["terms"]
+        assert report["verdict"] in ("named", "one_of") or report["reason"] == "held_out"
+        assert report["found"] or report["partial"]["explained_share"] > 0.9
         assert first["effect"] in ("delay", "lag")
         assert next(iter(first["parameters"].values()))["estimate"] == pytest.approx(0.5, abs=0.2)
 

@@ -154,7 +154,7 @@ ONE: dict[str, Callable[..., Any]] = {
     "truth as number": lambda x: (x > 0.0) * x + (x <= 0.0).to(x.dtype) + 2.0 * (x != 1.0).double(),
     "not": lambda x: torch.where(~(x > 0.0), x, 2.0 * x) + torch.where(torch.logical_not(x > 1.0), x, 0.0),
     "bool": lambda x: torch.where(x.bool(), 3.0 * x, x - 1.0),
-    "to bool": lambda x: x.to(torch.bool) * 5.0,
+    "to bool": lambda x: x.to(torch.bool) * 5.0 * torch.ones_like(x),
     "shape": lambda x: x.expand_as(x).contiguous().broadcast_to(x.shape).type_as(x),
     "tensor of one element": lambda x: x * torch.tensor(2.0, dtype=torch.float64),
 }
