@@ -72,8 +72,8 @@ class TestSumo:
         from benchmarks.sumo_sets import CASES, platoons
 
         report = discover(platoons(5, CASES["IDM, decides every 1 s"], runs=8, followers=2, seconds=120.0)).report
-        # With it, one of the four drivers kept back is worse in free simulation, in sum over all: then nothing is named.
-        (first, *_) = report["found"] or report["partial"]["terms"]
+        # With it one of the four drivers kept back is much worse in free simulation: then nothing is named.
+        first = (report["found"] or report["partial"]["terms"])[0]
         assert report["verdict"] in ("named", "one_of") or report["reason"] == "held_out"
         assert report["found"] or report["partial"]["explained_share"] > 0.9
         assert first["effect"] in ("delay", "lag")
