@@ -22,7 +22,7 @@ SIZE = 600
 """Width, and on a ring also height, of a picture (pixels)."""
 _LANE_HEIGHT = 200
 _NEAR = 150.0
-"""How far from the agent one sees on a long ring (m)."""
+"""How far from the agent one sees on a ring of several lanes, and on an endless road (m)."""
 _MOST_LANES = 8
 """Lanes beyond these are drawn over the first ones again."""
 _ASPHALT, _GROUND, _INK, _MARK = (70, 74, 82), (244, 243, 238), (30, 32, 36), (30, 90, 220)
@@ -48,10 +48,12 @@ def _pygame() -> Any:
     return pygame
 
 
-def _around(task: Task, values: dict[str, np.ndarray], ring: float) -> None:
-    """Leave only what is near the first agent, at places beside it: all of a ring would be too small to see."""
+def _around(task: Task, values: dict[str, np.ndarray], ring: float | None) -> None:
+    """Leave only what is near the first agent, at places beside it: a whole road would be too small to see."""
     first = values["position"][task.agents[0]]
-    away = (values["position"] - first + 0.5 * ring) % ring - 0.5 * ring
+    away = values["position"] - first
+    if ring is not None:
+        away = (away + 0.5 * ring) % ring - 0.5 * ring
     values["position"] = first + away
     values["present"] = values["present"] * (np.abs(away) <= _NEAR)
 
@@ -91,7 +93,7 @@ class Viewer:
         values["present"] = everybody if state.present is None else state.present[row].detach().cpu().numpy()
         values["lane"] = lane
         self._watch(task, state, row, lane)
-        if isinstance(task.road, Lanes) and task.road.ring is not None:
+        if isinstance(task.road, Lanes) and task.road.length is None:
             _around(task, values, task.road.ring)
         fastest = 10.0 if ring else 30.0
         (self._ring if ring else self._lane)(canvas, task, values, fastest)

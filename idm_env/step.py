@@ -353,14 +353,18 @@ class Stepping:
         if scene.history is not None:
             memory[PAST] = scene.history.pushed(scene)
         memory |= changes.driven_on(state.memory, motion.displacement, self.dt)
+        gap, links = self._gaps(state, motion), state.links
+        if motion.lane is not None:
+            gap, links = self.road.view(state).placed(state, motion, gap)
         return state._replace(
             position=motion.position,
             speed=motion.speed,
             accel=motion.accel,
-            gap=self._gaps(state, motion),
+            gap=gap,
             step=state.step + 1,
             present=motion.present,
             memory=memory,
+            links=links,
         )
 
     def _gaps(self, state: State, motion: Motion) -> Tensor:

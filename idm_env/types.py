@@ -117,7 +117,8 @@ class State(NamedTuple):
 class Motion(NamedTuple):
     """What integration yields and replay overrides.
 
-    Displacement in this step (m), then position (m), speed (m/s), acceleration (m/s²) and validity at its end.
+    Displacement in this step (m), then position (m), speed (m/s), acceleration (m/s²), validity and, where records say
+    it, lane at its end (−1 where they do not).
     """
 
     displacement: Tensor
@@ -125,6 +126,7 @@ class Motion(NamedTuple):
     speed: Tensor
     accel: Tensor
     present: Tensor | None
+    lane: Tensor | None = None
 
 
 class Neighbour(NamedTuple):
@@ -252,7 +254,8 @@ class Command(NamedTuple):
 class Record(NamedTuple):
     """Input of the effect ``replay``: the record at the *end* of the step and which vehicles follow it.
 
-    ``active`` (bool) marks replayed vehicles; ``present`` (0 or 1, or None for all there) which vehicles exist.
+    ``active`` (bool) marks replayed vehicles; ``present`` (0 or 1, or None for all there) which vehicles exist. On a
+    road of several lanes ``lane`` says where each is, be it replayed or not, and is −1 where that is left to it.
     """
 
     position: Tensor
@@ -260,6 +263,7 @@ class Record(NamedTuple):
     accel: Tensor
     active: Tensor
     present: Tensor | None = None
+    lane: Tensor | None = None
 
 
 class Imagined(NamedTuple):

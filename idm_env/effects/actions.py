@@ -47,4 +47,5 @@ class Replay(Effect):
             torch.where(record.active, record.speed, motion.speed),
             torch.where(record.active, record.accel, motion.accel),
             motion.present if record.present is None else record.present,
+            record.lane,
         )

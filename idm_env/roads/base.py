@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from idm_env.types import FAR, Links, Neighbour, State
+from idm_env.types import FAR, Links, Motion, Neighbour, State
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,13 @@ class Road(abc.ABC):
         if lane is not None:
             raise ValueError(f"a {type(self).__name__} has one lane, and lane = … was given. Use Lanes(count).")
         return None
+
+    def placed(self, state: State, motion: Motion, gap: Tensor) -> tuple[Tensor, Links | None]:
+        """Return gaps (m) and links after records have said who is on which lane; ``gap`` are those of before.
+
+        ValueError on a road that has one lane only.
+        """
+        raise ValueError(f"a {type(self).__name__} has one lane, and a record says lanes. Use Lanes(count).")
 
     @property
     def leaving(self) -> bool:

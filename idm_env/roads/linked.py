@@ -10,7 +10,7 @@ from torch import Tensor
 
 from idm_env.roads.beside import Preference, Side, Sideways
 from idm_env.roads.order import Order, laps
-from idm_env.types import FAR, Links, Moving, Neighbour, State
+from idm_env.types import FAR, Links, Motion, Moving, Neighbour, State
 
 if TYPE_CHECKING:
     from idm_env.roads.lanes import Lanes
@@ -154,6 +154,23 @@ class Linked(Sideways):
         if present is None or not self.road.leaving:
             return present
         return present * (position < self.road.left_at(self.links_now.lane, position)).to(present.dtype)
+
+    def placed(self, state: State, motion: Motion, gap: Tensor) -> tuple[Tensor, Links]:
+        """Return gaps (m) and links after records have said who is on which lane: gaps of new leaders are measured.
+
+        Whoever is placed may be anywhere, so all are laid out anew.
+        """
+        assert motion.lane is not None
+        before, position = self.links_now, motion.position
+        lane = torch.where(motion.lane >= 0, motion.lane, before.lane)
+        order = Order.of(position, lane, motion.present, self.road.count, self.road.ring)
+        leader, follower = order.links()
+        changed = lane != before.lane
+        for there in (state.present, motion.present):
+            changed = changed if there is None else changed & (there > 0)
+        links = before._replace(lane=lane, leader=leader, follower=follower, changed=before.changed + changed)
+        fresh = Linked(self.road, links, position).gaps(position, state.length)
+        return torch.where(leader == before.leader, gap, fresh), links
 
     # -- who is still leaving a lane ------------------------------------------------------------------------------
 

@@ -15,10 +15,21 @@ from idm_env.tasks.open_lanes import BottleneckTask, MergeTask
 from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.replay import ReplayTask
+from idm_env.tasks.replay_lanes import ReplayLanesTask
 from idm_env.tasks.ring import RingTask
 
 TASKS: dict[str, type[Task]] = {
-    task.name: task for task in (RingTask, FollowTask, PlatoonTask, ReplayTask, HighwayTask, MergeTask, BottleneckTask)
+    task.name: task
+    for task in (
+        RingTask,
+        FollowTask,
+        PlatoonTask,
+        ReplayTask,
+        ReplayLanesTask,
+        HighwayTask,
+        MergeTask,
+        BottleneckTask,
+    )
 }
 
 
@@ -53,6 +64,7 @@ __all__ = [
     "MergeTask",
     "Pay",
     "PlatoonTask",
+    "ReplayLanesTask",
     "ReplayTask",
     "RingTask",
     "Task",

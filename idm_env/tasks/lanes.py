@@ -47,6 +47,11 @@ class LanesTask(Task):
     discrete: int = 0
 
     def __post_init__(self) -> None:
+        self._check_lanes()
+        super().__post_init__()
+
+    def _check_lanes(self) -> None:
+        """Check what every task on several lanes says."""
         whole("seen", self.seen, 1)
         whole("discrete", self.discrete, 0)
         if self.discrete == 1:
@@ -54,7 +59,6 @@ class LanesTask(Task):
         at_least("spread", self.spread, 0.0)
         if self.spread >= 1.0:
             raise ValueError(f"spread = {self.spread:g} must be below 1: desired speeds are positive.")
-        super().__post_init__()
 
     @property
     @abc.abstractmethod

@@ -233,8 +233,13 @@ class ReplayTask(Task):
             length=length,
             present=present,
             step=torch.zeros_like(start),
+            lane=self.lane_at(start),
         )
         return World(state, {"start": start})
+
+    def lane_at(self, time: Tensor) -> Tensor | None:
+        """Return the recorded lanes at time steps of the record; None where vehicles keep theirs."""
+        return None
 
     def _recorded(self, time: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Return motion ``(n, slots, 3)`` and presence ``(n, slots)`` at time steps of the record."""

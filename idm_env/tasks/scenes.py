@@ -34,8 +34,11 @@ class Scene(NamedTuple):
 
 
 @dataclass
-class _Track:
-    """One vehicle on the common clock: arrays (time,), NaN where it is not there; ``leader`` holds ids or ''."""
+class Track:
+    """One vehicle on the common clock: arrays (time,), NaN where it is not there; ``leader`` holds ids or ''.
+
+    ``lane`` is an id of its run and first lane, ``lanes`` (time,) the file's numbers.
+    """
 
     key: str
     lane: str
@@ -45,6 +48,7 @@ class _Track:
     gap: np.ndarray
     measured: np.ndarray
     leader: np.ndarray
+    lanes: np.ndarray
 
 
 @lru_cache(maxsize=4)
@@ -55,6 +59,11 @@ def recorded_scene(path: str, dt: float, runs: tuple[str, ...] | None) -> Scene:
         ValueError: If a run does not exist or its step does not fit ``dt``.
         DataError: If the file cannot be used.
     """
+    return _laid_out(recorded_tracks(path, dt, runs), dt)
+
+
+def recorded_tracks(path: str, dt: float, runs: tuple[str, ...] | None) -> list[Track]:
+    """Return the tracks of the chosen runs of a file, on a clock of ``dt``; errors as in ``recorded_scene``."""
     from idm_env.data import load
 
     trajectories = load(path)
@@ -66,10 +75,10 @@ def recorded_scene(path: str, dt: float, runs: tuple[str, ...] | None) -> Scene:
         stride = dt / trajectories.steps[run]
         if stride < 0.99 or abs(stride - round(stride)) > 0.01:
             raise ValueError(f"dt = {dt:g} s is no multiple of the step of run '{run}', {trajectories.steps[run]:g} s.")
-    return _laid_out(_tracks(trajectories.table, chosen, dt), dt)
+    return _tracks(trajectories.table, chosen, dt)
 
 
-def _tracks(table: Any, runs: Sequence[str], dt: float) -> list[_Track]:
+def _tracks(table: Any, runs: Sequence[str], dt: float) -> list[Track]:
     """Return the tracks of the chosen runs, every row whose time falls on the clock."""
     columns = {name: np.asarray(table[name]) for name in ("run_id", "vehicle_id", "leader_id", "time_s", "position_m")}
     columns |= {name: np.asarray(table[name]) for name in ("speed_mps", "gap_m", "length_m", "gap_measured", "lane")}
@@ -79,15 +88,17 @@ def _tracks(table: Any, runs: Sequence[str], dt: float) -> list[_Track]:
     step = np.round(time).astype(int)
     on_clock = np.abs(time - step) < 0.25
     keys = np.char.add(np.char.add(columns["run_id"].astype(str), "/"), columns["vehicle_id"].astype(str))
+    rows_of: dict[str, list[int]] = {key: [] for key in keys.tolist()}
+    for row in np.flatnonzero(on_clock).tolist():
+        rows_of[keys[row]].append(row)
     tracks = []
-    for key in dict.fromkeys(keys.tolist()):
-        mine = (keys == key) & on_clock
+    for key, mine in rows_of.items():
         at = step[mine]
         # A step of time to which two rows are rounded keeps the first.
         at, first = np.unique(at, return_index=True)
         part = {name: values[mine][first] for name, values in columns.items()}
         position, speed, gap = (np.full(step.max() + 1, np.nan) for _ in range(3))
-        track = _Track(
+        track = Track(
             key=key,
             lane=f"{part['run_id'][0]}/{part['lane'][0]}",
             length=float(part["length_m"][0]),
@@ -96,16 +107,18 @@ def _tracks(table: Any, runs: Sequence[str], dt: float) -> list[_Track]:
             gap=gap,
             measured=np.zeros(step.max() + 1, bool),
             leader=np.full(step.max() + 1, "", object),
+            lanes=np.full(step.max() + 1, np.nan),
         )
         track.position[at], track.speed[at] = part["position_m"].astype(float), part["speed_mps"].astype(float)
         track.gap[at] = part["gap_m"].astype(float)
+        track.lanes[at] = part["lane"].astype(float)
         track.measured[at] = part["gap_measured"].astype(bool)
         track.leader[at] = ["" if x is None else f"{part['run_id'][0]}/{x}" for x in part["leader_id"]]
         tracks.append(track)
     return tracks
 
 
-def _laid_out(tracks: list[_Track], dt: float) -> Scene:
+def _laid_out(tracks: list[Track], dt: float) -> Scene:
     """Lay tracks out in chains, behind empty slots and seats."""
     by_key = {track.key: track for track in tracks}
     ahead = {track.key: _only_leader(track, by_key) for track in tracks}
@@ -115,7 +128,7 @@ def _laid_out(tracks: list[_Track], dt: float) -> Scene:
             follower[leader] = key
     ahead = {key: leader if follower.get(leader or "") == key else None for key, leader in ahead.items()}
     lanes = {lane: i for i, lane in enumerate(sorted({track.lane for track in tracks}))}
-    slots: list[tuple[str, _Track | None, np.ndarray | None]] = []
+    slots: list[tuple[str, Track | None, np.ndarray | None]] = []
     for track in tracks:
         if ahead[track.key] is not None:
             continue
@@ -131,7 +144,7 @@ def _laid_out(tracks: list[_Track], dt: float) -> Scene:
     return _scene(slots, lanes, len(tracks[0].position), dt)
 
 
-def _only_leader(track: _Track, by_key: dict[str, _Track]) -> str | None:
+def _only_leader(track: Track, by_key: dict[str, Track]) -> str | None:
     """Return the one vehicle that this one always follows while that is there, or None."""
     leaders = {leader for leader in track.leader if leader}
     if len(leaders) != 1:
@@ -143,7 +156,7 @@ def _only_leader(track: _Track, by_key: dict[str, _Track]) -> str | None:
     return leader if bool((track.leader[both] == leader).all()) else None
 
 
-def _align(track: _Track, leader: _Track) -> None:
+def _align(track: Track, leader: Track) -> None:
     """Shift positions so that measured gaps hold; between them the last shift holds."""
     known = np.flatnonzero(track.measured & np.isfinite(track.gap) & np.isfinite(leader.position))
     if len(known):
@@ -151,7 +164,7 @@ def _align(track: _Track, leader: _Track) -> None:
         track.position += np.interp(np.arange(len(track.position)), known, shift)
 
 
-def _seat(track: _Track, by_key: dict[str, _Track]) -> np.ndarray:
+def _seat(track: Track, by_key: dict[str, Track]) -> np.ndarray:
     """Return position and speed (2, time) of whoever leads: as far ahead as the gap says, of the follower's length."""
     position = np.where(track.leader != "", track.position + track.gap + track.length, np.nan)
     speed = track.speed.copy()
@@ -162,13 +175,13 @@ def _seat(track: _Track, by_key: dict[str, _Track]) -> np.ndarray:
 
 
 def _scene(
-    slots: list[tuple[str, _Track | None, np.ndarray | None]], lanes: dict[str, int], steps: int, dt: float
+    slots: list[tuple[str, Track | None, np.ndarray | None]], lanes: dict[str, int], steps: int, dt: float
 ) -> Scene:
     motion = np.zeros((steps, len(slots), 3))
     present = np.zeros((steps, len(slots)), bool)
     for i, (_, track, seat) in enumerate(slots):
         if track is not None:
-            motion[:, i], present[:, i] = _motion(track, seat, dt)
+            motion[:, i], present[:, i] = smoothed(track, seat, dt)
     ahead = np.zeros_like(present)
     ahead[:, 1:] = present[:, :-1]
     return Scene(
@@ -181,7 +194,7 @@ def _scene(
     )
 
 
-def _motion(track: _Track, seat: np.ndarray | None, dt: float) -> tuple[np.ndarray, np.ndarray]:
+def smoothed(track: Track, seat: np.ndarray | None, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the smooth motion (time, 3) and presence; where it is not there a vehicle stands where it was last."""
     from idm_env.data.smooth import fuse
 

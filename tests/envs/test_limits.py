@@ -15,6 +15,7 @@ USUAL = {
     "follow": 1000,
     "platoon": 3000,
     "replay": 300,
+    "replay_lanes": 300,
     "highway": 3000,
     "merge": 3000,
     "bottleneck": 3000,

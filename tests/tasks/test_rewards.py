@@ -16,6 +16,7 @@ CASES = {
     "follow, hard": {"task": "follow", "max_command": 30.0, "controlled": 2},
     "platoon": {"task": "platoon", "controlled": 2},
     "replay": {"task": "replay"},
+    "replay lanes": {"task": "replay_lanes", "controlled": 2, "lane_commands": True},
     "highway": {"task": "highway", "vehicles": 30, "length": 300.0, "max_command": 4.0, "controlled": 3},
     "merge": {"task": "merge", "vehicles": 40, "max_command": 4.0, "controlled": 3},
     "bottleneck": {"task": "bottleneck", "vehicles": 40, "max_command": 4.0, "controlled": 3},
