@@ -22,7 +22,7 @@ from torch import Tensor
 from idm_env import choices, shares
 from idm_env.changes import NOW, beside, seen_merging, wished
 from idm_env.roads.beside import preferred, signalled
-from idm_env.roads.linked import Claim, Linked, without_absent
+from idm_env.roads.linked import Claim, Linked, still_changing, without_absent
 from idm_env.types import Inputs, Params, State
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
     assert isinstance(view, Linked)
     due = due if state.present is None else due & (state.present > 0)
     if state.moving is not None:
-        due = due & (state.moving.until <= (state.step if state.step.dim() == 0 else state.step.unsqueeze(-1)))
+        due = due & ~still_changing(state)
     how = stepping.decisions
     if how == "pathwise" or (how == "surrogate" and not torch.is_grad_enabled()):
         return _done(stepping, view, state, inputs, params, due)[0]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from idm_env.choices import settled
 from idm_env.roads.lanes import Lanes
-from idm_env.roads.linked import Linked, standing, without_absent
+from idm_env.roads.linked import Linked, standing, still_changing, without_absent
 from idm_env.types import FAR, Moving, Params, State, Trips
 
 if TYPE_CHECKING:
@@ -107,10 +107,9 @@ def turnover(stepping: Stepping, state: State, params: Params) -> State:
     """
     if state.present is None or state.links is None:
         return state
-    now = state.step.remainder(stepping.decides_after) == 0
+    now = state.clock.remainder(stepping.decides_after) == 0
     if not bool(now.any()):
         return state
-    now = now if now.dim() == 0 else now.unsqueeze(-1)
     if stepping.road.leaving:
         state = _departed(stepping, state, now)
     return state if state.trips is None else _entered(stepping, state, params, now)
@@ -176,8 +175,7 @@ def _entered(stepping: Stepping, state: State, params: Params, now: Tensor) -> S
 def _rear_of_leaving(state: State, lanes: Tensor) -> Tensor:
     """Return where the last of those ends who are still leaving each lane (m)."""
     assert state.moving is not None and state.present is not None
-    step = state.step if state.step.dim() == 0 else state.step.unsqueeze(-1)
-    there = (state.moving.until > step) & (state.present > 0)
+    there = still_changing(state) & (state.present > 0)
     mine = there.unsqueeze(-2) & (state.moving.origin.unsqueeze(-2) == lanes.unsqueeze(-1))
     return torch.where(mine, (state.position - state.length).unsqueeze(-2), FAR).amin(-1)
 

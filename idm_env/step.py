@@ -152,9 +152,8 @@ class Stepping:
 
     def due(self, state: State) -> Tensor:
         """Return who decides about lanes at this step (bool), to broadcast against ``(..., vehicles)``."""
-        step = state.step if state.step.dim() == 0 else state.step.unsqueeze(-1)
-        phase = step.remainder(self.decides_after)
-        return phase == (self.turns(state.speed.shape[-1]).to(step.device) if self.decides_in_blocks else 0)
+        phase = state.clock.remainder(self.decides_after)
+        return phase == (self.turns(state.speed.shape[-1]).to(phase.device) if self.decides_in_blocks else 0)
 
     @cached_property
     def _unspoken(self) -> dict[str, dict[str, float]]:

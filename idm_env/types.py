@@ -14,10 +14,13 @@ Nobody there
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from torch import Tensor
+
+Tree = TypeVar("Tree")
+"""A tensor, None, or a tuple or mapping of trees."""
 
 FAR = 1e4
 """Gap to a neighbour that is not there (m): finite, so that nothing downstream meets an infinity."""
@@ -112,6 +115,11 @@ class State(NamedTuple):
     trips: Trips | None = None
     choices: Choices | None = None
     moving: Moving | None = None
+
+    @property
+    def clock(self) -> Tensor:
+        """Steps, to broadcast against ``(..., vehicles)``."""
+        return self.step if self.step.dim() == 0 else self.step.unsqueeze(-1)
 
 
 class Motion(NamedTuple):
@@ -279,3 +287,15 @@ class Adjacent(NamedTuple):
     distance: Tensor
     speed: Tensor
     present: Tensor
+
+
+def mapped(function: Callable[..., Tensor], first: Tree, *rest: Any) -> Tree:
+    """Apply a function to every tensor of like-shaped tuples and mappings; None stays None."""
+    if first is None:
+        return first
+    if isinstance(first, Tensor):
+        return function(first, *rest)  # type: ignore[return-value]
+    if isinstance(first, Mapping):
+        return {k: mapped(function, v, *(r[k] for r in rest)) for k, v in first.items()}  # type: ignore[return-value]
+    assert isinstance(first, tuple)
+    return type(first)(*(mapped(function, *parts) for parts in zip(first, *rest, strict=True)))  # type: ignore[return-value]

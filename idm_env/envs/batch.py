@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.envs.beginnings import Beginnings, mapped
+from idm_env.envs.beginnings import Beginnings
 from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Untraceable
 from idm_env.tasks import Draw, World
-from idm_env.types import Params, State
+from idm_env.types import Params, State, mapped
 
 if TYPE_CHECKING:
     from idm_env.envs.values import Values
@@ -321,7 +321,7 @@ class Batch:
                 found["failsafe"] = given < command
         if "crash" in asked:
             found["crash"] = crashed
-        return found | {name: x for name, x in task.told(after).items() if name in asked}
+        return found | {name: x for name, x in task.told(after).items() if name in asked} if asked else found
 
     def detach(self) -> None:
         """Cut the graph behind the present state, for truncated back-propagation."""

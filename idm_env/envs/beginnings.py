@@ -6,16 +6,14 @@ still crash some row begins anew at every step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from idm_env.tasks import World
+from idm_env.types import mapped
 
-Tree = TypeVar("Tree")
 Make = Callable[[np.ndarray, np.ndarray], World]
 """Rows and their episodes → the worlds that these episodes begin with."""
 
@@ -65,15 +63,3 @@ class Beginnings:
         where = torch.as_tensor(chosen)
         mapped(lambda held, new: held.index_put_((where.to(held.device),), new), self._worlds, made)
         self._ready[chosen] = of
-
-
-def mapped(function: Callable[..., Tensor], first: Tree, *rest: Any) -> Tree:
-    """Apply a function to every tensor of like-shaped tuples and mappings; None stays None."""
-    if first is None:
-        return first
-    if isinstance(first, Tensor):
-        return function(first, *rest)  # type: ignore[return-value]
-    if isinstance(first, Mapping):
-        return {k: mapped(function, v, *(r[k] for r in rest)) for k, v in first.items()}  # type: ignore[return-value]
-    assert isinstance(first, tuple)
-    return type(first)(*(mapped(function, *parts) for parts in zip(first, *rest, strict=True)))  # type: ignore[return-value]

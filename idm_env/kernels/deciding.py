@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
@@ -12,11 +11,10 @@ from torch import Tensor
 
 from idm_env.changes import seen_merging
 from idm_env.decisions import decided
-from idm_env.effects.base import Effect
 from idm_env.kernels import decision_loops, lanes, order_loops
 from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import dense, operand
-from idm_env.kernels.printed import FUNCTIONS, HEADER
+from idm_env.kernels.printed import FUNCTIONS, HEADER, printed
 from idm_env.kernels.tiles import ROW, Array
 from idm_env.population import turnover
 from idm_env.roads import Lanes
@@ -24,9 +22,9 @@ from idm_env.roads.chains import Places
 from idm_env.roads.linked import Linked
 from idm_env.scalar import library
 from idm_env.scalar.graph import Slot
-from idm_env.scalar.record import Form, Untraceable
+from idm_env.scalar.record import Form
 from idm_env.scalar.wishes import HERE, SEARCHED, SIDES, Wishes
-from idm_env.step import Integration, Stepping
+from idm_env.step import Stepping
 from idm_env.types import Inputs, Links, Params, State
 
 if TYPE_CHECKING:
@@ -54,23 +52,13 @@ class Decision:
 
 
 def decision(simulator: Stepping, form: Form) -> Decision | str:
-    """Return the compiled decision of a simulator, or why there is none (said once, as a warning)."""
-    try:
-        return _decision(simulator.road, simulator.effects, simulator.dt, simulator.integration, form)  # type: ignore[arg-type]
-    except TypeError as error:  # an effect with a choice that cannot be hashed
-        return f"an effect cannot be a key: {error}"
+    """Return the compiled decision of a simulator, or why there is none."""
+    return printed(_decision, simulator, form, "decisions about lanes are not compiled")
 
 
-@lru_cache(maxsize=256)
-def _decision(
-    road: Lanes, effects: tuple[Effect, ...], dt: float, integration: Integration, form: Form
-) -> Decision | str:
-    try:
-        wishes = Wishes(Stepping(road, effects, dt, integration), form)
-    except Untraceable as why:
-        warnings.warn(f"decisions about lanes are not compiled: {why}.", stacklevel=2)
-        return str(why)
-    return Decision(wishes, f"One decision about lanes of {', '.join(e.name for e in effects)}, {integration}.")
+def _decision(simulator: Stepping, form: Form) -> Decision:
+    names = ", ".join(e.name for e in simulator.effects)
+    return Decision(Wishes(simulator, form), f"One decision about lanes of {names}, {simulator.integration}.")
 
 
 class Traffic:

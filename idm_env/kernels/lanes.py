@@ -151,8 +151,7 @@ def starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
         if name.startswith("memory of "):
             found.append(plan_state.memory[name.removeprefix("memory of ")])
         elif name == "step":
-            step = plan_state.step.to(plan_state.speed.dtype)
-            found.append(step if step.dim() == 0 else step.unsqueeze(-1))
+            found.append(plan_state.clock.to(plan_state.speed.dtype))
         else:
             found.append(getattr(plan_state, name))
     return found

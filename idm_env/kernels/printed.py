@@ -7,8 +7,10 @@ inputs, memories and presence there are.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +24,8 @@ from idm_env.scalar.record import Form, Untraceable, record
 from idm_env.scalar.source import row
 from idm_env.scalar.tiles import TileText
 from idm_env.step import Integration, Stepping
+
+Made = TypeVar("Made")
 
 FUNCTIONS = Path(__file__).with_name("functions.py")
 """What printed phases call."""
@@ -156,28 +160,42 @@ def _flat(moves: dict[str, list[tuple[int, int, int]]], order: tuple[str, ...]) 
     return np.array(found, np.int64).reshape(-1, 4)
 
 
-def tile_kernel(simulator: Stepping, form: Form) -> TileKernel | str:
-    """Return the kernel of a simulator, or why there is none (said once, as a warning, where an effect is why)."""
-    if type(simulator.road) not in (Lane, Ring, Chains):
-        return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
+def printed(make: Callable[[Stepping, Form], Made], simulator: Stepping, form: Form, otherwise: str) -> Made | str:
+    """Return what is printed from a simulator, kept for the next one like it; or why there is nothing.
+
+    Where an effect is why, a warning says so once, and what happens ``otherwise``.
+    """
     try:
-        return _tile_kernel(simulator.road, simulator.effects, simulator.dt, simulator.integration, form)
+        return _printed(make, simulator.road, simulator.effects, simulator.dt, simulator.integration, form, otherwise)
     except TypeError as error:  # an effect with a choice that cannot be hashed
         return f"an effect cannot be a key: {error}"
 
 
-@lru_cache(maxsize=256)
-def _tile_kernel(
-    road: Road, effects: tuple[Effect, ...], dt: float, integration: Integration, form: Form
-) -> TileKernel | str:
+@lru_cache(maxsize=512)
+def _printed(
+    make: Callable[[Stepping, Form], Any], road: Road, effects: tuple[Effect, ...], dt: float,
+    integration: Integration, form: Form, otherwise: str,
+) -> Any:  # fmt: skip
     try:
-        recording = record(Stepping(road, effects, dt, integration), form)
+        return make(Stepping(road, effects, dt, integration), form)
     except Untraceable as why:
-        warnings.warn(f"no compiled kernel, the torch path runs instead: {why}.", stacklevel=2)
+        warnings.warn(f"{otherwise}: {why}.", stacklevel=3)
         return str(why)
-    program = Program(recording)
-    title = f"One step of {', '.join(e.name for e in effects)} on a {type(road).__name__.lower()}, {integration}."
-    return TileKernel(program, TileText(program, ring=isinstance(road, Ring), flags=form.flags), title)
 
 
-__all__ = ["MEASURES", "TileKernel", "tile_kernel"]
+def tile_kernel(simulator: Stepping, form: Form) -> TileKernel | str:
+    """Return the kernel of a simulator, or why there is none."""
+    if type(simulator.road) not in (Lane, Ring, Chains):
+        return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
+    return printed(_tile_kernel, simulator, form, "no compiled kernel, the torch path runs instead")
+
+
+def _tile_kernel(simulator: Stepping, form: Form) -> TileKernel:
+    program = Program(record(simulator, form))
+    road, names = type(simulator.road).__name__.lower(), ", ".join(e.name for e in simulator.effects)
+    title = f"One step of {names} on a {road}, {simulator.integration}."
+    ring = isinstance(simulator.road, Ring)
+    return TileKernel(program, TileText(program, ring=ring, flags=form.flags), title)
+
+
+__all__ = ["MEASURES", "TileKernel", "printed", "tile_kernel"]

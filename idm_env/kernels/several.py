@@ -22,7 +22,7 @@ from idm_env.kernels.printed import TileKernel, tile_kernel
 from idm_env.roads import Lanes
 from idm_env.roads.chains import Chains, Places
 from idm_env.scalar.record import Form
-from idm_env.types import Inputs, Params, State
+from idm_env.types import Inputs, Params, State, Tree, mapped
 
 if TYPE_CHECKING:
     from idm_env.simulator import Simulator
@@ -173,58 +173,45 @@ def _some_decided(
     after = after._replace(links=traffic.links, step=state.step)
     if places is not None:
         fresh = traffic.places(after._replace(step=part.step), halo)
-        places = None if fresh is None else _put(places, None, fresh, which, rows)
+        places = None if fresh is None else _put(places, places, fresh, which, rows)
     return _put(state, part._replace(step=state.step), after, which, rows), places
 
 
-def _of_rows(tree: Any, which: Tensor, rows: int) -> Any:
+def _of_rows(tree: Tree, which: Tensor, rows: int) -> Tree:
     """Return what belongs to some rows; what is the same for all of them stays."""
-    if isinstance(tree, Tensor):
-        return tree[which] if tree.dim() > 1 and len(tree) == rows else tree
-    if isinstance(tree, Mapping):
-        return {name: _of_rows(x, which, rows) for name, x in tree.items()}
-    return tree if tree is None else type(tree)(*(_of_rows(x, which, rows) for x in tree))
+    return mapped(lambda x: x[which] if x.dim() > 1 and len(x) == rows else x, tree)
 
 
-def _put(tree: Any, before: Any, after: Any, which: Tensor, rows: int) -> Any:
+def _put(tree: Tree, before: Tree, after: Tree, which: Tensor, rows: int) -> Tree:
     """Return a tree in which some rows, that were ``before``, are ``after``; what is the same tensor stays."""
-    if isinstance(tree, Tensor):
-        if after is before:
-            return tree
-        return tree.expand(rows, *after.shape[1:]).index_put((which,), after)
-    if isinstance(tree, Mapping):
-        return {name: _put(x, before[name], after[name], which, rows) for name, x in tree.items()}
-    if tree is None:
-        return None
-    was = (None,) * len(tree) if before is None else before
-    return type(tree)(*(_put(*parts, which, rows) for parts in zip(tree, was, after, strict=True)))
+
+    def put(x: Tensor, was: Tensor, now: Tensor) -> Tensor:
+        return x if now is was else x.expand(rows, *now.shape[1:]).index_put((which,), now)
+
+    return mapped(put, tree, before, after)
 
 
-def _cut(tree: Any, begin: int, count: int | None) -> Any:
+def _cut(tree: Tree, begin: int, count: int | None) -> Tree:
     """Return some steps of inputs, or the one step where ``count`` is None."""
-    if isinstance(tree, Tensor):
-        return tree[begin] if count is None else tree[begin : begin + count]
-    if isinstance(tree, Mapping):
-        return {name: _cut(x, begin, count) for name, x in tree.items()}
-    return tree if tree is None else type(tree)(*(_cut(x, begin, count) for x in tree))
+    return mapped(lambda x: x[begin] if count is None else x[begin : begin + count], tree)
 
 
-def _placed(tree: Any, places: Places, state: State, leading: int = 0) -> Any:
+def _placed(tree: Tree, places: Places, state: State, leading: int = 0) -> Tree:
     """Return what belongs to vehicles in the order of places; what is the same for all of them stays.
 
     ``leading`` dimensions are neither rows nor vehicles: an input's first one is time.
     """
-    if isinstance(tree, Tensor):
-        n = state.speed.shape[-1]
-        if tree.dim() == 0 or tree.shape[-1] != n or n == 1:
-            return tree
-        more = (1,) * (leading + state.speed.dim() - tree.dim())
-        shape = (*tree.shape[:leading], *state.speed.shape)
-        tree = tree.reshape(*tree.shape[:leading], *more, *tree.shape[leading:])
-        return tree.expand(shape).gather(-1, places.slots.expand(*shape[:-1], -1))
-    if isinstance(tree, Mapping):
-        return {name: _placed(x, places, state, leading) for name, x in tree.items()}
-    return tree if tree is None else type(tree)(*(_placed(x, places, state, leading) for x in tree))
+    n = state.speed.shape[-1]
+
+    def placed(x: Tensor) -> Tensor:
+        if x.dim() == 0 or x.shape[-1] != n or n == 1:
+            return x
+        more = (1,) * (leading + state.speed.dim() - x.dim())
+        shape = (*x.shape[:leading], *state.speed.shape)
+        x = x.reshape(*x.shape[:leading], *more, *x.shape[leading:])
+        return x.expand(shape).gather(-1, places.slots.expand(*shape[:-1], -1))
+
+    return mapped(placed, tree)
 
 
 def _moved(memory: Mapping[str, Tensor], index: Tensor, n: int) -> dict[str, Tensor]:

@@ -32,8 +32,10 @@ class Claim(NamedTuple):
     signals: Tensor
 
 
-def _step(state: State) -> Tensor:
-    return state.step if state.step.dim() == 0 else state.step.unsqueeze(-1)
+def still_changing(state: State) -> Tensor:
+    """Return who is still leaving a lane (bool)."""
+    assert state.moving is not None
+    return state.moving.until > state.clock
 
 
 def standing(state: State) -> Moving:
@@ -215,7 +217,7 @@ class Linked(Sideways):
     def _leaving(self, state: State) -> Order:
         """Return those who are still leaving a lane, in order."""
         assert state.moving is not None
-        there = state.moving.until > _step(state)
+        there = still_changing(state)
         if state.present is not None:
             there = there & (state.present > 0)
         origin, position = state.moving.origin, state.position
@@ -242,7 +244,7 @@ class Linked(Sideways):
         """Return the state after a decision in which those who were granted a change take some steps for it."""
         assert before.links is not None and after.links is not None
         moving = before.moving or standing(before)
-        until = torch.where(claim.granted, _step(before) + steps, moving.until)
+        until = torch.where(claim.granted, before.clock + steps, moving.until)
         moving = Moving(torch.where(claim.granted, before.links.lane, moving.origin), until, moving.shadow)
         lane, after = after.links.lane, after._replace(moving=moving)
         around = self._leaving(after).around(lane, after.position)
