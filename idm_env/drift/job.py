@@ -10,7 +10,7 @@ import numpy as np
 
 from idm_env import keep
 from idm_env import report as page
-from idm_env.config import Model, Numbers, save_model
+from idm_env.config import Model, Numbers, nested, save_model
 from idm_env.data.fingerprint import fitted_on
 from idm_env.drift.estimate import Estimate
 from idm_env.drift.kinds import Told, tell
@@ -63,11 +63,7 @@ def model_of(found: Estimate) -> Model:
     drivers, names = found.drivers, found.drivers.free
 
     def numbers(row: np.ndarray) -> Numbers:
-        nested: Numbers = {}
-        for name, value in zip(names, np.exp(row).tolist(), strict=True):
-            effect, parameter = name.split(".")
-            nested.setdefault(effect, {})[parameter] = value
-        return nested
+        return nested(dict(zip(names, np.exp(row).tolist(), strict=True)))
 
     s = found.settings
     drifts = {

@@ -12,7 +12,7 @@ import torch
 
 from idm_env import keep
 from idm_env import report as page
-from idm_env.config import Model, Numbers, load_model, save_model
+from idm_env.config import Model, load_model, nested, save_model
 from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories
 from idm_env.data.fingerprint import fingerprints
 from idm_env.data.folder import Share, shares, stamp
@@ -211,25 +211,17 @@ def model_of(found: Estimates, by: str = "driver") -> Model:
     Above ``MOST_DRIVERS`` groups it has the median only.
     """
 
-    def numbers(row: torch.Tensor) -> Numbers:
-        nested: Numbers = {}
-        for name, value in zip(found.names, row.tolist(), strict=True):
-            effect, parameter = name.split(".")
-            nested.setdefault(effect, {})[parameter] = value
-        return nested
+    def named(row: torch.Tensor) -> dict[str, float]:
+        return dict(zip(found.names, row.tolist(), strict=True))
 
     simulator = found.simulator
     several = 1 < len(found.groups) <= MOST_DRIVERS
-    middle = numbers(found.values.median(0).values)
-    for name, value in found.fixed.items():
-        effect, parameter = name.split(".")
-        middle.setdefault(effect, {})[parameter] = value
     return Model(
         effects=simulator.without("replay").effects if "replay" in simulator.by_name else simulator.effects,
-        parameters=middle,
+        parameters=nested({**named(found.values.median(0).values), **found.fixed}),
         dt=found.dt,
         integration=simulator.integration,
-        drivers={g: numbers(found.values[i]) for i, g in enumerate(found.groups)} if several else {},
+        drivers={g: nested(named(found.values[i])) for i, g in enumerate(found.groups)} if several else {},
         by=by,
     )
 

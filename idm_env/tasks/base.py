@@ -290,8 +290,8 @@ class Task(abc.ABC):
         if who is None:
             return params
         made = {effect: dict(values) for effect, values in params.items()}
+        dtype = next(iter(params[self.simulator.base.name].values())).dtype
         for (effect, name), values in self._behaviour.drivers.items():
-            dtype = next(iter(params[self.simulator.base.name].values())).dtype
             table = self.constant(f"drivers' {effect}.{name}", np.array(values), who.device, dtype)
             made[effect][name] = table[who]
         return made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -58,8 +59,8 @@ class HighwayTask(LanesTask):
                 f"lanes of {self.length:g} m. Take fewer vehicles or a longer ring."
             )
 
-    @property
-    def several(self) -> Lanes:
+    @cached_property
+    def road(self) -> Lanes:  # type: ignore[override]
         """The ring of several lanes."""
         return Lanes(self.lanes_count, ring=float(self.length))
 

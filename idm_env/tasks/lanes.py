@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -60,15 +61,10 @@ class LanesTask(Task):
         if self.spread >= 1.0:
             raise ValueError(f"spread = {self.spread:g} must be below 1: desired speeds are positive.")
 
-    @property
+    @cached_property
     @abc.abstractmethod
-    def several(self) -> Lanes:
-        """The road."""
-
-    @property
     def road(self) -> Lanes:  # type: ignore[override]
         """The road of several lanes."""
-        return self.several
 
     @property
     def machinery(self) -> tuple[Effect, ...]:  # type: ignore[override]
@@ -135,12 +131,12 @@ class LanesTask(Task):
     @property
     def own_features(self) -> tuple[tuple[str, float, float, float], ...]:
         """What an agent observes of itself: name, scale, lowest and highest value."""
-        return ("speed", 20.0, 0.0, FASTEST), ("lane", 1.0, 0.0, float(self.several.count - 1))
+        return ("speed", 20.0, 0.0, FASTEST), ("lane", 1.0, 0.0, float(self.road.count - 1))
 
     @property
     def features(self) -> Features:
         """What is seen of oneself, and of each vehicle nearby."""
-        n, last, own = self.seen, float(self.several.count - 1), tuple(zip(*self.own_features, strict=True))
+        n, last, own = self.seen, float(self.road.count - 1), tuple(zip(*self.own_features, strict=True))
         each = [f"{what}_{k}" for k in range(n) for what in ("there", "ahead", "left", "speed")]
         return Features(
             (*own[0], *each),

@@ -6,6 +6,7 @@ import abc
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -96,7 +97,7 @@ class OpenLanesTask(LanesTask):
         like = params["idm"]["max_accel"]
         trips = self._trips(draw, like.dtype)
         inside = trips.departs < 0
-        begins = self.several.at_lane(trips.lane, trips.departs, "begins")
+        begins = self.road.at_lane(trips.lane, trips.departs, "begins")
         place = torch.where(inside, begins - trips.departs * self.entry_speed, begins)
         inside = inside & (place < self.filled)
         state = self.simulator.state(
@@ -114,7 +115,7 @@ class OpenLanesTask(LanesTask):
     def seen_of_self(self, state: State) -> list[Tensor]:
         """Return ``own_features``, 0 for those not on the road."""
         assert state.links is not None and state.present is not None
-        ends = (self.several.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT)
+        ends = (self.road.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT)
         there = self.pick(state.present)
         return [x * there for x in (*super().seen_of_self(state), torch.ones_like(there), self.pick(ends))]
 
@@ -136,7 +137,7 @@ class OpenLanesTask(LanesTask):
         """Return whose episodes end in a crash: of all, where vehicles touch or one drives over the end of its lane."""
         state = world.state
         assert state.links is not None and state.present is not None
-        over = (state.position > self.several.closed_at(state.links.lane, state.position)) & (state.present > 0)
+        over = (state.position > self.road.closed_at(state.links.lane, state.position)) & (state.present > 0)
         crashed = super().crashed(world)
         return crashed | over.any(-1, keepdim=True).expand_as(crashed)
 
@@ -155,8 +156,8 @@ class MergeTask(OpenLanesTask):
     inflow: float = 2400.0
     ramp_inflow: float = 500.0
 
-    @property
-    def several(self) -> Lanes:
+    @cached_property
+    def road(self) -> Lanes:  # type: ignore[override]
         """Two lanes of 900 m, and the ramp, which is lane 0."""
         return Lanes(3, length=900.0, ends=(on_ramp(0, begin=400.0, end=600.0, entry=100.0),))
 
@@ -186,8 +187,8 @@ class BottleneckTask(OpenLanesTask):
 
     inflow: float = 2600.0
 
-    @property
-    def several(self) -> Lanes:
+    @cached_property
+    def road(self) -> Lanes:  # type: ignore[override]
         """The road, 800 m long."""
         return Lanes(4, length=800.0, ends=(lane_drop(0, at=400.0), lane_drop(3, at=400.0), lane_drop(2, at=600.0)))
 
