@@ -1,6 +1,6 @@
 """What discovery says of measured traffic: ZalaZone per car model and pooled, with and without the grade, and the rest.
 
-    python -m benchmarks.measured --data ../shared/data --out measured.jsonl [--only zalazone]
+    python -m benchmarks.measured --data ../shared/data --out measured.jsonl [--only zalazone] [--executor processes]
 
 One line of JSON per case is kept, so that a run goes on where it stopped; at the end the table. The columns grade and
 altitude_m are taken out of ZalaZone unless the case says that the grade is known.
@@ -23,8 +23,10 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import polars as pl  # noqa: E402
 
+from benchmarks import workers  # noqa: E402
 from idm_env.data import load  # noqa: E402
 from idm_env.discovery import Discovery, discover  # noqa: E402
+from idm_env.progress import OnProgress, silent  # noqa: E402
 
 FEWEST_RUNS = 7
 
@@ -60,6 +62,14 @@ def run(folder: Path, case: dict[str, Any]) -> Discovery:
     for condition in case.get("where", ()):
         trajectories = trajectories.where(condition)
     return discover(trajectories, place=case.get("place"), known=case.get("known", ()))
+
+
+def timed(part: tuple[str, Path, dict[str, Any]], _: OnProgress = silent) -> dict[str, Any]:
+    """Return the row of a case (name, folder of the data, case)."""
+    name, folder, case = part
+    begin = time.process_time()
+    found = run(folder, case)
+    return row(name, found, time.process_time() - begin)
 
 
 def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
@@ -143,19 +153,19 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("IDM_ENV_DATA", "../shared/data")))
     parser.add_argument("--out", type=Path, default=Path("measured.jsonl"))
     parser.add_argument("--only", default="", help="part of the names of the cases to run")
+    workers.add(parser)
     arguments = parser.parse_args()
     done = {}
     if arguments.out.exists():
         done = {r["case"]: r for r in map(json.loads, arguments.out.read_text().splitlines())}
     wanted = {n: c for n, c in cases(arguments.data).items() if arguments.only in n}
-    for name, case in wanted.items():
-        if name in done:
-            continue
-        begin = time.process_time()
-        done[name] = row(name, run(arguments.data, case), time.process_time() - begin)
-        with arguments.out.open("a") as file:
-            file.write(json.dumps(done[name]) + "\n")
-        print(f"{name}: {done[name]['verdict']}", file=sys.stderr)
+    missing = [(name, arguments.data, case) for name, case in wanted.items() if name not in done]
+    with workers.of(arguments) as executor:
+        for _, found in executor.map(timed, missing):
+            done[found["case"]] = found
+            with arguments.out.open("a") as file:
+                file.write(json.dumps(found) + "\n")
+            print(f"{found['case']}: {found['verdict']}", file=sys.stderr)
     print(table([done[n] for n in wanted if n in done]))
 
 

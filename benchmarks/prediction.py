@@ -1,6 +1,6 @@
 """Metrics of prediction over scenario files against single futures: by scene, and by kind and pace of all agents.
 
-    python -m benchmarks.prediction FILE… [--shares]
+    python -m benchmarks.prediction FILE… [--shares] [--executor processes]
 
 Shares of the ways in which agents go on (``idm_env.prediction.shares``) are fitted to all scenes but the one that is
 predicted, so every figure is held out. ``--shares`` prints those fitted to all scenes, which the package ships.
@@ -12,8 +12,10 @@ import argparse
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
+from benchmarks import workers
 from idm_env.data.scenario import Scenario
 from idm_env.data.womd import scenarios
 from idm_env.prediction.files import OURS, case_of
@@ -21,6 +23,7 @@ from idm_env.prediction.metrics import Score, score, summary
 from idm_env.prediction.predict import METHODS, Mixture, Prediction, chosen, mixture
 from idm_env.prediction.scene import Scene
 from idm_env.prediction.shares import SHARES, Seen, Shares, fit_shares, seen
+from idm_env.progress import OnProgress, silent
 
 STRAIGHT = "constant velocity"
 LEAST_S = 3
@@ -45,7 +48,7 @@ class Known:
         return score(case_of(self.scene.scenario, prediction))
 
 
-def known_agents(scenario: Scenario) -> list[Known]:
+def known_agents(scenario: Scenario, _: OnProgress = silent) -> list[Known]:
     """Return the agents of a scene that are valid at the present and at ``LEAST_S``."""
     scene, found = Scene(scenario), []
     for index, agent in enumerate(scenario.agents):
@@ -94,9 +97,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--shares", action="store_true", help="print the shares fitted to all scenes, and nothing else")
+    workers.add(parser)
     options = parser.parse_args()
     begin = time.perf_counter()
-    scenes = [known_agents(scenario) for path in options.files for scenario in scenarios(path)]
+    parts = [scenario for path in options.files for scenario in scenarios(path)]
+    with workers.of(options) as executor:
+        scenes = [scene for _, scene in sorted(executor.map(known_agents, parts), key=itemgetter(0))]
     if options.shares:
         for (kind, pace), values in fit_shares(one.seen for scene in scenes for one in scene).items():
             count = sum((one.seen.kind, one.seen.pace) == (kind, pace) for scene in scenes for one in scene)

@@ -5,7 +5,7 @@ documentation says of them that EIDM and KraussPS react to the slope of the road
 ``actionStepLength`` makes drivers decide rarely, which is a latency; ``speedFactor`` spreads desired speeds. Its IDM
 acts on the state of one step earlier.
 
-    python -m benchmarks.sumo_sets --sets 2
+    python -m benchmarks.sumo_sets --sets 2 [--executor processes]
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from benchmarks import workers
 from idm_env.bench.peers import straight_lane
 from idm_env.data import Trajectories, scripted
+from idm_env.progress import OnProgress, silent
 
 STEP = 0.1
 LENGTH = 4.5
@@ -126,27 +128,33 @@ def _files(folder: Path, random: np.random.Generator, case: Case, followers: int
     ]  # fmt: skip
 
 
-def main() -> None:
+def told(part: tuple[str, int, int], _: OnProgress = silent) -> dict[str, Any]:
+    """Return what discovery says of one set (case, seed, number)."""
     from idm_env.discovery import discover
 
+    name, seed, number = part
+    found = discover(platoons(seed, CASES[name]), seed=number)
+    error = found.report["error"]
+    return {
+        "case": name, "verdict": found.verdict, "found": [f["effect"] or f["label"] for f in found.report["found"]],
+        "parameters": [
+            {k: round(v["estimate"], 4) for k, v in list(f["parameters"].items())[:3]} for f in found.report["found"]
+        ],
+        "gap_rmse_m": [round(error[x]["gap_rmse_m"], 3) for x in ("before", "after", "floor")],
+        "why": found.report["reason"],
+    }  # fmt: skip
+
+
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", type=int, default=1, help="sets of every case")
     parser.add_argument("--first-seed", type=int, default=40_000)
+    workers.add(parser)
     arguments = parser.parse_args()
-    for name, case in CASES.items():
-        for number in range(arguments.sets):
-            found = discover(platoons(arguments.first_seed + number, case), seed=number)
-            error = found.report["error"]
-            print(json.dumps({
-                "case": name, "verdict": found.verdict,
-                "found": [f["effect"] or f["label"] for f in found.report["found"]],
-                "parameters": [
-                    {k: round(v["estimate"], 4) for k, v in list(f["parameters"].items())[:3]}
-                    for f in found.report["found"]
-                ],
-                "gap_rmse_m": [round(error[x]["gap_rmse_m"], 3) for x in ("before", "after", "floor")],
-                "why": found.report["reason"],
-            }), flush=True)  # fmt: skip
+    sets = [(name, arguments.first_seed + number, number) for name in CASES for number in range(arguments.sets)]
+    with workers.of(arguments) as executor:
+        for _, row in executor.map(told, sets):
+            print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

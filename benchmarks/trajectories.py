@@ -1,6 +1,6 @@
 """Filtering and reconstruction side by side with every baseline, on vehicles that no tuning has seen; and their times.
 
-    python benchmarks/trajectories.py --data FOLDER [--part filter|reconstruct|time]
+    python -m benchmarks.trajectories --data FOLDER [--part filter|reconstruct|time] [--executor processes]
 
 FOLDER holds the measured files named in ``FILES``. Baselines are tuned on the truth of every other vehicle, for each
 figure by itself; ours sees no truth: its noise is fitted to the noisy positions of those same vehicles. The published
@@ -19,6 +19,8 @@ import numpy as np
 import polars as pl
 import torch
 
+from benchmarks import workers
+from idm_env.progress import OnProgress, silent
 from idm_env.trajectories import baselines, paper
 from idm_env.trajectories.noise import SPARSE_WHITE_M, fit_noise
 from idm_env.trajectories.recipe import clock_of, overlaps, recipe
@@ -73,9 +75,9 @@ def score(
     return tally.row()
 
 
-def show(name: str, row: dict[str, float | int], note: str = "") -> None:
+def line(name: str, row: dict[str, float | int], note: str = "") -> str:
     values = " ".join(f"{row[key]:8.{digits}f}" for key, _, digits in SHOWN)
-    print(f"  {name:24s} {values}  {note}", flush=True)
+    return f"  {name:24s} {values}  {note}"
 
 
 SHOWN = (
@@ -89,8 +91,8 @@ HEAD = f"  {'method':24s} " + " ".join(f"{title:>8s}" for _, title, _ in SHOWN)
 def best_of(
     name: str, tuned: list[Track], scored: list[Track], truth: Callable[[Track], Motion], ends: float = 0.0,
     given: dict[str, float] | None = None,
-) -> None:  # fmt: skip
-    """Tune a baseline on some tracks, for each figure by itself, and show what it does to the others."""
+) -> list[str]:  # fmt: skip
+    """Tune a baseline on some tracks, for each figure by itself, and return what it does to the others."""
     rows: list[tuple[dict[str, float], dict[str, float | int]]] = []
     for choice in baselines.BASELINES[name][1]:
         whole = {**choice, **(given or {})}
@@ -99,10 +101,12 @@ def best_of(
     for what in ("speed_rmse_mps", "accel_rmse_mps2"):
         choice, _ = min(rows, key=lambda row: row[1][what])
         found.setdefault(tuple(choice.items()), []).append(what[:5])
+    lines = []
     for choice, what in found.items():
         note = ", ".join(f"{key} {value:g}" for key, value in choice)
         row = score(scored, _motions(name, scored, dict(choice)), truth, ends)
-        show(name, row, f"{note} for {' and '.join(what)}" if note else "")
+        lines.append(line(name, row, f"{note} for {' and '.join(what)}" if note else ""))
+    return lines
 
 
 def _motions(name: str, tracks: list[Track], choice: dict[str, float]) -> list[Motion]:
@@ -118,21 +122,25 @@ def halves(tracks: list[Track]) -> tuple[list[Track], list[Track]]:
     ]
 
 
-def filtering(data: Path) -> None:
-    """Score on either half what was tuned on the other, with the ends of the tracks and without."""
+def filtering(part: tuple[Path, int], _: OnProgress = silent) -> str:
+    """Return scores on the half that tuned nothing, with the ends of the tracks and without; (data, which half)."""
+    data, number = part
     truth = truth_of(pl.read_parquet(data / CLEAN), with_run=False)
     first, second = halves(list(Pieces(read_table(data / RAW))))
-    for number, (tuned, scored) in enumerate(((first, second), (second, first)), 1):
-        noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
-        ours = recipe(scored, 0.1, noise)
-        published = [paper.imitate(t).motion for t in scored]
-        for ends in ENDS_S:
-            counts = f"half {number}: tuned on {len(tuned)} tracks, scored on the other {len(scored)}"
-            print(f"filtering, {counts}, without the first and last {ends:g} s\n{HEAD}")
-            show("ours", score(scored, [f.motion for f in ours], truth, ends), f"new overlaps {overlaps(ours)[1]}")
-            show("the paper's recipe", score(scored, published, truth, ends))
-            for name in baselines.available():
-                best_of(name, tuned, scored, truth, ends)
+    tuned, scored = (first, second) if number == 1 else (second, first)
+    noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
+    ours = recipe(scored, 0.1, noise)
+    published = [paper.imitate(t).motion for t in scored]
+    lines = []
+    for ends in ENDS_S:
+        counts = f"half {number}: tuned on {len(tuned)} tracks, scored on the other {len(scored)}"
+        lines += [f"filtering, {counts}, without the first and last {ends:g} s", HEAD]
+        own = score(scored, [f.motion for f in ours], truth, ends)
+        lines.append(line("ours", own, f"new overlaps {overlaps(ours)[1]}"))
+        lines.append(line("the paper's recipe", score(scored, published, truth, ends)))
+        for name in baselines.available():
+            lines += best_of(name, tuned, scored, truth, ends)
+    return "\n".join(lines)
 
 
 def thinned(track: Track, seconds: float) -> Track:
@@ -144,27 +152,31 @@ def thinned(track: Track, seconds: float) -> Track:
     return track.part(np.array(kept))
 
 
-def reconstruction(data: Path) -> None:
-    """Score every method against what thinning left out; baselines are tuned on every other vehicle."""
-    for place, (file, count, shortest) in FILES.items():
-        frame = pl.read_parquet(data / file)
-        long = [t for t in Pieces(read_table(data / file)) if t.time_s[-1] - t.time_s[0] >= shortest]
-        # evenly over the file, and at most two minutes of each
-        chosen = [long[i] for i in np.unique(np.linspace(0, len(long) - 1, 2 * count).astype(int))]
-        parts = halves([t.part(t.time_s <= t.time_s[0] + 120.0) for t in chosen])
-        truth = truth_of(frame, with_run=True)
-        for seconds in SPARSE_S:
-            tuned, scored = ([s for s in (thinned(t, seconds) for t in ts) if len(s) >= 3] for ts in parts)
-            noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
-            print(f"reconstruction: {place}, {len(scored)} tracks, a sample every {seconds:g} s\n{HEAD}")
-            ours = recipe(scored, 0.1, noise, SPARSE)
-            show("ours", score(scored, [f.motion for f in ours], truth))
-            for fixed in (False, True):
-                steps = [paper.imitate(t, paper.RECONSTRUCT_STEP_S, fixed_parameters=fixed).motion for t in scored]
-                dense = [_dense(m, clock_of(t, 0.1)) for m, t in zip(steps, scored, strict=True)]
-                show("  … parameters fixed" if fixed else "the paper's recipe", score(scored, dense, truth))
-            for name in baselines.available():
-                best_of(name, tuned, scored, truth, given={"sigma": SPARSE_WHITE_M} if name == "Kalman/RTS" else None)
+def reconstruction(part: tuple[Path, str, float], _: OnProgress = silent) -> str:
+    """Return scores of every method against what thinning left out, (data, place, seconds between samples).
+
+    Baselines are tuned on every other vehicle.
+    """
+    data, place, seconds = part
+    file, count, shortest = FILES[place]
+    long = [t for t in Pieces(read_table(data / file)) if t.time_s[-1] - t.time_s[0] >= shortest]
+    # evenly over the file, and at most two minutes of each
+    chosen = [long[i] for i in np.unique(np.linspace(0, len(long) - 1, 2 * count).astype(int))]
+    both = halves([t.part(t.time_s <= t.time_s[0] + 120.0) for t in chosen])
+    truth = truth_of(pl.read_parquet(data / file), with_run=True)
+    tuned, scored = ([s for s in (thinned(t, seconds) for t in ts) if len(s) >= 3] for ts in both)
+    noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
+    lines = [f"reconstruction: {place}, {len(scored)} tracks, a sample every {seconds:g} s", HEAD]
+    ours = recipe(scored, 0.1, noise, SPARSE)
+    lines.append(line("ours", score(scored, [f.motion for f in ours], truth)))
+    for fixed in (False, True):
+        steps = [paper.imitate(t, paper.RECONSTRUCT_STEP_S, fixed_parameters=fixed).motion for t in scored]
+        dense = [_dense(m, clock_of(t, 0.1)) for m, t in zip(steps, scored, strict=True)]
+        lines.append(line("  … parameters fixed" if fixed else "the paper's recipe", score(scored, dense, truth)))
+    for name in baselines.available():
+        given = {"sigma": SPARSE_WHITE_M} if name == "Kalman/RTS" else None
+        lines += best_of(name, tuned, scored, truth, given=given)
+    return "\n".join(lines)
 
 
 def _dense(motion: Motion, clock: np.ndarray) -> Motion:
@@ -217,15 +229,20 @@ def main() -> None:
     parser.add_argument("--part", choices=("filter", "reconstruct", "time"))
     parser.add_argument("--tracks", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=60.0)
+    workers.add(parser)
     options = parser.parse_args()
     if options.part in (None, "time"):
         timing(options.tracks, options.seconds)
     if options.data is None:
         return
-    if options.part in (None, "filter"):
-        filtering(options.data)
-    if options.part in (None, "reconstruct"):
-        reconstruction(options.data)
+    with workers.of(options) as executor:
+        if options.part in (None, "filter"):
+            for _, text in executor.map(filtering, [(options.data, number) for number in (1, 2)]):
+                print(text, flush=True)
+        if options.part in (None, "reconstruct"):
+            parts = [(options.data, place, seconds) for place in FILES for seconds in SPARSE_S]
+            for _, text in executor.map(reconstruction, parts):
+                print(text, flush=True)
 
 
 if __name__ == "__main__":
