@@ -38,7 +38,7 @@ def fitted(records: Records, names: Sequence[str]) -> list[tuple[Model, np.ndarr
     """Return IDM and IDM with the terms as fitted on these records, each with its drivers' spread."""
     catalogue = Catalogue(tuple(make(name) for name in names), located=False)
     plain, joint = Model((), catalogue), Model(tuple(simple(name) for name in names), catalogue)
-    rows, weak = whole(records), replace(search.first_prior(), free=False)
+    rows, weak = whole(records).settled(), replace(search.first_prior(), free=False)
     task = Task(rows, None, weak)
     first = solve(task, plain, np.tile(weak.centre, (task.groups, 1)), np.zeros(0), iterations=10, tolerance=1e-3)
     prior = search.population(first.theta, rows)

@@ -22,11 +22,11 @@ def judged(law: CarFollowing, null: Solution, fit: Records, kept: Records, adapt
     """Return a law's errors on the runs kept back, with what the null has beside its own law, as it stands there.
 
     Drivers' spread is estimated on the runs that fit, in free simulation, and is the prior for those kept back. With
-    ``adapt`` their parameters come from every other block of time, and the blocks between are scored; without it groups
-    keep the parameters of the runs that fit.
+    ``adapt`` their parameters come from every other block of time than what is scored; without it groups keep the
+    parameters of the runs that fit.
     """
     model, values = Model(null.model.terms, Catalogue(tuple(null.model.named), law, located=False)), null.values
-    weak, rows = search.first_prior(law), whole(fit)
+    weak, rows = search.first_prior(law), whole(fit).settled()
     task = Task(rows, None, weak)
     centre = np.tile(weak.centre, (task.groups, 1))
     first = solve(task, Frozen(model, values), centre, np.zeros(0), iterations=15, tolerance=1e-3)

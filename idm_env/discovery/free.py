@@ -2,7 +2,7 @@
 
 Predictions over five seconds, whitened, do not see a slow set-point that is wrong: a driver's noise looks the same
 there. In free simulation it shows. θ of every driver comes from every other block of time, φ from other runs, and the
-blocks between are scored, as on runs kept back.
+blocks between are scored.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, thet
     are over-fitted, and an effect that only regularises them looks like a finding. So every model has the weight with
     which it predicts best what its drivers' parameters have not seen, on the runs that choose.
     """
-    rows, frozen = whole(records), Frozen(model, values)
+    rows, frozen = whole(records).settled(), Frozen(model, values)
     scored = judge.halves(rows)
     part = replace(rows, valid=rows.valid & ~scored)
     task = Task(part, None, replace(prior, free=False))

@@ -21,15 +21,13 @@ from idm_env.discovery.units import units
 class Judged:
     """Errors of every row's free simulation [R, samples], what was simulated, and errors 5 s ahead of windows [W].
 
-    ``gap`` and ``speed`` are the simulated ones, ``scored`` the samples that count; a driver's record may be cut into
-    several rows, and a driver may have several records: figures per driver are those of ``followers``.
+    ``gap`` and ``speed`` are the simulated ones; a driver's record may be cut into several rows, and a driver may have
+    several records: figures per driver are those of ``followers``.
     """
 
     rows: Rows
-    theta: np.ndarray
     gap: np.ndarray
     speed: np.ndarray
-    scored: np.ndarray
     ahead: np.ndarray
     ahead_record: np.ndarray
 
@@ -37,7 +35,7 @@ class Judged:
     def gap_error(self) -> np.ndarray:
         """Simulated less measured gap (m) [R, samples], 0 where it does not count."""
         records = self.rows.records
-        return np.where(self.scored, np.clip(self.gap - records.gap[self.rows.samples], -200, 200), 0.0)
+        return np.where(self.rows.valid, np.clip(self.gap - records.gap[self.rows.samples], -200, 200), 0.0)
 
     @cached_property
     def followers(self) -> tuple[tuple[str, str], ...]:
@@ -53,9 +51,9 @@ class Judged:
     @cached_property
     def squares(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Sums of squares and numbers of samples [followers] of every error."""
-        speed_error = np.where(self.scored, self.speed - self.rows.records.speed[self.rows.samples], 0.0)
+        speed_error = np.where(self.rows.valid, self.speed - self.rows.records.speed[self.rows.samples], 0.0)
         of_row = self.follower[self.rows.record]
-        samples = self._summed(of_row, self.scored.sum(1))
+        samples = self._summed(of_row, self.rows.valid.sum(1))
         of_window = self.follower[self.ahead_record]
         return {
             "gap_rmse_m": (self._summed(of_row, (self.gap_error**2).sum(1)), samples),
@@ -70,12 +68,12 @@ class Judged:
 
     @property
     def gap_rmse(self) -> np.ndarray:
-        """Gap RMSE of every follower (m), NaN where nothing was scored."""
+        """Gap RMSE of every follower (m), NaN where there is nothing to score."""
         square, count = self.squares["gap_rmse_m"]
         return np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.nan)
 
     def summary(self) -> dict[str, float]:
-        """Return the four errors of the report; the pooled ones weigh every scored sample alike."""
+        """Return the four errors of the report; the pooled ones weigh every sample alike."""
         pooled = {
             key: float(np.sqrt(square.sum() / count.sum())) if count.sum() else float("nan")
             for key, (square, count) in self.squares.items()
@@ -105,7 +103,7 @@ def unweighed(
 
     From two starts, the prior's centre and ``start`` [G, P]; every group keeps the better one.
     """
-    rows = whole(records) if rows is None else rows
+    rows = (whole(records) if rows is None else rows).settled()
     frozen, empty = Frozen(model, values), np.zeros(0)
     task = Task(rows, None, replace(prior, free=False))
     centre = np.tile(prior.centre, (task.groups, 1))
@@ -169,7 +167,7 @@ def everywhere(records: Records, task: Task, solution: Solution) -> places.Respo
 
 
 def halves(rows: Rows) -> np.ndarray:
-    """Return [R, samples] which samples lie in the blocks of time that are scored; the others fit θ."""
+    """Return [R, samples] which samples lie in every second block of time: 30 s, or a quarter of a shorter record."""
     records = rows.records
     scored = np.zeros(rows.valid.shape, bool)
     for i in range(len(rows)):
@@ -185,26 +183,28 @@ def judge(
 ) -> Judged:
     """Return the errors on held-out records.
 
-    With ``adapt`` θ of every driver comes from every other block of time (30 s, or a quarter of a shorter record), with
-    the population as prior, and the blocks between are scored; without it ``theta`` [G, P] is used, and everything
-    scored.
+    With ``adapt`` θ of a driver comes from every second block of time (30 s, or a quarter of a shorter record), with
+    the population as prior, and the blocks between are scored; then the other way round, so that all time is. Without it
+    ``theta`` [G, P] is used.
     """
-    rows = whole(records)
-    scored = halves(rows) if adapt else rows.valid
+    rows, short = whole(records), windows(records)
+    frozen, near = Frozen(model, values), Task(short, None, prior)
     if adapt:
-        part = replace(rows, valid=rows.valid & ~scored)
-        fitted = calibrate(records, model, values, prior, part, theta)
-        theta = fitted.theta
-    assert theta is not None
-    frozen = Frozen(model, values)
-    empty = np.zeros((1, 0))
-    task = Task(rows, None, prior)
-    gap, speed = (x[0] for x in task.predict(theta[None], frozen, empty))
-    short = windows(records)
-    near = Task(short, None, prior)
-    ahead = near.errors(theta[None], frozen, empty)[0][:, -1]
-    odd = short.block % 2 == 1 if adapt else np.ones(len(short), bool)
-    return Judged(rows, theta, gap, speed, scored, ahead[odd], short.record[odd])
+        thetas = np.stack([
+            calibrate(records, model, values, prior, replace(rows, valid=part), theta).theta
+            for part in (rows.valid & ~halves(rows), halves(rows))
+        ])  # fmt: skip
+        # Of two copies, the second is scored where the first was fitted.
+        there, then = (~halves(rows)).astype(int), (short.block % 2 == 0).astype(int)
+    else:
+        assert theta is not None
+        thetas, there, then = theta[None], np.zeros(rows.valid.shape, int), np.zeros(len(short), int)
+    empty = np.zeros((len(thetas), 0))
+    gap, speed = (
+        np.take_along_axis(x, there[None], 0)[0] for x in Task(rows, None, prior).predict(thetas, frozen, empty)
+    )
+    ahead = np.take_along_axis(near.errors(thetas, frozen, empty)[..., -1], then[None], 0)[0]
+    return Judged(rows, gap, speed, ahead, short.record)
 
 
 def floor(records: Records) -> dict[str, float]:

@@ -25,12 +25,13 @@ TITLES = {
 }
 MEANING_OF_ERRORS = {
     "gap in free simulation": "every follower is simulated alone from its first measured sample on, behind its "
-    "measured leader; root mean square of simulated less measured gap over all scored samples of all followers",
+    "measured leader; root mean square of simulated less measured gap over all samples of all followers",
     "the same, median follower": "half of the followers err by less",
     "gap 5 s ahead": "the simulation starts anew on the measured state every 5 s; root mean square of the gap's error "
     "at the end of the 5 s",
     "speed in free simulation": "as the first, of the speed",
-    "scored": "every other stretch of time (up to 30 s); the stretches between fit the driver's own parameters",
+    "the driver's own parameters": "in every stretch of time (up to 30 s) those fitted to every second stretch, from "
+    "the one before and the one after it on; a stretch is never scored with parameters that have seen it",
     "noise of measurement": "what the noise in the file alone would leave of a perfect model",
 }
 DATA = {
@@ -125,7 +126,7 @@ def _first_picture(d: Discovery) -> Iterator[Block]:
     yield pages.picture(
         figure,
         f"The follower kept back whose error with {d.judgement.titles[0]} is the median one: run {run}, vehicle "
-        f"{vehicle}. Below: simulated less measured gap where it is scored (shaded, as in the table).",
+        f"{vehicle}. Below: simulated less measured gap.",
         pictures.first_screen(d, (4.2, 4.6)),
     )
 

@@ -67,8 +67,8 @@ def all_of(d: Discovery) -> list[tuple[str, Block]]:
     put("Residual over position and time", "The same acceleration as a map.", maps(d))
     put(
         "Measured and simulated gap",
-        "Best, median and worst follower kept back, in free simulation behind the measured leader. Shaded spans are "
-        "scored, as in the table; the drivers' own parameters come from the others.",
+        "Best, median and worst follower kept back, in free simulation behind the measured leader; in every "
+        "stretch (up to 30 s) with the driver's own parameters from those before and after it.",
         gaps(d),
     )
     put(
@@ -278,7 +278,7 @@ def maps(d: Discovery) -> Figure:
 
 
 def _trace(judged: Judged, follower: int) -> tuple[np.ndarray, ...]:
-    """Return time, measured gap, simulated gap and where it is scored, of all pieces of a follower's record.
+    """Return time, measured gap and simulated gap of all pieces of a follower's record.
 
     Pieces are divided by NaN. The samples are those of every table.
     """
@@ -288,10 +288,10 @@ def _trace(judged: Judged, follower: int) -> tuple[np.ndarray, ...]:
         valid = rows.valid[i]
         at = rows.samples[i][valid]
         time = rows.records.signals[at, twin.COLUMNS.index("time")]
-        piece = np.stack([time, rows.records.gap[at], judged.gap[i][valid], judged.scored[i][valid]])
-        pieces += [piece, np.array([[time[-1]], [np.nan], [np.nan], [0.0]])]
-    time, measured, simulated, scored = np.concatenate(pieces, axis=1)
-    return time - time[0], measured, simulated, scored > 0
+        piece = np.stack([time, rows.records.gap[at], judged.gap[i][valid]])
+        pieces += [piece, np.array([[time[-1]], [np.nan], [np.nan]])]
+    time, measured, simulated = np.concatenate(pieces, axis=1)
+    return time - time[0], measured, simulated
 
 
 def typical(d: Discovery) -> int | None:
@@ -324,15 +324,12 @@ def first_screen(d: Discovery, size: tuple[float, float] = (9.0, 4.0)) -> Figure
     )  # fmt: skip
     handles = []
     for i, (name, judged, colour, style) in enumerate(named(d)):
-        time, measured, simulated, scored = _trace(judged, follower)
+        time, measured, simulated = _trace(judged, follower)
         if not i:
             handles += above.plot(time, measured, color=TRUTH, lw=1.5, label="measured")
-            shade = {"where": scored, "color": "#e6edf4", "zorder": -5, "lw": 0}
-            for axis in (above, below):
-                axis.fill_between(time, 0, 1, transform=axis.get_xaxis_transform(), **shade)
         label = f"{name}: {judged.gap_rmse[follower]:.2f} m"
         handles += above.plot(time, simulated, color=colour, ls=style, lw=1.1, label=label)
-        below.plot(time, np.where(scored, simulated - measured, np.nan), color=colour, ls=style, lw=1.1)
+        below.plot(time, simulated - measured, color=colour, ls=style, lw=1.1)
     below.axhline(0, color=TRUTH, lw=0.6)
     above.set_ylabel("gap (m)")
     below.set_ylabel("residual (m)")
@@ -354,12 +351,9 @@ def gaps(d: Discovery) -> Figure | None:
     for axis, follower, title in zip(axes, picks, ("best", "median", "worst"), strict=True):
         texts = []
         for i, (name, judged, colour, style) in enumerate(models):
-            time, measured, simulated, scored = _trace(judged, int(follower))
+            time, measured, simulated = _trace(judged, int(follower))
             if not i:
                 axis.plot(time, measured, color=TRUTH, lw=1.4, label="measured")
-                axis.fill_between(
-                    time, 0, 1, where=scored, transform=axis.get_xaxis_transform(), color="#e6edf4", zorder=-5, lw=0
-                )
             axis.plot(time, simulated, color=colour, ls=style, lw=1, label=name)
             texts.append(f"{name} {judged.gap_rmse[follower]:.2f} m")
         run, vehicle = models[0][1].followers[follower]

@@ -193,6 +193,17 @@ class Rows:
         """Run of every row."""
         return self.records.run[self.record]
 
+    def settled(self) -> Rows:
+        """Return the rows without the first seconds of records, for calibrations in free simulation.
+
+        What the driver saw and did before a record begins is not known, and a delay, a memory or a smoother's edge
+        makes errors of it that no parameter explains: fitted to them, parameters err where they matter.
+        """
+        span = (self.records.bounds[1:] - self.records.first)[self.record] * self.records.dt
+        begin = np.where(span >= SHORT_S, TRIM_S[0], 1.0)
+        since = (self.samples - self.records.first[self.record][:, None]) * self.records.dt
+        return replace(self, valid=self.valid & (since >= begin[:, None]))
+
     @cached_property
     def samples(self) -> np.ndarray:
         """Index of every kept sample, [rows, samples], inside the record."""

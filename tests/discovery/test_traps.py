@@ -72,12 +72,11 @@ class TestSumo:
         from benchmarks.sumo_sets import CASES, platoons
 
         report = discover(platoons(5, CASES["IDM, decides every 1 s"], runs=8, followers=2, seconds=120.0)).report
-        # With it one of the four drivers kept back is much worse in free simulation: then nothing is named.
-        first = (report["found"] or report["partial"]["terms"])[0]
-        assert report["verdict"] in ("named", "one_of") or report["reason"] == "held_out"
-        assert report["found"] or report["partial"]["explained_share"] > 0.9
-        assert first["effect"] in ("delay", "lag")
-        assert next(iter(first["parameters"].values()))["estimate"] == pytest.approx(0.5, abs=0.2)
+        (found,) = report["found"]
+        assert report["verdict"] in ("named", "one_of") and found["effect"] in ("delay", "lag")
+        assert found["parameters"]["delay"]["estimate"] == pytest.approx(0.5, abs=0.2)
+        # What the drivers saw before their records begin moves nobody's parameters so far that this is lost.
+        assert report["helps"]["gap_rmse_m"]["ratio"] < 0.6
 
 
 def test_what_vehicles_of_one_run_share_is_located_there(monkeypatch: pytest.MonkeyPatch) -> None:
