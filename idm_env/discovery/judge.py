@@ -184,8 +184,8 @@ def judge(
     """Return the errors on held-out records.
 
     With ``adapt`` θ of a driver comes from every second block of time (30 s, or a quarter of a shorter record), with
-    the population as prior, and the blocks between are scored; then the other way round, so that all time is. Without it
-    ``theta`` [G, P] is used.
+    the population as prior, and the blocks between are scored; then the other way round, so that all time is. Without
+    it ``theta`` [G, P] is used.
     """
     rows, short = whole(records), windows(records)
     frozen, near = Frozen(model, values), Task(short, None, prior)
