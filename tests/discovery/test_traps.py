@@ -72,7 +72,7 @@ class TestSumo:
         from benchmarks.sumo_sets import CASES, platoons
 
         report = discover(platoons(5, CASES["IDM, decides every 1 s"], runs=8, followers=2, seconds=120.0)).report
-        (found,) = report["found"]
+        found = report["found"][0]
         assert report["verdict"] in ("named", "one_of") and found["effect"] in ("delay", "lag")
         assert found["parameters"]["delay"]["estimate"] == pytest.approx(0.5, abs=0.2)
         # What the drivers saw before their records begin moves nobody's parameters so far that this is lost.
