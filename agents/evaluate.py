@@ -91,8 +91,12 @@ def evaluate_ring(
     warmup: int = WARMUP,
     draws: Sequence[int] = (0,),
 ) -> dict[str, Any]:
-    """Return the figures of a policy on rings of these lengths, from a take-over after ``warmup`` steps on."""
-    start = ring_start(environment, lengths, warmup, draws)
+    """Return the figures of a policy on rings of these lengths, from a take-over after ``warmup`` steps on.
+
+    Lengths are those of 22 vehicles; with more of them rings are as much longer.
+    """
+    share = task_of(environment).vehicles / 22
+    start = ring_start(environment, [length * share for length in lengths], warmup, draws)
     return judge_ring(start, drive(start, act, STEPS))
 
 

@@ -1,15 +1,17 @@
 """Agents side by side: equal searches, ten seeds of the best, held-out rings and drivers.
 
     python benchmarks/agents.py reference [--rings failsafe-shock] [--out runs/benchmark]
-    python benchmarks/agents.py run [--only ring-ppo] [--trial 0] [--seeds 3] [--executor processes --jobs 8]
+    python benchmarks/agents.py run [--only ring-ppo] [--trial 0] [--seeds 3] [--times 10] [--executor ray]
     python benchmarks/agents.py table [--out runs/benchmark]
     python benchmarks/agents.py takeover [--out runs/benchmark]
 
 ``reference`` has what learns nothing, ``run`` the searches and the seeds of each best trial (or of the one that is
 given, without a search). Every training is one process with one thread and one file of results; what is done is
-skipped, what another process works on is left to it, so the command may be interrupted, repeated, and started several
-times; ``--executor ray --ray-address HOST:PORT`` trains on a cluster with shared storage. CPU seconds are those of
-training; evaluations every 3 s are not counted.
+skipped, what was interrupted goes on from its last checkpoint, what another process works on is left to it, so the
+command may be interrupted, repeated, and started several times; ``--executor ray --ray-address HOST:PORT`` trains on a
+cluster with shared storage. A training ends with its updates, so that a busy machine does not shorten it, or after 150
+CPU seconds; ``--times 10`` gives it ten times as many of both, over which the learning rate falls. CPU seconds are
+those of training; evaluations every 3 s are not counted.
 """
 
 from __future__ import annotations
@@ -33,11 +35,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import workers  # noqa: E402 (found by the path above)
+from idm_env.config import read_yaml  # noqa: E402
 from idm_env.executor import Executor, Serial  # noqa: E402
 from idm_env.progress import OnProgress  # noqa: E402
 
-BUDGET = {"ring-shac": 90.0}
-"""CPU seconds of a training, 45 where nothing else is said; the three that are compared have the same."""
+LIMIT = 150.0
+"""CPU seconds after which a training ends that has updates left."""
 EVERY = 3.0
 RINGS = ("failsafe", "failsafe-shock", "brakes", "brakes-shock")
 """Of the reference rows (``benchmarks.agents_reference.rings``)."""
@@ -68,6 +71,7 @@ SEARCH: dict[str, list[Options]] = {
     ],
     "ring-shac": [{}],
     "ring-drivers-apg": [{}],
+    "ring-brakes-apg": [{}],
     "follow-apg": [{}],
     "follow-ppo": [{}],
 }
@@ -77,25 +81,31 @@ MODULES = {"apg": "agents.apg", "ppo": "agents.ppo", "sac": "agents.ppo", "shac"
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One training: a configuration, the number of its trial, what the trial changes, and a seed."""
+    """One training: a configuration, the number of its trial, what the trial changes, a seed, and how much longer."""
 
     config: str
     trial: int
     options: Options
     seed: int
+    times: int = 1
 
     @property
     def name(self) -> str:
         """The folder of its results."""
-        return f"{self.config}/trial{self.trial}/seed{self.seed}"
+        longer = f"x{self.times}" if self.times > 1 else ""
+        return f"{self.config}/trial{self.trial}{longer}/seed{self.seed}"
 
     def command(self, out: Path) -> list[str]:
         """Return the command that trains."""
         module = MODULES[self.config.split("-")[-1]]
         words = [sys.executable, "-m", module, "--config", f"configs/{self.config}.yaml", "--seed", str(self.seed)]
-        words += ["--out", str(out), "--cpu-seconds", str(BUDGET.get(self.config, 45.0))]
-        words += ["--evaluate-every", str(EVERY)]
-        for key, value in self.options.items():
+        words += ["--out", str(out), "--cpu-seconds", str(LIMIT * self.times)]
+        words += ["--evaluate-every", str(EVERY * self.times**0.5)]
+        options = dict(self.options)
+        if self.times > 1:
+            given = read_yaml(ROOT / "configs" / f"{self.config}.yaml")
+            options["updates"] = self.times * options.get("updates", given["updates"])
+        for key, value in options.items():
             option = "--" + key.replace("_", "-")
             words += [option] if value is True else [option, str(value)]
         return words
@@ -135,8 +145,12 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
     training = out / job.name / "training"
 
     def make() -> dict[str, Any]:
-        shutil.rmtree(training, ignore_errors=True)
-        done = subprocess.run(job.command(training), cwd=ROOT, capture_output=True, text=True, check=False)
+        command = job.command(training)
+        if (training / "last.pt").exists():
+            command.append("--resume")
+        else:
+            shutil.rmtree(training, ignore_errors=True)
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         row = {**dataclasses.asdict(job), **outcome(training, done, unseen=job.seed in SEEDS)}
         print(f"{job.name}: {json.dumps(row['summary'])}", flush=True)
         return row
@@ -151,7 +165,7 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
     from agents.rollout import FRESH
 
     if not (training / "last.pt").exists() or not (training / "best.pt").exists():
-        summary = {"solved": False, "ever": False, "error": True}
+        summary = {"solved": False, "ever": False, "spent": 0.0, "error": True}
         return {"error": done.stderr[-2000:], "history": [], "summary": summary}
     policy, content = load(training / "last.pt")
     best, at_best = load(training / "best.pt")
@@ -172,6 +186,7 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
         "steps": None if first is None else history[first]["steps"],
         "ever": any(row["passed"] for row in history),
         "untrained": untrained["passed"],
+        "spent": history[-1]["cpu_seconds"] if history else 0.0,
         "error": done.returncode != 0,
     }
     result = {
@@ -221,8 +236,18 @@ def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
     return ranks.index(max(ranks)), done
 
 
-def run(configs: list[str], out: Path, seeds: int, given: int | None = None, executor: Executor | None = None) -> None:
-    """Do every search and the first ``seeds`` seeds of its best trial, or those of a given one without any search."""
+def run(
+    configs: list[str],
+    out: Path,
+    seeds: int,
+    given: int | None = None,
+    executor: Executor | None = None,
+    times: int = 1,
+) -> None:
+    """Do every search and the first ``seeds`` seeds of its best trial, or those of a given one without any search.
+
+    ``times`` makes the trainings of these seeds longer, not those of the search.
+    """
     executor = executor or Serial()
     searched = [job for config in configs for job in trials(config)] if given is None else []
     deque(executor.map(train, [Training(job, out) for job in searched]), 0)
@@ -233,7 +258,7 @@ def run(configs: list[str], out: Path, seeds: int, given: int | None = None, exe
             print(f"{config}: another process is still searching.")
             continue
         best = SEARCH[config][trial]
-        wanted += [Job(config, trial, best, s) for s in (SEEDS if config.startswith("ring") else FEW)[:seeds]]
+        wanted += [Job(config, trial, best, s, times) for s in (SEEDS if config.startswith("ring") else FEW)[:seeds]]
     deque(executor.map(train, [Training(job, out) for job in wanted]), 0)
 
 
@@ -247,6 +272,7 @@ def main() -> None:
     parser.add_argument("--rings", nargs="*", default=list(RINGS), choices=RINGS, help="of the reference rows")
     parser.add_argument("--trial", type=int, help="train the seeds of this trial, without a search")
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train no more seeds than that")
+    parser.add_argument("--times", type=int, default=1, help="train the seeds for so many times the updates")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
     workers.add(parser)
     options = parser.parse_args()
@@ -265,7 +291,7 @@ def main() -> None:
         agents_reference.show(options.out.resolve(), options.rings, once)
     else:
         with workers.of(options) as executor:
-            run(options.only, options.out.resolve(), options.seeds, options.trial, executor)
+            run(options.only, options.out.resolve(), options.seeds, options.trial, executor, options.times)
 
 
 if __name__ == "__main__":

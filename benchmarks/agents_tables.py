@@ -12,9 +12,19 @@ Row = dict[str, Any]
 
 
 def results(out: Path, config: str) -> list[Row]:
-    """Return every result of a configuration, by trial and seed."""
+    """Return every result of a configuration, by trial, length of training and seed."""
     found = [json.loads(path.read_text()) for path in (out / config).glob("trial*/seed*/result.json")]
-    return sorted(found, key=lambda r: (r["trial"], r["seed"]))
+    return sorted(found, key=lambda r: (r["trial"], r.get("times", 1), r["seed"]))
+
+
+def groups(out: Path, config: str, seeds: Sequence[int]) -> dict[str, list[Row]]:
+    """Return the results of a configuration's seeds, by what was trained for how long."""
+    found: dict[str, list[Row]] = {}
+    for r in results(out, config):
+        if r["seed"] in seeds:
+            times = r.get("times", 1)
+            found.setdefault(f"{r['trial']}" + (f", {times} times" if times > 1 else ""), []).append(r)
+    return found
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -58,14 +68,14 @@ def solved(rows: Sequence[Row]) -> int:
 def summary_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
     """Print one row per agent: how many seeds, how soon, how well at the end and on held-out traffic."""
     rows = []
-    for config in configs:
-        part = [r for r in results(out, config) if r["seed"] in seeds]
-        if not part:
-            continue
+    for config, name, part in ((c, n, p) for c in configs for n, p in groups(out, c, seeds).items()):
         done = [r["summary"] for r in part if r["summary"]["solved"]]
         ended = [r for r in part if r["history"]]
+        if not ended:
+            continue
         rows.append([
-            config, str(part[0]["trial"]), f"{len(done)} of {len(part)}", str(sum(r["summary"]["ever"] for r in ended)),
+            config, name, f"{len(done)} of {len(part)}", str(sum(r["summary"]["ever"] for r in ended)),
+            spread([r["summary"]["spent"] for r in part], ".0f"),
             spread([d["cpu_seconds"] for d in done], ".1f"), spread([d["steps"] / 1000 for d in done], ".0f"),
             f"{min(r['fresh_last']['speed_ratio'] for r in ended):.3f}",
             f"{max(r['fresh_last']['speed_std'] for r in ended):.2f}",
@@ -73,31 +83,41 @@ def summary_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> No
             str(sum(r["fresh_last"]["collisions"] for r in ended)),
         ])  # fmt: skip
     table(
-        ("agent", "trial", "solved", "ever passed", "CPU s to solved", "1000 steps to solved", "worst last ratio",
-         "worst last std (m/s)", "smallest time gap (s)", "collisions"), rows,
+        ("agent", "trial", "solved", "ever passed", "CPU s trained", "CPU s to solved", "1000 steps to solved",
+         "worst last ratio", "worst last std (m/s)", "smallest time gap (s)", "collisions"), rows,
     )  # fmt: skip
 
 
 def ratio_line(out: Path, ours: str, theirs: str, seeds: Sequence[int]) -> None:
-    """Print how much more another agent needs, where both have solved seeds: medians, and the range over all pairs."""
-    one, other = ([r["summary"] for r in results(out, c) if r["seed"] in seeds] for c in (ours, theirs))
-    for key, name in (("cpu_seconds", "CPU seconds"), ("steps", "environment steps")):
-        a, b = ([s[key] for s in part if s["solved"]] for part in (one, other))
-        if a and b:
-            middle = statistics.median(b) / statistics.median(a)
-            print(f"\n{theirs} / {ours}, {name} to solved: {middle:.1f} ({min(b) / max(a):.1f}–{max(b) / min(a):.1f})")
-        else:
-            print(
-                f"\n{theirs} / {ours}, {name} to solved: no ratio, {len(b)} of {len(other)} and {len(a)} of {len(one)}"
-            )
+    """Print how much more another agent needs: medians, and the range over all pairs, of those that solved.
+
+    Of those that did not it is only known that they need more than they had.
+    """
+    one, others = groups(out, ours, seeds), groups(out, theirs, seeds)
+    base = [r["summary"] for part in one.values() for r in part]
+    for name, part in others.items():
+        other = [r["summary"] for r in part]
+        for key, what in (("cpu_seconds", "CPU seconds"), ("steps", "environment steps")):
+            a, b = ([s[key] for s in some if s["solved"]] for some in (base, other))
+            told = f"\n{theirs} ({name}) / {ours}, {what} to solved: "
+            if a and b:
+                middle = statistics.median(b) / statistics.median(a)
+                print(f"{told}{middle:.1f} ({min(b) / max(a):.1f}–{max(b) / min(a):.1f})", end="")
+            else:
+                print(f"{told}no ratio", end="")
+            print(f"; {len(b)} of {len(other)} and {len(a)} of {len(base)} solved", end="")
+            spent = [s["spent"] for s in other if not s["solved"]]
+            if a and spent and key == "cpu_seconds":
+                print(f"; those not solved had {min(spent) / statistics.median(a):.0f} times {ours}'s median", end="")
+            print(".")
 
 
 def seed_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
     """Print every seed: before any update, last and best checkpoint; the last one on held-out lengths and drivers."""
     rows = []
-    for config in configs:
-        for r in results(out, config):
-            if r["seed"] not in seeds or not r["history"]:
+    for config, name, part in ((c, n, p) for c in configs for n, p in groups(out, c, seeds).items()):
+        for r in part:
+            if not r["history"]:
                 continue
             s, unseen = r["summary"], r["held_out"]
             when = [f"{s['cpu_seconds']:.1f}", f"{s['steps'] // 1000}"] if s["solved"] else ["–", "–"]
@@ -108,10 +128,10 @@ def seed_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
             ]
             ends = ["/".join(ring(r[k])) for k in ("fresh_last", "fresh_best")]
             before = "/".join(ring(r["untrained"])[:2])
-            rows.append([config, str(r["seed"]), before, *when, *ends, *far])
+            rows.append([config, name, str(r["seed"]), before, *when, *ends, *far])
     figures = "ratio/std/time gap/collisions"
     table(
-        ("agent", "seed", "before any update", "CPU s", "1000 steps", f"last: {figures}", f"best: {figures}",
+        ("agent", "trial", "seed", "before any update", "CPU s", "1000 steps", f"last: {figures}", f"best: {figures}",
          "lengths 200–300 m", "drivers ±20 %, worst", "drivers mixed"), rows,
     )  # fmt: skip
 

@@ -80,7 +80,6 @@ def test_what_another_process_works_on_is_left_to_it(benchmark, tmp_path):
 def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
     compared = ("ring-apg", "ring-ppo", "ring-sac")
     assert {len(benchmark.SEARCH[c]) for c in compared} == {5}
-    assert not set(compared) & set(benchmark.BUDGET)
     from agents import apg, ppo, shac
 
     kinds = {"apg": apg.Arguments, "ppo": ppo.Arguments, "sac": ppo.Arguments, "shac": shac.Arguments}
@@ -140,3 +139,45 @@ def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tm
     assert "failsafe: 4 of 20 random policies pass, so it is no test." in printed
     assert "failsafe-shock: 0 of 20 random policies pass, so it is a test." in printed
     assert set(benchmark.RINGS) == set(agents_reference.rings())
+
+
+def test_longer_trainings_have_as_many_times_the_updates_and_a_place_of_their_own(benchmark, tmp_path):
+    benchmark.run(["ring-ppo", "ring-apg"], tmp_path, 1, given=4, times=3)
+    given = [dict(zip(c[3::2], c[4::2], strict=False)) for c in benchmark.trained]
+    assert [g["--updates"] for g in given] == ["150", "132"]  # three times those of trial 4
+    assert {g["--cpu-seconds"] for g in given} == {str(3 * benchmark.LIMIT)}
+    assert (tmp_path / "ring-ppo/trial4x3/seed0/result.json").exists()
+    benchmark.run(["ring-drivers-apg"], tmp_path, 1, times=2)
+    assert benchmark.trained[-1][-1] == "64"  # twice those of its file
+
+
+def test_an_interrupted_training_is_resumed(benchmark, tmp_path):
+    job = benchmark.Job("ring-apg", 0, {}, 1)
+    training = tmp_path / job.name / "training"
+    training.mkdir(parents=True)
+    (training / "last.pt").touch()
+    benchmark.perform(job, tmp_path)
+    benchmark.perform(benchmark.Job("ring-apg", 0, {}, 2), tmp_path)
+    assert ["--resume" in command for command in benchmark.trained] == [True, False]
+
+
+def test_what_never_solved_is_told_with_what_it_had(tmp_path, capsys):
+    from benchmarks.agents_tables import ratio_line
+
+    def result(config, seed, solved, times=1):
+        summary = {"solved": solved, "spent": 40.0 * times, "cpu_seconds": 20.0 + seed, "steps": 1000}
+        folder = tmp_path / config / f"trial0x{times}" / f"seed{seed}"
+        folder.mkdir(parents=True)
+        row = {"trial": 0, "times": times, "seed": seed, "summary": summary}
+        (folder / "result.json").write_text(json.dumps(row))
+
+    for seed in range(3):
+        result("ring-apg", seed, True)
+        result("ring-ppo", seed, False, times=5)
+    result("ring-sac", 0, True)
+    ratio_line(tmp_path, "ring-apg", "ring-ppo", range(10))
+    ratio_line(tmp_path, "ring-apg", "ring-sac", range(10))
+    told = capsys.readouterr().out
+    assert "ring-ppo (0, 5 times) / ring-apg, CPU seconds to solved: no ratio; 0 of 3 and 3 of 3 solved; " in told
+    assert "those not solved had 10 times ring-apg's median." in told
+    assert "ring-sac (0) / ring-apg, CPU seconds to solved: 1.0 (0.9–1.0); 1 of 1 and 3 of 3 solved." in told
