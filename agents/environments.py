@@ -12,7 +12,10 @@ from torch import Tensor
 from idm_env.envs.settings import KEYWORDS
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.tasks import Task, make_task
-from idm_env.types import State
+from idm_env.types import Choices, Links, Moving, State, Trips
+
+PARTS: dict[str, Any] = {"links": Links, "trips": Trips, "choices": Choices, "moving": Moving}
+"""Parts of a state that are several tensors."""
 
 
 def task_of(environment: Mapping[str, Any]) -> Task:
@@ -52,9 +55,12 @@ def snapshot(env: DiffIDMVectorEnv) -> dict[str, Any]:
     """Return everything that ``restore`` needs to continue the episodes of a vector exactly."""
     batch, world = env.batch, env.batch.world
     assert world is not None
-    state = {k: v for k, v in world.state._asdict().items() if k != "memory"}
+    state = {k: v for k, v in world.state._asdict().items() if k not in ("memory", *PARTS)}
+    parts = {k: getattr(world.state, k) for k in PARTS}
     return {
         "state": state,
+        # As plain mappings, which a checkpoint may hold.
+        "parts": {k: dict(v._asdict()) for k, v in parts.items() if v is not None},
         "memory": dict(world.state.memory),
         "episode": dict(world.episode),
         "seeds": batch.seeds.tolist(),
@@ -67,7 +73,8 @@ def restore(env: DiffIDMVectorEnv, saved: Mapping[str, Any]) -> Tensor:
     batch = env.batch
     env.reset(seed=list(saved["seeds"]))
     batch.episodes[:] = np.asarray(saved["numbers"]) - 1
-    state = State(**saved["state"], memory=saved["memory"])
+    parts: Any = {name: PARTS[name](**columns) for name, columns in saved.get("parts", {}).items()}
+    state = State(**saved["state"], memory=saved["memory"], **parts)
     env.reset(options={"state": state})
     assert batch.world is not None
     batch.world = batch.world._replace(episode=saved["episode"])

@@ -29,18 +29,19 @@ from agents.rollout import (
     Driven,
     Start,
     drive,
-    follow_start,
+    episodes_start,
+    moments,
     ring_start,
     uniform_speed,
 )
-from idm_env import metrics
+from idm_env import metrics, population
 from idm_env.envs.gym import DiffIDMEnv
 from idm_env.tasks.ring import RingTask
 
 STEPS = 3000
 JUDGED = 1000
 SPEED_RATIO, SPEED_STD, TIME_GAP, IN_A_ROW = 0.97, 0.15, 0.8, 5
-TEST: dict[str, dict[str, Any]] = {"ring": {"shock": 4.0}, "follow": {}}
+TEST: dict[str, dict[str, Any]] = {"ring": {"shock": 4.0}, "follow": {}, "merge": {}, "bottleneck": {}}
 """Keywords of the environment in which policies of a task are judged, over those in which they are trained."""
 
 
@@ -167,9 +168,9 @@ def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int 
     wheels (J/kg per metre); the same of the recorded leader as ``leader_…``; ``time_gap``: its smallest (s);
     ``collisions``: stretches with one; ``spacing``: its mean gap (m).
     """
-    start = follow_start(environment, count)
+    start = episodes_start(environment, count)
     task = start.task
-    driven = drive(start, act, task.horizon or STEPS, rewards=True)
+    driven = drive(start, act, task.horizon or STEPS)
     first = task.agents[0]
     speed, accel, gap = (x.double() for x in (driven.speed, driven.accel, driven.gap))
     fuel = {name: metrics.fuel(speed, accel, name) for name in metrics.FUELS}
@@ -198,12 +199,67 @@ def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int 
     }
 
 
+# -- traffic that flows in and out ------------------------------------------------------------------------------------
+
+
+def evaluate_lanes(act: Act | None, environment: Mapping[str, Any], count: int = 8) -> dict[str, Any]:
+    """Return the figures of a policy in ``count`` episodes of traffic that flows in and out: see ``judge_lanes``."""
+    return judge_lanes(episodes_start(environment, count), act, 1)[0]
+
+
+def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, Any]]:
+    """Return the figures of policies that drive together, each in its share of the episodes, one after the other.
+
+    Episodes last 300 s; the first 100 s fill the road and are not judged. ``speed``: mean of all on the road (m/s);
+    ``outflow``: vehicles that leave, an hour; ``queued``: vehicles waiting at the entries at the end; each the mean
+    over episodes, the outflow also of each in ``outflows``. ``reward``: mean per step, as if nobody crashed;
+    ``collisions``: episodes with a crash.
+    """
+    task, like = start.task, start.world.state.speed
+    rows = len(like)
+    none = like.new_zeros(rows, len(task.agents))
+    crashed = torch.zeros(rows, dtype=torch.bool)
+    inside, way, reward, left = (torch.zeros(rows, dtype=torch.float64) for _ in range(4))
+    with torch.no_grad():
+        for t, (before, _, command, after) in enumerate(moments(start, act, STEPS)):
+            state, trips = after.state, after.state.trips
+            assert state.present is not None and trips is not None
+            crashed |= task.crashed(after).any(-1)
+            gone = trips.left.sum(-1).double()
+            if t < JUDGED:
+                left = gone
+                continue
+            inside += state.present.sum(-1)
+            way += (state.present * state.speed).sum(-1)
+            reward += task.earned(before, none if command is None else command, after).mean(-1)
+    judged = STEPS - JUDGED
+    columns = {
+        "speed": way / inside,
+        "outflow": (gone - left) * 3600.0 / (judged * task.simulator.dt),
+        "queued": population.counts(task.simulator, state).queued.double(),
+        "reward": reward / judged,
+    }
+    parts = {name: x.view(policies, -1) for name, x in columns.items()}
+    crashes = crashed.view(policies, -1).sum(-1)
+    return [
+        {
+            **{name: float(x[i].mean()) for name, x in parts.items()},
+            "collisions": int(crashes[i]),
+            "passed": not bool(crashes[i]),
+            "outflows": parts["outflow"][i].tolist(),
+        }
+        for i in range(policies)
+    ]
+
+
 # -- any task --------------------------------------------------------------------------------------------------------
 
 
 def evaluate(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a policy in the environment of its test (``as_judged``); None is the human driver."""
-    tests: dict[str, Callable[..., dict[str, Any]]] = {"ring": evaluate_ring, "follow": evaluate_follow}
+    tests: dict[str, Callable[..., dict[str, Any]]] = {
+        "ring": evaluate_ring, "follow": evaluate_follow, "merge": evaluate_lanes, "bottleneck": evaluate_lanes,
+    }  # fmt: skip
     return tests[environment.get("task", "ring")](act, environment)
 
 

@@ -165,7 +165,7 @@ def repeated(start: Start, times: int) -> Start:
     fields: Any = {k: many(x) for k, x in state._asdict().items() if isinstance(x, Tensor)}
     memory = {name: many(x) for name, x in state.memory.items()}
     world = World(state._replace(**fields, memory=memory), {k: many(x) for k, x in start.world.episode.items()})
-    return start._replace(world=world, draw=start.draw._replace(key=many(start.draw.key)))
+    return start._replace(world=world, seeds=start.seeds * times)
 
 
 def judge(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from agents.environments import task_of
+from idm_env.envs.batch import Batch
+from idm_env.envs.settings import settings
 from idm_env.tasks import Draw, Task, World
 from idm_env.types import Params
 
@@ -45,29 +47,62 @@ class Start(NamedTuple):
 
     task: Task
     world: World
-    draw: Draw
+    seeds: tuple[int, ...]
     params: Params
 
+    @property
+    def draw(self) -> Draw:
+        """Where the noise of each row comes from: that of an environment of its seed, in its first episode."""
+        return Draw.of(torch.tensor(self.seeds), torch.zeros(len(self.seeds), dtype=torch.int64))
 
-def drive(start: Start, act: Act | None, steps: int, rewards: bool = False) -> Driven:
-    """Roll a policy out from given worlds; ``act`` None leaves everybody to the human drivers."""
-    task, world, draw, params = start
-    like = world.state.speed
-    none = like.new_zeros(len(like), len(task.agents))
-    kept: list[tuple[Tensor, ...]] = []
-    with torch.inference_mode():
-        for t in range(steps):
+
+class Moment(NamedTuple):
+    """A step of a rollout: the worlds before and after it, actions and what they command (None of human drivers)."""
+
+    before: World
+    action: Tensor | None
+    command: Tensor | None
+    after: World
+
+
+def moments(start: Start, act: Act | None, steps: int) -> Iterator[Moment]:
+    """Roll a policy out from given worlds, a step at a time; ``act`` None leaves everybody to the human drivers."""
+    task, world, _, params = start
+    draw = start.draw
+    for t in range(steps):
+        with torch.no_grad():
             if t % BLOCK == 0:
-                normals = task.normals(draw, world.state.step, BLOCK, like.dtype)
+                normals = task.normals(draw, world.state.step, BLOCK, world.state.speed.dtype)
             action = None if act is None else act(task.observe(world).flatten(1))
             command = None if action is None else task.command(action)
             now = {name: x[t % BLOCK] for name, x in normals.items()}
             after = task.step(world, command, now, params, advance=task.simulator.advance)
-            reward = task.reward(world, none if command is None else command, after) if rewards else none
-            world = after
-            kept.append(
-                (after.state.speed, after.state.accel, after.state.gap, none if action is None else action, reward)
-            )
+        yield Moment(world, action, command, after)
+        world = after
+
+
+def drive(start: Start, act: Act | None, steps: int) -> Driven:
+    """Roll a policy out from given worlds as environments do, compiled, and keep every step.
+
+    Rows go on after an end, as if nothing had happened.
+    """
+    task, rows = start.task, len(start.world.state.speed)
+    batch = Batch(settings(task=task, info="none"), rows)
+    batch.seed(range(rows), start.seeds)
+    batch.reset()
+    batch.world = start.world
+    seen = task.observe(start.world).flatten(1)
+    none = torch.zeros(rows, len(task.agents))
+    kept: list[tuple[Tensor, ...]] = []
+    with torch.no_grad():
+        for _ in range(steps):
+            action = None if act is None else act(seen)
+            outcome = batch.step(None if action is None else action.numpy())
+            state = batch.glance().state
+            # What is glanced at holds until the next step.
+            moved = (state.speed.clone(), state.accel.clone(), state.gap.clone())
+            kept.append((*moved, none if action is None else action, torch.tensor(outcome.reward)))
+            seen = torch.tensor(outcome.observation).flatten(1)
     return Driven(*(torch.stack(column) for column in zip(*kept, strict=True)))
 
 
@@ -77,21 +112,22 @@ def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws
     chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": warmup}
     task = task_of({**chosen, "length": [min(lengths), max(lengths)]})
     params = task.params(torch.float32, "cpu")
-    keys, states, episodes = [], [], []
+    seeds, states, episodes = [], [], []
     for i, length in enumerate(lengths):
-        draw = Draw.of(torch.tensor([SEED + 1000 * k + i for k in draws]), torch.zeros(len(draws), dtype=torch.int64))
+        own = [SEED + 1000 * k + i for k in draws]
+        draw = Draw.of(torch.tensor(own), torch.zeros(len(own), dtype=torch.int64))
         one = task_of({**chosen, "length": length})
         world = one.reset(draw, params)
         states.append(world.state)
         episodes.append(world.episode)
-        keys.append(draw.key)
+        seeds += own
     memory = {name: torch.cat([s.memory[name] for s in states]) for name in states[0].memory}
     columns: Any = {
         k: torch.cat([getattr(s, k) for s in states]) for k in ("position", "speed", "accel", "gap", "length", "step")
     }
     episode = {name: torch.cat([e[name] for e in episodes]) for name in episodes[0]}
     world = World(states[0]._replace(**columns, memory=memory), episode)
-    return Start(task, world, Draw(torch.cat(keys)), params)
+    return Start(task, world, tuple(seeds), params)
 
 
 def ring_start(
@@ -122,13 +158,14 @@ def uniform_speed(start: Start) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _follow_start(environment: str, count: int) -> Start:
+def _episodes_start(environment: str, count: int, times: int) -> Start:
     task = task_of(json.loads(environment))
     params = task.params(torch.float32, "cpu")
-    draw = Draw.of(torch.arange(SEED, SEED + count), torch.zeros(count, dtype=torch.int64))
-    return Start(task, task.reset(draw, params), draw, params)
+    seeds = tuple(range(SEED, SEED + count)) * times
+    draw = Draw.of(torch.tensor(seeds), torch.zeros(len(seeds), dtype=torch.int64))
+    return Start(task, task.reset(draw, params), seeds, params)
 
 
-def follow_start(environment: Mapping[str, Any], count: int) -> Start:
-    """Return ``count`` queues behind drawn stretches of the recorded leaders."""
-    return _follow_start(json.dumps(dict(environment), sort_keys=True), count)
+def episodes_start(environment: Mapping[str, Any], count: int, times: int = 1) -> Start:
+    """Return ``count`` episodes of a task as they begin, of seeds that training does not use, so many times over."""
+    return _episodes_start(json.dumps(dict(environment), sort_keys=True), count, times)

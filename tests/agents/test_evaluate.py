@@ -11,7 +11,7 @@ from agents import common, evaluate
 from agents.classical import FollowerStopper, PISaturation, Seen, controllers, no_command, seen
 from agents.common import Policy
 from agents.evaluate import solved_at
-from agents.rollout import Driven, ring_start, uniform_speed
+from agents.rollout import Driven, drive, moments, ring_start, uniform_speed
 from idm_env import metrics
 from idm_env.tasks import make_task
 
@@ -32,6 +32,26 @@ def test_uniform_speed_of_unequal_drivers_fills_the_ring():
     v = float(uniform_speed(start))
     gaps = [(2.0 + v * t) / (1.0 - (v / 30.0) ** 4) ** 0.5 for t in time_gap]
     assert sum(gaps) == pytest.approx(250.0 - 22 * 5.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("controlled", [1, 3])
+def test_a_driven_policy_moves_as_pure_steps_do(controlled):
+    """Evaluations step as compiled environments do; noise, failsafe and shock are those of the task's own step."""
+    keywords = {**RING, "noise": 0.2, "failsafe": 3.0, "shock": 4.0, "shock_after": 2.0, "controlled": controlled}
+    start = ring_start(keywords, (220.0, 260.0), 100, draws=(0, 3))
+
+    def act(seen):
+        assert seen.shape == (4, 3 * controlled)
+        return (seen[:, :controlled] - 0.2).clamp(-1.0, 1.0)
+
+    fast, slow = drive(start, act, 60), list(moments(start, act, 60))
+    for name in ("speed", "accel", "gap"):
+        wanted = torch.stack([getattr(moment.after.state, name) for moment in slow])
+        assert torch.allclose(getattr(fast, name), wanted, atol=1e-4)
+    assert torch.allclose(fast.action, torch.stack([moment.action for moment in slow]), atol=1e-5)
+    rewards = torch.stack([start.task.reward(m.before, m.command, m.after) for m in slow])
+    assert torch.allclose(fast.reward, rewards, atol=1e-5)
+    assert float(fast.accel[30, :, start.task.shocked].min()) == pytest.approx(-4.0)  # the shock is among them
 
 
 def drives(start, speed, gap):

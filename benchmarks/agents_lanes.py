@@ -1,0 +1,139 @@
+"""Tasks ``merge`` and ``bottleneck``: what vehicles that have learned nothing do there, beside what Flow has published.
+
+    python -m benchmarks.agents_lanes [--out runs/lanes] [--trained runs/merge-apg/last.pt …]
+
+A tenth of the vehicles is controlled, behind a failsafe of 3 m/s², with commands from −4.5 to 2.6 m/s²; lanes are left
+to their drivers. Every row is eight episodes of 300 s, the same for all, of which the last 200 s count. Families of
+policies that are there are not driven again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from agents import common
+from agents.common import Policy
+from agents.environments import first_seed, human_driving, task_of
+from agents.evaluate import evaluate_lanes, judge_lanes
+from agents.rollout import Act, episodes_start
+from benchmarks.agents import once
+from benchmarks.agents_tables import table
+
+Row = dict[str, Any]
+CONTROL: Row = {"controlled": 0.1, "failsafe": 3.0, "max_command": [-4.5, 2.6]}
+TASKS: dict[str, Row] = {
+    "merge": {"task": "merge", **CONTROL},
+    "merge, 3000 + 800 an hour": {"task": "merge", "inflow": 3000.0, "ramp_inflow": 800.0, **CONTROL},
+    "bottleneck": {"task": "bottleneck", **CONTROL},
+    "bottleneck, 1900 an hour": {"task": "bottleneck", "inflow": 1900.0, **CONTROL},
+}
+CONSTANTS = (-0.2, -0.05, 0.0, 0.05, 0.2, 1.0)
+NETWORKS, EPISODES = 10, 8
+
+
+Family = dict[str, Act]
+"""Policies by the names of their rows, which drive together."""
+
+
+def constants(environment: Row) -> Family:
+    """Return policies that always command the same acceleration (m/s²)."""
+    task = task_of(environment)
+
+    def constant(accel: float) -> Act:
+        return lambda seen: task.action(seen.new_full((len(seen), len(task.agents)), accel))
+
+    return {f"always {accel:g} m/s²": constant(accel) for accel in CONSTANTS}
+
+
+def uniform(environment: Row) -> Family:
+    """Return a policy that draws every action anew, evenly in [−1, 1]."""
+    generator, agents = torch.Generator().manual_seed(0), len(task_of(environment).agents)
+    return {"random actions": lambda seen: 2.0 * torch.rand(len(seen), agents, generator=generator) - 1.0}
+
+
+def networks(environment: Row) -> Family:
+    """Return unfitted networks, their last layer at a random scale: 0.01 to 3 times torch's own, bias ± 0.1."""
+    observations, _ = human_driving(environment, first_seed(0, 0), count=4, steps=1000)
+    made: Family = {}
+    for seed in range(NETWORKS):
+        torch.manual_seed(seed)
+        policy = Policy(observations.shape[-1])
+        policy.mean.copy_(observations.mean(0))
+        policy.scale.copy_(observations.std(0).clamp_min(1e-3))
+        with torch.no_grad():
+            last = policy.body[-1]
+            assert isinstance(last, torch.nn.Linear)
+            last.weight.mul_(10.0 ** (2.5 * torch.rand(())))
+            last.bias.add_(0.2 * (torch.rand(()) - 0.5))
+        made[f"random network {seed}"] = policy
+    return made
+
+
+def trained(environment: Row, paths: Sequence[Path]) -> Family:
+    """Return the agents among these checkpoints that were trained on the task."""
+    loaded = {path.parent.name: common.load(path) for path in paths}
+    return {f"trained: {name}": policy for name, (policy, c) in loaded.items() if c["task"] == environment["task"]}
+
+
+def driven(family: Family, environment: Row) -> dict[str, Row]:
+    """Return the figures of every policy of a family; an empty one stands for IDM."""
+    if not family:
+        return {"IDM, nobody controlled": evaluate_lanes(None, environment, EPISODES)}
+    start = episodes_start(environment, EPISODES, len(family))
+
+    def act(seen: Tensor) -> Tensor:
+        return torch.cat([one(part) for one, part in zip(family.values(), seen.chunk(len(family)), strict=True)])
+
+    return dict(zip(family, judge_lanes(start, act, len(family)), strict=True))
+
+
+def told(name: str, row: str, r: Row) -> list[str]:
+    """Return the cells of a row: means over episodes, and the range of outflows."""
+    low, high = min(r["outflows"]), max(r["outflows"])
+    flow = f"{r['outflow']:.0f} ({low:.0f}–{high:.0f})"
+    return [name, row, f"{r['speed']:.1f}", flow, f"{r['queued']:.0f}", f"{r['reward']:.3f}", str(r["collisions"])]
+
+
+def main() -> None:
+    """Drive what is missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/lanes"))
+    parser.add_argument("--trained", nargs="*", type=Path, default=[], help="checkpoints of agents, as further rows")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = []
+    for name, environment in TASKS.items():
+        makers: dict[str, Callable[[], Family]] = {
+            "idm": dict,
+            "constants": partial(constants, environment),
+            "uniform": partial(uniform, environment),
+            "networks": partial(networks, environment),
+        }
+        found: dict[str, dict[str, Row] | None] = {}
+        for kind, make in makers.items():
+            folder = options.out / name.replace(" ", "-") / kind
+            found[kind] = once(folder, lambda make=make, environment=environment: driven(make(), environment))
+            print(f"{name}: {kind}", flush=True)
+        agents = trained(environment, options.trained)
+        found["trained"] = driven(agents, environment) if agents else None
+        for kind, family in found.items():
+            shown = family or {}
+            if kind in ("constants", "networks") and family:
+                best = max(family, key=lambda row: family[row]["reward"])
+                shown = {f"best of {len(family)}: {best}": family[best]}
+            rows += [told(name, row, r) for row, r in shown.items()]
+    table(
+        ("task", "vehicles controlled by", "mean speed (m/s)", "outflow (vehicles an hour)", "queued at the end",
+         "reward per step", f"episodes with a crash, of {EPISODES}"), rows,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

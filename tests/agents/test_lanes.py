@@ -1,0 +1,119 @@
+"""Agents in traffic that flows in and out: the figures by which they are judged, and policies that drive together."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+
+import pytest
+import torch
+
+from agents import apg, common, evaluate
+from agents.environments import human_driving, task_of
+from agents.rollout import episodes_start
+from benchmarks import agents_lanes, agents_shared
+
+FREE = {"task": "bottleneck", "inflow": 720.0, "vehicles": 40, "controlled": [4], "failsafe": 3.0}
+
+
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setattr(evaluate, "STEPS", 1200)
+    monkeypatch.setattr(evaluate, "JUDGED", 600)
+
+
+def test_in_free_traffic_what_comes_goes(short):
+    """720 an hour are 12 in the 60 s that are judged, give or take who is just at an end, and nobody waits."""
+    found = evaluate.evaluate_lanes(None, FREE, 2)
+    assert all(abs(flow - 720.0) <= 2 * 60.0 for flow in found["outflows"])
+    assert found["queued"] == 0 and found["passed"] and 20.0 < found["speed"] < 32.0
+    assert found["outflow"] == pytest.approx(sum(found["outflows"]) / 2)
+
+
+def test_policies_that_drive_together_drive_as_alone(monkeypatch):
+    monkeypatch.setattr(evaluate, "STEPS", 300)
+    monkeypatch.setattr(evaluate, "JUDGED", 100)
+    task = task_of(FREE)
+    accels = (-3.0, 0.3)
+
+    def constant(accel):
+        return lambda seen: task.action(torch.full((len(seen), len(task.agents)), accel))
+
+    family = {f"{a}": constant(a) for a in accels}
+
+    def act(seen):
+        return torch.cat([one(part) for one, part in zip(family.values(), seen.chunk(2), strict=True)])
+
+    together = evaluate.judge_lanes(episodes_start(FREE, 2, 2), act, 2)
+    alone = [evaluate.evaluate_lanes(one, FREE, 2) for one in family.values()]
+    assert together == alone
+    assert together[0]["speed"] < together[1]["speed"] - 1.0  # who stands holds up those behind
+
+
+def test_apg_learns_in_traffic_that_flows(quick, monkeypatch):
+    """Gradients go through vehicles that enter, change lanes and leave."""
+    monkeypatch.setattr(common, "human_driving", partial(human_driving, count=2, steps=60))
+    environment = {**FREE, "vehicles": 24, "max_episode_steps": 60}
+    history = apg.train(apg.Arguments(**{**quick, "environment": environment, "updates": 2}, count=2, window=20))
+    assert [row["updates"] for row in history] == [0, 1, 2]
+    policy, _ = common.load(quick["out"] / "last.pt")
+    before, _ = common.begin(apg.Arguments(**{**quick, "environment": environment}), "apg")
+    assert all(bool(torch.isfinite(x).all()) for x in policy.parameters())
+    assert not torch.equal(policy.body[-1].weight, before.body[-1].weight)
+
+
+def test_rows_of_lanes_are_driven_once(tmp_path, monkeypatch, capsys):
+    row = {
+        "speed": 9.0,
+        "outflow": 1700.0,
+        "queued": 40.0,
+        "reward": 0.2,
+        "collisions": 1,
+        "outflows": [1600.0, 1800.0],
+    }
+    driven = []
+
+    def drive(family, environment):
+        driven.append(environment["task"])
+        return {name: {**row, "reward": 0.1 * i} for i, name in enumerate(family or {"IDM": None})}
+
+    monkeypatch.setattr(agents_lanes, "driven", drive)
+    monkeypatch.setattr(
+        agents_lanes, "networks", lambda environment: {"random network 0": None, "random network 1": None}
+    )
+    monkeypatch.setattr("sys.argv", ["agents_lanes", "--out", str(tmp_path)])
+    agents_lanes.main()
+    before = len(driven)
+    agents_lanes.main()
+    assert before == len(driven) == 4 * len(agents_lanes.TASKS)
+    told = capsys.readouterr().out
+    assert "| bottleneck | best of 6: always 1 m/s² | 9.0 | 1700 (1600–1800) | 40 | 0.500 | 1 |" in told
+    assert "best of 2: random network 1" in told
+
+
+def test_shared_policies_are_judged_on_rings_as_long_as_their_vehicles_need(tmp_path, monkeypatch, capsys):
+    judged = []
+
+    def judge(act, environment, draws):
+        judged.append((environment["vehicles"], environment["controlled"], act is None))
+        return {"speed_ratio": 1.0, "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}
+
+    monkeypatch.setattr(agents_shared, "evaluate_ring", judge)
+    monkeypatch.setattr(agents_shared.common, "load", lambda path, task: (path, {}))
+    path = tmp_path / "ring-apg/trial0/seed1/training/last.pt"
+    monkeypatch.setattr("sys.argv", ["agents_shared", "--out", str(tmp_path), "--checkpoints", str(path)])
+    for _ in range(2):
+        agents_shared.main()
+    assert judged.count((110, 2, True)) == judged.count((110, 5, False)) == 1 and (110, 5, True) not in judged
+    assert "| 110 | 5 (4.5 %) | ring-apg/trial0/seed1 | 1.000 | 0.10 | 1.00 | 0 | yes |" in capsys.readouterr().out
+    assert json.loads((tmp_path / "22-1/IDM-for-all/result.json").read_text())["passed"]
+
+
+def test_a_ring_of_twice_the_vehicles_is_twice_as_long(monkeypatch):
+    made = []
+    monkeypatch.setattr(evaluate, "ring_start", lambda e, lengths, *rest: made.append(list(lengths)))
+    monkeypatch.setattr(evaluate, "judge_ring", lambda *given: {})
+    monkeypatch.setattr(evaluate, "drive", lambda *given: None)
+    for vehicles in (22, 44):
+        evaluate.evaluate_ring(None, {"task": "ring", "vehicles": vehicles, "length": 1000.0}, (220.0, 270.0))
+    assert made == [[220.0, 270.0], [440.0, 540.0]]
