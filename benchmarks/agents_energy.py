@@ -1,0 +1,163 @@
+"""Fuel behind measured leaders that training has not seen: a vehicle and the ten that follow it, by two models of fuel.
+
+    python -m benchmarks.agents_energy [--seeds 3] [--updates 30] [--out runs/energy] [--data ngsim_i80_pairs.parquet]
+
+Vehicle 1 drives behind each held-out leader of the I-80 pairs, from where the recorded follower was; ten vehicles with
+IDM calibrated on the training pairs drive behind it, from equilibrium. Vehicle 1 is the recorded follower itself,
+another calibrated IDM, or an agent of task ``follow``, trained by gradients behind the training pairs' leaders.
+Trainings that are there are not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from agents import apg, common
+from agents.environments import task_of
+from agents.imitation import default_data, observe
+from agents.rollout import Act
+from benchmarks.agents_tables import table
+from idm_env import metrics
+from idm_env.data import Episode, episodes, load
+from idm_env.effects import Control
+from idm_env.fitting.fit import base_simulator, fit
+from idm_env.tasks.recorded import equilibrium_gap
+from idm_env.types import Command, Params, Record
+
+Row = dict[str, Any]
+BEHIND, LENGTH, SHORTEST = 10, 5.0, 300
+"""Vehicles behind vehicle 1, their length (m), and steps of the shortest stretch that agents are trained on."""
+
+
+def driven(items: Sequence[Episode], params: Params, kind: str, act: Act | None, limits: tuple[float, float]) -> Row:
+    """Return speeds, accelerations and gaps of vehicle 1 and those behind it, ``(steps, leaders, vehicles)``.
+
+    ``kind`` is recorded, idm or agent; beyond the end of a record, which ``valid`` tells, nothing is judged.
+    """
+    steps, vehicles = max(len(e) for e in items), BEHIND + 2
+    simulator = base_simulator(items[0].dt)
+    agent = kind == "agent"
+    if agent:
+        simulator = simulator.adding(Control())
+    params = {**simulator.defaults(dtype=torch.float64), **params}
+
+    def padded(columns: Sequence[np.ndarray]) -> Tensor:
+        return torch.as_tensor(np.stack([np.pad(c, (0, steps - len(c)), mode="edge") for c in columns], 1))
+
+    # Positions of the follower are measured from its leader, so that their gap is the measured one.
+    lead = [padded([getattr(e.leader, name) for e in items]) for name in ("position_m", "speed_mps", "accel_mps2")]
+    own = [padded([getattr(e.driver, name) for e in items]) for name in ("position_m", "speed_mps", "accel_mps2")]
+    speed = torch.stack([lead[1][0], *[own[1][0]] * (BEHIND + 1)], -1)
+    length = torch.tensor([[e.leader.length_m, *[LENGTH] * (BEHIND + 1)] for e in items], dtype=torch.float64)
+    gaps = equilibrium_gap(simulator.base.driver(params["idm"]), speed[:, 2:])
+    position = torch.cat((lead[0][0, :, None], own[0][0, :, None] - torch.cat(
+        (torch.zeros(len(items), 1), (gaps + LENGTH).cumsum(-1)), -1)), -1)  # fmt: skip
+    state = simulator.state(position, speed, params, length=length)
+    replayed = torch.arange(vehicles) < (2 if kind == "recorded" else 1)
+    kept = []
+    for t in range(1, steps):
+        columns = (torch.stack([a[t], *[b[t]] * (BEHIND + 1)], -1) for a, b in zip(lead, own, strict=True))
+        record = Record(*columns, replayed)
+        inputs: dict[str, Any] = {"replay": record}
+        if agent:
+            assert act is not None
+            seen = observe(state.speed[:, 1], state.speed[:, 0], state.gap[:, 1]).float()
+            action = act(seen).clamp(-1.0, 1.0).double()
+            command = torch.where(action < 0.0, -action * limits[0], action * limits[1])
+            inputs["control"] = Command(command.expand(-1, vehicles), torch.arange(vehicles) == 1)
+        state = simulator.step(state, inputs, params)
+        kept.append(tuple(x[:, 1:] for x in (state.speed, state.accel, state.gap)))
+    v, a, gap = (torch.stack(column) for column in zip(*kept, strict=True))
+    valid = torch.as_tensor(np.array([[t < len(e) for e in items] for t in range(1, steps)]))
+    return {"speed": v, "accel": a, "gap": gap, "valid": valid}
+
+
+def judged(run: Row) -> Row:
+    """Return the figures of every leader: litres per 100 km of all eleven by both models, mean speed, gaps."""
+    weight = run["valid"].unsqueeze(-1).double()
+    way = (run["speed"] * weight).sum((0, 2))
+    litres = {
+        model: (100.0 * (metrics.fuel(run["speed"], run["accel"], model) * weight).sum((0, 2)) / way)
+        for model in metrics.FUELS
+    }
+    gap = torch.where(run["valid"], run["gap"][..., 0], torch.nan)
+    touched = (torch.where(weight > 0, run["gap"], torch.inf).amin((0, 2)) <= 0.0).sum()
+    return {
+        **litres,
+        "speed": way / weight.sum((0, 2)) / (BEHIND + 1),
+        "farthest": float(np.nanmax(gap.numpy())),
+        "nearest": float(np.nanmin(gap.numpy())),
+        "collisions": int(touched),
+    }
+
+
+def environment_of(training: Path, idm: Row) -> Row:
+    """Return the keywords of task ``follow`` behind the training pairs' leaders."""
+    return {
+        "task": "follow", "leader": str(training), "vehicles": BEHIND + 2, "max_command": 3.0, "crash_cost": 50.0,
+        "max_episode_steps": SHORTEST, "parameters": {"idm": idm},
+    }  # fmt: skip
+
+
+def told(name: str, r: Row, base: Row) -> list[str]:
+    """Return the cells of a row: pooled means, the median saving over leaders, and how many leaders save."""
+    cells = [name]
+    for model in metrics.FUELS:
+        saved = [100.0 * (1.0 - float(x) / float(y)) for x, y in zip(r[model], base[model], strict=True)]
+        better = sum(x > 0.0 for x in saved)
+        cells.append(f"{float(r[model].mean()):.2f}; {statistics.median(saved):+.1f} %, {better} of {len(saved)}")
+    slower = 100.0 * (float(r["speed"].mean()) / float(base["speed"].mean()) - 1.0)
+    return [*cells, f"{slower:+.1f} %", f"{r['nearest']:.1f}–{r['farthest']:.1f}", str(r["collisions"])]
+
+
+def main() -> None:
+    """Train what is missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--updates", type=int, default=30)
+    parser.add_argument("--out", type=Path, default=Path("runs/energy"))
+    parser.add_argument("--data", type=Path, default=default_data())
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.out.mkdir(parents=True, exist_ok=True)
+    trajectories = load(options.data).where("in_manifest=true")
+    training, test = trajectories.split("split=test")
+    found = fit(episodes(training, max_gap=None), by="all")
+    idm = {name.removeprefix("idm."): float(x) for name, x in zip(found.names, found.values()[0], strict=True)}
+    print("IDM, calibrated on the training pairs:", {name: round(x, 3) for name, x in idm.items()})
+    leaders = options.out / "training.parquet"
+    training.table.write_parquet(leaders)
+    environment = environment_of(leaders, idm)
+    items = list(episodes(test, max_gap=None, smooth=True))
+    params = {"idm": {name: torch.tensor(x, dtype=torch.float64) for name, x in idm.items()}}
+    limits = task_of(environment).command_limits
+    base = judged(driven(items, params, "recorded", None, limits))
+    rows = [told("recorded follower", base, base)]
+    rows.append(told("calibrated IDM", judged(driven(items, params, "idm", None, limits)), base))
+    for seed in range(options.seeds):
+        folder = options.out / f"seed{seed}"
+        if not (folder / "done").exists():
+            apg.train(
+                apg.Arguments(
+                    environment=environment, out=folder, seed=seed, updates=options.updates, count=16, window=SHORTEST,
+                    clone=500, learning_rate=1e-2, evaluate_every=1e9, resume=(folder / "last.pt").exists(),
+                )
+            )  # fmt: skip
+            (folder / "done").touch()
+        policy = common.load(folder / "last.pt", "follow")[0]
+        rows.append(told(f"agent, seed {seed}", judged(driven(items, params, "agent", policy, limits)), base))
+        print(*rows[-1], sep=" | ", flush=True)
+    head = [f"L/100 km by {model}; saved, leaders" for model in metrics.FUELS]
+    table(("vehicle 1", *head, "mean speed", "gaps of vehicle 1 (m)", f"collisions, of {len(items)}"), rows)
+
+
+if __name__ == "__main__":
+    main()
