@@ -185,8 +185,10 @@ def _plan(
     made = [operand(x.to(kind), batch, size) for x in given]
     made += [operand(x, batch, size, steps) for x in (*numbers, *(part_of(inputs, n) for n in kernel.flags))]
     strides = table([*(s for _, s in made), (0, size, 1)])
-    differentiated = _differentiated(program.moving, state, given[len(program.statics) :], numbers, kernel.signals)
-    tape = torch.is_grad_enabled() and any(x.requires_grad for x in differentiated)
+    differentiated = list[Tensor]()
+    if torch.is_grad_enabled():
+        differentiated = _differentiated(program.moving, state, given[len(program.statics) :], numbers, kernel.signals)
+    tape = any(x.requires_grad for x in differentiated)
     plan = _Plan(
         kernel, simulator, state, inputs, params, steps, min(block, steps), keep, tape,
         tuple(a for a, _ in made), strides, threads,
@@ -232,21 +234,27 @@ def _forward(
     return now, before, kept, tape
 
 
+def _ran(plan: _Plan) -> tuple[list[Tensor], list[tuple[list[Array | None], Array]]]:
+    """Return the last states, the last past and what is kept, without a graph; and the tape."""
+    start = [dense(x.to(plan.state.speed.dtype), plan.shape) for x in starts(plan.state, plan.kernel.program.states)]
+    past = past_rows(plan.state.memory[PAST], plan.shape) if plan.slots else plan.past()
+    ends, after, kept, tape = _forward(plan, start, past)
+    out = [torch.from_numpy(x).view(plan.shape) for x in ends if x is not None]
+    if plan.slots:
+        out.append(past_tensor(after, plan.slots, plan.shape))
+    if plan.keep:
+        out += [torch.from_numpy(x).view(plan.steps, *plan.shape) for x in kept]
+    return out, tape
+
+
 class _Rollout(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, plan: _Plan, *sources: Tensor) -> tuple[Tensor, ...]:
         program = plan.kernel.program
-        start = [dense(x.to(plan.state.speed.dtype), plan.shape) for x in starts(plan.state, program.states)]
-        past = past_rows(plan.state.memory[PAST], plan.shape) if plan.slots else plan.past()
-        ends, after, kept, tape = _forward(plan, start, past)
+        out, tape = _ran(plan)
         ctx.plan, ctx.tape = plan, tape
         ctx.save_for_backward(*sources)
         ctx.set_materialize_grads(False)
-        out = [torch.from_numpy(x).view(plan.shape) for x in ends if x is not None]
-        if plan.slots:
-            out.append(past_tensor(after, plan.slots, plan.shape))
-        if plan.keep:
-            out += [torch.from_numpy(x).view(plan.steps, *plan.shape) for x in kept]
         fixed = [x for x, n in zip(out, program.states, strict=False) if n not in program.moving]
         ctx.mark_non_differentiable(*fixed)
         return tuple(out)
@@ -359,7 +367,7 @@ def rollout(
     """
     plan, sources = _plan(kernel, simulator, state, inputs, params, steps, block, keep, threads)
     program = kernel.program
-    out = _Rollout.apply(plan, *sources)
+    out = _Rollout.apply(plan, *sources) if plan.tape else tuple(_ran(plan)[0])
     kept = out[len(program.states) + bool(plan.slots) :]
     return state_after(program, state, out, steps), tuple(kept) if keep else None
 

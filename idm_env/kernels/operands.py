@@ -62,7 +62,10 @@ def _collapsed(x: Tensor) -> int | None:
 
 def dense(x: Tensor, shape: Sequence[int]) -> Array:
     """Return a tensor as one flat array of that shape, in the batch's order."""
-    return x.detach().expand(*shape).contiguous().view(-1).numpy()
+    x = x.detach()
+    if x.shape != shape:
+        x = x.expand(*shape)
+    return x.contiguous().view(-1).numpy()
 
 
 def reduced(gradient: Array, full: Sequence[int], like: Tensor) -> Tensor:

@@ -77,18 +77,13 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         return recorded_lanes(str(self.data), dt, None if self.runs is None else self.runs[0], self.first_lane)
 
     @cached_property
-    def several(self) -> Lanes:
+    def road(self) -> Lanes:  # type: ignore[override]
         """The road: a lane is where somebody drives on it in the record."""
         ends = [
             End(k, begin=float(low), closed=False, opens=float(low), closes=float(high) + 1.0)
             for k, (low, high) in enumerate(self.scene.extent)
         ]
         return Lanes(len(ends), ends=tuple(ends))
-
-    @property
-    def road(self) -> Lanes:  # type: ignore[override]
-        """The road of several lanes."""
-        return self.several
 
     @property
     def lanes(self) -> tuple[int, ...]:

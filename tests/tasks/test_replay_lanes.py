@@ -266,7 +266,7 @@ def test_the_whole_i75_recording(measured):
     """88 vehicles, 51 changes: lanes as in the file, positions as the smoother leaves them (at most 0.12 m)."""
     path = str(measured("highsim_i75_lanes.parquet"))
     task = make_task("replay_lanes", data=path)
-    assert len(task.scene.ids) == 88 and task.several.count == 4
+    assert len(task.scene.ids) == 88 and task.road.count == 4
     table = pl.read_parquet(path)
     last = None
     for at, state in all_states(task, 799, 0):
