@@ -24,7 +24,9 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import torch  # noqa: E402
+from scipy.stats import energy_distance  # noqa: E402
 
+from benchmarks import drift_gru  # noqa: E402
 from idm_env.data import Episode, episodes, load  # noqa: E402
 from idm_env.drift import forecast  # noqa: E402
 from idm_env.drift.estimate import Estimate, estimate, usual  # noqa: E402
@@ -123,6 +125,7 @@ class Rows:
     def __init__(self, items: list[Episode], starts: list[tuple[int, int]]) -> None:
         self.items, self.starts = items, starts
         self.lines: list[tuple[str, float, int, list[float]]] = []
+        self.distances: list[tuple[str, list[float]]] = []
         self.base: dict[float, tuple[float, float]] = {}
 
     def truth(self, horizon: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -136,6 +139,7 @@ class Rows:
 
     def score(self, name: str, gap: np.ndarray, speed: np.ndarray) -> None:
         """Score draws [steps, n, starts]; one draw is a point forecast."""
+        self.distances.append((name, self._distances(gap, speed)))
         for horizon in HORIZONS:
             there, true_gap, true_speed = self.truth(horizon)
             step = round(horizon / self.items[0].dt) - 1
@@ -153,6 +157,28 @@ class Rows:
                 numbers += [float(forecast.log_score(x, y).mean()) for x, y in ((s, true_gap), (v, true_speed))]
             self.lines.append((name, horizon, int(ok.sum()), numbers))
 
+    def _distances(self, gap: np.ndarray, speed: np.ndarray) -> list[float]:
+        """Return how far distributions over all steps are from the measured: time gap, acceleration and jerk.
+
+        Energy distances (Székely and Rizzo 2013) in units of the measured standard deviation: 0 are the same ones.
+        """
+        there = np.zeros((len(gap), len(self.starts)), bool)
+        truth = np.full((2, len(gap) + 1, len(self.starts)), np.nan)
+        for i, (r, t) in enumerate(self.starts):
+            e = self.items[r].part(t, min(t + len(gap) + 1, len(self.items[r])))
+            there[: len(e) - 1, i] = True
+            truth[:, : len(e), i] = e.gap_m, e.speed_mps
+        first = np.broadcast_to(truth[1, :1], (1, *speed.shape[1:]))
+        told = _quantities(gap, np.concatenate([first, speed]), self.items[0].dt)
+        true = _quantities(truth[0, 1:, None], truth[1][:, None], self.items[0].dt)
+        found = []
+        for x, y in zip(told, true, strict=True):
+            ok = np.broadcast_to(there[-len(x) :, None], x.shape) & np.isfinite(x)
+            x, y = x[ok], y[:, 0][there[-len(y) :] & np.isfinite(y[:, 0])]
+            scale = y.std()
+            found.append(float(energy_distance(x / scale, y / scale)))
+        return found
+
     def table(self) -> str:
         """Return the table, by horizon."""
         lines = [
@@ -169,7 +195,20 @@ class Rows:
                     else:
                         text += "– | – | –"
                     lines.append(text)
+        lines += [
+            "",
+            "free simulation of 30 s | energy distance: time gap | acceleration | jerk",
+            "--- | --- | --- | ---",
+        ]
+        lines += [f"{name} | " + " | ".join(f"{d:.3f}" for d in x) for name, x in self.distances]
         return "\n".join(lines)
+
+
+def _quantities(gap: np.ndarray, speed: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return time gaps (s), where anybody moves, accelerations and jerks of gaps [T, ...] and speeds [T + 1, ...]."""
+    accel = np.diff(speed, axis=0) / dt
+    time_gap = np.where(speed[1:] > 1.0, gap / np.maximum(speed[1:], 1.0), np.nan)
+    return time_gap, accel, np.diff(accel, axis=0) / dt
 
 
 def residuals(drivers: Drivers, theta: np.ndarray) -> np.ndarray:
@@ -194,13 +233,11 @@ def _means(x: np.ndarray, stride: int) -> np.ndarray:
     return x[: len(x) // stride * stride].reshape(-1, stride).mean(1)
 
 
-def by_residual(
-    theta: np.ndarray, items: list[Episode], starts: list[tuple[int, int]], coefficients: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return IDM's forecasts with the residual as an AR(k) goes on from the past, [steps, 1, starts]."""
-    dt = items[0].dt
-    bare = Drivers(simulator(dt), Batch.of(items, substeps=1), Batch.of(items, substeps=1), IDM_NAMES)
-    past, stride, steps = residuals(bare, theta), round(RESIDUAL_S / dt), round(HORIZONS[-1] / dt)
+def going_on(
+    past: np.ndarray, starts: list[tuple[int, int]], coefficients: np.ndarray, dt: float, steps: int
+) -> np.ndarray:
+    """Return residuals [steps, starts] as an AR(k) goes on from the ``past`` [T − 1, rows] of drivers."""
+    stride = round(RESIDUAL_S / dt)
     ahead = np.zeros((steps, len(starts)))
     for i, (r, t) in enumerate(starts):
         known = list(_means(past[t % stride : t, r], stride))
@@ -209,9 +246,17 @@ def by_residual(
         for j in range(0, steps, stride):
             known.append(float(coefficients @ known[: -ORDER - 1 : -1]))
             ahead[j : j + stride, i] = known[-1]
+    return ahead
+
+
+def by_residual(
+    drivers: Drivers, theta: np.ndarray, starts: list[tuple[int, int]], ahead: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the forecasts [steps, 1, starts] of a driver's law with residuals ``ahead`` (m/s²) [steps, starts]."""
+    items, dt, steps = drivers.batch.episodes, drivers.batch.dt, len(ahead)
     model = simulator(dt, Noise())
     made = Batch.of([items[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
-    params = bare.params(torch.tensor(theta[[r for r, _ in starts]]))
+    params = drivers.params(torch.tensor(theta[[r for r, _ in starts]]))
     params["noise"] = {"sigma": torch.ones((), dtype=torch.float64)}
     inputs = dict(made.inputs(model))
     inputs["noise"] = torch.tensor(ahead[: made.steps]).unsqueeze(-1).expand(made.steps, len(starts), 2)
@@ -279,7 +324,16 @@ def i80(folder: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[
     )  # fmt: skip
     rows.score("IDM + last error", *persistent(plain, nothing, mine, starts, *ahead))
     trained = Drivers(simulator(dt), training, training, IDM_NAMES)
-    rows.score(f"IDM + AR({ORDER})", *by_residual(mine, kept, starts, autoregression(trained, theta)))
+    past, count = residuals(plain, mine), round(HORIZONS[-1] / dt)
+    on = going_on(past, starts, autoregression(trained, theta), dt, count)
+    rows.score(f"IDM + AR({ORDER})", *by_residual(plain, mine, starts, on))
+    lengths = np.array([len(e) for e in train])
+    nets = drift_gru.trained(
+        residuals(trained, theta), training.gap.numpy(), training.speed.numpy(), lengths, count
+    )  # fmt: skip
+    on = drift_gru.ahead(nets, past, batch.gap.numpy(), batch.speed.numpy(), starts)
+    rows.score("IDM + GRU", *by_residual(plain, mine, starts, on))
+    say("nets trained")
     for name, drifts in MODELS.items():
         for noise in NOISES if choose else (noises[name],):
             label = f"{name}, noise {noise[0]:g} m, {noise[1]:g} m/s"
