@@ -151,7 +151,6 @@ def discover(
     report["calibration"] = calibrated
     report["prior"] = {
         "alike_s": decided.null.prior.alike_s, "tried_s": list(free.GRID_S), "gap_rmse_m": list(decided.stand.rmse_m),
-        "alike_s_after": discovery.final.prior.alike_s,
     }  # fmt: skip
     kept = prepared.of_runs(kept_runs) if kept_runs else prepared
     report["ceilings"] = ceilings.told(decided.stand, kept, decided.null, decided.rounds[0].left)
@@ -285,10 +284,12 @@ def _finish(
             confirmed.append(s)
 
     def judged(s: Solution) -> tuple[Solution, judge.Judged | None]:
-        theta = judge.calibrate(prepared if adapt else fit_records, s.model, s.values, s.prior, start=s.theta)
+        # All models are calibrated alike, with the weight of the population that serves the null best.
+        prior = replace(s.prior, alike_s=null.prior.alike_s)
+        theta = judge.calibrate(prepared if adapt else fit_records, s.model, s.values, prior, start=s.theta)
         if kept is None:
             return theta, None
-        return theta, judge.judge(kept, s.model, s.values, s.prior, None if adapt else theta.theta, adapt)
+        return theta, judge.judge(kept, s.model, s.values, prior, None if adapt else theta.theta, adapt)
 
     # Where nothing was added, what came nearest is compared with the null and says what it would have done.
     added = final is not null

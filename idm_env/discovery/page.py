@@ -30,8 +30,8 @@ MEANING_OF_ERRORS = {
     "gap 5 s ahead": "the simulation starts anew on the measured state every 5 s; root mean square of the gap's error "
     "at the end of the 5 s",
     "speed in free simulation": "as the first, of the speed",
-    "the driver's own parameters": "in every stretch of time (up to 30 s) those fitted to every second stretch, from "
-    "the one before and the one after it on; a stretch is never scored with parameters that have seen it",
+    "the driver's own parameters": "in every stretch of time (up to 30 s) those fitted to the stretches beside it, "
+    "to every second one of the record; what is scored has never fitted them",
     "noise of measurement": "what the noise in the file alone would leave of a perfect model",
 }
 DATA = {

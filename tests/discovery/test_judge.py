@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import judge
+from idm_env.discovery import discover, judge
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import Records, gather, whole
-from idm_env.discovery.search import first_prior
+from idm_env.discovery.search import Search, first_prior
 
 POSITION = 14
 
@@ -52,3 +52,23 @@ def test_all_time_is_scored_and_by_parameters_that_have_not_seen_it(records: Rec
     assert np.abs(before - after)[rows.valid & ~second].max() > 0.01
     judged = judge.judge(records, Model(), np.zeros(0), first_prior(), None, True)
     assert judged.squares["gap_rmse_m"][1].sum() == rows.valid.sum()
+
+
+def test_all_models_are_calibrated_with_the_weight_of_the_null(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the choice of the weight, and not the effect, would decide which of them errs less."""
+    weights, right, weigh = [], judge.judge, Search.weighed
+
+    def kept(records, model, values, prior, *rest):  # type: ignore[no-untyped-def]
+        weights.append((bool(model.terms), prior.alike_s))
+        return right(records, model, values, prior, *rest)
+
+    def weighed(self, now):  # type: ignore[no-untyped-def]
+        at, now = weigh(self, now)
+        return at, replace(now, prior=replace(now.prior, alike_s=500.0 if now.model.terms else 15.0))
+
+    monkeypatch.setattr(judge, "judge", kept)
+    monkeypatch.setattr(Search, "weighed", weighed)
+    made, _ = synthetic.generate(5, runs=8, followers=2, seconds=80.0, effect="lag")
+    assert discover(made, effects=["lag"]).verdict == "named"
+    assert {terms for terms, _ in weights} == {False, True}
+    assert {alike_s for _, alike_s in weights} == {15.0}
