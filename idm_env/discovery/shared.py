@@ -16,7 +16,9 @@ from scipy.stats import norm as normal
 from idm_env.discovery.places import Responses, scan
 
 TURNS = 199
-ALPHA = 0.01
+ALPHA = 0.002
+"""Scores of chance have longer tails than a normal one: at 0.01 three of 128 generated sets with nothing in them stood
+out."""
 LARGEST = 6.0
 """A residual counts at most so much: one vehicle's emergency is nobody else's."""
 FEWEST_RUNS = 4
