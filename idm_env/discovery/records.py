@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from idm_env.data import DataError, Episode, Trajectories
-from idm_env.data.episode import time_step
-from idm_env.data.records import Record
+from idm_env.data.samples import VEHICLES, Samples
 from idm_env.discovery import march as twin
 from idm_env.fitting.problem import group_of
 
@@ -83,19 +82,20 @@ def gather(
 
     ``trajectories`` tell how fast drivers went before their episodes began.
     """
-    dt = time_step(episodes)
+    samples = Samples.of(episodes)
     group, groups = group_of(episodes, by)
     runs = tuple(dict.fromkeys(e.run_id for e in episodes))
     before = _histories(episodes, trajectories)
-    pieces = [_with_history(_signals(e, period), h, dt) for e, h in zip(episodes, before, strict=True)]
+    parts = np.split(_signals(samples, period), samples.bounds[1:-1])
+    pieces = [_with_history(part, h, samples.dt) for part, h in zip(parts, before, strict=True)]
     bounds = np.append(0, np.cumsum([len(p) for p in pieces]))
     return Records(
-        episodes=tuple(episodes),
-        dt=dt,
+        episodes=samples.episodes,
+        dt=samples.dt,
         signals=np.ascontiguousarray(np.concatenate(pieces)),
         bounds=bounds,
         first=bounds[:-1] + np.array([len(h) for h in before]),
-        length=np.array([e.length_m for e in episodes]),
+        length=samples.length[:, VEHICLES.index("driver")],
         group=group.numpy(),
         groups=groups,
         run=np.array([runs.index(e.run_id) for e in episodes]),
@@ -104,22 +104,23 @@ def gather(
     )
 
 
-def _signals(e: Episode, period: float) -> np.ndarray:
-    def rear(record: Record) -> np.ndarray:
-        return record.position_m - record.length_m
-
-    place = e.place_m
+def _signals(samples: Samples, period: float) -> np.ndarray:
+    """Return the columns of the loop, [samples, columns]."""
+    second, leader, driver, behind = range(len(VEHICLES))
+    place = samples.place
     if period > 0.0:
-        place = np.unwrap(place, period=period)
+        place = np.concatenate([np.unwrap(p, period=period) for p in np.split(place, samples.bounds[1:-1])])
+    rear = samples.position - np.repeat(samples.length, samples.lengths, axis=0)
+    position, speed, accel, present = samples.position, samples.speed, samples.accel, samples.present
     columns = [
-        rear(e.leader), e.leader.speed_mps, e.leader.accel_mps2,
-        rear(e.second_leader), e.second_leader.speed_mps, e.second_leader.accel_mps2, e.second_leader.present,
-        e.behind.position_m, e.behind.speed_mps, e.behind.accel_mps2, e.behind.present,
-        e.adjacent.position_m - e.position_m, e.adjacent.speed_mps, e.adjacent.present,
-        e.position_m, e.speed_mps, e.driver.accel_mps2, e.time_s, place,
+        rear[:, leader], speed[:, leader], accel[:, leader],
+        rear[:, second], speed[:, second], accel[:, second], present[:, second],
+        position[:, behind], speed[:, behind], accel[:, behind], present[:, behind],
+        *samples.beside.T,
+        position[:, driver], speed[:, driver], accel[:, driver], samples.time, place,
     ]  # fmt: skip
     assert len(columns) == len(twin.COLUMNS)
-    return np.stack([np.asarray(c, float) for c in columns], axis=1)
+    return np.stack(columns, axis=1)
 
 
 def _histories(episodes: Sequence[Episode], trajectories: Trajectories | None) -> list[np.ndarray]:

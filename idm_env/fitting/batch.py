@@ -16,12 +16,10 @@ import torch
 from torch import Tensor
 
 from idm_env.data import DataError, Episode
-from idm_env.data.episode import time_step
+from idm_env.data.samples import VEHICLES, Samples
 from idm_env.simulator import Simulator
 from idm_env.types import Adjacent, Inputs, Params, State
 from idm_env.types import Record as Replayed
-
-COLUMNS = ("second_leader", "leader", "driver", "behind")
 
 INTEGRATION_STEP_S = 0.025
 """Largest step (s) by which measured data are simulated: at 0.1 s the first-order error of a step biases parameters
@@ -34,7 +32,7 @@ class Batch:
 
     Time is first. Measured on T samples: ``gap``, ``speed`` and ``valid``, [T, rows]. Records on the steps in
     between too, (T − 1) · substeps + 1 of them: ``position``, ``all_speed``, ``accel`` and ``present`` [·, rows, 4]
-    in the order of ``COLUMNS``, positions in the coordinate of places; ``beside`` is distance, speed and presence of
+    in the order of ``VEHICLES``, positions in the coordinate of places; ``beside`` is distance, speed and presence of
     the adjacent vehicle, each [·, rows]. ``length`` is [rows, 4], ``first_step`` [rows].
     """
 
@@ -58,42 +56,31 @@ class Batch:
 
         ``substeps`` None takes as many as ``INTEGRATION_STEP_S`` asks for.
         """
-        items = tuple(episodes)
-        dt = time_step(items)
-        steps = max(len(e) for e in items)
+        samples = Samples.of(episodes)
+        begin, end, steps = samples.bounds[:-1], samples.bounds[1:], int(samples.lengths.max())
+        at = np.minimum(begin + np.arange(steps)[:, None], end - 1)  # padded with its last sample
 
-        def stack(columns: Sequence[np.ndarray]) -> Tensor:
-            padded = [np.pad(c, [(0, steps - len(c))], mode="edge") for c in columns]
-            return torch.as_tensor(np.stack(padded, axis=1), dtype=dtype)
+        def rows(x: np.ndarray) -> Tensor:
+            return torch.as_tensor(x[at], dtype=dtype)
 
-        fine = substeps or max(1, math.ceil(dt / INTEGRATION_STEP_S - 1e-6))
-
-        records = [[getattr(e, name) for name in COLUMNS] for e in items]
-
-        def four(field: str) -> Tensor:
-            return torch.stack([stack([getattr(r[i], field) for r in records]) for i in range(4)], dim=-1)
-
+        fine = substeps or max(1, math.ceil(samples.dt / INTEGRATION_STEP_S - 1e-6))
         # Everything is moved along with the driver, so that places are those of its own track at the start.
-        moved = torch.as_tensor([float(e.place_m[0] - e.position_m[0]) for e in items], dtype=dtype)
-        position, speed = four("position_m") + moved[:, None], four("speed_mps")
-
+        driver = VEHICLES.index("driver")
+        moved = torch.as_tensor(samples.place[begin] - samples.position[begin, driver], dtype=dtype)
+        position, speed, beside = rows(samples.position) + moved[:, None], rows(samples.speed), rows(samples.beside)
         return cls(
-            episodes=items,
-            dt=dt,
-            gap=stack([e.gap_m for e in items]),
-            speed=stack([e.speed_mps for e in items]),
-            valid=stack([np.ones(len(e)) for e in items]) * _inside([len(e) for e in items], steps, dtype),
-            position=_between_positions(position, speed, dt, fine),
+            episodes=samples.episodes,
+            dt=samples.dt,
+            gap=rows(samples.gap),
+            speed=speed[..., driver].contiguous(),
+            valid=torch.as_tensor(np.arange(steps)[:, None] < samples.lengths, dtype=dtype),
+            position=_between_positions(position, speed, samples.dt, fine),
             all_speed=_between(speed, fine),
-            accel=_between(four("accel_mps2"), fine),
-            present=_held(four("present"), fine),
-            length=torch.as_tensor([[r.length_m for r in four] for four in records], dtype=dtype),
-            first_step=torch.as_tensor([round(float(e.time_s[0]) / dt * fine) for e in items]),
-            beside=(
-                _between(stack([e.adjacent.position_m - e.position_m for e in items]), fine),
-                _between(stack([e.adjacent.speed_mps for e in items]), fine),
-                _held(stack([e.adjacent.present.astype(float) for e in items]), fine),
-            ),
+            accel=_between(rows(samples.accel), fine),
+            present=_held(rows(samples.present), fine),
+            length=torch.as_tensor(samples.length, dtype=dtype),
+            first_step=torch.as_tensor(np.round(samples.time[begin] / samples.dt * fine).astype(int)),
+            beside=(_between(beside[..., 0], fine), _between(beside[..., 1], fine), _held(beside[..., 2], fine)),
             substeps=fine,
         )
 
@@ -182,10 +169,6 @@ class Batch:
                     f"effect '{name}' takes an input that measured data do not have. Remove it from the model."
                 )
         return inputs
-
-
-def _inside(lengths: list[int], steps: int, dtype: torch.dtype) -> Tensor:
-    return (torch.arange(steps)[:, None] < torch.as_tensor(lengths)).to(dtype)
 
 
 def _between(x: Tensor, substeps: int) -> Tensor:
