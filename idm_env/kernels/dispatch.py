@@ -99,13 +99,13 @@ def _unfit_tensors(state: State, inputs: Inputs, params: Params) -> str | None:
         for name, value in values.items():
             if not isinstance(value, Tensor):
                 return f"{effect}.{name} is no tensor"
-            if not _within(value.shape, shape):
+            if value.dim() and not _within(value.shape, shape):
                 return f"{effect}.{name} enlarges the batch"
             tensors.append(value)
     for x in tensors:
-        if x.device.type != "cpu":
+        if not x.is_cpu:
             return f"tensors are on {x.device}; kernels run on the CPU"
-        if x.dtype not in (kind, torch.bool):
+        if x.dtype is not kind and x.dtype is not torch.bool:
             return f"tensors are {kind} and {x.dtype}"
     for x in _tensors(inputs):
         if x.dim() == 0 or not _within(x.shape[1:], shape):

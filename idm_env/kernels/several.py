@@ -97,9 +97,9 @@ def rollout(
     own = {name: params[name] for name in inner.by_name}
     stops = bool(simulator.changes) or state.present is not None
     every = simulator.decides_after if stops else max(steps, 1)
-    stages = sorted({0, *simulator.turns(state.speed.shape[-1]).tolist()}) if stops else [0]
+    blocks = stops and simulator.decides_in_blocks
+    stages = sorted({0, *simulator.turns(state.speed.shape[-1]).tolist()}) if blocks else [0]
     block = lanes.BLOCK if road.ring is not None else every
-    wishes = decision(simulator, Form.of(state._replace(links=None), inputs)) if simulator.changes else ""
     traffic = Traffic(simulator, state)
     kept: list[tuple[Tensor, ...]] = []
     first, halo, places = state, 0, None
@@ -108,7 +108,10 @@ def rollout(
         clocks = clocks[:1]
     while done < steps:
         phase = (clocks + done) % every
-        own_turn = np.isin(phase, stages) if stops else np.zeros(len(phase), bool)
+        own_turn = np.isin(phase, stages) if blocks else (phase == 0) & stops
+        wishes: Any = ""
+        if simulator.changes and own_turn.any():
+            wishes = decision(simulator, Form.of(state._replace(links=None), inputs))
         alike = len(phase) == 1
         if own_turn.all() and alike:
             after = _decided(traffic, wishes, state, _cut(inputs, done, None), params, int(phase[0]))
