@@ -58,23 +58,27 @@ def round_ring(q, first, last):
 def whose(which, places, c, at, m, step, to, behind, begin, order, ring, base):
     """Fill ``which`` with the slots of the ``c``-th place, as seen from ranks ``at`` to ``at + m``: own for nobody."""
     first, last, up = begin[to], begin[to + 1], places[c, 1]
+    around = ring > 0 and last > first
     for j in range(m):
         q = (at + j if step == 0 else behind[at + j]) - up
-        if ring > 0 and last > first:
-            q = round_ring(q, first, last)
-        there = first <= q < last
-        which[c * CHUNK + j] = base + order[q if there else at + j]
+        if not first <= q < last:
+            q = round_ring(q, first, last) if around else at + j
+        which[c * CHUNK + j] = base + order[q]
 
 
 @exact
-def laps(way, plain, ring):
-    """Return whole laps (m) by which ``plain`` falls short of the way that is known."""
-    return ring * np.floor((way - plain) / ring + 0.5)
+def count_laps(position, base, order, place, count, ring, lap):
+    """Write how many laps of the ring the vehicle of each rank has driven."""
+    for r in range(count):
+        lap[r] = np.int64(np.floor((np.float64(position[base + order[r]]) - place[r]) / ring + 0.5))
 
 
 @exact
-def find(w, target, kind, at, m, exists, to, behind, begin, place, order, position, base, ring, tables):
-    """Fill one row with what a search says of lane ``to``, as seen from ranks ``at`` to ``at + m``."""
+def find(w, target, kind, at, m, exists, to, behind, begin, lap, ring, tables):
+    """Fill one row with what a search says of lane ``to``, as seen from ranks ``at`` to ``at + m``.
+
+    Laps (m) are what differences of positions lack of the way ahead, or behind.
+    """
     first, last = begin[to], begin[to + 1]
     around = ring > 0 and last > first
     if kind == LANE:
@@ -91,18 +95,16 @@ def find(w, target, kind, at, m, exists, to, behind, begin, place, order, positi
             w[target + j] = around or behind[at + j] < last
     elif not around:
         fill(w, target, 0, m)
+    elif kind == LAPS_AHEAD:
+        for j in range(m):
+            q = behind[at + j]
+            over = q == first
+            w[target + j] = ring * (lap[at + j] - lap[last - 1 if over else q - 1] + over)
     else:
         for j in range(m):
-            r, q = at + j, behind[at + j]
-            mine = np.float64(position[base + order[r]])
-            if kind == LAPS_AHEAD:
-                ahead = q - 1 if q > first else last - 1
-                way = place[ahead] - place[r] + (ring if q == first else 0.0)
-                w[target + j] = laps(way, np.float64(position[base + order[ahead]]) - mine, ring)
-            else:
-                after = q if q < last else first
-                way = place[r] - place[after] + (ring if q == last else 0.0)
-                w[target + j] = -laps(-way, np.float64(position[base + order[after]]) - mine, ring)
+            q = behind[at + j]
+            over = q == last
+            w[target + j] = -(ring * (lap[at + j] - lap[first if over else q] - over))
 
 
 @exact
@@ -115,8 +117,7 @@ def fill_alike(w, slots, plan, row):
 
 @exact
 def fill_rows(
-    w, slots, plan, places, which, at, m, own_lane, begin, count, place, order, left, right, position, base, row, n,
-    ring, tables,
+    w, slots, plan, places, which, at, m, own_lane, begin, count, order, left, right, lap, base, row, ring, tables,
 ):  # fmt: skip
     """Fill the rows of the phase for ranks ``at`` to ``at + m``, all of one lane."""
     for c in range(len(places)):
@@ -135,7 +136,7 @@ def fill_rows(
             exists = 0 <= to < count
             find(
                 w, i * ROW, kind, at, m, exists, to if exists else own_lane, left if side == 1 else right, begin,
-                place, order, position, base, ring, tables,
+                lap, ring, tables,
             )  # fmt: skip
         elif plan[i, BY_VEHICLE] != 0:
             gather(w, i * ROW, plan[i, ADDRESS], row * plan[i, BY_ROW] - base, which, plan[i, PLACE] * CHUNK, m)
@@ -292,11 +293,13 @@ def decide(
     fresh_order, fresh_begin = np.empty(n, np.int64), np.empty(count + 1, np.int64)
     left, right, winner = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n + count, np.int64)
     utility, to_left, granted = np.empty(n, k.dtype), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    signals, nearest = np.zeros(n, np.int8), np.empty(n)
+    signals, nearest, lap = np.zeros(n, np.int8), np.empty(n), np.zeros(n, np.int64)
     for row in range(rows):
         base = row * n
         if not walk(leader, follower, lane, position, present, coming, n, count, ring, base, order, begin, place):
             return False
+        if ring > 0:
+            count_laps(position, base, order, place, begin[count], ring, lap)
         beside(place, begin, count, 1, left)
         beside(place, begin, count, -1, right)
         fill_alike(w, slots, plan, row)
@@ -308,8 +311,8 @@ def decide(
                 if len(turn) and not any_of(turn, order, at, m):
                     continue
                 fill_rows(
-                    w, slots, plan, places, which, at, m, own, begin, count, place, order, left, right, position,
-                    base, row, n, ring, tables,
+                    w, slots, plan, places, which, at, m, own, begin, count, order, left, right, lap, base, row,
+                    ring, tables,
                 )  # fmt: skip
                 call(phase, w, padded(m), k)  # type: ignore[call-arg]
                 some |= settle(
