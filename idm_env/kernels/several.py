@@ -60,12 +60,15 @@ class _LaidOut:
         kept = self._kept.get(id(parts[1]))
         if kept is None or kept[2] != halo:
             return None
+        # What was kept is no inference tensor, so it has a version.
         same = all((ref and ref()) is x for ref, x in zip(kept[0], parts, strict=True))
         return kept[3] if same and kept[1] == _versions(parts) else None
 
     def put(self, state: State, halo: int, places: Places) -> None:
-        """Keep the places of a state."""
+        """Keep the places of a state; not in ``torch.inference_mode``, whose tensors do not tell when they change."""
         parts = self._parts(state)
+        if any(x is not None and x.is_inference() for x in parts):
+            return
         refs = tuple(None if x is None else weakref.ref(x) for x in parts)
         while len(self._kept) >= self._most:
             self._kept.pop(next(iter(self._kept)))

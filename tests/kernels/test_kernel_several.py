@@ -216,6 +216,21 @@ def test_compiled_decisions_are_pathwise(how: Decisions) -> None:
     assert dispatch.refusal(timed, state, {}, params) == "compiled changes take no time, and Lanes has a duration"
 
 
+def test_single_steps_in_inference_mode_are_those_without() -> None:
+    """Inference tensors do not tell when they change, so nothing is remembered of them."""
+    simulator = Simulator(Lanes(3, ring=500.0), (IDM(), Mobil(), Brakes()))
+    params = simulator.defaults(dtype=torch.float32)
+    ends = []
+    for quick in (True, False):
+        with torch.inference_mode(quick):
+            position = torch.arange(N) * (480.0 / N)
+            state = simulator.state(position, torch.full((N,), 8.0), params, lane=torch.arange(N) % 3)
+            for _ in range(12):
+                state = simulator.advance(state, {}, params)
+            ends.append(state.position)
+    assert torch.equal(*ends)
+
+
 def test_vehicles_that_have_passed_through_each_other_take_the_torch_path() -> None:
     """Their links are no order of positions, and are not guessed at."""
     simulator = Simulator(Lanes(2, ring=300.0), (IDM(), Brakes()))
