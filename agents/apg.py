@@ -42,7 +42,7 @@ class Arguments(common.Arguments):
         first: Keywords of the environment that differ in the first updates; only in YAML.
         first_updates: How many updates these are.
         heed: Reward per step that an agent loses for each m/s² of its command that the failsafe of the first updates
-            would cut off, as far as its brakes could do better; in all updates.
+            would cut off, as far as its brakes could do better; it grows to that over the first updates.
     """
 
     out: Path = Path("runs/apg")
@@ -111,11 +111,13 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             # Seeded by the update, so that a resumed training repeats it.
             torch.manual_seed(environments.first_seed(arguments.seed, update))
             share = rate / arguments.learning_rate
+            # It grows while the failsafe is there: first a vehicle learns to drive, then to brake by itself.
+            heed = arguments.heed * min((update + 1) / max(arguments.first_updates, 1), 1.0)
             push = arguments.explore * share * torch.randn(arguments.count, len(env.task.agents))
             for _ in range(arguments.window):
                 action = policy(observation) + push
                 if guard is not None:
-                    total = total - arguments.heed * beyond(guard, env, action).mean()
+                    total = total - heed * beyond(guard, env, action).mean()
                 observation, reward, *_ = env.step(action)
                 total = total + reward.mean()
             loss = -total / arguments.window
