@@ -94,7 +94,8 @@ def between_halves(at: Stand) -> float:
 def refitted(records: Records, null: Solution) -> float:
     """Return the gap RMSE (m) of records if drivers are fitted to just the half of their time that is scored."""
     rows, empty, square = whole(records), np.zeros((1, 0)), 0.0
-    for half in (judge.halves(rows), rows.valid & ~judge.halves(rows)):
+    second = judge.halves(rows)
+    for half in (second, rows.valid & ~second):
         own = replace(rows, valid=half)
         task, theta = judge.unweighed(records, null.model, null.values, null.prior, own, null.theta)
         errors = Task(own, None, task.prior).errors(theta[None], Frozen(null.model, null.values), empty)[0]

@@ -190,12 +190,13 @@ def judge(
     rows, short = whole(records), windows(records)
     frozen, near = Frozen(model, values), Task(short, None, prior)
     if adapt:
+        second = halves(rows)
         thetas = np.stack([
             calibrate(records, model, values, prior, replace(rows, valid=part), theta).theta
-            for part in (rows.valid & ~halves(rows), halves(rows))
+            for part in (rows.valid & ~second, second)
         ])  # fmt: skip
         # Of two copies, the second is scored where the first was fitted.
-        there, then = (~halves(rows)).astype(int), (short.block % 2 == 0).astype(int)
+        there, then = (~second).astype(int), (short.block % 2 == 0).astype(int)
     else:
         assert theta is not None
         thetas, there, then = theta[None], np.zeros(rows.valid.shape, int), np.zeros(len(short), int)

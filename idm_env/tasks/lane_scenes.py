@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from idm_env.data.errors import DataError
 from idm_env.tasks.scenes import Track, recorded_tracks, smoothed
+
+if TYPE_CHECKING:
+    import torch
+
+    from idm_env.types import State
 
 
 class LanesScene(NamedTuple):
@@ -114,13 +119,13 @@ def made_up_lanes(dt: float, vehicles: int = 24, seconds: float = 90.0) -> Lanes
     position = 300.0 - 36.0 * torch.div(index, 3, rounding_mode="floor").double() + 6.0 * share
     speed = torch.full_like(position, 18.0)
     state = simulator.state(position, speed, params, length=4.5, lane=index % 3)
-    seen, lanes = [torch.stack((state.position, state.speed, state.accel), -1)], [index % 3]
+
+    def seen(now: State) -> tuple[torch.Tensor, torch.Tensor]:
+        assert now.links is not None
+        return torch.stack((now.position, now.speed, now.accel), -1), now.links.lane
+
     with torch.no_grad():
-        for _ in range(round(seconds / dt)):
-            state = simulator.step(state, {}, params)
-            assert state.links is not None
-            seen.append(torch.stack((state.position, state.speed, state.accel), -1))
-            lanes.append(state.links.lane)
-    motion, lane = torch.stack(seen).numpy(), torch.stack(lanes).numpy()
+        _, kept = simulator.rollout(state, {}, params, round(seconds / dt), keep=seen)
+    motion, lane = (torch.cat((x[None], later)).numpy() for x, later in zip(seen(state), kept, strict=True))
     there, length = np.ones(lane.shape, bool), np.full(vehicles, 4.5)
     return _seen(motion, there, lane, length, tuple(f"made-up/{i}" for i in range(vehicles)), 3)
