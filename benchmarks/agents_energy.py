@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from agents import apg, common
 from agents.environments import task_of
@@ -27,7 +26,9 @@ from agents.rollout import Act
 from benchmarks.agents_tables import table
 from idm_env import metrics
 from idm_env.data import Episode, episodes, load
+from idm_env.data.samples import VEHICLES
 from idm_env.effects import Control
+from idm_env.fitting.batch import Batch
 from idm_env.fitting.fit import base_simulator, fit
 from idm_env.tasks.recorded import equilibrium_gap
 from idm_env.types import Command, Params, Record
@@ -42,19 +43,15 @@ def driven(items: Sequence[Episode], params: Params, kind: str, act: Act | None,
 
     ``kind`` is recorded, idm or agent; beyond the end of a record, which ``valid`` tells, nothing is judged.
     """
-    steps, vehicles = max(len(e) for e in items), BEHIND + 2
+    batch, vehicles = Batch.of(items, substeps=1), BEHIND + 2
     simulator = base_simulator(items[0].dt)
     agent = kind == "agent"
     if agent:
         simulator = simulator.adding(Control())
     params = {**simulator.defaults(dtype=torch.float64), **params}
 
-    def padded(columns: Sequence[np.ndarray]) -> Tensor:
-        return torch.as_tensor(np.stack([np.pad(c, (0, steps - len(c)), mode="edge") for c in columns], 1))
-
-    # Positions of the follower are measured from its leader, so that their gap is the measured one.
-    lead = [padded([getattr(e.leader, name) for e in items]) for name in ("position_m", "speed_mps", "accel_mps2")]
-    own = [padded([getattr(e.driver, name) for e in items]) for name in ("position_m", "speed_mps", "accel_mps2")]
+    motions = (batch.position, batch.all_speed, batch.accel)
+    lead, own = ([x[..., VEHICLES.index(who)] for x in motions] for who in ("leader", "driver"))
     speed = torch.stack([lead[1][0], *[own[1][0]] * (BEHIND + 1)], -1)
     length = torch.tensor([[e.leader.length_m, *[LENGTH] * (BEHIND + 1)] for e in items], dtype=torch.float64)
     gaps = equilibrium_gap(simulator.base.driver(params["idm"]), speed[:, 2:])
@@ -63,7 +60,7 @@ def driven(items: Sequence[Episode], params: Params, kind: str, act: Act | None,
     state = simulator.state(position, speed, params, length=length)
     replayed = torch.arange(vehicles) < (2 if kind == "recorded" else 1)
     kept = []
-    for t in range(1, steps):
+    for t in range(1, len(batch.gap)):
         columns = (torch.stack([a[t], *[b[t]] * (BEHIND + 1)], -1) for a, b in zip(lead, own, strict=True))
         record = Record(*columns, replayed)
         inputs: dict[str, Any] = {"replay": record}
@@ -76,8 +73,7 @@ def driven(items: Sequence[Episode], params: Params, kind: str, act: Act | None,
         state = simulator.step(state, inputs, params)
         kept.append(tuple(x[:, 1:] for x in (state.speed, state.accel, state.gap)))
     v, a, gap = (torch.stack(column) for column in zip(*kept, strict=True))
-    valid = torch.as_tensor(np.array([[t < len(e) for e in items] for t in range(1, steps)]))
-    return {"speed": v, "accel": a, "gap": gap, "valid": valid}
+    return {"speed": v, "accel": a, "gap": gap, "valid": batch.valid[1:] > 0}
 
 
 def judged(run: Row) -> Row:

@@ -307,9 +307,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of the keys of the sets to run, such as 'one|delay'")
     parser.add_argument("--out", type=Path, default=Path("discovery_benchmark.jsonl"))
     arguments = parser.parse_args()
-    done: dict[str, dict[str, Any]] = {}
-    if arguments.out.exists():
-        done = {r["key"]: r for r in map(json.loads, arguments.out.read_text().splitlines())}
+    done = workers.kept(arguments.out, "key")
     wanted = [
         j for j in jobs(arguments.sets, arguments.clean, arguments.first_seed, arguments.few) if arguments.only in j.key
     ]

@@ -138,9 +138,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("drift_sets.jsonl"))
     workers.add(parser)
     arguments = parser.parse_args()
-    done = {}
-    if arguments.out.exists():
-        done = {s["seed"]: s for s in map(json.loads, arguments.out.read_text().splitlines())}
+    done = workers.kept(arguments.out, "seed")
     wanted = range(arguments.first_seed, arguments.first_seed + arguments.sets)
     with workers.of(arguments) as executor:
         for _, row in executor.map(scored, [seed for seed in wanted if seed not in done]):

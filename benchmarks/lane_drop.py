@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ import torch
 
 from benchmarks import lane_drop_zipper
 from benchmarks.lane_drop_zipper import BASE, FLOW
+from benchmarks.lanes_sumo import started
 from idm_env import keep, population
 from idm_env.effects import IDM, Brakes, Control, MandatoryChange, Mobil, Noise
 from idm_env.roads import Lanes, lane_drop
@@ -109,27 +110,15 @@ def stands(state: State, chosen: torch.Tensor, place: Place) -> torch.Tensor:
 
 def sumo(minutes: int, values: Mapping[str, float]) -> float | None:
     """Return vehicles per hour out of the long road in SUMO (IDM, LC2013); None without ``libsumo``."""
-    try:
-        import libsumo
-    except ImportError:
-        return None
-    with tempfile.TemporaryDirectory() as folder:
-        net, routes = Path(folder, "net.xml"), Path(folder, "routes.xml")
-        net.write_text(_net())
-        routes.write_text(_routes(minutes * 60.0, values))
-        libsumo.start([
-            "sumo", "-n", str(net), "-r", str(routes), "--step-length", str(DT), "--step-method.ballistic",
-            "--error-log", str(Path(folder, "errors")), "--no-step-log", "--no-warnings", "--time-to-teleport", "-1",
-            "--collision.action", "none", "--seed", "1",
-        ])  # fmt: skip
-        try:
-            left = 0
-            for k in range(int(minutes * 60.0 / DT)):
-                libsumo.simulationStep()
-                left += libsumo.simulation.getArrivedNumber() if k * DT >= minutes * 20.0 else 0
-            return left / (minutes * 40.0 / 3600.0)
-        finally:
-            libsumo.close()
+    options = ["--step-method.ballistic", "--collision.action", "none", "--error-log", os.devnull, "--seed", "1"]
+    with started(_net(), _routes(minutes * 60.0, values), DT, *options) as libsumo:
+        if libsumo is None:
+            return None
+        left = 0
+        for k in range(int(minutes * 60.0 / DT)):
+            libsumo.simulationStep()
+            left += libsumo.simulation.getArrivedNumber() if k * DT >= minutes * 20.0 else 0
+        return left / (minutes * 40.0 / 3600.0)
 
 
 def _net() -> str:

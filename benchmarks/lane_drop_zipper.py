@@ -8,11 +8,12 @@ IDM; today's has none.
 
 from __future__ import annotations
 
+import os
 import random
-import tempfile
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
+
+from benchmarks.lanes_sumo import started
 
 BASE = {"max_accel": 2.6, "comfort_decel": 4.5, "time_gap": 1.0, "min_gap": 2.5, "desired_speed": 30.0}
 FLOW = 2600.0
@@ -33,23 +34,9 @@ def idm(values: Mapping[str, float]) -> str:
 
 def sumo(values: Mapping[str, float], derived: bool, warmup: int = 1000, steps: int = 2000) -> float | None:
     """Return vehicles per hour out, after 500 s, in 1000 s; None without ``libsumo``."""
-    try:
-        import libsumo
-    except ImportError:
-        return None
-    with tempfile.TemporaryDirectory() as folder:
-        net, routes = Path(folder, "net.xml"), Path(folder, "routes.xml")
-        net.write_text(_net())
-        routes.write_text(_routes(values))
-        libsumo.start([
-            "sumo", "-n", str(net), "-r", str(routes), "--step-length", str(STEP), "--time-to-teleport", "-1",
-            "--collision.action", "remove", "--collision.check-junctions", "true", "--max-depart-delay", "0.5",
-            "--error-log", str(Path(folder, "errors")), "--no-step-log", "--no-warnings", "--seed", "1",
-        ])  # fmt: skip
-        try:
-            return _driven(libsumo, values, derived, warmup, steps)
-        finally:
-            libsumo.close()
+    options = ["--collision.action", "remove", "--collision.check-junctions", "true", "--max-depart-delay", "0.5"]
+    with started(_net(), _routes(values), STEP, *options, "--error-log", os.devnull, "--seed", "1") as libsumo:
+        return None if libsumo is None else _driven(libsumo, values, derived, warmup, steps)
 
 
 def _driven(libsumo: Any, values: Mapping[str, float], derived: bool, warmup: int, steps: int) -> float:

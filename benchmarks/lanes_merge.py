@@ -14,8 +14,8 @@ import torch
 from idm_env import keep, population
 from idm_env import report as page
 from idm_env.effects import IDM, Brakes, Courtesy, MandatoryChange, Mobil, Noise
-from idm_env.roads import Lanes, on_ramp
 from idm_env.simulator import Simulator
+from idm_env.tasks import MergeTask
 from idm_env.types import Trips
 
 DEMANDS = (2400.0, 2800.0, 3200.0, 3400.0, 3600.0, 3800.0, 4000.0, 4400.0, 4800.0)
@@ -25,10 +25,8 @@ DT, SEEDS, RAMP, SLOTS = 0.2, 4, 0.2, 250
 
 def outflows(courteous: bool, minutes: int = 20) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return outflow (vehicles/h) in each minute, mean speed at the end of each (m/s), and queues: by demand, seed."""
-    simulator = Simulator(
-        Lanes(3, length=900.0, ends=(on_ramp(0, begin=400.0, end=600.0, entry=100.0),)),
-        (IDM(), Noise(), Mobil(), MandatoryChange(), *([Courtesy()] if courteous else []), Brakes()), dt=DT,
-    )  # fmt: skip
+    effects = (IDM(), Noise(), Mobil(), MandatoryChange(), *([Courtesy()] if courteous else []), Brakes())
+    simulator = Simulator(MergeTask().road, effects, dt=DT)
     draw = torch.Generator().manual_seed(1)
     each = [at_random(demand, draw) for demand in DEMANDS for _ in range(SEEDS)]
     given = Trips(*(torch.stack(column) for column in zip(*each, strict=True)))

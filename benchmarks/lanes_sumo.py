@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,28 @@ from benchmarks.lanes_ring import DRIVER, DT, LANES
 MODELS = ("LC2013", "SL2015")
 
 
+@contextmanager
+def started(net: str, routes: str, step: float, *options: str) -> Iterator[Any]:
+    """Give ``libsumo`` on a net with its traffic, where nobody is teleported, and end it; None where it is missing."""
+    if not find_spec("libsumo"):
+        yield None
+        return
+    import libsumo
+
+    with tempfile.TemporaryDirectory() as folder:
+        at_net, at_routes = Path(folder, "net.xml"), Path(folder, "routes.xml")
+        at_net.write_text(net)
+        at_routes.write_text(routes)
+        libsumo.start([
+            "sumo", "-n", str(at_net), "-r", str(at_routes), "--step-length", str(step), "--time-to-teleport", "-1",
+            "--no-step-log", "--no-warnings", *options,
+        ])  # fmt: skip
+        try:
+            yield libsumo
+        finally:
+            libsumo.close()
+
+
 def sumo(
     each: int, per_km: float, seconds: float, model: str = "LC2013", seed: int = 1
 ) -> tuple[float, float, float] | None:
@@ -23,25 +47,12 @@ def sumo(
 
     ``model`` is SUMO's lane-change model; ``SL2015`` has a lateral resolution of 0.8 m.
     """
-    if not find_spec("libsumo"):
-        return None
-    import libsumo
-
     ring = each / LANES / per_km * 1000.0
-    with tempfile.TemporaryDirectory() as folder:
-        net, routes = Path(folder, "net.xml"), Path(folder, "routes.xml")
-        net.write_text(_net(ring))
-        routes.write_text(_routes(each, ring, min(20.0, 0.5 * (1000.0 / per_km - 7.0)), model))
-        libsumo.start([
-            "sumo", "-n", str(net), "-r", str(routes), "--step-length", str(DT), "--step-method.ballistic",
-            "--no-step-log", "--no-warnings", "--time-to-teleport", "-1", "--collision.action", "none",
-            "--seed", str(seed),
-            *(["--lateral-resolution", "0.8"] if model == "SL2015" else []),
-        ])  # fmt: skip
-        try:
-            return _driven(libsumo, seconds)
-        finally:
-            libsumo.close()
+    routes = _routes(each, ring, min(20.0, 0.5 * (1000.0 / per_km - 7.0)), model)
+    options = ["--step-method.ballistic", "--collision.action", "none", "--seed", str(seed)]
+    options += ["--lateral-resolution", "0.8"] if model == "SL2015" else []
+    with started(_net(ring), routes, DT, *options) as libsumo:
+        return None if libsumo is None else _driven(libsumo, seconds)
 
 
 def _net(ring: float) -> str:

@@ -155,9 +155,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of the names of the cases to run")
     workers.add(parser)
     arguments = parser.parse_args()
-    done = {}
-    if arguments.out.exists():
-        done = {r["case"]: r for r in map(json.loads, arguments.out.read_text().splitlines())}
+    done = workers.kept(arguments.out, "case")
     wanted = {n: c for n, c in cases(arguments.data).items() if arguments.only in n}
     missing = [(name, arguments.data, case) for name, case in wanted.items() if name not in done]
     with workers.of(arguments) as executor:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
 from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
 
 from idm_env.executor import KINDS, Executor, opened
 
@@ -13,6 +16,12 @@ def add(parser: argparse.ArgumentParser, usual: str = "serial") -> None:
     parser.add_argument("--executor", choices=KINDS, default=usual, help="where parts run; no result depends on it")
     parser.add_argument("--jobs", type=int, help="parts that run at a time; default: one per processor")
     parser.add_argument("--ray-address", help="of a Ray cluster, host:port or auto; default: Ray on this machine")
+
+
+def kept(out: Path, column: str) -> dict[Any, dict[str, Any]]:
+    """Return the rows that a file has, a line of JSON each, by one of their columns; none where there is no file."""
+    rows = map(json.loads, out.read_text().splitlines()) if out.exists() else ()
+    return {row[column]: row for row in rows}
 
 
 def of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
