@@ -54,11 +54,11 @@ def compare(before: Judged, after: Judged, seed: int = 0) -> dict[str, Compariso
     for key in ERRORS:
         (was, count), (now, _) = before.squares[key], after.squares[key]
         seen = count > 0
-        result[key] = _compared(was[seen], now[seen], float(count[seen].sum()), runs[seen], seed)
+        result[key] = compared(was[seen], now[seen], float(count[seen].sum()), runs[seen], seed)
     return result
 
 
-def _compared(was: np.ndarray, now: np.ndarray, samples: float, runs: np.ndarray, seed: int) -> Comparison:
+def compared(was: np.ndarray, now: np.ndarray, samples: float, runs: np.ndarray, seed: int) -> Comparison:
     """Compare sums of squares of followers [F] in runs [F]."""
     errors = [float(np.sqrt(x.sum() / samples)) if samples else float("nan") for x in (was, now)]
     change = 0.5 * np.log(now.sum() / was.sum()) if samples and was.sum() > 0 else float("nan")

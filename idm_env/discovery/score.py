@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from idm_env.discovery.solve import Linear, Solution, Task, cost_of, equations, prior_of, projected
 from idm_env.discovery.units import rho, signs, units
-from idm_env.parameters import Parameter
 
 ALPHA = 0.05
 FREE_SHARE = 0.2
 """Share of the level that goes to candidates in free simulation, the rest to the same in windows (Bonferroni)."""
-POWER = 0.8
 FAINT = 0.003
 """Gain in log RMSE of a run that is hardly worth the name."""
 SYSTEMATIC = 0.01
@@ -121,9 +117,7 @@ def westfall_young(gains: np.ndarray, seed: int = 0, run: np.ndarray | None = No
     """
     candidates, count = gains.shape
     run = np.arange(count) if run is None else run
-    roots = np.sign(gains) * np.sqrt(np.abs(gains))
-    flips = signs(run, rho(roots, run), seed)
-    statistic = flips @ roots.T / np.sqrt(np.abs(gains).sum(1) + FAINT * count)
+    statistic = _flipped(gains, seed, run)
     highest = statistic.max(1)
     p_value = (highest[:, None] >= statistic[0] - 1e-12).mean(0)
     mean = gains.mean(1)
@@ -134,6 +128,24 @@ def westfall_young(gains: np.ndarray, seed: int = 0, run: np.ndarray | None = No
     error = np.sqrt((off**2).sum(1) * runs / (runs - 1)) / count if runs > 1 else np.full(candidates, np.inf)
     width = student.ppf(0.975, max(runs - 1, 1)) * error
     return Tested(p_value, mean, np.stack([mean - width, mean + width], axis=1))
+
+
+def _flipped(gains: np.ndarray, seed: int, run: np.ndarray) -> np.ndarray:
+    """Return the statistic of candidates with signs flipped [flips, K], first as it is."""
+    roots = np.sign(gains) * np.sqrt(np.abs(gains))
+    flips = signs(run, rho(roots, run), seed)
+    statistic: np.ndarray = flips @ roots.T / np.sqrt(np.abs(gains).sum(1) + FAINT * gains.shape[1])
+    return statistic
+
+
+def level(gains: np.ndarray, seed: int, run: np.ndarray, share: float) -> float:
+    """Return from which statistic on a further candidate is significant beside these [K, units].
+
+    ``share`` of ``ALPHA`` is what the test has. A strong candidate is itself among the highest with its own signs.
+    """
+    highest = np.sort(_flipped(gains, seed, run).max(1))[::-1]
+    above = int(np.ceil(ALPHA * share * len(highest))) - 2
+    return float(highest[above]) + 1e-9 if above >= 0 else float(highest[0]) + 1e-9
 
 
 def interval_of(solution: Solution, task: Task) -> np.ndarray:
@@ -175,60 +187,3 @@ def half_width(solution: Solution, task: Task) -> np.ndarray:
     own = np.array([p.role != "place" for p in solution.model.parameters])
     result: np.ndarray = np.sqrt(width**2 + (1.96 * SYSTEMATIC * own * (solution.values - null)) ** 2)
     return result
-
-
-@dataclass(frozen=True)
-class Strength:
-    """What data say of an absent effect's strength: estimate, its 95 % interval, and what would have been found.
-
-    ``seen`` is the smallest distance from the null that the test over the whole list finds four times in five, from the
-    interval's width; ``typical`` the distance of the catalogue's default. Of an unknown profile, with a strength at
-    each of its ``knots``, ``estimate`` is that furthest from the null, with the interval of all; ``seen`` the median.
-    """
-
-    parameter: Parameter
-    estimate: float
-    low: float
-    high: float
-    seen: float
-    typical: float
-    knots: int = 1
-
-    @property
-    def beyond(self) -> float:
-        """Distance from the null that the data exclude (95 %)."""
-        null = self.parameter.null or 0.0
-        return max(abs(self.low - null), abs(self.high - null))
-
-
-def strength_of(solution: Solution, task: Task, label: str, tests: int) -> Strength | None:
-    """Return the strength of a term that has one, or only such, else None; ``tests`` candidates were tested."""
-    where = solution.model.where(label)
-    parameters = solution.model.parameters[where]
-    strengths = [i for i, p in enumerate(parameters) if p.null is not None and p.role == "strength"]
-    if not strengths or 1 < len(strengths) < len(parameters):
-        return None
-    at = where.start + np.array(strengths)
-    width, estimate = half_width(solution, task)[at], solution.values[at]
-    p = parameters[strengths[0]]
-    assert p.null is not None
-    seen = float(np.median(width)) / 1.96 * float(normal.ppf(1.0 - ALPHA / max(tests, 1)) + normal.ppf(POWER))
-    furthest = float(estimate[np.abs(estimate - p.null).argmax()])
-    low, high = float((estimate - width).min()), float((estimate + width).max())
-    term = next(t for t in solution.model.terms if t.label == label)
-    typical = abs(p.default - p.null) if len(strengths) == 1 else term.smoothness
-    return Strength(p, furthest, low, high, seen, typical, len(strengths))
-
-
-PROMISING = 0.02
-"""Mean gain in log RMSE on held-out units that is no sign of nothing, significant or not."""
-
-
-def powerful(strengths: Sequence[Strength], tested: Tested, smallest: float) -> bool:
-    """Tell whether most effects of the catalogue would have been found at their typical strengths.
-
-    Not where units are so few that their ``smallest`` p-value leaves no room, or a gain is large without being beyond
-    chance.
-    """
-    seen = bool(strengths) and float(np.mean([s.seen <= s.typical for s in strengths])) >= 0.5
-    return seen and smallest <= 0.4 * ALPHA and bool(tested.gain.max(initial=0.0) < PROMISING)

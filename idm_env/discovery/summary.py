@@ -11,9 +11,11 @@ import numpy as np
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import judge, words
 from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
+from idm_env.discovery.decide import LEAST_GAIN
 from idm_env.discovery.model import Term
+from idm_env.discovery.power import Bar, Strength, powerful, strength_of
 from idm_env.discovery.records import Records
-from idm_env.discovery.score import Strength, interval_of, powerful, strength_of
+from idm_env.discovery.score import FREE_SHARE, interval_of, level
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
@@ -98,8 +100,9 @@ def report(
     found = entries if judged.added else []
     first = rounds[0]
     structured = any(r.significant for r in (first, *(r for r in rounds if r.free)))
-    strengths = _strengths(first, task)
-    smallest = smallest_p(units(task.rows.records).run)
+    run = units(task.rows.records).run
+    strengths = _strengths(first, task, bar(first, run, judged.seed, len(kept_runs)))
+    smallest = smallest_p(run)
     power = len(fit_runs) >= MANY_RUNS or powerful(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest
     )
@@ -154,12 +157,20 @@ def report(
     return _plain(content)
 
 
-def _strengths(first: Any, task: Task) -> dict[str, Strength]:
+def bar(first: Any, run: np.ndarray, seed: int, kept: int) -> Bar:
+    """Return what a candidate had to reach in the first round, on units of runs ``run``, and on ``kept`` runs."""
+    # It has to explain half of what any smooth function of the state explains.
+    rest = 0.5 * np.log(2.0 - np.exp(-2.0 * max(float(first.left.mean()), 0.0)))
+    gains = np.array([s.gains for s in first.scored])
+    return Bar(level(gains, seed, run, 1.0 - FREE_SHARE), max(LEAST_GAIN, float(rest)), kept)
+
+
+def _strengths(first: Any, task: Task, reached: Bar) -> dict[str, Strength]:
     """Return by name what the first round says of the strengths of effects that have one."""
     found = {}
     for s in first.scored:
         if s.solution is not None and s.term.effect is not None and s.term.effect in ALL:
-            one = strength_of(s.solution, task, s.term.label, len(first.scored))
+            one = strength_of(s.solution, task, s.term.label, reached)
             if one is not None:
                 found[s.term.effect] = one
     return found

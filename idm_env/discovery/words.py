@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from idm_env.discovery.compare import Comparison, Light
 from idm_env.discovery.model import Term
-from idm_env.discovery.score import Strength
+from idm_env.discovery.power import Strength
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.verdict import Reason, Refusal, Verdict
 from idm_env.effects import ALL
@@ -237,12 +238,19 @@ def _limits(strengths: Mapping[str, Strength]) -> str:
     best = sorted(strengths, key=lambda name: strengths[name].beyond / strengths[name].typical)[:SHOWN]
     worst = sorted(strengths, key=lambda name: -strengths[name].seen / strengths[name].typical)[:SHOWN]
     known = ", ".join(f"no {plain(n)} beyond {_strength(strengths[n], strengths[n].beyond)}" for n in best)
-    hidden = ", ".join(f"a {plain(n)} below {_strength(strengths[n], strengths[n].seen)}" for n in worst)
+    hidden = ", ".join(f"a {plain(n)} {_below(_strength(strengths[n], strengths[n].seen))}" for n in worst)
     return f"; there is {known} (95 %), and {hidden} would not have been seen"
 
 
+def _below(strength: str) -> str:
+    """Say up to which strength nothing would be seen."""
+    return f"below {strength}" if strength else "of whatever strength"
+
+
 def _strength(s: Strength, distance: float) -> str:
-    """Return a distance from the null, shares in percent."""
+    """Return a distance from the null, shares in percent; nothing where it is infinite."""
+    if not math.isfinite(distance):
+        return ""
     unit = s.parameter.unit
     return f"{number(100.0 * distance, 2)} %" if unit == "1" else f"{number(distance, 2)} {unit}"
 
@@ -256,7 +264,8 @@ def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:
         for name, s in strengths.items()
     ]
     unseen = [
-        f"{plain(name)} below {amount(float(f'{s.seen:.2g}'), s.parameter.unit)}" for name, s in strengths.items()
+        f"{plain(name)} {_below(amount(float(f'{s.seen:.2g}'), s.parameter.unit) if math.isfinite(s.seen) else '')}"
+        for name, s in strengths.items()
     ]
     return [
         f"Excluded (95 %): {'; '.join(told)}.",

@@ -10,8 +10,9 @@ import pytest
 
 from idm_env.data import Trajectories, synthetic
 from idm_env.discovery import ceilings, score
+from idm_env.discovery.power import Strength, powerful
 from idm_env.discovery.records import Records
-from idm_env.discovery.score import Strength, powerful, westfall_young
+from idm_env.discovery.score import westfall_young
 from idm_env.discovery.units import LEAST_RHO, rho, signs, smallest_p, units
 from idm_env.parameters import Parameter
 

@@ -15,8 +15,8 @@ from idm_env.discovery import Discovery, compare, discover, judge, verdict, word
 from idm_env.discovery import model as terms
 from idm_env.discovery.compare import ERRORS, Comparison, Light
 from idm_env.discovery.model import Model
+from idm_env.discovery.power import Strength
 from idm_env.discovery.records import gather
-from idm_env.discovery.score import Strength
 from idm_env.discovery.search import first_prior
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
 from idm_env.effects import ALL, CANDIDATES
@@ -76,14 +76,14 @@ def test_intervals_cover_the_true_change() -> None:
             run = np.repeat(np.arange(runs), each)
             change = np.log(0.9) + common[run] + 0.2 * random.standard_normal(len(run))
             was = np.ones(len(run))
-            found = compare._compared(was, was * np.exp(2 * change), 10.0 * len(run), run, trial)
+            found = compare.compared(was, was * np.exp(2 * change), 10.0 * len(run), run, trial)
             true = 0.9 * np.exp(0.2**2 * (2 if runs >= compare.RUNS else 1))  # of the root of the mean square
             covered.append(found.low < true < found.high)
         assert np.mean(covered) > 0.88, (runs, each)
 
 
 def test_one_follower_tells_nothing() -> None:
-    found = compare._compared(np.ones(1), np.full(1, 0.1), 10.0, np.array(["a"]), 0)
+    found = compare.compared(np.ones(1), np.full(1, 0.1), 10.0, np.array(["a"]), 0)
     assert found.light is Light.SAME and found.low == 0.0 and found.high == float("inf")
 
 
@@ -231,6 +231,10 @@ def test_none_says_what_is_excluded_and_what_would_not_have_been_seen() -> None:
     )
     assert hidden.startswith("a drag below 0.0003 1/m, a response lag below 0.2 s, a slope of the road below 1 %")
     assert hidden.endswith("would not have been seen.")
+    strengths["drag"] = dataclasses.replace(strengths["drag"], seen=float("inf"))
+    text = words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {}, strengths=strengths)
+    assert "and a drag of whatever strength, a response lag below 0.2 s" in text
+    assert "drag of whatever strength; response lag below 0.2 s" in words.excluded(Verdict.NONE, strengths)[1]
 
 
 def test_ceilings_are_told_with_the_smooth_function_and_the_sensors(lag: Discovery) -> None:
