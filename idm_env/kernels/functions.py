@@ -15,8 +15,31 @@ _MAGIC = 6755399441055744.0
 """1.5 · 2^52: added to a double, it leaves the nearest whole number in the lowest bits."""
 
 _LOG2_E = 1.4426950408889634
+_ROOT_HALF = 0.7071067811865476
 _LN2_HIGH, _LN2_LOW = 0.693147180369123816490, 1.90821492927058770002e-10
 """ln 2 in two parts, the first with trailing zeros, so that n ln 2 is exact (Cody and Waite 1980)."""
+
+
+def _parts(number: ir.Type, bits: ir.IntType, mantissa: int, kind: types.Float, root: float) -> Any:
+    half = int.from_bytes(np.array(root, str(kind)).tobytes(), "little")
+
+    @intrinsic
+    def parts(typing_context: Any, x: Any) -> Any:
+        """Return n and m with x = m 2^n and m from √½ to √2, for a normal positive number."""
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            whole = builder.bitcast(arguments[0], bits)
+            power = builder.ashr(builder.sub(whole, ir.Constant(bits, half)), ir.Constant(bits, mantissa))
+            rest = builder.bitcast(builder.sub(whole, builder.shl(power, ir.Constant(bits, mantissa))), number)
+            return context.make_tuple(builder, signature.return_type, (builder.sitofp(power, number), rest))
+
+        return types.UniTuple(kind, 2)(kind), generate
+
+    return parts
+
+
+_parts_of = _parts(ir.DoubleType(), ir.IntType(64), 52, types.float64, _ROOT_HALF)
+_parts_of_single = _parts(ir.FloatType(), ir.IntType(32), 23, types.float32, _ROOT_HALF)
 
 
 def _exponent(number: ir.Type, bits: ir.IntType, bias: int, mantissa: int, kind: types.Float) -> Any:
@@ -104,3 +127,43 @@ _FAR_32 = np.float32(-40.0)
 def sigmoid_float32(x):
     """Return 1 / (1 + e^−x), not below 4e-18, for the same reason."""
     return _ONE / (_ONE + exp_float32(-x if x > _FAR_32 else -_FAR_32))
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def log1p_float64(x):
+    """Return log(1 + x) of a double above −1, within two units in the last place."""
+    u = 1.0 + x
+    # What rounding took from 1 + x, relative to it.
+    lost = ((1.0 - (u - x)) if x > 1.0 else (x - (u - 1.0))) / u
+    n, m = _parts_of(u)  # type: ignore[call-arg]
+    # log m = 2 artanh s as a series; s² ≤ 0.0295, so the first term left out is below 1e-18.
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    p = 1.0 / 21.0
+    p = p * z + 1.0 / 19.0
+    p = p * z + 1.0 / 17.0
+    p = p * z + 1.0 / 15.0
+    p = p * z + 1.0 / 13.0
+    p = p * z + 1.0 / 11.0
+    p = p * z + 1.0 / 9.0
+    p = p * z + 1.0 / 7.0
+    p = p * z + 1.0 / 5.0
+    p = p * z + 1.0 / 3.0
+    return n * _LN2_HIGH + (2.0 * s + (2.0 * s * z * p + (n * _LN2_LOW + lost)))
+
+
+_TWO, _C9_LOG, _C7_LOG, _C5_LOG, _C3_LOG = (np.float32(x) for x in (2.0, 1 / 9, 1 / 7, 1 / 5, 1 / 3))
+
+
+@numba.njit(cache=True, error_model="numpy", forceinline=True)
+def log1p_float32(x):
+    """Return log(1 + x) of a float above −1, within two units in the last place."""
+    u = _ONE + x
+    lost = ((_ONE - (u - x)) if x > _ONE else (x - (u - _ONE))) / u
+    n, m = _parts_of_single(u)  # type: ignore[call-arg]
+    s = (m - _ONE) / (m + _ONE)
+    z = s * s
+    p = _C9_LOG * z + _C7_LOG
+    p = p * z + _C5_LOG
+    p = p * z + _C3_LOG
+    return n * _LN2_HIGH_32 + (_TWO * s + (_TWO * s * z * p + (n * _LN2_LOW_32 + lost)))

@@ -38,7 +38,7 @@ Printed by idm_env from one recorded step; see idm_env/scalar. Delete at will: i
 import numpy as np
 from numba import carray, cfunc, types
 
-from idm_env.kernels.functions import exp_{kind} as exp, sigmoid_{kind} as sigmoid
+from idm_env.kernels.functions import exp_{kind} as exp, log1p_{kind} as log1p, sigmoid_{kind} as sigmoid
 
 ROW = {row}
 SIZE = (1 << 40,)

@@ -122,8 +122,7 @@ def _tally(motions: Sequence[Motion], tracks: Sequence[Track], seconds: float) -
 
 def _imitated(tracks: Sequence[Track], dt: float, fixed: bool) -> tuple[list[Filtered], list[dict[str, Any]]]:
     filtered, rows = [], []
-    for track in tracks:
-        found = paper.imitate(track, dt, fixed_parameters=fixed)
+    for track, found in zip(tracks, paper.imitate(tracks, dt, fixed_parameters=fixed), strict=True):
         clock = found.motion.time_s
         unknown = np.full((len(clock), 3), np.nan)
         at = nearest(track, clock)

@@ -213,7 +213,7 @@ def _compile() -> None:
     nobody = np.full(len(time_s), "")
     track = Track("", "", 0, time_s, 10.0 * time_s, 4.5, nobody, np.full(len(time_s), -1))
     recipe([track], 0.1, fit_noise([(time_s, track.position_m)], 0.1, evaluations=2))
-    paper.imitate(track, iterations=1)
+    paper.imitate([track], iterations=1)
 
 
 def _plan(spool: Spool, settings: Settings, bridge: float | None) -> Plan:

@@ -34,8 +34,7 @@ def score(spool: Spool, plan: Plan, settings: Settings) -> list[dict[str, Any]]:
         return []
     given, out = zip(*(thinned(track) for track in tracks), strict=True)
     if plan.noise is None:
-        fixed = settings.fixed_parameters
-        ours = [paper.imitate(track, plan.dt, fixed_parameters=fixed).motion for track in given]
+        ours = [f.motion for f in paper.imitate(given, plan.dt, fixed_parameters=settings.fixed_parameters)]
     else:
         ours = [f.motion for f in recipe(list(given), plan.dt, plan.noise, plan.choices)]
     motions = {OURS[settings.recipe]: ours}

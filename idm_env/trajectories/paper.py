@@ -10,26 +10,62 @@ put back into their bounds after every step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from idm_env.effects import IDM, Brakes, ImaginedLeader
+from idm_env.effects.base import Effect, P
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
 from idm_env.trajectories.recipe import clock_of
 from idm_env.trajectories.scores import Motion
 from idm_env.trajectories.tracks import Track
+from idm_env.types import Imagined, Neighbour, Scene
+
+if TYPE_CHECKING:
+    from idm_env.kernels.descent import Bounds, Found
 
 NAMES = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 START = np.array([10.0, 2.0, 1.0, 5.0, 50.0])
 LOW = np.array([5.0, 0.1, 0.1, 1.0, 20.0])
 HIGH = np.array([10.0, 5.0, 5.0, 10.0, 60.0])
-GAP_BOUNDS = np.array([1.0, 1e4])
-CLOSING_BOUNDS = np.array([-100.0, 100.0])
+FIVE = {f"idm.{name}": (low, high) for name, low, high in zip(NAMES, LOW.tolist(), HIGH.tolist(), strict=True)}
+GAP_BOUNDS = (1.0, 1e4)
+CLOSING_BOUNDS = (-100.0, 100.0)
 MAX_DECEL = 10.0
 ITERATIONS = 500
 RATES = (0.1, 0.01)
 FILTER_STEP_S, RECONSTRUCT_STEP_S = 0.1, 1.0
-NOBODY = np.empty(0)
-"""No real leader: an imagined one."""
+NEAREST_M = 0.1
+"""A real leader is never nearer than this (m)."""
+TOGETHER = 512
+"""Tracks fitted at a time, those of like length; they share nothing but the loop."""
+
+
+class Ahead(NamedTuple):
+    """Input of ``RealLeader``: a leader's rear bumper (m) and speed (m/s)."""
+
+    rear: Tensor
+    speed: Tensor
+
+
+@dataclass(frozen=True)
+class RealLeader(Effect):
+    """A leader whose motion is given, never nearer than ``NEAREST_M``: 1/s² has no other floor as published."""
+
+    kind: ClassVar[str] = "real_leader"
+
+    def perceive(self, scene: Scene, p: P) -> Scene:
+        """Return the scene with the given leader."""
+        ahead: Ahead = scene.input(self.name)
+        gap = (ahead.rear - scene.position).clamp_min(NEAREST_M)
+        there = torch.ones_like(scene.leader.present)
+        return scene._replace(leader=Neighbour(gap, ahead.speed, torch.zeros_like(ahead.speed), there))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,49 +80,94 @@ class Imitated:
 
 
 def imitate(
-    track: Track, dt: float = FILTER_STEP_S, *, iterations: int = ITERATIONS, fixed_parameters: bool = False
-) -> Imitated:
-    """Fit one track by the published recipe; a data point is compared at the simulation step nearest in time.
+    tracks: Sequence[Track], dt: float = FILTER_STEP_S, *, iterations: int = ITERATIONS, fixed_parameters: bool = False
+) -> list[Imitated]:
+    """Fit each track by the published recipe; a data point is compared at the simulation step nearest in time.
 
-    ``fixed_parameters`` keeps the five at their initial values (the paper's ablation). ImportError without numba.
+    ``fixed_parameters`` keeps the five at their initial values (the paper's ablation). ValueError without numba.
     """
-    from idm_env.trajectories import paper_loops as loops
-
-    clock = clock_of(track, dt)
-    at = np.clip(np.round((track.time_s - clock[0]) / dt).astype(np.int64), 0, len(clock) - 1)
-    target = track.position_m - track.position_m[0]
-    speed0 = max(0.0, float(target[1] / (track.time_s[1] - track.time_s[0])))
-    values, gap, closing = START.copy(), np.full(len(clock), 10.0), np.zeros(len(clock))
-    position, speed, accel = (np.empty(len(clock)) for _ in range(3))
-    loss = loops.optimise(
-        at, target, speed0, values, gap, closing, NOBODY, NOBODY, LOW, HIGH, GAP_BOUNDS, CLOSING_BOUNDS, dt, MAX_DECEL,
-        iterations, RATES[0], RATES[1], fixed_parameters, position, speed, accel,
-    )  # fmt: skip
-    return Imitated(Motion(clock, position + track.position_m[0], speed, accel), values, gap, closing, float(loss))
+    clocks = [clock_of(track, dt) for track in tracks]
+    by_length = sorted(range(len(tracks)), key=lambda i: len(clocks[i]))
+    found: dict[int, Imitated] = {}
+    for begin in range(0, len(tracks), TOGETHER):
+        some = by_length[begin : begin + TOGETHER]
+        done = _imitated([tracks[i] for i in some], [clocks[i] for i in some], dt, iterations, fixed_parameters)
+        found.update(zip(some, done, strict=True))
+    return [found[i] for i in range(len(tracks))]
 
 
-def follow(position_m: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
+def _imitated(
+    tracks: Sequence[Track], clocks: Sequence[np.ndarray], dt: float, iterations: int, fixed: bool
+) -> list[Imitated]:
+    targets = [track.position_m - track.position_m[0] for track in tracks]
+    at = [
+        np.clip(np.round((track.time_s - clock[0]) / dt).astype(np.int64), 0, len(clock) - 1)
+        for track, clock in zip(tracks, clocks, strict=True)
+    ]
+    speed0 = [max(0.0, x[1] / (track.time_s[1] - track.time_s[0])) for x, track in zip(targets, tracks, strict=True)]
+    gap = torch.full((max(len(clock) for clock in clocks), len(tracks), 1), 10.0, dtype=torch.float64)
+    bounds = {"imagined.gap": GAP_BOUNDS, "imagined.closing_speed": CLOSING_BOUNDS} | ({} if fixed else FIVE)
+    ahead = Imagined(gap, torch.zeros_like(gap))
+    driven = _descended(
+        ImaginedLeader(), ahead, np.tile(START, (len(tracks), 1)), speed0, dt, at, targets, bounds, iterations
+    )
+    values = np.stack([driven.params[f"idm.{name}"] for name in NAMES], axis=-1)
+    found = []
+    for i, (track, clock) in enumerate(zip(tracks, clocks, strict=True)):
+        own = slice(0, len(clock))
+        # The acceleration of a step starts at its own speed.
+        position, speed, accel = driven.position[own, i], driven.speed[own, i], driven.accel[1:][own, i]
+        imagined = driven.inputs["imagined.gap"][own, i], driven.inputs["imagined.closing_speed"][own, i]
+        loss = float(np.abs(position[at[i]] - targets[i]).mean())
+        found.append(Imitated(Motion(clock, position + track.position_m[0], speed, accel), values[i], *imagined, loss))
+    return found
+
+
+def follow(
+    position_m: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float, *,
+    iterations: int = ITERATIONS,
+) -> np.ndarray:  # fmt: skip
     """Return the five values fitted behind a real leader to positions [K] every ``dt`` (s), by the same optimisation.
 
     This is the recipe of prediction: nothing is imagined. ``rear_m`` and ``pace`` [K] are the leader's rear bumper (m)
     and speed (m/s), ``speed0`` the first speed (m/s).
     """
-    from idm_env.trajectories import paper_loops as loops
-
-    count = len(position_m)
-    values, origin = START.copy(), position_m[0]
-    gap, closing, position, speed, accel = (np.empty(count) for _ in range(5))
-    loops.optimise(
-        np.arange(count), position_m - origin, speed0, values, gap, closing, rear_m - origin, pace, LOW, HIGH,
-        GAP_BOUNDS, CLOSING_BOUNDS, dt, MAX_DECEL, ITERATIONS, RATES[0], RATES[1], False, position, speed, accel,
-    )  # fmt: skip
-    return values
+    origin = position_m[0]
+    at, target = np.arange(len(position_m)), position_m - origin
+    ahead = _ahead(rear_m - origin, pace)
+    found = _descended(RealLeader(), ahead, START[None], [speed0], dt, [at], [target], FIVE, iterations)
+    return np.array([found.params[f"idm.{name}"][0] for name in NAMES])
 
 
 def drive(values: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
     """Return the distances [K] that the five values drive from 0 at ``speed0``, behind a leader as in ``follow``."""
-    from idm_env.trajectories import paper_loops as loops
+    found = _descended(RealLeader(), _ahead(rear_m, pace), values[None], [speed0], dt, [], [], {}, 0)
+    return found.position[:-1, 0]
 
-    gap, closing, position, speed, accel = (np.empty(len(rear_m)) for _ in range(5))
-    loops.forward(speed0, values, gap, closing, rear_m, pace, dt, MAX_DECEL, position, speed, accel)
-    return position
+
+def _ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:
+    return Ahead(*(torch.as_tensor(np.asarray(x, float))[:, None, None] for x in (rear_m, pace)))
+
+
+def _descended(
+    leader: Effect, ahead: Imagined | Ahead, values: np.ndarray, speed0: Sequence[float], dt: float,
+    at: Sequence[np.ndarray], targets: Sequence[np.ndarray], bounds: Bounds, iterations: int,
+) -> Found:  # fmt: skip
+    """Fit rows of ``values`` [N, 5] and of the input ``ahead`` (steps, N, 1) to distances at the steps ``at`` [N]."""
+    from idm_env.kernels.descent import Observed, descend
+
+    simulator = Simulator(Lane(), (IDM(sharpness=1.0), leader, Brakes(sharpness=1.0)), dt, "euler")
+    params: Any = simulator.defaults(dtype=torch.float64)
+    params["idm"] = dict(zip(NAMES, torch.as_tensor(values).T[..., None], strict=True))
+    params["brakes"]["max_decel"] = torch.tensor(MAX_DECEL, dtype=torch.float64)
+    speed = torch.tensor(speed0, dtype=torch.float64)[:, None]
+    state = simulator.state(torch.zeros_like(speed), speed, params)
+    sizes = [len(x) for x in at]
+    observed = Observed(
+        np.concatenate([[], *at]).astype(np.int64), np.repeat(np.arange(len(at)), sizes),
+        np.concatenate([[], *targets]), np.repeat([1.0 / size for size in sizes], sizes),
+    )  # fmt: skip
+    return descend(
+        simulator, state, {leader.name: ahead}, params, len(ahead[0]), observed, bounds,
+        iterations=iterations, rates=RATES,
+    )  # fmt: skip

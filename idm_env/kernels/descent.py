@@ -1,0 +1,98 @@
+"""Many small fits at once: parameters and inputs of a simulator by Adam on positions that were observed.
+
+Each vehicle has a lane, values and observations of its own; they share nothing but the loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from idm_env.kernels import descent_loops, dispatch, tiles
+from idm_env.kernels.lanes import part_of, starts, static_of
+from idm_env.kernels.memory import addresses
+from idm_env.kernels.operands import dense, operand, table
+from idm_env.kernels.tiles import Array
+from idm_env.scalar.record import slot_name
+from idm_env.simulator import Simulator
+from idm_env.types import Inputs, Params, State
+
+Bounds = Mapping[str, tuple[float, float]]
+"""Lowest and highest value by full name (``idm.time_gap``, ``imagined.gap``); what is not named stays as it is."""
+
+
+class Observed(NamedTuple):
+    """Positions (m) of vehicles by number after so many steps, 0 for the start, and the weights of their errors."""
+
+    step: Array
+    vehicle: Array
+    position: Array
+    weight: Array
+
+
+class Found(NamedTuple):
+    """Values [vehicles] and inputs [steps, vehicles] by full name; motion [steps + 1, vehicles], the start first.
+
+    ``accel`` is the acceleration of the step before, as in a state (m/s²).
+    """
+
+    params: dict[str, Array]
+    inputs: dict[str, Array]
+    position: Array
+    speed: Array
+    accel: Array
+
+
+def descend(
+    simulator: Simulator, state: State, inputs: Inputs, params: Params, steps: int, observed: Observed, bounds: Bounds,
+    *, iterations: int, rates: tuple[float, float],
+) -> Found:  # fmt: skip
+    """Minimise Σ weight · |position − observed| of a state ``(vehicles, 1)`` in float64, by Adam between bounds.
+
+    The learning rate falls linearly from the first of ``rates`` to the second. ValueError where no kernel can run.
+    """
+    kernel = dispatch.found(simulator, state, inputs, params)
+    if isinstance(kernel, str) or kernel.signals:
+        why = kernel if isinstance(kernel, str) else "an effect looks back in time"
+        raise ValueError(f"{why}; this descent is compiled and has no other path.")
+    program, shape = kernel.program, tuple(state.speed.shape)
+    count = rows = shape[0]
+    values = np.array([dense(static_of(simulator, state, params, n), shape) for n in program.parameters])
+    parts = [dense(part_of(inputs, n)[:steps], (steps, *shape)) for n in kernel.numbers]
+    given = np.array(parts).reshape(len(parts), steps * count)
+    slots = {slot_name(*name.split(".", 1)): name for name in bounds}
+    low, high = _limits(values, [bounds.get(n) for n in program.parameters])
+    given_low, given_high = _limits(given, [bounds.get(slots.get(n, "")) for n in kernel.numbers])
+    moves = any(n in slots for n in kernel.numbers)
+    made = [operand(static_of(simulator, state, params, n).double(), shape[:-1], 1) for n in program.statics]
+    made += [(x, (0, 1, 1)) for x in values] + [(x, (count, 1, 1)) for x in given]
+    made += [operand(part_of(inputs, n), shape[:-1], 1, steps) for n in kernel.flags]
+    start = [dense(x.double(), shape) for x in starts(state, program.states)]
+    kept, seeds, nothing = np.zeros((4, steps, count)), np.zeros(4 * steps * count), np.zeros(1)
+    wide, around = tiles.width(1, 0), tiles.halo(steps, program.reach)
+    kind = "float64"
+    descent_loops.descend(
+        addresses(start), addresses([None] * len(start)), nothing, kept.reshape(-1), seeds, *observed, values,
+        np.zeros_like(values), low, high, given, np.zeros_like(given if moves else given[:0]), given_low, given_high,
+        kernel.measures, kernel.forward(kind), kernel.backward(kind), kernel.looks, kernel.recalls, kernel.sends,
+        kernel.read, kernel.taped, kernel.again, addresses([x for x, _ in made]),
+        table([*(s for _, s in made), (0, 1, 1)]), kernel.constants[kind], steps, rows, 1, wide, around,
+        tiles.tiles(rows, 1, wide, around), iterations, *rates,
+    )  # fmt: skip
+    first = [dense(x, shape)[None] for x in (state.position, state.speed, state.accel)]
+    return Found(
+        dict(zip(program.parameters, values, strict=True)),
+        {slots[n]: x.reshape(steps, count) for n, x in zip(kernel.numbers, given, strict=True) if n in slots},
+        *(np.concatenate((x, y)) for x, y in zip(first, kept[:3], strict=True)),
+    )
+
+
+def _limits(values: Array, bounds: Sequence[tuple[float, float] | None]) -> tuple[Array, Array]:
+    """Return lowest and highest values in the shape of ``values``: what has no bounds stays where it is."""
+    free = [
+        (np.full_like(x, b[0]), np.full_like(x, b[1])) if b else (x, x) for x, b in zip(values, bounds, strict=True)
+    ]
+    low, high = zip(*free, strict=True) if free else ((), ())
+    return np.array(low).reshape(values.shape), np.array(high).reshape(values.shape)
