@@ -1,6 +1,7 @@
 """Fuel behind measured leaders that training has not seen: a vehicle and the ten that follow it, by two models of fuel.
 
-    python -m benchmarks.agents_energy [--seeds 3] [--updates 30] [--out runs/energy] [--data ngsim_i80_pairs.parquet]
+    python -m benchmarks.agents_energy [--seeds 3] [--updates 30] [--fuel-weight 1] [--out runs/energy]
+        [--data ngsim_i80_pairs.parquet]
 
 Vehicle 1 drives behind each held-out leader of the I-80 pairs, from where the recorded follower was; ten vehicles with
 IDM calibrated on the training pairs drive behind it, from equilibrium. Vehicle 1 is the recorded follower itself,
@@ -95,11 +96,11 @@ def judged(run: Row) -> Row:
     }
 
 
-def environment_of(training: Path, idm: Row) -> Row:
-    """Return the keywords of task ``follow`` behind the training pairs' leaders."""
+def environment_of(training: Path, idm: Row, weight: float) -> Row:
+    """Return the keywords of task ``follow`` behind the training pairs' leaders, with a weight of fuel."""
     return {
         "task": "follow", "leader": str(training), "vehicles": BEHIND + 2, "max_command": 3.0, "crash_cost": 50.0,
-        "max_episode_steps": SHORTEST, "parameters": {"idm": idm},
+        "max_episode_steps": SHORTEST, "parameters": {"idm": idm}, "fuel_weight": weight,
     }  # fmt: skip
 
 
@@ -119,6 +120,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--updates", type=int, default=30)
+    parser.add_argument("--fuel-weight", type=float, default=0.1, help="reward per US gallon per hour in training")
     parser.add_argument("--out", type=Path, default=Path("runs/energy"))
     parser.add_argument("--data", type=Path, default=default_data())
     options = parser.parse_args()
@@ -131,7 +133,7 @@ def main() -> None:
     print("IDM, calibrated on the training pairs:", {name: round(x, 3) for name, x in idm.items()})
     leaders = options.out / "training.parquet"
     training.table.write_parquet(leaders)
-    environment = environment_of(leaders, idm)
+    environment = environment_of(leaders, idm, options.fuel_weight)
     items = list(episodes(test, max_gap=None, smooth=True))
     params = {"idm": {name: torch.tensor(x, dtype=torch.float64) for name, x in idm.items()}}
     limits = task_of(environment).command_limits
@@ -139,7 +141,7 @@ def main() -> None:
     rows = [told("recorded follower", base, base)]
     rows.append(told("calibrated IDM", judged(driven(items, params, "idm", None, limits)), base))
     for seed in range(options.seeds):
-        folder = options.out / f"seed{seed}"
+        folder = options.out / f"fuel{options.fuel_weight:g}" / f"seed{seed}"
         if not (folder / "done").exists():
             apg.train(
                 apg.Arguments(
@@ -149,7 +151,13 @@ def main() -> None:
             )  # fmt: skip
             (folder / "done").touch()
         policy = common.load(folder / "last.pt", "follow")[0]
-        rows.append(told(f"agent, seed {seed}", judged(driven(items, params, "agent", policy, limits)), base))
+        rows.append(
+            told(
+                f"agent, w = {options.fuel_weight:g}, seed {seed}",
+                judged(driven(items, params, "agent", policy, limits)),
+                base,
+            )
+        )
         print(*rows[-1], sep=" | ", flush=True)
     head = [f"L/100 km by {model}; saved, leaders" for model in metrics.FUELS]
     table(("vehicle 1", *head, "mean speed", "gaps of vehicle 1 (m)", f"collisions, of {len(items)}"), rows)

@@ -29,7 +29,9 @@ RINGS = ((22, 1), (110, 2), (110, 5), (110, 11), (110, 22), (440, 20))
 
 def environment(vehicles: int, agents: int) -> Row:
     """Return the keywords of a ring with a shock."""
-    return {**environment_of("ring-apg"), "vehicles": vehicles, "controlled": agents, "shock": 4.0}
+    longer = vehicles / 22
+    length = [220.0 * longer, 270.0 * longer]
+    return {**environment_of("ring-apg"), "vehicles": vehicles, "length": length, "controlled": agents, "shock": 4.0}
 
 
 def main() -> None:

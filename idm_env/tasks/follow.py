@@ -16,7 +16,7 @@ from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Ended, Features, Pay, Task, World
-from idm_env.tasks.checks import whole
+from idm_env.tasks.checks import at_least, whole
 from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import Leaders, equilibrium_gap, head, made_up_leader, queue, recorded_leaders, starts
@@ -53,15 +53,17 @@ class FollowTask(Task):
     1, s0 = 2, everybody in equilibrium at the start.
 
     Observation, per agent: ``v/40, v_lead/40, gap/100`` (m/s and m; raw: without the scales).
-    Reward, per agent: ``1 − fuel/10 − 0.002 u² − 2 p``; fuel is the mean rate of the agent and everybody behind it (US
-    gallons per hour; the source's own energy model is not public, ``fuel_model`` stands in), u its command (m/s²), p
-    in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap below 1 s. Below −2 it saturates towards
-    −4 (``floored``). Terminated where vehicles touch, which pays ``−crash_cost`` instead: 5001 by default, so that a
-    crash is worse than any survival (``idm_env.tasks.crash``); the source takes 50. Truncated at the end of the record,
-    and after ``max_episode_steps``: 1000, or what the longest record has.
+    Reward, per agent: ``1 − w fuel − 0.002 u² − 2 p``; w is ``fuel_weight``, 0.1 in the source, fuel the mean rate of
+    the agent and everybody behind it (US gallons per hour; the source's own energy model is not public, ``fuel_model``
+    stands in), u its command (m/s²), p in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap
+    below 1 s. Below −2 it saturates towards −4 (``floored``). Terminated where vehicles touch, which pays
+    ``−crash_cost`` instead: 5001 by default, so that a crash is worse than any survival (``idm_env.tasks.crash``); the
+    source takes 50. Truncated at the end of the record, and after ``max_episode_steps``: 1000, or what the longest
+    record has.
 
     Args:
         fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
+        fuel_weight: Reward per US gallon per hour: with 0.1 hardly anything is gained by saving.
         leader: A trajectory file; every leader that somebody follows in it may be drawn. None is the project's own
             made-up trace.
     """
@@ -78,11 +80,13 @@ class FollowTask(Task):
     vehicles: int = 7
     max_command: float | Sequence[float] = 3.0
     fuel_model: str = "kamal"
+    fuel_weight: float = 0.1
     leader: str | None = None
 
     def __post_init__(self) -> None:
         whole("vehicles", self.vehicles, 2)
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
+        at_least("fuel_weight", self.fuel_weight, 0.0)
         super().__post_init__()
         longest = self._longest
         if (self.max_episode_steps or 0) > longest:
@@ -161,7 +165,7 @@ class FollowTask(Task):
         return self.clip(seen)
 
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
-        """Return ``1 − fuel/10 − 0.002 u² − 2 p``, saturated below −2."""
+        """Return ``1 − w fuel − 0.002 u² − 2 p``, saturated below −2."""
         state = after.state
         fuel = metrics.fuel(state.speed, state.accel, self.fuel_model) * _GALLONS_PER_HOUR
         # Running means from the back: of every vehicle and those behind it.
@@ -169,7 +173,7 @@ class FollowTask(Task):
         behind = fuel.flip(-1).cumsum(-1).flip(-1) / count
         gap, speed = self.pick(state.gap), self.pick(state.speed)
         penalty = headway_penalty(gap, speed)
-        reward = 1.0 - 0.1 * self.pick(behind) - 0.002 * command * command - 2.0 * penalty
+        reward = 1.0 - self.fuel_weight * self.pick(behind) - 0.002 * command * command - 2.0 * penalty
         return floored(reward, KNEE, LOWEST)
 
     def ended(self, world: World) -> Ended:

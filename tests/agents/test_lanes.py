@@ -95,7 +95,8 @@ def test_shared_policies_are_judged_on_rings_as_long_as_their_vehicles_need(tmp_
     judged = []
 
     def judge(act, environment, draws):
-        judged.append((environment["vehicles"], environment["controlled"], act is None))
+        task = task_of(environment)  # refused where vehicles do not fit the ring
+        judged.append((task.vehicles, len(task.agents), act is None))
         return {"speed_ratio": 1.0, "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}
 
     monkeypatch.setattr(agents_shared, "evaluate_ring", judge)

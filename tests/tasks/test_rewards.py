@@ -14,6 +14,7 @@ CASES = {
     "ring, the other fuel": {"task": "ring", "warmup": 60, "fuel": 3.0, "fuel_model": "circles"},
     "follow": {"task": "follow"},
     "follow, hard": {"task": "follow", "max_command": 30.0, "controlled": 2},
+    "follow, thrifty": {"task": "follow", "fuel_weight": 2.0},
     "platoon": {"task": "platoon", "controlled": 2},
     "replay": {"task": "replay"},
     "replay lanes": {"task": "replay_lanes", "controlled": 2, "lane_commands": True},
