@@ -13,7 +13,7 @@ import random
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks.lanes_sumo import started
+from benchmarks.lanes_sumo import idm, started
 
 BASE = {"max_accel": 2.6, "comfort_decel": 4.5, "time_gap": 1.0, "min_gap": 2.5, "desired_speed": 30.0}
 FLOW = 2600.0
@@ -21,15 +21,6 @@ SHARE, REACH, SIGHT = 0.2, 20.0, 30.0
 """Share of vehicles under the derived controller; how far before a merge it acts (ours to choose: 10, 20 and 30 m gave
 1809, 1825 and 1804 vehicles an hour in SUMO), and how near to it a human counts (m)."""
 STEP = 0.5
-
-
-def idm(values: Mapping[str, float]) -> str:
-    """Return the attributes of a type of vehicle in SUMO."""
-    return (
-        f'carFollowModel="IDM" laneChangeModel="LC2013" length="5" accel="{values["max_accel"]}" sigma="0.2" '
-        f'decel="{values["comfort_decel"]}" tau="{values["time_gap"]}" minGap="{values["min_gap"]}" '
-        f'maxSpeed="{values["desired_speed"]}" speedFactor="1"'
-    )
 
 
 def sumo(values: Mapping[str, float], derived: bool, warmup: int = 1000, steps: int = 2000) -> float | None:

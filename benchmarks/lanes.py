@@ -3,21 +3,34 @@
 ``python -m benchmarks.lanes speed [rollouts|highway]`` prints million vehicle updates per CPU second beside
 SUMO, and env steps per CPU second of ``highway`` beside HighwayEnv (``lanes_speed.py``).
 ``python -m benchmarks.lanes flow`` prints and draws flow and changes over density, beside others (``lanes_flow.py``).
-``python -m benchmarks.lanes drop [published]`` prints the outflow of a lane drop, ours or the published one, beside
-SUMO's and what is published (``lane_drop.py``).
+``python -m benchmarks.lanes drop [published|behaviours]`` prints the outflow of a lane drop, ours or the published one,
+beside SUMO's and what is published, or with one behaviour changed at a time (``lane_drop.py``).
 ``python -m benchmarks.lanes merge`` prints and draws outflow over demand at a ramp (``lanes_merge.py``).
+``python -m benchmarks.lanes capacity`` prints and draws flow before and after a breakdown at a ramp, beside SUMO's
+(``lanes_capacity.py``).
 ``python -m benchmarks.lanes laws [vehicle-steps]`` counts what breaks a law in random traffic (``lanes_laws.py``).
 ``python -m benchmarks.lanes gradients [scenes]`` tells how good gradients through choices are (``lanes_gradients``).
+
+Flow, drop and capacity keep their rows under ``out/``, do not drive them again, and take ``--executor`` and ``--jobs``.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import torch
 from rich.console import Console
 
-from benchmarks import lane_drop, lanes_flow, lanes_gradients, lanes_laws, lanes_merge, lanes_speed
+from benchmarks import (
+    lane_drop,
+    lanes_capacity,
+    lanes_flow,
+    lanes_gradients,
+    lanes_laws,
+    lanes_merge,
+    lanes_speed,
+    workers,
+)
 from idm_env import progress
 
 
@@ -31,22 +44,32 @@ def laws(steps: float) -> None:
 def main() -> None:
     """Run what is asked for."""
     torch.set_num_threads(1)
-    what = sys.argv[1] if len(sys.argv) > 1 else "speed"
-    if what == "speed":
-        lanes_speed.table(sys.argv[2] if len(sys.argv) > 2 else "rollouts,highway")
-    elif what == "flow":
-        lanes_flow.table()
-    elif what == "drop":
-        lane_drop.published() if sys.argv[2:] == ["published"] else lane_drop.main()
-    elif what == "merge":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "what", nargs="?", default="speed", choices=("speed", "flow", "drop", "merge", "capacity", "laws", "gradients")
+    )
+    parser.add_argument("more", nargs="?", help="what of it, or how much")
+    workers.add(parser)
+    arguments = parser.parse_args()
+    more = arguments.more
+    if arguments.what == "speed":
+        lanes_speed.table(more or "rollouts,highway")
+    elif arguments.what == "flow":
+        lanes_flow.table(arguments)
+    elif arguments.what == "drop":
+        drops = {None: lane_drop.main, "published": lane_drop.published, "behaviours": lane_drop.behaviours}
+        if more not in drops:
+            parser.error(f"unknown lane drop '{more}'. Take published or behaviours, or leave it out.")
+        drops[more](arguments)
+    elif arguments.what == "merge":
         lanes_merge.table()
-    elif what == "laws":
-        laws(float(sys.argv[2]) if len(sys.argv) > 2 else 1e9)
-    elif what == "gradients":
-        with progress.shown(Console(stderr=True)) as on_progress:
-            lanes_gradients.table(int(sys.argv[2]) if len(sys.argv) > 2 else 50, on_progress)
+    elif arguments.what == "capacity":
+        lanes_capacity.table(arguments)
+    elif arguments.what == "laws":
+        laws(float(more or 1e9))
     else:
-        sys.exit(f"unknown benchmark '{what}'. Take speed, flow, drop, merge, laws or gradients.")
+        with progress.shown(Console(stderr=True)) as on_progress:
+            lanes_gradients.table(int(more or 50), on_progress)
 
 
 if __name__ == "__main__":

@@ -6,23 +6,24 @@ ours, have politeness 0.2, threshold 0.1 m/s² and safe deceleration 4 m/s²; SU
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+import argparse
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from benchmarks import workers
 from benchmarks.lanes_ring import DRIVER, DT, LANES, changes, traffic
 from benchmarks.lanes_sumo import MODELS, sumo
 from idm_env import keep
 from idm_env import report as page
+from idm_env.progress import OnProgress
 
 DENSITIES = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0)
 SECONDS = 300.0
-KEPT = Path("out/lanes-flow.json")
+KEPT = Path("out/lanes-flow.jsonl")
 
 
 def ours(density: float) -> tuple[float, float]:
@@ -70,37 +71,35 @@ def highway_env(density: float, seconds: float = 60.0) -> tuple[float, float] | 
     return way / time, changed / len(middle) / time * 3600.0
 
 
-def _peer(model: str) -> Callable[[float], tuple[float, float] | None]:
-    def of(density: float) -> tuple[float, float] | None:
-        found = sumo(200, density, SECONDS, model)
-        return None if found is None else found[:2]
+class Part(NamedTuple):
+    """One simulator at one density (vehicles per km and lane)."""
 
-    return of
-
-
-WHO: dict[str, Callable[[float], tuple[float, float] | None]] = {
-    "idm_env": ours, **{f"SUMO {model}": _peer(model) for model in MODELS}, "HighwayEnv": highway_env,
-}  # fmt: skip
+    who: str
+    density: float
 
 
-def measured(on_row: Callable[[str], None]) -> dict[str, dict[str, Any]]:
-    """Return mean speed and changes by simulator and density; what ``KEPT`` has is not driven again."""
-    found: dict[str, dict[str, Any]] = json.loads(KEPT.read_text()) if KEPT.is_file() else {}
-    KEPT.parent.mkdir(parents=True, exist_ok=True)
-    for name, drive in WHO.items():
-        for density in DENSITIES:
-            if f"{density:g}" not in found.setdefault(name, {}):
-                on_row(f"{name} at {density:g} /km/lane")
-                found[name][f"{density:g}"] = drive(density)
-                keep.write_text(KEPT, json.dumps(found, indent=1))
-    return found
+WHO = ("idm_env", *(f"SUMO {model}" for model in MODELS), "HighwayEnv")
 
 
-def picture(found: dict[str, dict[str, Any]], path: Path) -> None:
+def drive(part: Part, on_progress: OnProgress) -> tuple[float, float] | None:
+    """Return mean speed (m/s) and changes per vehicle and hour; None where the simulator is not installed."""
+    who, density = part
+    if who == "idm_env":
+        return ours(density)
+    if who == "HighwayEnv":
+        return highway_env(density)
+    found = sumo(200, density, SECONDS, who.removeprefix("SUMO "))
+    return None if found is None else found[:2]
+
+
+Rows = dict[str, dict[float, tuple[float, float] | None]]
+
+
+def picture(found: Rows, path: Path) -> None:
     """Draw flow and change rate over density."""
     figure, axes = page.figure(1, 2, size=(9.0, 3.4))
     for name, colour in zip(WHO, ("#1e5adc", "#d1495b", "#e8a33d", "#6a6f78"), strict=True):
-        known = [(d, found[name][f"{d:g}"]) for d in DENSITIES if found[name][f"{d:g}"] is not None]
+        known = [(d, row) for d, row in found[name].items() if row is not None]
         if known:
             at = [d for d, _ in known]
             axes[0, 0].plot(at, [v * d * 3.6 for d, (v, _) in known], "o-", ms=4, color=colour, label=name)
@@ -114,15 +113,17 @@ def picture(found: dict[str, dict[str, Any]], path: Path) -> None:
     keep.write(path, lambda beside: figure.savefig(beside, dpi=110))
 
 
-def table(path: Path = Path("out/lanes-flow.png")) -> None:
+def table(arguments: argparse.Namespace, path: Path = Path("out/lanes-flow.png")) -> None:
     """Print flow (vehicles per hour and lane) and changes per vehicle and hour, and draw them."""
-    found = measured(lambda row: print(row, flush=True))
+    parts = {f"{name} at {density:g} /km/lane": Part(name, density) for name in WHO for density in DENSITIES}
+    driven = workers.named(drive, parts, KEPT, arguments)
+    found: Rows = {name: {d: driven[f"{name} at {d:g} /km/lane"] for d in DENSITIES} for name in WHO}
     print("| per km and lane | " + " | ".join(f"{name}: flow, changes" for name in WHO) + " |")
     print("| --- |" + " --- |" * len(WHO))
     for density in DENSITIES:
         cells = []
         for name in WHO:
-            row = found[name][f"{density:g}"]
+            row = found[name][density]
             cells.append("not installed" if row is None else f"{row[0] * density * 3.6:.0f}, {row[1]:.0f}")
         print(f"| {density:g} | " + " | ".join(cells) + " |")
     picture(found, path)

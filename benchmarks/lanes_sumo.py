@@ -1,15 +1,15 @@
-"""SUMO (``libsumo``) on the ring of ``lanes_ring``: the same drivers, and lane changes of its own."""
+"""SUMO (``libsumo``): begun and ended, roads of several lanes for it, and the ring of ``lanes_ring`` driven."""
 
 from __future__ import annotations
 
 import math
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -38,6 +38,62 @@ def started(net: str, routes: str, step: float, *options: str) -> Iterator[Any]:
             yield libsumo
         finally:
             libsumo.close()
+
+
+class Edge(NamedTuple):
+    """An edge between two nodes, from ``begin`` to ``end`` (m); its lane 0 is lane ``right`` of the whole road."""
+
+    name: str
+    begins: str
+    ends: str
+    lanes: int
+    begin: float
+    end: float
+    right: int = 0
+
+
+def idm(values: Mapping[str, float]) -> str:
+    """Return the attributes of a type of vehicle that drives by IDM in SUMO."""
+    return (
+        f'carFollowModel="IDM" laneChangeModel="LC2013" length="5" accel="{values["max_accel"]}" sigma="0.2" '
+        f'decel="{values["comfort_decel"]}" tau="{values["time_gap"]}" minGap="{values["min_gap"]}" '
+        f'maxSpeed="{values["desired_speed"]}" speedFactor="1"'
+    )
+
+
+def net(edges: Sequence[Edge]) -> str:
+    """Return a straight road: lanes go on into the edges that follow where these have them, otherwise they end."""
+    last = max(edge.end for edge in edges)
+    parts = [f'<net version="1.16"><location netOffset="0,0" convBoundary="0,0,{last},20" '
+             f'origBoundary="0,0,{last},20" projParameter="!"/>']  # fmt: skip
+    for e in edges:
+        lanes = "".join(
+            f'<lane id="{e.name}_{k}" index="{k}" speed="60" length="{e.end - e.begin}" '
+            f'shape="{e.begin},{3 * (k + e.right)} {e.end},{3 * (k + e.right)}"/>'
+            for k in range(e.lanes)
+        )
+        parts.append(f'<edge id="{e.name}" from="{e.begins}" to="{e.ends}" priority="1">{lanes}</edge>')
+    places = {node: at for e in edges for node, at in ((e.begins, e.begin), (e.ends, e.end))}
+    connections = []
+    for node, x in places.items():
+        incoming = [e for e in edges if e.ends == node]
+        links = [
+            (a.name, i, b.name, i + a.right - b.right)
+            for a in incoming for i in range(a.lanes)
+            for b in edges if b.begins == node and b.right <= i + a.right < b.right + b.lanes
+        ]  # fmt: skip
+        connections += links
+        none = "0" * len(links)
+        asked = "".join(f'<request index="{k}" response="{none}" foes="{none}" cont="0"/>' for k in range(len(links)))
+        arriving = " ".join(f"{e.name}_{k}" for e in incoming for k in range(e.lanes))
+        parts.append(
+            f'<junction id="{node}" type="{"priority" if links else "dead_end"}" x="{x}" y="0" incLanes="{arriving}" '
+            f'intLanes="" shape="{x},0 {x},12 {x},6">{asked}</junction>'
+        )
+    parts += [
+        f'<connection from="{a}" to="{b}" fromLane="{i}" toLane="{j}" dir="s" state="M"/>' for a, i, b, j in connections
+    ]
+    return "".join(parts) + "</net>"
 
 
 def sumo(

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from idm_env.executor import KINDS, Executor, opened
+from idm_env.executor import KINDS, Executor, Work, opened
+
+P = TypeVar("P")
 
 
 def add(parser: argparse.ArgumentParser, usual: str = "serial") -> None:
@@ -27,3 +31,17 @@ def kept(out: Path, column: str) -> dict[Any, dict[str, Any]]:
 def of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
     """Give the executor that the arguments name."""
     return opened(arguments.executor, arguments.jobs, arguments.ray_address)
+
+
+def named(work: Work[P, Any], parts: Mapping[str, P], out: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what every part gives, by name; each is kept in a file when it is done, and not done again."""
+    done = kept(out, "name")
+    todo = [name for name in parts if name not in done]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with of(arguments) as executor, out.open("a") as file:
+        for i, found in executor.map(work, [parts[name] for name in todo]):
+            done[todo[i]] = json.loads(json.dumps({"name": todo[i], "found": found}))
+            file.write(json.dumps(done[todo[i]]) + "\n")
+            file.flush()
+            print(f"{todo[i]}: done, kept in {out}", file=sys.stderr, flush=True)
+    return {name: done[name]["found"] for name in parts}

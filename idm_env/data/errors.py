@@ -32,6 +32,11 @@ class Repair:
         return self.text
 
 
+def by_kind(repairs: Iterable[Repair]) -> list[tuple[str, int]]:
+    """Return the kind and the number of each, as ``report.account`` takes them."""
+    return [(repair.kind, repair.count) for repair in repairs]
+
+
 @dataclass
 class Counted:
     """Repairs by kind and wording, added up over the pieces of a file."""

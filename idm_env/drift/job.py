@@ -11,6 +11,7 @@ import numpy as np
 from idm_env import keep
 from idm_env import report as page
 from idm_env.config import Model, Numbers, nested, save_model
+from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import fitted_on
 from idm_env.drift.estimate import Estimate
 from idm_env.drift.kinds import Told, tell
@@ -39,7 +40,6 @@ def drift_file(
         best = told.found[told.one_of[0]] if told.one_of else told.steady
         marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in pair[0]])
         save_model(out / "model.yaml", replace(model_of(best), fitted_on=marked))
-        left_out = ((r.kind, r.count) for r in smooth.left_out)
         result = {
             "schema": 1,
             "command": page.command_line(),
@@ -50,7 +50,7 @@ def drift_file(
             "estimates": {name: e.table() for name, e in {"none": told.steady, **told.found}.items()},
             "data": {
                 **trajectories.summary(), "episodes": len(smooth), "taken": len(chosen), "dt": best.drivers.batch.dt,
-                "account": page.account(((r.kind, r.count) for r in trajectories.repairs), left_out),
+                "account": page.account(by_kind(trajectories.repairs), by_kind(smooth.left_out)),
             },
             "versions": page.versions(),
         }  # fmt: skip

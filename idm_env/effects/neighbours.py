@@ -17,6 +17,9 @@ from idm_env.effects.idm import interaction
 from idm_env.parameters import Parameter
 from idm_env.types import Adjacent, Driver, Scene
 
+STANDSTILL_S = 1.0
+"""Nobody brakes for whom he lets in so hard that he would stand sooner than in this time (s)."""
+
 
 @dataclass(frozen=True)
 class SecondLeader(Effect):
@@ -138,18 +141,20 @@ class Courtesy(Effect):
 
     ::
 
-        − w min(b, a max(0, (s*_m / s_m)² − (s* / s)²))
+        − w min(b, v / 1 s, a max(0, (s*_m / s_m)² − (s* / s)²))
 
     s_m (m) is the gap to a vehicle in a lane beside that wished for this one at the last decision and was not granted
     it, taken to drive on at the speed that it had then. With w = 1 a driver follows whichever is nearer, within b;
-    after the gap creation of LMRS (Schakel, Knoop, van Arem 2012). Whom to let in plays no part in his own wishes.
+    after the gap creation of LMRS (Schakel, Knoop, van Arem 2012). A driver slows down for another, but does not stand
+    for him: two that wait for each other side by side would wait for ever. Whom to let in plays no part in his own
+    wishes.
     """
 
     kind: ClassVar[str] = "courtesy"
     sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2012,)
     adds: ClassVar[bool] = True  # a weight below 0 keeps others out
     title: ClassVar[str] = "courtesy"
-    equation: ClassVar[str] = "− w min(b, a max(0, (s*_m/s_m)² − (s*/s)²))"
+    equation: ClassVar[str] = "− w min(b, v / 1 s, a max(0, (s*_m/s_m)² − (s*/s)²))"
     wording: ClassVar[tuple[str, str]] = (
         "drivers close up to keep out whoever signals beside them",
         "drivers let in whoever signals beside them, which IDM does not see",
@@ -168,7 +173,8 @@ class Courtesy(Effect):
         assert other is not None
         own = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed) * scene.leader.present
         more = torch.relu(interaction(driver, scene.speed, other.gap, other.speed) - own)
-        return -p["weight"] * other.present * torch.minimum(driver.comfort_decel, driver.max_accel * more)
+        most = torch.minimum(driver.comfort_decel, scene.speed / STANDSTILL_S)
+        return -p["weight"] * other.present * torch.minimum(most, driver.max_accel * more)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from idm_env import keep
 from idm_env import report as page
 from idm_env.config import Model, load_model, nested, save_model
 from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories
+from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import fingerprints
 from idm_env.data.folder import Share, shares, stamp
 from idm_env.effects import Brakes, base_named
@@ -117,7 +118,7 @@ def _fit_file(work: _Work) -> dict[str, Any]:
         held_out, lost = _held_out(source, options, held, found.estimates, pooled.estimates)
         left_out += lost
     data = {**trajectories.summary(), "left_out": [str(r) for r in chosen.left_out], "episodes": len(chosen)}
-    data["account"] = _account(trajectories.repairs, left_out)
+    data["account"] = page.account(by_kind(trajectories.repairs), by_kind(left_out))
     result = _write(work, found, held_out, data, fingerprints(trajectories, _drivers(chosen)).values())
     pooled.parts.remove()
     return result
@@ -178,10 +179,6 @@ def _write(
 
 def _drivers(items: Episodes) -> list[tuple[str, str]]:
     return [(episode.run_id, episode.vehicle_id) for episode in items]
-
-
-def _account(repairs: Iterable[Repair], left_out: Iterable[Repair]) -> str:
-    return page.account(((r.kind, r.count) for r in repairs), ((r.kind, r.count) for r in left_out))
 
 
 def _held_out(
@@ -340,7 +337,7 @@ def _simulate_file(
             **trajectories.summary(),
             "left_out": [str(r) for r in items.left_out],
             "episodes": len(items),
-            "account": _account(trajectories.repairs, items.left_out),
+            "account": page.account(by_kind(trajectories.repairs), by_kind(items.left_out)),
         },
         "drivers_with_own_parameters": matched,
         "error": error.summary(),

@@ -13,6 +13,7 @@ from idm_env import keep
 from idm_env import report as page
 from idm_env.config import Model, load_model, save_model
 from idm_env.data import DataError, Trajectories
+from idm_env.data.errors import by_kind
 from idm_env.effects import IDM, Brakes, Mobil, base_named
 from idm_env.fitting.choices import (
     Choice,
@@ -179,9 +180,7 @@ def fit_lane_changes(
 
 def _result(found: LaneChanges, trajectories: Trajectories, options: ChangeOptions) -> dict[str, Any]:
     decisions, compared = found.decisions, found.compared()
-    account = page.account(
-        ((r.kind, r.count) for r in trajectories.repairs), ((r.kind, r.count) for r in decisions.left_out)
-    )
+    account = page.account(by_kind(trajectories.repairs), by_kind(decisions.left_out))
     left = int((decisions.chosen == 1).sum())
     return {
         "schema": 1,

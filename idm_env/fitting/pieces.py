@@ -16,7 +16,7 @@ import torch
 
 from idm_env import report as page
 from idm_env.data import DataError, Episode, Repair, Trajectories
-from idm_env.data.errors import Counted
+from idm_env.data.errors import Counted, by_kind
 from idm_env.data.fingerprint import fingerprints
 from idm_env.data.folder import Share
 from idm_env.executor import Executor
@@ -180,7 +180,5 @@ def account_of(found: Joined, source: str) -> dict[str, Any]:
         "repairs": [{"kind": r.kind, "count": r.count, "text": r.text} for r in repairs.repairs()],
         "left_out": [r.text for r in left_out.repairs()],
         "episodes": len(found.errors.gap_rmse),
-        "account": page.account(
-            ((r.kind, r.count) for r in repairs.repairs()), ((r.kind, r.count) for r in left_out.repairs())
-        ),
+        "account": page.account(by_kind(repairs.repairs()), by_kind(left_out.repairs())),
     }

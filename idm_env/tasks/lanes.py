@@ -47,12 +47,9 @@ class LanesTask(Task):
     lane_commands: bool = False
     discrete: int = 0
 
-    def __post_init__(self) -> None:
-        self._check_lanes()
-        super().__post_init__()
-
-    def _check_lanes(self) -> None:
-        """Check what every task on several lanes says."""
+    def _check_episode(self) -> None:
+        """Check what every task on several lanes says, too."""
+        super()._check_episode()
         whole("seen", self.seen, 1)
         whole("discrete", self.discrete, 0)
         if self.discrete == 1:

@@ -55,8 +55,7 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         one_of("first_lane", self.first_lane, FIRST_LANES)
         if self.runs is not None and len(self.runs) != 1:
             raise ValueError(f"runs = {list(self.runs)} must name one run: runs are different roads.")
-        self._check_lanes()
-        ReplayTask.__post_init__(self)
+        super().__post_init__()
 
     @property
     def own_effects(self) -> tuple[Effect, ...]:  # type: ignore[override]

@@ -300,6 +300,22 @@ def test_courtesy_opens_a_gap_for_whoever_signals() -> None:
         assert (int(state.links.changed[0]), int(state.links.follower[0])) == ((1, 4) if weight else (0, 0))
 
 
+def test_courtesy_waits_for_nobody_for_ever() -> None:
+    """Two that stand side by side at the end of a lane, and all behind them, get on, however courteous they are."""
+    position = torch.tensor([198.0, 192.8, 190.5, 185.0, 183.0, 177.5], dtype=DTYPE)  # the second 0.2 m behind a rear
+    lane = torch.tensor([1, 0, 1, 0, 1, 0])
+    simulator = Simulator(
+        Lanes(2, ends=(lane_drop(1, at=200.0),)), (IDM(), make("courtesy"), Mobil(), MandatoryChange(), Brakes())
+    )
+    params = simulator.defaults(dtype=DTYPE)
+    params["courtesy"]["weight"] = torch.tensor(1.0, dtype=DTYPE)
+    state = simulator.state(position, torch.zeros_like(position), params, lane=lane)
+    for _ in range(12):
+        state, kept = simulator.rollout(state, {}, params, 50)
+        assert (kept.gap > 0).all()
+    assert state.links is not None and (state.links.lane == 0).all() and (state.position > 205.0).all()
+
+
 @pytest.mark.parametrize("duration", [0.0, 2.0])
 def test_gradients_with_choices_frozen_are_exact(duration: float) -> None:
     """Finite differences that flip no choice agree with back-propagation through changes, ends of lanes included."""
