@@ -39,6 +39,7 @@ BEHIND, LENGTH, SHORTEST = 10, 5.0, 300
 """Vehicles behind vehicle 1, their length (m), and steps of the shortest stretch that agents are trained on."""
 
 
+@torch.no_grad()
 def driven(items: Sequence[Episode], params: Params, kind: str, act: Act | None, limits: tuple[float, float]) -> Row:
     """Return speeds, accelerations and gaps of vehicle 1 and those behind it, ``(steps, leaders, vehicles)``.
 

@@ -36,13 +36,14 @@ def test_the_recorded_follower_drives_as_recorded_and_only_its_record_counts(ite
 def test_an_agent_commands_vehicle_1_within_its_limits(items):
     def brake(seen):
         assert seen.shape == (2, 3)
-        return -torch.ones(2, 1)
+        return -torch.ones(2, 1, requires_grad=True)  # as a network's
 
     idm = agents_energy.driven(items, PARAMS, "idm", None, (-3.0, 3.0))
     run = agents_energy.driven(items, PARAMS, "agent", brake, (-2.0, 3.0))
     assert torch.allclose(run["accel"][0, :, 0], torch.full((2,), -2.0, dtype=torch.float64))
     assert torch.allclose(run["speed"][0, :, 1:], idm["speed"][0, :, 1:])  # those behind have not noticed yet
     assert float(run["speed"][200:, :, 0].abs().max()) < 1e-6
+    assert agents_energy.judged(run)["farthest"] > agents_energy.judged(idm)["farthest"]
 
 
 def test_fuel_of_steady_driving_is_that_of_the_models():
