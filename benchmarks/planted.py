@@ -82,7 +82,7 @@ def beside_the_model(found: Discovery, batch: Batch) -> Tensor:
     return (speed[1:] - kept.speed[0, :, driver].reshape(steps, rows)) / batch.dt
 
 
-def planted(found: Discovery, noise: tuple[float, float], effect: Effect, parameters: dict[str, float], seed: int,
+def planted(found: Discovery, noise: tuple[float, float], effect: Effect, numbers: dict[str, float], seed: int,
             turned: bool = True) -> Trajectories:  # fmt: skip
     """Return trajectories of the fitted drivers with the effect, each behind copies of the measured vehicles.
 
@@ -90,13 +90,13 @@ def planted(found: Discovery, noise: tuple[float, float], effect: Effect, parame
         found: A discovery on the measured data.
         noise: Standard deviations of measured positions (m) and speeds (m/s).
         effect: What is planted.
-        parameters: Its parameters.
+        numbers: Its parameters.
         seed: Of drift and noise.
         turned: Whether the drift begins at a random time; else the drivers do again what they did.
     """
     random, batch = np.random.default_rng(seed), Batch.of(found.records.episodes, substeps=1)
     simulator, drivers = behind(found, effect)
-    own_params = {n: torch.tensor(x, dtype=torch.float64) for n, x in parameters.items()}
+    own_params = {n: torch.tensor(x, dtype=torch.float64) for n, x in numbers.items()}
     params = {**drivers, effect.name: own_params}
     at, driver = batch.columns(simulator)
     own = beside_the_model(found, batch)
@@ -127,9 +127,11 @@ def planted(found: Discovery, noise: tuple[float, float], effect: Effect, parame
     return replace(Trajectories.from_frame(pl.concat(tables), source=f"planted, seed {seed}"), drivers=followers)
 
 
-def typical(effect: Effect) -> dict[str, float]:
-    """Return an effect's parameters as it is by default."""
-    return {p.name: p.default for p in effect.parameters}
+def parameters(found: Discovery, name: str) -> dict[str, float]:
+    """Return an effect's parameters as the strength was told of: as the first round fitted them."""
+    at = next(s for s in found.rounds[0].scored if s.term.label == name)
+    values = at.solution.values[at.solution.model.where(name)]
+    return {p.name: float(x) for p, x in zip(at.term.parameters, values, strict=True)}
 
 
 @cache
@@ -157,7 +159,9 @@ def measure(job: tuple[str, float, int, tuple[Any, ...]], on_progress: OnProgres
     away = 1.0 if own.default > null else -1.0
     strength = null + away * times * said["would_be_found"]
     begin = time.process_time()
-    report = discover(planted(found, noise, effect, typical(effect) | {own.name: strength}, number), seed=number).report
+    report = discover(
+        planted(found, noise, effect, parameters(found, name) | {own.name: strength}, number), seed=number
+    ).report
     names = [f["effect"] or f["label"] for f in report["found"]]
     others = [n for f in report["found"] for n in f["equivalent"]]
     alike = {name} | ({"delay", "lag"} if name in ("delay", "lag") else set())

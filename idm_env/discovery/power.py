@@ -1,10 +1,10 @@
 """The smallest strength of an effect that would have been found: planted into what the fitted drivers do.
 
-Nothing is simulated anew: the effect is planted into the predictions of the fitted drivers through their responses to
-it, every driver's own parameters following, on top of their own errors, drift included, whose signs are drawn anew for
-every run. Each draw goes through what decides on an addition: strengths from other runs, gains, the level that the test
-over the whole list asks for, the least gain and the lockbox. ``python -m benchmarks.planted`` plants into simulations,
-lets the whole tool look at them, and says how often it finds what is said here.
+In a report nothing is simulated anew: the effect is planted into the predictions of the fitted drivers through their
+responses to it, every driver's own parameters following, on top of their own errors, drift included, whose signs are
+drawn anew for every run. Each draw goes through what decides on an addition: strengths from other runs, gains, the
+level that the test over the whole list asks for, the least gain and the lockbox. ``python -m benchmarks.planted``
+plants into simulations, lets the whole tool look at them, and says how often it finds what is said here.
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ DRAWS = 200
 FACTORS = (1e-3, 1e2)
 """Strengths, in units of the usual one, between which the smallest is sought."""
 CLOSE = 1.05
+BEYOND_LINES = 1.5
+"""What lines leave out. Candidates that show the same effect raise the level of the test along with it, and errors on
+runs kept back have their say, so that of 13 effects planted into simulations 5 were found at what lines say, and of
+12 none at half of that (``benchmarks.planted --seed 4242 --repeats 1``, from which this was chosen)."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +178,7 @@ def strength_of(solution: Solution, task: Task, label: str, bar: Bar) -> Strengt
     term = next(t for t in solution.model.terms if t.label == label)
     typical = abs(p.default - p.null) if len(strengths) == 1 else term.smoothness
     shape = np.ones(1) if len(strengths) == 1 else np.sin(2.0 * np.pi * np.arange(len(strengths)) / WAVE_KNOTS)
-    seen = Planted.of(solution, task, at, shape, bar).smallest(typical)
+    seen = BEYOND_LINES * Planted.of(solution, task, at, shape, bar).smallest(typical)
     if term.effect is not None and ALL[term.effect].latency:
         # A latency that comes out below one step of the data becomes part of the null.
         seen = max(seen, task.rows.records.dt + float(normal.ppf(POWER) / 1.96 * np.median(width)))

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.stats import t as student
 
 from idm_env.drift import filter_loops as loops
 from idm_env.drift.linear import Drivers, Path
@@ -34,9 +35,13 @@ NEAR = 0.3
 """Distance from a limit, on the logarithm, within which a number counts as at it: there the likelihood is flat."""
 FLAT = 4.0
 """Curvature below which a number is known worse than by half of itself: the likelihood is no parabola there."""
-LIKELY = 1.96
+LIKELY = 0.975
+"""Quantile of Student's t for an end of an interval, with one degree of freedom less than drivers."""
 LONGEST = 0.3
 """By how much a driver's log θ may move from one path to the next."""
+SETTLED = 4
+"""Paths before the first settings are sought: far from the drivers' path steps are not linear, and settings that make
+up for that lead to a worse one (a wandering v0 of 0.24 came out as 0.98)."""
 SPREAD = 0.3
 """Spread of drivers' log θ about what is usual.
 
@@ -92,8 +97,9 @@ class Estimate:
     def table(self) -> list[dict[str, float | str]]:
         """Return one row per number: estimate and interval."""
         rows: list[dict[str, float | str]] = []
+        reach = float(student.ppf(LIKELY, max(len(self.drivers.batch) - 1, 1)))
         for name, x, error in zip(self.names, self.settings.packed(), self.log_error, strict=True):
-            low, high = (math.exp(min(x + s * LIKELY * error, 50.0)) for s in (-1.0, 1.0))
+            low, high = (math.exp(min(x + s * reach * error, 50.0)) for s in (-1.0, 1.0))
             rows.append({"name": name, "estimate": math.exp(x), "low": low, "high": high})
         return rows
 
@@ -153,7 +159,7 @@ def estimate(
     spread: float | np.ndarray = SPREAD,
     measured: Batch | None = None,
     noise: tuple[float, float] | None = None,
-    rounds: int = 5,
+    rounds: int = 4,
     on_progress: OnProgress = silent,
 ) -> Estimate:
     """Estimate σ and τ of every drifting effect of the simulator, and the noise of measurement, on measured drivers.
@@ -177,10 +183,12 @@ def estimate(
     settings = Settings(
         np.array([known[f"{n}.sigma"].default for n in drivers.drifts]),
         np.array([known[f"{n}.memory_time"].default for n in drivers.drifts]),
-        np.array(noise or (0.1, 0.1)), 0.1, np.broadcast_to(np.asarray(spread, float), len(free)).copy(),
+        np.array(noise or (0.1, 0.1)), 0.02, np.broadcast_to(np.asarray(spread, float), len(free)).copy(),
     )  # fmt: skip
     limits = _limits(drivers, noise)
     path = Path.at(drivers, np.broadcast_to(np.clip(theta, *drivers.bounds), (len(batch), len(free))).copy())
+    for _ in range(SETTLED):
+        path = _path(Likelihood(drivers, path), settings)
     for number in range(rounds):
         around = Likelihood(drivers, path)
         settings = _maximised(around, settings, limits)

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import drift, drift_gru
+from benchmarks import drift, drift_gru, drift_sets
+from idm_env.data import episodes
+from idm_env.drift.estimate import estimate, usual
+from idm_env.drift.kinds import behind_a_record
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.problem import IDM_NAMES
 
 STEPS = 6
 
@@ -46,3 +51,13 @@ def test_distributions_that_are_alike_have_no_distance() -> None:
     moving = drift._quantities(gap, np.concatenate([speed[:1], speed]), 0.5)
     assert moving[0][:, 0, 0] == pytest.approx(gap[:, 0, 0] / speed[:, 0, 0])
     assert moving[1].sum() == pytest.approx((speed[-1, 0, 0] - speed[0, 0, 0]) / 0.5)
+
+
+def test_a_wandering_desired_speed_is_found_again() -> None:
+    """A set in which settings sought about a first, bad path led to a worse one: σ came out four times too large."""
+    kind, sigma, memory_time = drift_sets.HIDDEN[3][0], 0.24, 20.0
+    made = drift_sets.made(1048, kind, sigma, memory_time)
+    smooth, raw = (Batch.of(list(episodes(made, smooth=x)), substeps=1) for x in (True, False))
+    found = estimate(behind_a_record(smooth.dt, kind), smooth, IDM_NAMES, usual(IDM_NAMES), measured=raw)
+    for row, true in zip(found.table()[:2], (sigma, memory_time), strict=True):
+        assert row["low"] < true < row["high"] and 0.7 < row["estimate"] / true < 1.4
