@@ -143,7 +143,7 @@ def discover(
         kept_runs,
         searching,
         decided,
-        refused,
+        refused | searching.unplaced,
         by,
         seed,
     )

@@ -292,12 +292,13 @@ def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
                 refused[effect.name] = f"no {effect.beyond} is measured"
         if effect.sought == "given" and not any(effect.column in e.columns for e in records.episodes):
             refused[effect.name] = f"the file has no column {effect.column}"
-        if effect.sought in ("interval", "step") and effect.changes not in twin.PULSED:
+        if effect.sought in ("profile", "interval", "step") and effect.changes not in twin.PULSED:
             refused[effect.name] = (
-                f"an effect that is sought in an interval must say which of {', '.join(twin.PULSED)} it changes, "
+                f"an effect that is sought at places or times must say which of {', '.join(twin.PULSED)} it changes, "
                 f"and changes = '{effect.changes}'"
             )
-        if effect.kind not in catalogue.PACKAGED and (why := twin.why_not_recorded(effect, records.dt)):
+        unknown = effect.name not in refused and effect.kind not in catalogue.PACKAGED
+        if unknown and (why := twin.why_not_recorded(effect, records.dt)):
             refused[effect.name] = why
     return refused
 

@@ -58,6 +58,8 @@ class Search:
     """The model that was weighed last, and how it stands in free simulation."""
     squares: dict[Solution, np.ndarray] = field(default_factory=dict)
     """What ``free_run_squares`` has said."""
+    unplaced: dict[str, str] = field(default_factory=dict)
+    """Effects that were sought at places or times and had none to be tried at, and why."""
 
     @property
     def units(self) -> Units:
@@ -210,6 +212,8 @@ class Search:
             shortest = {"position": 2, "time": 3}[coordinate]
             found = places.scan(responses, what, coordinate, width, open_end=open_end, shortest=shortest)
             if found is None:
+                if named is not None and number == 1:
+                    self.unplaced[named.name] = f"no {coordinate} in these data is covered for long enough to be tried"
                 return
             term = _interval_term(what, coordinate, found, open_end, named, period)
             if term.label in have:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -104,6 +104,11 @@ class Effect:
                 f"effect {cls.__name__} overrides {mine or 'no hook'}; override exactly one of {', '.join(HOOKS)}."
             )
         cls.hook = mine[0]
+        for promise, known in (("sought", Sought), ("beyond", Neighbour)):
+            if (value := getattr(cls, promise)) not in get_args(known):
+                raise TypeError(
+                    f"effect {cls.__name__}: {promise} = {value!r} is none of {', '.join(map(repr, get_args(known)))}."
+                )
         # Not inherited: a subclass has another equation, and what its parent promised of his is not known of it.
         cls.adds = vars(cls).get("adds", cls.hook in ("adapt", "accelerate", "limit"))
         cls.remembers = cls.remember is not Effect.remember

@@ -18,7 +18,10 @@ def same_class(a: type[Effect], b: type[Effect]) -> bool:
 
 
 def entered(effect: type[Effect], known: dict[str, type[Effect]]) -> type[Effect]:
-    """Enter a class among the known ones; ValueError for one without a name, or with another's."""
+    """Enter a class among the known ones.
+
+    ValueError for one without a name, with another's, or that cannot be made without arguments.
+    """
     if not (isinstance(effect, type) and issubclass(effect, Effect)):
         raise ValueError(f"{effect!r} is no class of effects. Register the class, such as register(MyEffect).")
     if not effect.kind:
@@ -26,13 +29,19 @@ def entered(effect: type[Effect], known: dict[str, type[Effect]]) -> type[Effect
     taken = known.get(effect.kind)
     if taken is not None and not same_class(taken, effect):
         raise ValueError(f"the name '{effect.kind}' of {effect.__name__} is that of {taken.__name__}. Give it another.")
+    try:
+        effect()
+    except TypeError as error:
+        raise ValueError(
+            f"effect '{effect.kind}' cannot be made without arguments ({error}). Give its fields defaults."
+        ) from None
     known[effect.kind] = effect
     return effect
 
 
 def is_candidate(effect: type[Effect]) -> bool:
-    """Tell whether a search can switch an effect on and off: it is no car-following and has a null."""
-    return not issubclass(effect, CarFollowing) and effect.hook != "place" and any(
+    """Tell whether a search can switch an effect on and off: it has a null, and accelerations that it changes."""
+    return not issubclass(effect, CarFollowing) and effect.hook not in ("place", "change") and any(
         p.null is not None for p in effect().parameters
     )  # fmt: skip
 

@@ -10,17 +10,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from idm_env.kernels import descent_loops, dispatch, tiles
+from idm_env.kernels import descent_loops, tiles
 from idm_env.kernels.lanes import part_of, starts, static_of
 from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import dense, operand, table
+from idm_env.kernels.printed import tile_kernel
 from idm_env.kernels.tiles import Array
-from idm_env.scalar.record import slot_name
+from idm_env.scalar.record import Form, slot_name
 from idm_env.simulator import Simulator
 from idm_env.types import Inputs, Params, State
 
 Bounds = Mapping[str, tuple[float, float]]
 """Lowest and highest value by full name (``idm.time_gap``, ``imagined.gap``); what is not named stays as it is."""
+
+
+BLOCK = 256
+"""Steps between two states of the tape."""
 
 
 class Observed(NamedTuple):
@@ -51,16 +56,18 @@ def descend(
 ) -> Found:  # fmt: skip
     """Minimise Σ weight · |position − observed| of a state ``(vehicles, 1)`` in float64, by Adam between bounds.
 
-    The learning rate falls linearly from the first of ``rates`` to the second. ValueError where no kernel can run.
+    The learning rate falls linearly from the first of ``rates`` to the second. ImportError without numba; ValueError
+    for effects that cannot be compiled.
     """
-    kernel = dispatch.found(simulator, state, inputs, params)
+    kernel = tile_kernel(simulator, Form.of(state, inputs))
     if isinstance(kernel, str) or kernel.signals:
-        why = kernel if isinstance(kernel, str) else "an effect looks back in time"
-        raise ValueError(f"{why}; this descent is compiled and has no other path.")
+        raise ValueError(
+            kernel if isinstance(kernel, str) else "an effect looks back in time, and no past is kept here."
+        )
     program, shape = kernel.program, tuple(state.speed.shape)
-    count = rows = shape[0]
-    values = np.array([dense(static_of(simulator, state, params, n), shape) for n in program.parameters])
-    parts = [dense(part_of(inputs, n)[:steps], (steps, *shape)) for n in kernel.numbers]
+    count = shape[0]
+    values = np.array([dense(static_of(simulator, state, params, n).double(), shape) for n in program.parameters])
+    parts = [dense(part_of(inputs, n)[:steps].double(), (steps, *shape)) for n in kernel.numbers]
     given = np.array(parts).reshape(len(parts), steps * count)
     slots = {slot_name(*name.split(".", 1)): name for name in bounds}
     low, high = _limits(values, [bounds.get(n) for n in program.parameters])
@@ -69,17 +76,16 @@ def descend(
     made = [operand(static_of(simulator, state, params, n).double(), shape[:-1], 1) for n in program.statics]
     made += [(x, (0, 1, 1)) for x in values] + [(x, (count, 1, 1)) for x in given]
     made += [operand(part_of(inputs, n), shape[:-1], 1, steps) for n in kernel.flags]
-    start = [dense(x.double(), shape) for x in starts(state, program.states)]
-    kept, seeds, nothing = np.zeros((4, steps, count)), np.zeros(4 * steps * count), np.zeros(1)
-    wide, around = tiles.width(1, 0), tiles.halo(steps, program.reach)
-    kind = "float64"
+    blocks = -(-steps // BLOCK)
+    tape = np.zeros((blocks + 1, len(program.states), count))
+    tape[0] = [dense(x.double(), shape) for x in starts(state, program.states)]
+    kept, wide, kind = np.zeros((4, steps, count)), tiles.width(1, 0), "float64"
     descent_loops.descend(
-        addresses(start), addresses([None] * len(start)), nothing, kept.reshape(-1), seeds, *observed, values,
-        np.zeros_like(values), low, high, given, np.zeros_like(given if moves else given[:0]), given_low, given_high,
-        kernel.measures, kernel.forward(kind), kernel.backward(kind), kernel.looks, kernel.recalls, kernel.sends,
-        kernel.read, kernel.taped, kernel.again, addresses([x for x, _ in made]),
-        table([*(s for _, s in made), (0, 1, 1)]), kernel.constants[kind], steps, rows, 1, wide, around,
-        tiles.tiles(rows, 1, wide, around), iterations, *rates,
+        tape, BLOCK, kept.reshape(-1), *observed, values, np.zeros_like(values), low, high, given,
+        np.zeros_like(given if moves else given[:0]), given_low, given_high, kernel.measures, kernel.forward(kind),
+        kernel.backward(kind), kernel.looks, kernel.recalls, kernel.sends, kernel.read, kernel.taped, kernel.again,
+        addresses([x for x, _ in made]), table([*(s for _, s in made), (0, 1, 1)]), kernel.constants[kind], steps,
+        count, wide, tiles.tiles(count, 1, wide, 0), iterations, *rates,
     )  # fmt: skip
     first = [dense(x, shape)[None] for x in (state.position, state.speed, state.accel)]
     return Found(

@@ -131,7 +131,7 @@ def sigmoid_float32(x):
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
 def log1p_float64(x):
-    """Return log(1 + x) of a double above −1, within two units in the last place."""
+    """Return log(1 + x) of a double, within two units in the last place; −∞ at −1 and nan below."""
     u = 1.0 + x
     # What rounding took from 1 + x, relative to it.
     lost = ((1.0 - (u - x)) if x > 1.0 else (x - (u - 1.0))) / u
@@ -149,15 +149,18 @@ def log1p_float64(x):
     p = p * z + 1.0 / 7.0
     p = p * z + 1.0 / 5.0
     p = p * z + 1.0 / 3.0
-    return n * _LN2_HIGH + (2.0 * s + (2.0 * s * z * p + (n * _LN2_LOW + lost)))
+    y = n * _LN2_HIGH + (2.0 * s + (2.0 * s * z * p + (n * _LN2_LOW + lost)))
+    y = y if u > 0.0 else (-np.inf if u == 0.0 else np.nan)
+    return x if x == np.inf else y
 
 
+_ZERO, _INFINITE, _NAN = np.float32(0.0), np.float32(np.inf), np.float32(np.nan)
 _TWO, _C9_LOG, _C7_LOG, _C5_LOG, _C3_LOG = (np.float32(x) for x in (2.0, 1 / 9, 1 / 7, 1 / 5, 1 / 3))
 
 
 @numba.njit(cache=True, error_model="numpy", forceinline=True)
 def log1p_float32(x):
-    """Return log(1 + x) of a float above −1, within two units in the last place."""
+    """Return log(1 + x) of a float, within two units in the last place; −∞ at −1 and nan below."""
     u = _ONE + x
     lost = ((_ONE - (u - x)) if x > _ONE else (x - (u - _ONE))) / u
     n, m = _parts_of_single(u)  # type: ignore[call-arg]
@@ -166,4 +169,6 @@ def log1p_float32(x):
     p = _C9_LOG * z + _C7_LOG
     p = p * z + _C5_LOG
     p = p * z + _C3_LOG
-    return n * _LN2_HIGH_32 + (_TWO * s + (_TWO * s * z * p + (n * _LN2_LOW_32 + lost)))
+    y = n * _LN2_HIGH_32 + (_TWO * s + (_TWO * s * z * p + (n * _LN2_LOW_32 + lost)))
+    y = y if u > _ZERO else (-_INFINITE if u == _ZERO else _NAN)
+    return x if x == _INFINITE else y

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 CONSTANT, STATIC, DYNAMIC = 0, 1, 2
 
 BOOLEAN = frozenset({"gt", "ge", "lt", "le", "eq", "ne", "and", "or", "not"})
-COSTLY = frozenset({"div", "sqrt", "exp", "expm1", "log", "pow", "tanh", "sigmoid", "sin", "cos"})
+COSTLY = frozenset({"div", "sqrt", "exp", "expm1", "log", "log1p", "pow", "tanh", "sigmoid", "sin", "cos"})
 """Operations worth taking out of the loop over time where they depend on parameters alone."""
 
 

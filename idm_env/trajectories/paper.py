@@ -43,8 +43,8 @@ RATES = (0.1, 0.01)
 FILTER_STEP_S, RECONSTRUCT_STEP_S = 0.1, 1.0
 NEAREST_M = 0.1
 """A real leader is never nearer than this (m)."""
-TOGETHER = 512
-"""Tracks fitted at a time, those of like length; they share nothing but the loop."""
+TOGETHER = 300_000
+"""Steps of all tracks that are fitted at a time (some 50 MB); they share nothing but the loop."""
 
 
 class Ahead(NamedTuple):
@@ -84,13 +84,15 @@ def imitate(
 ) -> list[Imitated]:
     """Fit each track by the published recipe; a data point is compared at the simulation step nearest in time.
 
-    ``fixed_parameters`` keeps the five at their initial values (the paper's ablation). ValueError without numba.
+    ``fixed_parameters`` keeps the five at their initial values (the paper's ablation). ImportError without numba.
     """
     clocks = [clock_of(track, dt) for track in tracks]
     by_length = sorted(range(len(tracks)), key=lambda i: len(clocks[i]))
     found: dict[int, Imitated] = {}
-    for begin in range(0, len(tracks), TOGETHER):
-        some = by_length[begin : begin + TOGETHER]
+    while by_length:
+        # The longest one left, and as many of like length as fit beside it.
+        many = max(TOGETHER // len(clocks[by_length[-1]]), 1)
+        some, by_length = by_length[-many:], by_length[:-many]
         done = _imitated([tracks[i] for i in some], [clocks[i] for i in some], dt, iterations, fixed_parameters)
         found.update(zip(some, done, strict=True))
     return [found[i] for i in range(len(tracks))]
@@ -164,7 +166,7 @@ def _descended(
     state = simulator.state(torch.zeros_like(speed), speed, params)
     sizes = [len(x) for x in at]
     observed = Observed(
-        np.concatenate([[], *at]).astype(np.int64), np.repeat(np.arange(len(at)), sizes),
+        np.concatenate([np.empty(0, np.int64), *at]), np.repeat(np.arange(len(at)), sizes),
         np.concatenate([[], *targets]), np.repeat([1.0 / size for size in sizes], sizes),
     )  # fmt: skip
     return descend(

@@ -15,10 +15,12 @@ import torch
 from idm_env import effects as catalogue
 from idm_env.config import load_model, save_model
 from idm_env.data import Trajectories, synthetic
-from idm_env.discovery import discover, march
+from idm_env.discovery import discover, march, places
+from idm_env.discovery import model as terms
 from idm_env.discovery.model import Model, simple
 from idm_env.discovery.records import Records
 from idm_env.effects import Effect
+from idm_env.effects.registry import is_candidate
 from idm_env.parameters import Parameter
 from tests.discovery.test_march import agrees
 
@@ -153,3 +155,47 @@ def test_a_registered_effect_is_a_candidate_and_names_are_not_taken_twice() -> N
         catalogue.register(Other)
     with pytest.raises(ValueError, match=r"has no class Nobody of effects\. It has: Fatigue"):
         catalogue.named(f"{EXAMPLE}:Nobody")
+
+
+def test_whatever_has_no_place_or_time_to_be_tried_at_is_a_candidate_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(places, "scan", lambda *given, **options: None)
+    trajectories, _ = synthetic.generate(5, runs=5, followers=2, seconds=60.0)
+    report = discover(trajectories, effects=["regime_shift", "drag"]).report
+    notes = {row["effect"]: row["note"] for row in report["candidates"]}
+    assert notes["regime_shift"] == "no time in these data is covered for long enough to be tried"
+    assert "covered" not in notes["drag"]
+
+
+def test_a_profile_of_what_cannot_be_changed_by_place_is_refused(platoon: Records) -> None:
+    class Mistaken(Mood):
+        kind = "mistaken"
+        sought = "profile"
+        changes = "gap"
+
+    assert "changes = 'gap'" in terms.testable(platoon, [Mistaken()])["mistaken"]
+
+
+def test_a_class_that_no_search_can_use_is_refused_at_once() -> None:
+    with pytest.raises(TypeError, match="Misspelt: sought = 'zone' is none of 'anywhere', 'profile'"):
+
+        class Misspelt(Mood):
+            sought = "zone"
+
+    @dataclass(frozen=True)
+    class Needy(Mood):
+        kind: ClassVar[str] = "needy"
+        needed: float = dataclasses.field(kw_only=True)
+
+    with pytest.raises(ValueError, match="effect 'needy' cannot be made without arguments"):
+        catalogue.register(Needy)
+
+    class Swerve(Effect):
+        kind = "swerve"
+        declared = (Parameter("gain", "c", "1", 0.2, -1.0, 1.0, null=0.0),)
+
+        def change(self, scene: Any, driver: Any, p: Any) -> Any:
+            raise NotImplementedError
+
+    assert "needy" not in catalogue.ALL and not is_candidate(Swerve)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 functions = pytest.importorskip("idm_env.kernels.functions", reason="numba is not installed")
 numba = pytest.importorskip("numba")
@@ -25,4 +26,8 @@ def test_log1p_is_within_two_units_in_the_last_place_of_the_true_one(kind: str) 
     filled(x, y)
     truth = np.log1p(x.astype(np.longdouble))
     assert y.dtype == kind
+    edges = np.array([-1.0, -1.5, -2.0, -np.inf, np.inf, np.nan], kind)
+    at_edges = np.empty_like(edges)
+    filled(edges, at_edges)
+    assert np.array_equal(at_edges, torch.log1p(torch.as_tensor(edges)).numpy(), equal_nan=True)
     assert (np.abs(y - truth) <= 2.0 * np.spacing(np.abs(truth).astype(kind))).all()
