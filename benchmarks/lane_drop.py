@@ -41,6 +41,8 @@ PUBLISHED: dict[str, tuple[float, float]] = {
 """Vehicles per hour out with human drivers, and with the derived controller: IDM with a 2.6, b 4.5, T 1, s0 2.5, v0 30,
 σ 0.2, and one parameter changed. Of twelve published changes these seven are known to us."""
 DT = 0.25
+LETS_GO = 10.0
+"""Nearer to a merge than this (m) the derived controller holds nobody back."""
 KEPT = Path("out/lane-drop.jsonl")
 
 
@@ -149,7 +151,8 @@ def stands(state: State, chosen: torch.Tensor, place: Place) -> torch.Tensor:
     """Return which of the chosen vehicles stop for a human beside them, by the derived controller (bool).
 
     Within 20 m of where its lane and the other of its pair become one, a vehicle stops while the next one behind it on
-    that other lane is a human within 30 m of there.
+    that other lane is a human within 30 m of there. In the last 10 m it goes on: here, unlike at a zipper, whoever has
+    to change lanes beside one that stands would wait for ever.
     """
     assert state.links is not None and state.present is not None
     lane, position = state.links.lane, state.position
@@ -161,7 +164,7 @@ def stands(state: State, chosen: torch.Tensor, place: Place) -> torch.Tensor:
     there = there & (early.unsqueeze(-1) == early.unsqueeze(-2)) & (other != lane).unsqueeze(-1)
     way, slot = torch.where(there, behind, torch.inf).min(-1)
     human = ~chosen.gather(-1, slot)
-    near = (to_end >= 0) & (to_end < lane_drop_zipper.REACH) & (position < place.second) & (state.present > 0)
+    near = (to_end > LETS_GO) & (to_end < lane_drop_zipper.REACH) & (position < place.second) & (state.present > 0)
     return chosen & near & human & (way + to_end < lane_drop_zipper.SIGHT)
 
 

@@ -3,9 +3,9 @@
 ``python -m benchmarks.lanes capacity``: two lanes, and a ramp from which one merges between 3000 and 3200 m, 400 m
 before the end. Demand rises by 25 vehicles an hour each minute, a fifth of it on the ramp. Traffic has broken down when
 on the 400 m before the ramp the mean speed falls below 15 m/s and stays there for five minutes. Flow is counted 200 m
-behind the ramp, in the five minutes before that and from five minutes after it on, for 15 minutes: so neither is chosen
-for being high or low. Every row changes one thing; SUMO (``libsumo``: IDM without noise, LC2013) drives the same road
-with the same departures. Rows are kept in ``out/lanes-capacity.jsonl``.
+behind the ramp, in the five minutes before that and from five minutes after it on, for 15 minutes or until the hour is
+over: so neither is chosen for being high or low. Every row changes one thing; SUMO (``libsumo``: IDM without noise,
+LC2013) drives the same road with the same departures. Rows are kept in ``out/lanes-capacity.jsonl``.
 
 Beside it, without any merging: what comes out of a standing queue on one lane, over the largest flow of equal gaps and
 speeds (Treiber, Hennecke and Helbing 2000 call the former the dynamic capacity).
@@ -37,8 +37,8 @@ from idm_env.types import State, Trips
 FIRST, LAST, MINUTES = 2800.0, 4300.0, 60
 """Demand at the beginning and in the end (vehicles/h)."""
 BEGIN, END, ENTRY, COUNTED, LENGTH = 3000.0, 3200.0, 2700.0, 3400.0, 3600.0
-BEFORE, AFTER, WAIT, STAYS = 5, 15, 5, 5
-"""Minutes that are counted before and after a breakdown, that pass between, and that a breakdown lasts at least."""
+BEFORE, AFTER, LEAST, WAIT, STAYS = 5, 15, 5, 5, 5
+"""Minutes that are counted before a breakdown, after it (at most, at least), that pass between, and that it lasts."""
 SLOW = 15.0
 DT, SEEDS, SPEED, NOISE = 0.2, 6, 20.0, 0.2
 KEPT = Path("out/lanes-capacity.jsonl")
@@ -211,7 +211,7 @@ def drive(part: Part, on_progress: OnProgress) -> list[dict[str, Any]] | None:
 
 def broken(speed: list[float]) -> int | None:
     """Return the minute in which traffic breaks down; None where it does not, or too late to be counted after it."""
-    for minute in range(BEFORE + WAIT, len(speed) - WAIT - AFTER + 1):
+    for minute in range(BEFORE + WAIT, len(speed) - WAIT - LEAST + 1):
         if all(v < SLOW for v in speed[minute : minute + STAYS]):
             return minute
     return None

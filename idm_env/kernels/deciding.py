@@ -72,6 +72,7 @@ class Traffic:
         self.rows = state.speed.numel() // self.n
         self._given: Links | None = state.links
         self._lasting: _Lasting | None = None
+        self._order: tuple[Array, Array] | None = None
 
     @property
     def links(self) -> Links:
@@ -109,14 +110,9 @@ class Traffic:
         """Return where vehicles lie in a row for as many steps as the halo is for; None where links are no order."""
         around = halo if self.road.ring is not None else 0
         wide = self.n + 2 * around * self.road.count
-        position = dense(state.position, self.shape)
         slots, own = np.empty(self.rows * wide, np.int64), np.empty(self.rows * self.n, np.int64)
-        led, leads = (np.empty(self.rows * wide, position.dtype) for _ in range(2))
-        lanes_of, leader, follower = (dense(x, self.shape) for x in self.links[:3])
-        if not order_loops.laid(
-            leader, follower, lanes_of, position, *self._present(state), self.rows, self.n,
-            self.road.count, self._ring, around, wide, slots, own, led, leads,
-        ):  # fmt: skip
+        led, leads = (np.empty(self.rows * wide, dense(state.position, self.shape).dtype) for _ in range(2))
+        if not self._lay(state, around, wide, slots, own, led, leads):
             return None
         at, (there, first, last) = (*self.shape[:-1], wide), (torch.from_numpy(x) for x in (slots, led, leads))
         there = there.view(at)
@@ -125,6 +121,18 @@ class Traffic:
             lane = self.links.lane.expand(self.shape).gather(-1, there)
             ends = self.road.closed_at(lane, state.position)
         return Places(there, torch.from_numpy(own).view(self.shape), first.view(at), last.view(at), ends)
+
+    def _lay(self, state: State, around: int, wide: int, *to: Array) -> bool:
+        """Lay all rows out into four arrays; False where links are no order. Whoever has just decided knows it."""
+        count, known = self.road.count, self._order
+        self._order = None
+        if known is not None:
+            order_loops.laid_by(*known, self.rows, self.n, count, around, wide, *to)
+            return True
+        lanes_of, leader, follower = (dense(x, self.shape) for x in self.links[:3])
+        position, there = dense(state.position, self.shape), self._present(state)
+        given = leader, follower, lanes_of, position, *there, self.rows, self.n, count, self._ring, around, wide
+        return bool(order_loops.laid(*given, *to))
 
     def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params, turn: Tensor) -> State | None:
         """Return the state after those have decided whose ``turn`` it is, or None where links are no order."""
@@ -139,16 +147,18 @@ class Traffic:
         sees = self.simulator.sees_mergers
         turns = turn.numpy() if self.simulator.decides_in_blocks else np.empty(0, np.bool_)
         merger = np.tile(np.arange(self.n), self.rows if sees else 0)
+        order, begin = np.empty(self.rows * self.n, np.int64), np.empty(self.rows * (self.road.count + 1), np.int64)
         tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], kind)
         done = decision_loops.decide(
             self._links, dense(state.position, self.shape), *self._present(state), self.rows, self.n,
             self.road.count, self._ring, self.road.handed == "left", tables, plan, places, phase, constants,
-            len(found.slots), fresh, merger, turns,
+            len(found.slots), fresh, merger, turns, order, begin,
         )  # fmt: skip
         del held
         self._given = None
         if not done:
             return None
+        self._order = order, begin
         which = torch.from_numpy(np.flatnonzero(fresh))
         links = self.links
         if len(which):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from idm_env.kernels.memory import fill, gather, number
+from idm_env.kernels.memory import copy, fill, gather, number
 from idm_env.kernels.order_loops import walk
 from idm_env.kernels.phases import call
 from idm_env.kernels.tiles import ROW, exact, padded, workspace
@@ -58,7 +58,13 @@ def round_ring(q, first, last):
 def whose(which, places, c, at, m, step, to, behind, begin, order, ring, base):
     """Fill ``which`` with the slots of the ``c``-th place, as seen from ranks ``at`` to ``at + m``: own for nobody."""
     first, last, up = begin[to], begin[to + 1], places[c, 1]
-    around = ring > 0 and last > first
+    size, around = last - first, ring > 0 and last > first
+    if around and size > abs(up):  # not more than once round: without a loop in it this is vector code
+        for j in range(m):
+            q = (at + j if step == 0 else number(behind, at + j, order)) - up
+            q += (size if q < first else 0) - (size if q >= last else 0)
+            which[c * CHUNK + j] = base + number(order, q, order)
+        return
     for j in range(m):
         q = (at + j if step == 0 else behind[at + j]) - up
         if not first <= q < last:
@@ -97,14 +103,16 @@ def find(w, target, kind, at, m, exists, to, behind, begin, lap, ring, tables):
         fill(w, target, 0, m)
     elif kind == LAPS_AHEAD:
         for j in range(m):
-            q = behind[at + j]
+            q = number(behind, at + j, w)
             over = q == first
-            w[target + j] = ring * (lap[at + j] - lap[last - 1 if over else q - 1] + over)
+            there = number(lap, last - 1 if over else q - 1, w)
+            w[target + j] = ring * (number(lap, at + j, w) - there + over)
     else:
         for j in range(m):
-            q = behind[at + j]
+            q = number(behind, at + j, w)
             over = q == last
-            w[target + j] = -(ring * (lap[at + j] - lap[first if over else q] - over))
+            there = number(lap, first if over else q, w)
+            w[target + j] = -(ring * (number(lap, at + j, w) - there - over))
 
 
 @exact
@@ -279,13 +287,14 @@ def find_mergers(order, begin, count, place, ring, left, right, signals, granted
 @exact
 def decide(
     links, position, present, coming, rows, n, count, ring, left_hand, tables, plan, places, phase, k, slots, fresh,
-    merger, turn,
+    merger, turn, orders, begins,
 ):  # fmt: skip
     """Decide in all rows: ``links`` (7, rows · n; as ``types.Links``) change in place, ``fresh`` marks new leaders.
 
     ``plan`` says what the ``slots`` rows of the printed ``phase`` are filled with, ``places`` whose. ``merger`` (rows ·
     n own slots, or empty if nobody looks) gets who signals beside everybody; those slots decide whose ``turn``
-    it is (empty: all). Returns False, with some rows decided, where links are not the order of positions.
+    it is (empty: all). ``orders`` (rows · n) and ``begins`` (rows · (count + 1)) get the order of every row afterwards,
+    as ``walk`` would put it. Returns False, with some rows decided, where links are not the order of positions.
     """
     lane, leader, follower, changed, refused, blocked, unjudged = links
     w, which = workspace((slots + RESULTS) * ROW, k), np.empty(len(places) * CHUNK, np.int64)
@@ -331,4 +340,8 @@ def decide(
             count_changes(
                 winner, order, left, right, to_left, begin, ring, base, lane, follower, changed, unjudged
             )  # fmt: skip
+            copy(order, 0, fresh_order, 0, begin[count])
+            copy(begin, 0, fresh_begin, 0, count + 1)
+        copy(orders, base, order, 0, n)
+        copy(begins, row * (count + 1), begin, 0, count + 1)
     return True

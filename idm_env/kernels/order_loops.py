@@ -91,6 +91,17 @@ def lay(order, begin, n, count, halo, wide, base, to, slots, own, led, leads):
 
 
 @exact
+def laid_by(order, begin, rows, n, count, halo, wide, slots, own, led, leads):
+    """Lay all rows out by an order that is known: ``order`` (rows · n) and ``begin`` (rows · (count + 1))."""
+    for row in range(rows):
+        first, lanes = row * n, row * (count + 1)
+        lay(
+            order[first : first + n], begin[lanes : lanes + count + 1], n, count, halo, wide, first, row * wide, slots,
+            own, led, leads,
+        )  # fmt: skip
+
+
+@exact
 def laid(
     leader, follower, lane, position, present, coming, rows, n, count, ring, halo, wide, slots, own, led, leads
 ):  # fmt: skip
