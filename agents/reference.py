@@ -29,9 +29,6 @@ ROWS_AT_ONCE = 192
 RANDOM = ("random networks", "random linear policies")
 HIDDEN: tuple[tuple[int, ...], ...] = ((32, 32), ())
 
-Wanted = Callable[[Task, Seen, Tensor], Tensor]
-"""Task, what the vehicle sees, each ``(policies, rings, 1)``, and uniform speeds ``(rings, 1)`` → accelerations."""
-
 
 class Family(NamedTuple):
     """Policies of one kind: a name for each, and the actions of some of them (indices) in the rings of a start."""

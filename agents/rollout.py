@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from agents.environments import task_of
+from idm_env.effects.idm import equilibrium_gap
 from idm_env.envs.batch import Batch
 from idm_env.envs.settings import settings
 from idm_env.tasks import Draw, Task, World
@@ -146,11 +147,12 @@ def uniform_speed(start: Start) -> Tensor:
     Solves ``Σ (s0 + v T)/√(1 − (v/v0)^4) = L − Σ l`` by bisection; drivers may differ.
     """
     p = start.task.driven(start.world.episode, start.params)["idm"]
+    driver = start.task.simulator.base.driver(dict(p))
     free = start.world.state.gap.sum(-1)
     low, high = torch.zeros_like(free), torch.full_like(free, 0.95) * p["desired_speed"].min()
     for _ in range(60):
         v = (0.5 * (low + high)).unsqueeze(-1)
-        gaps = (p["min_gap"] + v * p["time_gap"]) / torch.sqrt(1.0 - (v / p["desired_speed"]) ** 4)
+        gaps = equilibrium_gap(driver, v)
         fits = gaps.expand_as(start.world.state.gap).sum(-1) < free
         middle = v.squeeze(-1)
         low, high = torch.where(fits, middle, low), torch.where(fits, high, middle)

@@ -29,9 +29,9 @@ from idm_env import metrics
 from idm_env.data import Episode, episodes, load
 from idm_env.data.samples import VEHICLES
 from idm_env.effects import Control
+from idm_env.effects.idm import equilibrium_gap
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.fit import base_simulator, fit
-from idm_env.tasks.recorded import equilibrium_gap
 from idm_env.types import Command, Params, Record
 
 Row = dict[str, Any]

@@ -1,4 +1,4 @@
-"""Figures of traffic: time gaps, fuel and energy, equilibrium and string stability. Pure, differentiable, SI units."""
+"""Figures of traffic: time gaps, fuel and energy, string stability. Pure, differentiable, SI units."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from idm_env.checks import one_of
-from idm_env.types import FAR
 
 _CRUISE = (0.1569, 2.450e-2, -7.415e-4, 5.975e-5)
 _ACCELERATION = (0.07224, 9.681e-2, 1.075e-3)
@@ -99,20 +98,3 @@ def amplification(speed: Tensor, head: int = 0) -> Tensor:
 def string_stable(speed: Tensor, head: int = 0) -> Tensor:
     """Return whether the last vehicle disturbs its speed no more than ``head`` does; bool, shape ``(…)``."""
     return amplification(speed, head)[..., -1] <= 1.0
-
-
-def equilibrium_speed(gap: Tensor, driver: dict[str, Tensor], exponent: float = 4.0) -> Tensor:
-    """Return the speed at which IDM drivers with this gap do not accelerate (m/s), by bisection in [0, v0].
-
-    Solves ``1 − (v/v0)^δ = ((s0 + v T)/s)²``; 0 where the gap is not above s0. ``driver`` holds ``min_gap``,
-    ``time_gap`` and ``desired_speed`` as in ``params["idm"]``.
-    """
-    with torch.no_grad():
-        low = torch.zeros_like(gap)
-        high = driver["desired_speed"].expand_as(gap).clone()
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            wanted = (driver["min_gap"] + middle * driver["time_gap"]) / gap.clamp(0.1, FAR)
-            free = 1.0 - (middle / driver["desired_speed"]) ** exponent > wanted * wanted
-            low, high = torch.where(free, middle, low), torch.where(free, high, middle)
-        return 0.5 * (low + high)

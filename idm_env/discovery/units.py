@@ -32,11 +32,6 @@ class Units:
     def __len__(self) -> int:
         return len(self.run)
 
-    @property
-    def whole_runs(self) -> bool:
-        """Whether a unit is a run."""
-        return len(np.unique(self.run)) == len(self.run)
-
     def others(self, values: np.ndarray) -> np.ndarray:
         """Return, for every unit, the sum of values [units, ...] over the units of all other runs."""
         total = np.zeros((int(self.run.max(initial=-1)) + 1, *values.shape[1:]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,7 +13,7 @@ from torch.nn.functional import softplus
 from idm_env.effects import references
 from idm_env.effects.base import CarFollowing, P
 from idm_env.parameters import Parameter
-from idm_env.types import Driver, Scene
+from idm_env.types import FAR, Driver, Scene
 
 SMALLEST_GAP = 0.1
 """Below this gap (m) the inverse square is continued by its tangent, so overlaps push back, finitely."""
@@ -41,6 +42,43 @@ def interaction(driver: Driver, speed: Tensor, gap: Tensor, lead_speed: Tensor) 
 def soft_floor(x: Tensor, floor: Tensor | float, sharpness: float) -> Tensor:
     """``floor + softplus(sharpness (x − floor)) / sharpness``; with sharpness 1 the paper's soft_min_clamp."""
     return floor + softplus(sharpness * (x - floor), threshold=20.0) / sharpness
+
+
+def free_accel(driver: Driver, speed: Tensor) -> Tensor:
+    """Return what IDM drivers want without a leader: ``a [1 − (v/v0)⁴]`` (m/s²)."""
+    square = (speed / driver.desired_speed).square()
+    return driver.max_accel * (1.0 - square * square)
+
+
+def gap_for(accel: Tensor, speed: Tensor, closing_speed: Tensor, driver: Driver) -> Tensor:
+    """Return the gap (m) at which IDM accelerates so: ``s = s* / √(1 − (v/v0)⁴ − A/a)``, at most FAR."""
+    wanted = desired_gap(driver, speed, closing_speed)
+    square = (speed / driver.desired_speed).square()
+    left = 1.0 - square * square - accel / driver.max_accel
+    return (wanted / torch.sqrt(left.clamp_min(1e-12))).clamp_max(FAR)
+
+
+def equilibrium_gap(driver: Driver, speed: Tensor) -> Tensor:
+    """Return the gap at which IDM drivers keep a speed (m): ``(s0 + v T)/√(1 − (v/v0)⁴)``, v at most 0.95 v0."""
+    ratio = (speed / driver.desired_speed).clamp(0.0, 0.95)
+    return (driver.min_gap + speed * driver.time_gap) / torch.sqrt(1.0 - ratio**4)
+
+
+def equilibrium_speed(gap: Tensor, driver: Mapping[str, Tensor], exponent: float = 4.0) -> Tensor:
+    """Return the speed at which IDM drivers with this gap do not accelerate (m/s), by bisection in [0, v0].
+
+    Solves ``1 − (v/v0)^δ = ((s0 + v T)/s)²``; 0 where the gap is not above s0. ``driver`` holds ``min_gap``,
+    ``time_gap`` and ``desired_speed`` as in ``params["idm"]``.
+    """
+    with torch.no_grad():
+        low = torch.zeros_like(gap)
+        high = driver["desired_speed"].expand_as(gap).clone()
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            wanted = (driver["min_gap"] + middle * driver["time_gap"]) / gap.clamp(0.1, FAR)
+            free = 1.0 - (middle / driver["desired_speed"]) ** exponent > wanted * wanted
+            low, high = torch.where(free, middle, low), torch.where(free, high, middle)
+        return 0.5 * (low + high)
 
 
 class OfFiveParameters(CarFollowing):

@@ -23,7 +23,7 @@ from idm_env.types import Record as Replayed
 
 INTEGRATION_STEP_S = 0.025
 """Largest step (s) by which measured data are simulated: at 0.1 s the first-order error of a step biases parameters
-by up to 1 %, which is more than the noise of good data does (tests/fitting/test_recovery.py)."""
+by up to 1 %, which is more than the noise of good data does."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -186,7 +186,7 @@ def _printed(
 def tile_kernel(simulator: Stepping, form: Form) -> TileKernel | str:
     """Return the kernel of a simulator, or why there is none."""
     if type(simulator.road) not in (Lane, Ring, Chains):
-        return f"the road is {type(simulator.road).__name__}; kernels know Lane and Ring"
+        return f"the road is {type(simulator.road).__name__}; kernels know Lane, Ring and Lanes"
     return printed(_tile_kernel, simulator, form, "no compiled kernel, the torch path runs instead")
 
 

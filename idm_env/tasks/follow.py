@@ -14,12 +14,13 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
+from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import at_least, whole
 from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
-from idm_env.tasks.recorded import Leaders, equilibrium_gap, head, made_up_leader, queue, recorded_leaders, starts
+from idm_env.tasks.recorded import Leaders, head, made_up_leader, queue, recorded_leaders, starts
 from idm_env.types import Inputs, Params
 
 HORIZON = 1000

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
+from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Features, Pay, Task, World
 from idm_env.tasks.checks import at_least, span, whole
 from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
-from idm_env.tasks.recorded import equilibrium_gap, head, queue
+from idm_env.tasks.recorded import head, queue
 from idm_env.types import Inputs, Params
 
 _WAVE_STREAM = 21

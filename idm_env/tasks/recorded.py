@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from idm_env.tasks.random import Draw
-from idm_env.types import Driver, Record
+from idm_env.types import Record
 
 _TRACE_STREAM, _START_STREAM = 11, 12
 
@@ -81,12 +81,6 @@ def head(motion: Tensor, active: Tensor) -> Record:
     """Return the replay of vehicle 0 from its motion at the end of the step, shape ``(n, 3)``."""
     position, speed, accel = motion.unsqueeze(-2).unbind(-1)
     return Record(position, speed, accel, active)
-
-
-def equilibrium_gap(driver: Driver, speed: Tensor) -> Tensor:
-    """Return the gap at which IDM drivers keep a speed (m): ``(s0 + v T)/√(1 − (v/v0)⁴)``, v at most 0.95 v0."""
-    ratio = (speed / driver.desired_speed).clamp(0.0, 0.95)
-    return (driver.min_gap + speed * driver.time_gap) / torch.sqrt(1.0 - ratio**4)
 
 
 def queue(lead_position: Tensor, gaps: Tensor, length: float) -> Tensor:

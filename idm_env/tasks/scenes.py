@@ -222,9 +222,10 @@ def made_up_scene(dt: float, followers: int = 6, seconds: float = 600.0) -> Scen
     import torch
 
     from idm_env.effects import IDM, Brakes, Replay
+    from idm_env.effects.idm import equilibrium_gap
     from idm_env.roads import Lane
     from idm_env.simulator import Simulator
-    from idm_env.tasks.recorded import equilibrium_gap, head, made_up_leader, queue
+    from idm_env.tasks.recorded import head, made_up_leader, queue
 
     leader = torch.as_tensor(made_up_leader(dt, seconds).motion[0])
     simulator = Simulator(Lane(), (IDM(), Brakes(), Replay()), dt)

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, ImaginedLeader
-from idm_env.effects.idm import desired_gap
+from idm_env.effects.idm import free_accel, gap_for
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
-from idm_env.types import FAR, Driver, Imagined
+from idm_env.types import Driver, Imagined
 
 CAPABLE = {"max_accel": 5.0, "comfort_decel": 2.0, "time_gap": 1.5, "min_gap": 2.0, "desired_speed": 70.0}
 """The vehicle whose imagined leader is sought: its free acceleration and top speed are what no car exceeds."""
@@ -34,14 +33,6 @@ HURRY_MPS2 = 1.0
 def simulator(dt: float) -> Simulator:
     """Return IDM behind an imagined leader, with exact brakes, in ballistic steps of ``dt`` (s)."""
     return Simulator(Lane(), (IDM(), ImaginedLeader(), Brakes(width=FLOOR_WIDTH)), dt=dt)
-
-
-def imagined_gap(accel: Tensor, speed: Tensor, closing_speed: Tensor, driver: Driver) -> Tensor:
-    """Return the gap (m) at which IDM accelerates so: ``s = s* / √(1 − (v/v0)⁴ − A/a)``, at most FAR."""
-    wanted = desired_gap(driver, speed, closing_speed)
-    square = (speed / driver.desired_speed).square()
-    left = 1.0 - square * square - accel / driver.max_accel
-    return (wanted / torch.sqrt(left.clamp_min(1e-12))).clamp_max(FAR)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +76,10 @@ def drive(
     with torch.no_grad():
         for k in range(steps):
             behind = CATCH_UP[0] * (goal[0, k] - state.position) + CATCH_UP[1] * (goal[1, k] - state.speed)
-            square = (state.speed / driver.desired_speed).square()
-            engine = driver.max_accel * (1.0 - square * square) - 1e-6
+            engine = free_accel(driver, state.speed) - 1e-6
             accel = goal[2, k] + behind.clamp(-HURRY_MPS2, HURRY_MPS2)
             accel = torch.minimum(accel.clamp(lowest, highest), engine)
-            gap = imagined_gap(accel, state.speed, still, driver)
+            gap = gap_for(accel, state.speed, still, driver)
             kept[0, k], kept[1, k], kept[3, k] = (x[:, 0] for x in (state.position + origin, state.speed, gap))
             state = sim.step(state, {"imagined": Imagined(gap, still)}, params)
             kept[2, k] = state.accel[:, 0]

@@ -12,7 +12,7 @@ from agents.classical import FollowerStopper, PISaturation, Seen, controllers, n
 from agents.common import Policy
 from agents.evaluate import solved_at
 from agents.rollout import Driven, drive, moments, ring_start, uniform_speed
-from idm_env import metrics
+from idm_env.effects.idm import equilibrium_speed
 from idm_env.tasks import make_task
 
 RING: dict[str, Any] = {"task": "ring"}
@@ -23,7 +23,7 @@ def test_uniform_speed_is_the_equilibrium_of_equal_drivers():
     start = ring_start(RING, (220.0, 260.0))
     p = start.params["idm"]
     gap = start.world.state.gap.mean(-1)
-    assert torch.allclose(uniform_speed(start), metrics.equilibrium_speed(gap, dict(p)), atol=1e-4)
+    assert torch.allclose(uniform_speed(start), equilibrium_speed(gap, dict(p)), atol=1e-4)
 
 
 def test_uniform_speed_of_unequal_drivers_fills_the_ring():

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from idm_env import metrics
+from idm_env.effects.idm import equilibrium_speed
 
 
 def test_fuel_is_the_published_polynomial():
@@ -69,7 +70,7 @@ def test_equilibrium_speed_does_not_accelerate():
 
     simulator = Simulator(Ring(200.0), (IDM(),))
     params = simulator.defaults(dtype=torch.float64)
-    speed = metrics.equilibrium_speed(torch.tensor(15.0, dtype=torch.float64), params["idm"]).expand(10)
+    speed = equilibrium_speed(torch.tensor(15.0, dtype=torch.float64), params["idm"]).expand(10)
     position = -20.0 * torch.arange(10, dtype=torch.float64)
     accel = simulator.acceleration(simulator.state(position, speed, params), {}, params)
     torch.testing.assert_close(accel, torch.zeros(10, dtype=torch.float64), rtol=0, atol=1e-10)

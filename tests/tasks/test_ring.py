@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from idm_env import metrics
+from idm_env.effects.idm import equilibrium_speed
 from idm_env.tasks import Draw, make_task
 
 
@@ -73,7 +74,7 @@ def test_without_control_the_wave_emerges_and_costs_a_third_of_the_speed():
             world = task.step(world, None, {"noise": normals[t]}, params)
             speeds.append(world.state.speed)
     speed = torch.stack(speeds)
-    even = metrics.equilibrium_speed((world.state.gap + 5.0).mean(-1) - 5.0, params["idm"])
+    even = equilibrium_speed((world.state.gap + 5.0).mean(-1) - 5.0, params["idm"])
     lost = 1.0 - speed[2000:].mean((0, 2)) / even
     assert 0.25 < float(lost.mean()) < 0.40
     # A wave: at one time some stand while others drive, and it is not there in the beginning.
@@ -86,7 +87,7 @@ def test_a_policy_of_constant_speed_calms_the_traffic():
     # One vehicle that never exceeds 70 % of the equilibrium speed dissolves the wave, and all drive faster for it.
     task = make_task("ring", length=250.0, start="wave", warmup=300, noise=0.0)
     world, params = start(task)
-    even = metrics.equilibrium_speed(torch.tensor(250.0 / 22 - 5.0, dtype=torch.float64), params["idm"])
+    even = equilibrium_speed(torch.tensor(250.0 / 22 - 5.0, dtype=torch.float64), params["idm"])
     calm = even * 0.7
     with torch.no_grad():
         waves = float(world.state.speed.mean())

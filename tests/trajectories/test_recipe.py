@@ -7,9 +7,10 @@ import polars as pl
 import pytest
 import torch
 
+from idm_env.effects.idm import gap_for
 from idm_env.trajectories import baselines
 from idm_env.trajectories.drivers import parameter_rows
-from idm_env.trajectories.imagined import CAPABLE, drive, imagined_gap
+from idm_env.trajectories.imagined import CAPABLE, drive
 from idm_env.trajectories.noise import fit_noise
 from idm_env.trajectories.recipe import Filtered, clock_of, overlaps, recipe
 from idm_env.trajectories.scores import Motion, Tally
@@ -108,7 +109,7 @@ def test_every_acceleration_has_its_imagined_gap_and_the_simulator_does_it() -> 
     assert (driven.gap > 2.0).all() and np.isfinite(driven.gap).all()
     driver = Driver(**{name: torch.tensor(value) for name, value in CAPABLE.items()})
     speed = torch.linspace(0, 40, 50)
-    gaps = torch.stack([imagined_gap(torch.tensor(a), speed, torch.tensor(0.0), driver) for a in (-3.0, 0.0, 2.0)])
+    gaps = torch.stack([gap_for(torch.tensor(a), speed, torch.tensor(0.0), driver) for a in (-3.0, 0.0, 2.0)])
     assert (gaps.diff(dim=0) > 0).all()  # braking harder means a nearer leader
 
 
