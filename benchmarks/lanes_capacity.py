@@ -217,34 +217,36 @@ def broken(speed: list[float]) -> int | None:
     return None
 
 
-def drops(runs: list[dict[str, Any]]) -> list[tuple[float, float]]:
-    """Return flow before and after the breakdown (vehicles/h) of every run that has one."""
+def drops(runs: list[dict[str, Any]]) -> list[tuple[float, float, float]]:
+    """Return flow before and after the breakdown, and the most in as many minutes before, of runs that have one."""
     found = []
     for run in runs:
         minute = broken(run["speed"])
         if minute is not None:
             after = run["flow"][minute + WAIT : minute + WAIT + AFTER]
-            found.append((float(np.mean(run["flow"][minute - BEFORE : minute])), float(np.mean(after))))
+            most = max(_running(run["flow"][:minute]))
+            found.append((float(np.mean(run["flow"][minute - BEFORE : minute])), float(np.mean(after)), most))
     return found
 
 
 def _mean(values: list[float], form: str) -> str:
-    error = float(np.std(values, ddof=1)) / len(values) ** 0.5 if len(values) > 1 else math.nan
-    return f"{np.mean(values):{form}}" + ("" if math.isnan(error) else f" ± {error:{form}}")
+    """Return a mean with its standard error, which runs that are all the same do not have."""
+    error = float(np.std(values, ddof=1)) / len(values) ** 0.5 if len(set(values)) > 1 else math.nan
+    return f"{np.mean(values):{form}}" + ("" if math.isnan(error) else f" ± {error:{form.lstrip('+')}}")
 
 
 def _row(name: str, runs: list[dict[str, Any]] | None) -> str:
     if runs is None:
-        return f"| {name} | libsumo is not installed | | | |"
+        return f"| {name} | libsumo is not installed | | | | |"
     found = drops(runs)
     broke = f"{len(found)} of {len(runs)}"
     queued = f"{np.mean([run['queued'] for run in runs]):.0f}"
     if not found:
-        most = np.mean([max(_running(run["flow"])) for run in runs])
-        return f"| {name} | {broke} | – (at most {most:.0f} in five minutes) | – | – | {queued} |"
-    change = [100.0 * (after / before - 1.0) for before, after in found]
-    before, after = (_mean([pair[k] for pair in found], ".0f") for k in (0, 1))
-    return f"| {name} | {broke} | {before} | {after} | {_mean(change, '+.1f')} % | {queued} |"
+        most = _mean([max(_running(run["flow"])) for run in runs], ".0f")
+        return f"| {name} | {broke} | {most} | – | – | – | {queued} |"
+    change = [100.0 * (after / before - 1.0) for before, after, _ in found]
+    before, after, most = (_mean([row[k] for row in found], ".0f") for k in (0, 1, 2))
+    return f"| {name} | {broke} | {most} | {before} | {after} | {_mean(change, '+.1f')} % | {queued} |"
 
 
 def _running(flow: list[int]) -> list[float]:
@@ -305,7 +307,7 @@ def picture(found: dict[str, list[dict[str, Any]] | None], path: Path) -> None:
     names = [name.replace("`", "").replace("…", "Courtesy, b_safe 9,", 1) for name, _ in reversed(rows)]
     axes[0, 1].set_yticks(range(len(rows)), names, fontsize=8)
     axes[0, 1].set(xlabel="flow (vehicles/h)")
-    axes[0, 1].legend(frameon=False, fontsize=8)
+    axes[0, 1].legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     axes[0, 1].grid(alpha=0.25)
     path.parent.mkdir(parents=True, exist_ok=True)
     keep.write(path, lambda beside: figure.savefig(beside, dpi=110))
@@ -318,8 +320,8 @@ def table(arguments: argparse.Namespace, path: Path = Path("out/lanes-capacity.p
         print(f"| {accel:g} | {most:.0f} | {plain:.0f} ({plain / most:.2f}) | {noisy:.0f} ({noisy / most:.2f}) |")
     parts = {name: Part("ours", name) for name in CASES} | {f"SUMO, {name}": Part("sumo", name) for name in THEIRS}
     found = workers.named(drive, parts, KEPT, arguments)
-    print("\n| | broke down | flow before | out of the jam | change | queued in the end |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    print("\n| | broke down | most in 5 min | flow before | out of the jam | change | queued in the end |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     for name, runs in found.items():
         print(_row(name, runs))
     picture(found, path)

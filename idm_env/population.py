@@ -47,21 +47,37 @@ def trips(
         raise ValueError(f"per_hour = {dict(per_hour)} must give every lane that is entered vehicles an hour above 0.")
     if not (0.0 < seconds < math.inf and 0.0 <= speed < math.inf):
         raise ValueError(f"seconds = {seconds:g} and speed = {speed:g} m/s must be numbers above 0.")
-    departs, again, lane = [], [], []
-    total = sum(per_hour.values())
-    for k, flow in sorted(per_hour.items()):
-        each = 3600.0 / flow
-        count = int(seconds / each + 1e-9) if slots is None else int(slots * flow / total)
+    total, flows = sum(per_hour.values()), dict(sorted(per_hour.items()))
+    counts = {
+        k: int(seconds * flow / 3600.0 + 1e-9 if slots is None else slots * flow / total) for k, flow in flows.items()
+    }
+    for k, count in counts.items():
         if count < 1:
-            raise ValueError(f"no slot for lane {k}: {flow:g} vehicles an hour. Give more seconds, or more slots.")
-        departs += [each * (i + 1) for i in range(count)]
-        again += [math.inf if slots is None else each * count] * count
-        lane += [k] * count
+            raise ValueError(f"no slot for lane {k}: {flows[k]:g} vehicles an hour. Give more seconds, or more slots.")
+    departs, again, lane = evenly(flows, counts, first=1)
+    if slots is None:
+        again = [math.inf] * len(again)
     none = torch.zeros(len(lane), dtype=torch.int64)
     return Trips(
         torch.tensor(departs, dtype=dtype), torch.tensor(again, dtype=dtype), torch.tensor(lane),
         torch.full((len(lane),), speed, dtype=dtype), none, none.clone(),
     )  # fmt: skip
+
+
+def evenly(
+    per_hour: Mapping[int, float], counts: Mapping[int, int], first: int
+) -> tuple[list[float], list[float], list[int]]:  # fmt: skip
+    """Return when the trips of so many slots of each lane begin (s), after how long again (s), and their lanes.
+
+    ``first`` is how many intervals the first trip of a lane waits.
+    """
+    departs, again, lane = list[float](), list[float](), list[int]()
+    for k, flow in per_hour.items():
+        each, count = 3600.0 / flow, counts[k]
+        departs += [each * (i + first) for i in range(count)]
+        again += [each * count] * count
+        lane += [k] * count
+    return departs, again, lane
 
 
 def spread(given: Trips, shape: tuple[int, ...]) -> Trips:

@@ -70,12 +70,8 @@ class OpenLanesTask(LanesTask):
     def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
         """Return trips, of which the first ones began before the episode did; each up to a quarter aside in time."""
         flows, total = self.inflows, sum(self.inflows.values())
-        lane, departs, again = [], [], []
-        for k, flow in flows.items():
-            count, each = max(1, round(self.vehicles * flow / total)), 3600.0 / flow
-            lane += [k] * count
-            departs += [each * i for i in range(count)]
-            again += [each * count] * count
+        counts = {k: max(1, round(self.vehicles * flow / total)) for k, flow in flows.items()}
+        departs, again, lane = population.evenly(flows, counts, first=0)
         by_time = sorted(range(len(departs)), key=lambda i: departs[i])[: self.vehicles]
         while len(by_time) < self.vehicles:  # shares that are rounded down leave a slot to spare: it never drives
             by_time.append(-1)
