@@ -29,6 +29,7 @@ from benchmarks.lanes_sumo import Edge
 from idm_env import keep, population
 from idm_env import report as page
 from idm_env.effects import IDM, Brakes, Courtesy, Effect, MandatoryChange, Mobil, Noise
+from idm_env.effects.idm import equilibrium_gap
 from idm_env.progress import OnProgress
 from idm_env.roads import Lane, Lanes, on_ramp
 from idm_env.simulator import Simulator
@@ -264,9 +265,9 @@ def queue(
     params = simulator.defaults(dtype=torch.float64)
     params["idm"].update({name: torch.tensor(value, dtype=torch.float64) for name, value in DRIVER.items()})
     params["idm"]["max_accel"] = torch.tensor(accels, dtype=torch.float64).unsqueeze(-1)
-    speed = torch.linspace(0.1, DRIVER["desired_speed"] - 0.1, 4000, dtype=torch.float64)
-    free = (1.0 - (speed / DRIVER["desired_speed"]) ** 4).sqrt()
-    most = float((3600.0 * speed / ((DRIVER["min_gap"] + speed * DRIVER["time_gap"]) / free + 5.0)).max())
+    speed = torch.linspace(0.1, 0.95 * DRIVER["desired_speed"], 4000, dtype=torch.float64)
+    gap = equilibrium_gap(simulator.base.driver(dict(params["idm"])), speed)
+    most = float((3600.0 * speed / (gap + 5.0)).max())
     position = (-(5.0 + DRIVER["min_gap"] + 0.2) * torch.arange(count).double()).expand(len(accels), count).contiguous()
     start = simulator.state(position, torch.zeros_like(position), params)
     flows = []
