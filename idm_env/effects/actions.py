@@ -20,6 +20,7 @@ class Control(Effect):
     """
 
     kind: ClassVar[str] = "control"
+    takes: ClassVar[type | None] = Command
     adds: ClassVar[bool] = False
     rank: ClassVar[int] = 35
 
@@ -37,6 +38,7 @@ class Replay(Effect):
     """
 
     kind: ClassVar[str] = "replay"
+    takes: ClassVar[type | None] = Record
 
     def place(self, motion: Motion, scene: Scene, p: P) -> Motion:
         """Return the record where active."""

@@ -65,6 +65,7 @@ class Effect:
     ``sought``      what has to be found beside the strength
     ``changes``     what it changes: an acceleration, a parameter of the driver, a perceived signal, the response
     ``beyond``      whom the record must show
+    ``takes``       the type of what it takes from outside at every step (``scene.input``), if anything
     ``wind_up_s``   seconds of the record that it needs before a prediction begins; all of it, for one that remembers,
                     where nothing is said
     ``column``      column of a file that gives its ``profile``, if measured
@@ -94,6 +95,7 @@ class Effect:
     sought: ClassVar[Sought] = "anywhere"
     changes: ClassVar[str] = "acceleration"
     beyond: ClassVar[Neighbour] = "leader"
+    takes: ClassVar[type | None] = None
     wind_up_s: ClassVar[float] = 0.1
     column: ClassVar[str] = ""
 

@@ -137,6 +137,7 @@ class LaneCommand(Effect):
     """
 
     kind: ClassVar[str] = "lane_command"
+    takes: ClassVar[type | None] = Tensor
     declared: ClassVar[tuple[Parameter, ...]] = (_SAFE_DECEL,)
 
     def change(self, scene: Scene, driver: Driver, p: P) -> Wish:

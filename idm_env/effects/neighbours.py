@@ -185,6 +185,7 @@ class Lateral(Effect):
     """
 
     kind: ClassVar[str] = "lateral"
+    takes: ClassVar[type | None] = Adjacent
     title: ClassVar[str] = "friction with the adjacent lane"
     equation: ClassVar[str] = "− c max(v − v_adjacent, 0) exp(−|dx| / 25 m)"
     wording: ClassVar[tuple[str, str]] = (

@@ -119,6 +119,7 @@ class ImaginedLeader(Effect):
     """
 
     kind: ClassVar[str] = "imagined"
+    takes: ClassVar[type | None] = Imagined
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene with the imagined leader."""

@@ -150,25 +150,24 @@ class Batch:
         at, driver = self.columns(simulator)
         position = self.position[1:, :, at]
         active = torch.arange(position.shape[-1]) != driver
-        inputs: dict[str, object] = {
-            "replay": Replayed(
+        measured = {
+            Replayed: Replayed(
                 position,
                 self.all_speed[1:, :, at],
                 self.accel[1:, :, at],
                 active.expand_as(position),
                 self.present[1:, :, at] if at != slice(1, 3) else None,
-            )
+            ),
+            Adjacent: Adjacent(*(x[:-1, :, None].expand_as(position) for x in self.beside)),
         }
-        if "lateral" in simulator.by_name:
-            distance, speed, present = (x[:-1, :, None].expand_as(position) for x in self.beside)
-            inputs["lateral"] = Adjacent(distance, speed, present)
-        inputs = simulator.drawn(position[0], inputs, len(position), seed)
-        for name in ("control", "imagined"):
-            if name in simulator.by_name:
+        taking = {e.name: e.takes for e in simulator.effects if e.takes is not None}
+        for name, what in taking.items():
+            if what not in measured:
                 raise DataError(
                     f"effect '{name}' takes an input that measured data do not have. Remove it from the model."
                 )
-        return inputs
+        inputs = {name: measured[what] for name, what in taking.items()}
+        return simulator.drawn(position[0], inputs, len(position), seed)
 
 
 def _between(x: Tensor, substeps: int) -> Tensor:

@@ -31,7 +31,7 @@ from idm_env.fitting.decisions import Decisions, recorded_decisions
 from idm_env.fitting.options import Source
 from idm_env.progress import OnProgress, silent
 from idm_env.roads import Lanes
-from idm_env.types import Params
+from idm_env.types import Command, Params, Record
 
 WRITTEN = ("model.yaml", "report.json", "report.html")
 """What ``fit_lane_changes`` writes."""
@@ -144,7 +144,7 @@ def _model(options: ChangeOptions) -> Model:
         model = load_model(Path(options.model))
     else:
         model = Model((base_named(options.base) if options.base else IDM(), Brakes()))
-    kept = tuple(e for e in model.effects if e.name not in ("control", "replay", Mobil.kind))
+    kept = tuple(e for e in model.effects if e.takes not in (Command, Record) and e.name != Mobil.kind)
     return replace(model, effects=(*kept, Mobil(every=options.every)))
 
 

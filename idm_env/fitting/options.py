@@ -15,6 +15,7 @@ from idm_env.fitting.fit import Method, base_simulator
 from idm_env.fitting.problem import Loss, Objective
 from idm_env.roads import Lane
 from idm_env.simulator import Integration, Simulator
+from idm_env.types import Command, Record
 
 
 @dataclass(frozen=True)
@@ -92,5 +93,5 @@ class Options:
 
 def behind_records(model: Model) -> tuple[Effect, ...]:
     """Return a model's effects with replayed leaders, without an agent's control."""
-    effects = tuple(e for e in model.effects if e.name != "control")
-    return effects if "replay" in {e.name for e in effects} else (*effects, Replay())
+    effects = tuple(e for e in model.effects if e.takes is not Command)
+    return effects if any(e.takes is Record for e in effects) else (*effects, Replay())

@@ -32,7 +32,6 @@ from idm_env.types import Command, Inputs, Params, State
 
 _NORMALS_AT_ONCE = 1 << 16
 OBSERVATIONS = ("scaled", "raw")
-_TAKE_INPUTS = {"control", "replay", "imagined", "lateral", "lane_command"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -213,7 +212,7 @@ class Task(abc.ABC):
             made.parameters.setdefault("noise", {}).setdefault("sigma", self.noise * math.sqrt(made.dt))
         given = {effect.name for effect in self.machinery}
         for effect in made.effects:
-            if effect.name in _TAKE_INPUTS - given:
+            if effect.takes is not None and effect.name not in given:
                 raise ValueError(
                     f"effect '{effect.name}' takes an input that task '{self.name}' does not give. Leave it out here."
                 )

@@ -59,6 +59,7 @@ class RealLeader(Effect):
     """A leader whose motion is given, never nearer than ``NEAREST_M``: 1/s² has no other floor as published."""
 
     kind: ClassVar[str] = "real_leader"
+    takes: ClassVar[type | None] = Ahead
 
     def perceive(self, scene: Scene, p: P) -> Scene:
         """Return the scene with the given leader."""

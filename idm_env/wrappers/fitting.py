@@ -16,13 +16,13 @@ from idm_env.parameters import catalogue, constrain, unconstrain
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 from idm_env.tasks import Task
-from idm_env.types import Params
+from idm_env.types import Command, Params, Record
 
 if TYPE_CHECKING:
     from idm_env.fitting.fit import Fit
 
-_OTHERS = ("control", "replay")
-"""Effects through which a task acts: no driver's, so they are left out of what is fitted, and so is drift."""
+_OTHERS = (Command, Record)
+"""What effects take through which a task acts: no driver's, so they are left out of what is fitted, and so is drift."""
 
 
 class ParameterFitting:
@@ -62,9 +62,9 @@ class ParameterFitting:
 
         self.env = env
         task, params = _task_of(env)
-        following = next(e for e in task.simulator.effects if e.name not in _OTHERS and hasattr(e, "driver"))
+        following = next(e for e in task.simulator.effects if e.takes not in _OTHERS and hasattr(e, "driver"))
         self.free = tuple(f"{following.name}.{p.name}" for p in following.parameters) if free is None else tuple(free)
-        effects = tuple(e for e in task.simulator.effects if e.name not in _OTHERS and not e.draws)
+        effects = tuple(e for e in task.simulator.effects if e.takes not in _OTHERS and not e.draws)
         simulator = Simulator(Lane(), (*effects, Replay()), task.simulator.dt, task.simulator.integration)
         self.episodes = _episodes(trajectories, simulator.dt)
         self.by = by
@@ -169,7 +169,7 @@ class ParameterFitting:
 
         found = {name: float(value[group].detach()) for name, value in self.values().items()}
         simulator = self.problem.simulator
-        effects = tuple(e for e in simulator.effects if e.name not in _OTHERS and not e.draws)
+        effects = tuple(e for e in simulator.effects if e.takes not in _OTHERS and not e.draws)
         return Model(effects, numbers({**self.fixed, **found}), simulator.dt, simulator.integration)
 
 

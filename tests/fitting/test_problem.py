@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 from idm_env.data import DataError, Episodes
 from idm_env.data.episode import windows
 from idm_env.data.synthetic import Truth
-from idm_env.effects import IDM, Brakes, Replay, make
+from idm_env.effects import IDM, Brakes, ImaginedLeader, Lateral, Replay, make
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.problem import IDM_NAMES, Problem, group_of
 from idm_env.roads import Lane
@@ -135,6 +136,26 @@ def test_a_batch_starts_measured_and_counts_only_what_was_measured(platoon: tupl
     small = batch.rows([0])
     assert small.steps == 299 * 4 and len(small) == 1
     torch.testing.assert_close(small.position, batch.position[: small.steps + 1, :1])
+
+
+def test_an_effect_of_ones_own_is_given_what_was_measured_of_its_kind(platoon: tuple[Episodes, Truth]) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Beside(Lateral):
+        kind: ClassVar[str] = "beside"
+
+    @dataclasses.dataclass(frozen=True)
+    class Fancied(ImaginedLeader):
+        kind: ClassVar[str] = "fancied"
+
+    items = Episodes(tuple(e.part(0, 100) for e in platoon[0][:1]), ())
+    ours, given = (
+        Batch.of(items, substeps=1).inputs(Simulator(Lane(), (IDM(), Replay(), Brakes(), effect), dt=0.1))
+        for effect in (Beside(), Lateral())
+    )
+    for mine, known in zip(ours["beside"], given["lateral"], strict=True):
+        torch.testing.assert_close(mine, known)
+    with pytest.raises(DataError, match="effect 'fancied' takes an input that measured data do not have"):
+        Batch.of(items, substeps=1).inputs(Simulator(Lane(), (IDM(), Replay(), Brakes(), Fancied()), dt=0.1))
 
 
 def test_windows_cover_everything_once(platoon: tuple[Episodes, Truth]) -> None:
