@@ -12,7 +12,16 @@ from idm_env.discovery import free, judge, places, together
 from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import whole
-from idm_env.discovery.score import ALPHA, FREE_SHARE, Tested, at_level, held_out, log_gain, westfall_young
+from idm_env.discovery.score import (
+    ALPHA,
+    FREE_SHARE,
+    Tested,
+    at_level,
+    held_out,
+    interval_of,
+    log_gain,
+    westfall_young,
+)
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.solve import Solution, solve
 from idm_env.discovery.units import smallest_p
@@ -267,15 +276,16 @@ def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
 
 
 def _delete(searching: Search, final: Solution, base: int) -> Solution:
-    """Take back every added term whose loss costs less than an addition must gain."""
+    """Take back every added term whose interval contains its null, or whose loss costs less than an addition gains."""
     while len(final.model.terms) > base + 1:
-        now = held_out(searching.task, final)
+        now, intervals = held_out(searching.task, final), interval_of(final, searching.task)
         losses = []
         for index in range(base, len(final.model.terms)):
             begin = sum(t.size for t in final.model.terms[:index])
             keep = np.delete(final.values, np.arange(begin, begin + final.model.terms[index].size))
             less = solve(searching.task, final.model.without(index), final.theta, keep)
-            losses.append((float(log_gain(held_out(searching.task, less), now).mean()), index, less))
+            loss = float(log_gain(held_out(searching.task, less), now).mean())
+            losses.append((min(loss, 0.0) if together.contains_null(final, intervals, index) else loss, index, less))
         loss, _, less = min(losses, key=lambda x: x[0])
         if loss >= LEAST_GAIN:
             break

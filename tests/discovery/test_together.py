@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import free, search, together
+from idm_env.discovery import decide, free, search, together
 from idm_env.discovery import model as terms
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import gather, windows
+from idm_env.discovery.score import interval_of
 from idm_env.discovery.search import Search
 from idm_env.discovery.solve import Task, solve
 from idm_env.keep import Store
@@ -48,6 +49,18 @@ def test_a_term_that_is_not_there_is_taken_back(start: free.Stand) -> None:
     both = free.joint(start, model, np.array([-0.3, 1e-4]))
     kept = together._backward(start, both, 0)
     assert [t.label for t in kept.model.terms] == ["speed_time_gap"]
+
+
+def test_a_term_of_windows_whose_interval_contains_its_null_is_taken_back_whatever_it_gains(
+    searching: Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = Model((terms.simple("speed_time_gap"), terms.simple("drag")))
+    task = searching.task
+    both = solve(task, model, np.tile(task.prior.centre, (task.groups, 1)), np.array([-0.3, 1e-4]))
+    intervals = interval_of(both, task)
+    assert intervals[0, 2] < 0.0 and intervals[1, 1] < 0.0 < intervals[1, 2]
+    monkeypatch.setattr(decide, "log_gain", lambda *_: np.ones(1))  # the loss of no term is small
+    assert [t.label for t in decide._delete(searching, both, 0).model.terms] == ["speed_time_gap"]
 
 
 def test_what_windows_found_is_fitted_in_free_simulation_once_more(searching: Search, start: free.Stand) -> None:
