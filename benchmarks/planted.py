@@ -16,6 +16,7 @@ import json
 import os
 import sys
 import time
+import zlib
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -150,7 +151,7 @@ def fitted(seed: int, ou: float, runs: int, file: Path | None, where: tuple[str,
 
 def measure(job: tuple[str, float, int, tuple[Any, ...]], on_progress: OnProgress = silent) -> dict[str, Any]:
     """Plant an effect and say what ``explain`` makes of it."""
-    name, times, number, data = job
+    name, times, _, data = job
     found, noise = fitted(*data)
     said = next(e for e in found.report["excluded"] if e["effect"] == name)
     effect = make(name)
@@ -158,10 +159,9 @@ def measure(job: tuple[str, float, int, tuple[Any, ...]], on_progress: OnProgres
     null = own.null or 0.0
     away = 1.0 if own.default > null else -1.0
     strength = null + away * times * said["would_be_found"]
-    begin = time.process_time()
-    report = discover(
-        planted(found, noise, effect, parameters(found, name) | {own.name: strength}, number), seed=number
-    ).report
+    begin, seed = time.process_time(), zlib.crc32(key(job).encode())
+    numbers = parameters(found, name) | {own.name: strength}
+    report = discover(planted(found, noise, effect, numbers, seed)).report
     names = [f["effect"] or f["label"] for f in report["found"]]
     others = [n for f in report["found"] for n in f["equivalent"]]
     alike = {name} | ({"delay", "lag"} if name in ("delay", "lag") else set())

@@ -158,9 +158,11 @@ def headline(
             f"fitted to{_limits(strengths or {})}."
         )
     if verdict is Verdict.CANNOT_TELL:
+        powerless = refusal is not None and refusal.reason is Reason.NO_POWER
+        needed = "more runs, ten or more," if powerless else "four runs of three followers or seven runs, better ten,"
         return (
-            f"These data cannot tell: {reason(refusal, tried)}; four runs of three followers or seven runs are needed "
-            "(a quarter is kept for the final check), ten or more are better."
+            f"These data cannot tell: {reason(refusal, tried)}; {needed} are needed (a quarter is kept for the final "
+            "check)."
         )
     if refusal is not None and refusal.reason is Reason.HELD_OUT:
         return (

@@ -216,6 +216,13 @@ def test_words_of_none_claim_no_cause() -> None:
     assert verdict.Verdict("none") is Verdict.NONE
 
 
+def test_whoever_gave_seven_runs_is_not_told_that_seven_are_needed() -> None:
+    few = words.headline(Verdict.CANNOT_TELL, [], Refusal(Reason.FEW_RUNS, 2), "", {})
+    assert "only 2 runs are left" in few and "four runs of three followers or seven runs, better ten, are needed" in few
+    weak = words.headline(Verdict.CANNOT_TELL, [], Refusal(Reason.NO_POWER, 5), "", {})
+    assert "in the 5 runs left to choose on; more runs, ten or more, are needed" in weak
+
+
 def test_none_says_what_is_excluded_and_what_would_not_have_been_seen() -> None:
     """The strengths that these data know best against the usual ones, and those that show least."""
     lag, drag, slope = (ALL[n]().parameters[0] for n in ("lag", "drag", "grade"))
