@@ -131,6 +131,7 @@ def planted(found: Discovery, noise: tuple[float, float], effect: Effect, number
 def parameters(found: Discovery, name: str) -> dict[str, float]:
     """Return an effect's parameters as the strength was told of: as the first round fitted them."""
     at = next(s for s in found.rounds[0].scored if s.term.label == name)
+    assert at.solution is not None
     values = at.solution.values[at.solution.model.where(name)]
     return {p.name: float(x) for p, x in zip(at.term.parameters, values, strict=True)}
 
