@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -58,9 +59,13 @@ def test_report_files(drag: Discovery, tmp_path: Path) -> None:
 
 
 def test_nothing_is_found_where_nothing_is_hidden() -> None:
-    for ou in (0.0, 0.1):
+    # Six runs of two followers for 90 s who are unsteady would not show most effects at their usual strengths.
+    for ou, verdict in ((0.0, "none"), (0.1, "cannot_tell")):
         found = discover(data(None, ou=ou), effects=FEW)
-        assert found.verdict == "none"
+        seen = [
+            s["would_be_found"] is not None and s["would_be_found"] <= s["typical"] for s in found.report["excluded"]
+        ]
+        assert found.verdict == verdict and (np.mean(seen) >= 0.5) == (verdict == "none")
         assert found.report["found"] == []
         assert found.report["error"]["after"] == found.report["error"]["before"]
 
