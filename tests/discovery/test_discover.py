@@ -62,10 +62,7 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
     # Six runs of two followers for 90 s who are unsteady would not show most effects at their usual strengths.
     for ou, verdict in ((0.0, "none"), (0.1, "cannot_tell")):
         found = discover(data(None, ou=ou), effects=FEW)
-        seen = [
-            s["would_be_found"] is not None and s["would_be_found"] <= s["typical"] for s in found.report["excluded"]
-        ]
-        assert found.verdict == verdict and (np.mean(seen) >= 0.5) == (verdict == "none")
+        assert found.verdict == verdict
         assert found.report["found"] == []
         assert found.report["error"]["after"] == found.report["error"]["before"]
 
