@@ -41,7 +41,13 @@ from idm_env.tasks.ring import RingTask
 STEPS = 3000
 JUDGED = 1000
 SPEED_RATIO, SPEED_STD, TIME_GAP, IN_A_ROW = 0.97, 0.15, 0.8, 5
-TEST: dict[str, dict[str, Any]] = {"ring": {"shock": 4.0}, "follow": {}, "merge": {}, "bottleneck": {}}
+TEST: dict[str, dict[str, Any]] = {
+    "ring": {"shock": 4.0},
+    "follow": {},
+    "open_highway": {},
+    "merge": {},
+    "bottleneck": {},
+}
 """Keywords of the environment in which policies of a task are judged, over those in which they are trained."""
 
 
@@ -258,7 +264,8 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
 def evaluate(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a policy in the environment of its test (``as_judged``); None is the human driver."""
     tests: dict[str, Callable[..., dict[str, Any]]] = {
-        "ring": evaluate_ring, "follow": evaluate_follow, "merge": evaluate_lanes, "bottleneck": evaluate_lanes,
+        "ring": evaluate_ring, "follow": evaluate_follow, "open_highway": evaluate_lanes,
+        "merge": evaluate_lanes, "bottleneck": evaluate_lanes,
     }  # fmt: skip
     return tests[environment.get("task", "ring")](act, environment)
 

@@ -11,7 +11,7 @@ from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, Worl
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.highway import HighwayTask
-from idm_env.tasks.open_lanes import BottleneckTask, MergeTask
+from idm_env.tasks.open_lanes import BottleneckTask, MergeTask, OpenHighwayTask
 from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.replay import ReplayTask
@@ -27,6 +27,7 @@ TASKS: dict[str, type[Task]] = {
         ReplayTask,
         ReplayLanesTask,
         HighwayTask,
+        OpenHighwayTask,
         MergeTask,
         BottleneckTask,
     )
@@ -62,6 +63,7 @@ __all__ = [
     "HighwayTask",
     "KeywordError",
     "MergeTask",
+    "OpenHighwayTask",
     "Pay",
     "PlatoonTask",
     "ReplayLanesTask",

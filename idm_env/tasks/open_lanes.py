@@ -1,4 +1,4 @@
-"""Tasks ``merge`` and ``bottleneck``: traffic that flows in, has to change lanes before a lane ends, and leaves."""
+"""Tasks ``open_highway``, ``merge``, ``bottleneck``: traffic flows in, changes lanes, some of which end, and leaves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from idm_env import population
 from idm_env.effects import IDM, Brakes, Effect, MandatoryChange, Mobil
 from idm_env.roads import Lanes, lane_drop, on_ramp
 from idm_env.tasks.base import World
-from idm_env.tasks.checks import at_least
+from idm_env.tasks.checks import at_least, whole
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.types import Params, State, Trips
@@ -136,6 +136,44 @@ class OpenLanesTask(LanesTask):
         over = (state.position > self.road.closed_at(state.links.lane, state.position)) & (state.present > 0)
         crashed = super().crashed(world)
         return crashed | over.any(-1, keepdim=True).expand_as(crashed)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OpenHighwayTask(OpenLanesTask):
+    """Several lanes, none of which ends: ``highway`` with vehicles that come and go, as in HighwayEnv's.
+
+    Args:
+        lanes_count: Number of lanes.
+        length: Length of the road (m).
+        inflow: Vehicles an hour on all lanes together.
+    """
+
+    name: ClassVar[str] = "open_highway"
+    own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Mobil(), Brakes())
+
+    lanes_count: int = 4
+    length: float = 1000.0
+    inflow: float = 5000.0
+
+    def __post_init__(self) -> None:
+        whole("lanes_count", self.lanes_count, 1)
+        at_least("length", self.length, 100.0, "m")
+        super().__post_init__()
+
+    @cached_property
+    def road(self) -> Lanes:  # type: ignore[override]
+        """The road."""
+        return Lanes(self.lanes_count, length=float(self.length))
+
+    @property
+    def inflows(self) -> Mapping[int, float]:
+        """The same for each lane."""
+        return dict.fromkeys(range(self.lanes_count), self.inflow / self.lanes_count)
+
+    @property
+    def filled(self) -> float:
+        """Half of the road."""
+        return 0.5 * self.length
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -17,6 +17,7 @@ USUAL = {
     "replay": 300,
     "replay_lanes": 300,
     "highway": 3000,
+    "open_highway": 3000,
     "merge": 3000,
     "bottleneck": 3000,
 }

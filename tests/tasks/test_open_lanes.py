@@ -12,7 +12,7 @@ from idm_env import population
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.tasks import Draw, make_task
 
-OPEN = ("merge", "bottleneck")
+OPEN = ("merge", "bottleneck", "open_highway")
 
 
 @pytest.mark.parametrize("name", OPEN)

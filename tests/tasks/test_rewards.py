@@ -19,6 +19,7 @@ CASES = {
     "replay": {"task": "replay"},
     "replay lanes": {"task": "replay_lanes", "controlled": 2, "lane_commands": True},
     "highway": {"task": "highway", "vehicles": 30, "length": 300.0, "max_command": 4.0, "controlled": 3},
+    "open highway": {"task": "open_highway", "vehicles": 40, "max_command": 4.0, "controlled": 3},
     "merge": {"task": "merge", "vehicles": 40, "max_command": 4.0, "controlled": 3},
     "bottleneck": {"task": "bottleneck", "vehicles": 40, "max_command": 4.0, "controlled": 3},
     "replay, follow": {"task": "replay", "controlled": 3, "reward_terms": "follow"},
