@@ -139,7 +139,7 @@ def _cache() -> Finding:
 
 def _numba_cache() -> Path:
     named = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(named) if named else Path(__file__).parent / "kernels" / "__pycache__"
+    return Path(named) if named else Path(__file__).parent / "trajectories" / "__pycache__"
 
 
 def _writable(what: str, folder: Path, cure: str) -> Finding:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from idm_env.checks import nearest
 from idm_env.kernels import descent_loops, tiles
 from idm_env.kernels.lanes import part_of, starts, static_of
 from idm_env.kernels.memory import addresses
@@ -57,19 +58,22 @@ def descend(
     """Minimise Σ weight · |position − observed| of a state ``(vehicles, 1)`` in float64, by Adam between bounds.
 
     The learning rate falls linearly from the first of ``rates`` to the second. ImportError without numba; ValueError
-    for effects that cannot be compiled.
+    for effects that cannot be compiled, and for bounds of what nobody reads.
     """
     kernel = tile_kernel(simulator, Form.of(state, inputs))
     if isinstance(kernel, str) or kernel.signals:
         raise ValueError(
             kernel if isinstance(kernel, str) else "an effect looks back in time, and no past is kept here."
         )
+    slots = {slot_name(*name.split(".", 1)): name for name in bounds}
+    for slot, name in slots.items():
+        if name not in kernel.program.parameters and slot not in kernel.numbers:
+            raise ValueError(f"bounds of '{name}': no such number is read.{nearest(name, kernel.program.parameters)}")
     program, shape = kernel.program, tuple(state.speed.shape)
     count = shape[0]
     values = np.array([dense(static_of(simulator, state, params, n).double(), shape) for n in program.parameters])
     parts = [dense(part_of(inputs, n)[:steps].double(), (steps, *shape)) for n in kernel.numbers]
     given = np.array(parts).reshape(len(parts), steps * count)
-    slots = {slot_name(*name.split(".", 1)): name for name in bounds}
     low, high = _limits(values, [bounds.get(n) for n in program.parameters])
     given_low, given_high = _limits(given, [bounds.get(slots.get(n, "")) for n in kernel.numbers])
     moves = any(n in slots for n in kernel.numbers)

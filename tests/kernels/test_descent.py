@@ -15,7 +15,7 @@ descent = pytest.importorskip("idm_env.kernels.descent", reason="numba is not in
 STEPS, COUNT = 40, 3
 
 
-def fitted(kind=torch.float64, *more, iterations=30):
+def fitted(kind=torch.float64, *more, iterations=30, free="idm.max_accel"):
     sim = Simulator(Lane(), (IDM(), *more, Brakes()), 0.1)
     params = sim.defaults(dtype=kind)
     speed = torch.tensor([[5.0], [8.0], [11.0]], dtype=kind)
@@ -24,7 +24,7 @@ def fitted(kind=torch.float64, *more, iterations=30):
     which = np.repeat(np.arange(COUNT), STEPS + 1)
     target = np.concatenate([v * 0.1 * np.arange(STEPS + 1) for v in (5.5, 8.0, 10.0)])
     observed = descent.Observed(at, which, target, np.full(len(at), 1.0 / (STEPS + 1)))
-    bounds = {"idm.desired_speed": (2.0, 60.0), "idm.max_accel": (0.1, 5.0)}
+    bounds = {"idm.desired_speed": (2.0, 60.0), free: (0.1, 5.0)}
     return descent.descend(sim, state, {}, params, STEPS, observed, bounds, iterations=iterations, rates=(0.5, 0.05))
 
 
@@ -46,6 +46,13 @@ def test_runs_in_double_precision_whatever_is_switched_off():
         double = fitted()
     assert single.position.dtype == np.float64
     assert np.allclose(single.position, double.position, atol=1e-6)
+
+
+def test_a_bound_of_what_nobody_reads_is_refused():
+    with pytest.raises(
+        ValueError, match=r"bounds of 'idm.max_acel': no such number is read. Did you mean 'idm.max_accel'"
+    ):
+        fitted(free="idm.max_acel")
 
 
 def test_what_looks_back_is_refused():
