@@ -5,8 +5,8 @@
 A set is 20 drivers of 90 s, sampled every 0.2 s with errors of 0.1 m and 0.05 m/s, whose parameters differ by 20 %
 about others than those that the estimate takes for usual; leaders change their speed every 12 s or so. The sorts of
 drift take turns, then none. ``tell`` sees them as it sees a file; with ``--alone`` only the sort that is hidden is
-estimated, on sets with drift, which is a fifth of the work. One line of JSON per set is kept, so that a run goes on
-where it stopped.
+estimated, on sets with drift, which is a fifth of the work. One line of JSON per set is kept, both kinds in one file
+if need be, so that a run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ def scored(part: tuple[int, bool], on_progress: OnProgress = silent) -> dict[str
     begin, trajectories = time.process_time(), made(seed, drift, sigma, memory_time)
     smooth, measured = list(episodes(trajectories, smooth=True)), list(episodes(trajectories))
     row: dict[str, Any] = {
-        "seed": seed, "hidden": drift.name if sigma else "none", "sigma": sigma, "memory_time": memory_time,
-        "one_of": None, "gain": {},
+        "key": key(part), "seed": seed, "hidden": drift.name if sigma else "none",
+        "sigma": sigma, "memory_time": memory_time, "one_of": None, "gain": {},
     }  # fmt: skip
     if alone:
         batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
@@ -117,6 +117,12 @@ def scored(part: tuple[int, bool], on_progress: OnProgress = silent) -> dict[str
     rows = {str(r["name"]): r for r in found.table()}
     row["estimates"] = [rows[f"{drift.name}.{key}"] for key in ("sigma", "memory_time")]
     return row | {"cpu_s": time.process_time() - begin}
+
+
+def key(part: tuple[int, bool]) -> str:
+    """Return what a set (seed, alone) is called in the file of results."""
+    seed, alone = part
+    return f"{seed}|alone" if alone else str(seed)
 
 
 def table(sets: list[dict[str, Any]]) -> str:
@@ -150,17 +156,16 @@ def main() -> None:
     parser.add_argument("--alone", action="store_true", help="estimate only what is hidden, on sets with drift")
     workers.add(parser)
     arguments = parser.parse_args()
-    done = workers.kept(arguments.out, "seed")
-    wanted = list(range(arguments.first_seed, arguments.first_seed + arguments.sets))
-    if arguments.alone:
-        wanted = [seed for seed in wanted if HIDDEN[seed % len(HIDDEN)][1]]
+    done = workers.kept(arguments.out, "key")
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.sets)
+    wanted = [(s, arguments.alone) for s in seeds if not arguments.alone or HIDDEN[s % len(HIDDEN)][1]]
     with workers.of(arguments) as executor:
-        for _, row in executor.map(scored, [(seed, arguments.alone) for seed in wanted if seed not in done]):
-            done[row["seed"]] = json.loads(json.dumps(row))
+        for _, row in executor.map(scored, [part for part in wanted if key(part) not in done]):
+            done[row["key"]] = json.loads(json.dumps(row))
             with arguments.out.open("a") as file:
                 file.write(json.dumps(row) + "\n")
-            print(f"{row['seed']}: {row['hidden']}, told {row['one_of']}", file=sys.stderr, flush=True)
-    print(table([done[seed] for seed in wanted]))
+            print(f"{row['key']}: {row['hidden']}, told {row['one_of']}", file=sys.stderr, flush=True)
+    print(table([done[key(part)] for part in wanted]))
 
 
 if __name__ == "__main__":

@@ -46,8 +46,9 @@ MODELS = ("IDM", "interval", "curve")
 class Part:
     """Runs left out: the interval that others chose, what is missing there, and every model's errors.
 
-    ``weight`` and ``push`` [units] of the added acceleration (m/s²) there, its estimate is their ratio; ``squares``
-    and ``count`` [models, followers] of the gap in free simulation, ``runs`` [followers].
+    ``weight`` and ``push`` [runs left out] of the added acceleration (m/s²) there, its estimate is the ratio of their
+    sums; of the gap in free simulation ``squares`` [models, followers] of errors (m²) and ``count`` [followers] of
+    samples, in runs ``runs`` [followers].
     """
 
     begin: float
@@ -61,7 +62,7 @@ class Part:
 
 
 def part(rest: Records, kept: Records, longest: float) -> Part:
-    """Choose on ``rest`` and judge on ``kept``."""
+    """Choose an interval of at most ``longest`` m on ``rest`` and judge it on ``kept``, which share no run."""
     rows = windows(rest)
     task = Task(rows, search.first_noise(rows), search.first_prior())
     searching = Search(task, [], True, Store(None, "", False), silent)
@@ -83,7 +84,12 @@ def part(rest: Records, kept: Records, longest: float) -> Part:
     judged = [judge.judge(kept, model, values, null.prior, None, True) for model, values in tried]
     squares, counts = zip(*(j.squares["gap_rmse_m"] for j in judged), strict=True)
     runs = np.array([run for run, _ in judged[0].followers])
-    return Part(found.begin, found.end, found.amount, weight[:, 0, 0], push[:, 0], np.array(squares), counts[0], runs)
+    # Of few runs followers are counted: summed, so that runs are what an interval rests on.
+    of_run = there.units.run[None] == np.arange(len(kept.runs))[:, None]
+    return Part(
+        found.begin, found.end, found.amount, of_run @ weight[:, 0, 0], of_run @ push[:, 0], np.array(squares),
+        counts[0], runs,
+    )  # fmt: skip
 
 
 def parts(trajectories: Trajectories, place: str, folds: int, longest: float) -> list[Part]:
@@ -101,7 +107,7 @@ def parts(trajectories: Trajectories, place: str, folds: int, longest: float) ->
 
 
 def told(name: str, found: Sequence[Part]) -> str:
-    """Return a line of the table."""
+    """Return a line of the table from the parts [folds], whose runs and followers follow each other in it."""
     weight, push = (np.concatenate([getattr(p, key) for p in found]) for key in ("weight", "push"))
     amount = push.sum() / weight.sum()
     off = push - amount * weight

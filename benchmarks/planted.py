@@ -1,12 +1,13 @@
 """Is what ``explain`` says "would have been found" found? Effects planted into simulations of the fitted drivers.
 
-    python -m benchmarks.planted [FILE --where acc_run=ACC] [--times 1,0.5] [--repeats 4] [--out planted.jsonl]
+    python -m benchmarks.planted [FILE --where acc_run=ACC] [--times 1,0.5] [--repeats 2] [--out planted.jsonl]
 
 Without a file, a generated set without an effect (``--seed``, ``--ou``, ``--runs``). ``explain`` fits its drivers and
-says of every effect which strength it would have found four times in five. Then the drivers are simulated behind their
-measured leaders with that strength (times ``--times``) of the effect, with measurement noise, and with their own
-drift: what every driver's measured acceleration has beside the model, begun at a random time of the record. ``explain``
-sees the result as it sees a file. One line of JSON per set is kept, so that a run goes on where it stopped.
+says of every effect which strength it would have found: four times in five by lines, times ``BEYOND_LINES``. Then the
+drivers are simulated behind their measured leaders with that strength (times ``--times``) of the effect, with
+measurement noise, and with their own drift: what every driver's measured acceleration has beside the model, begun at a
+random time of the record. ``explain`` sees the result as it sees a file. Effects of which no strength would have been
+found are left out, and named. One line of JSON per set is kept, so that a run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -176,6 +177,13 @@ def measure(job: tuple[str, float, int, tuple[Any, ...]], on_progress: OnProgres
     }  # fmt: skip
 
 
+def told(excluded: list[dict[str, Any]], only: list[str]) -> tuple[list[str], list[str]]:
+    """Return which effects, of ``only`` where not empty, would have been found, and which at no strength."""
+    asked = [e for e in excluded if ALL[e["effect"]].sought == "anywhere" and e["effect"] in (only or ALL)]
+    seen = [e["effect"] for e in asked if e["would_be_found"] is not None]
+    return seen, [e["effect"] for e in asked if e["effect"] not in seen]
+
+
 def key(job: tuple[str, float, int, tuple[Any, ...]]) -> str:
     """Return what a set is called in the file of results."""
     name, times, number, (seed, ou, runs, file, where) = job
@@ -216,8 +224,9 @@ def main() -> None:
     for number in range(arguments.repeats):
         seed = arguments.seed + number if arguments.file is None else arguments.seed
         data = (seed, arguments.ou, arguments.runs, arguments.file, tuple(arguments.where))
-        told = [e["effect"] for e in fitted(*data)[0].report["excluded"] if ALL[e["effect"]].sought == "anywhere"]
-        names = [n for n in told if not arguments.effects or n in arguments.effects.split(",")]
+        names, hidden = told(fitted(*data)[0].report["excluded"], [n for n in arguments.effects.split(",") if n])
+        if hidden:
+            print(f"set {number}: not planted, as seen at no strength: {', '.join(hidden)}", file=sys.stderr)
         wanted += [(n, float(t), number, data) for n in names for t in arguments.times.split(",")]
     with workers.of(arguments) as executor:
         for _, row in executor.map(measure, [job for job in wanted if key(job) not in done]):

@@ -276,7 +276,10 @@ def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
 
 
 def _delete(searching: Search, final: Solution, base: int) -> Solution:
-    """Take back every added term whose interval contains its null, or whose loss costs less than an addition gains."""
+    """Take back added terms whose interval contains their null, or whose loss costs less than an addition gains.
+
+    As long as another is left: one alone was tested against none, and stays.
+    """
     while len(final.model.terms) > base + 1:
         now, intervals = held_out(searching.task, final), interval_of(final, searching.task)
         losses = []

@@ -11,7 +11,7 @@ import numpy as np
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import judge, words
 from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
-from idm_env.discovery.decide import LEAST_GAIN
+from idm_env.discovery.decide import LEAST_GAIN, Round
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Bar, Strength, powerful, strength_of
 from idm_env.discovery.records import Records
@@ -157,7 +157,7 @@ def report(
     return _plain(content)
 
 
-def bar(first: Any, run: np.ndarray, seed: int, kept: int) -> Bar:
+def bar(first: Round, run: np.ndarray, seed: int, kept: int) -> Bar:
     """Return what a candidate had to reach in the first round, on units of runs ``run``, and on ``kept`` runs."""
     # It has to explain half of what any smooth function of the state explains.
     rest = 0.5 * np.log(2.0 - np.exp(-2.0 * max(float(first.left.mean()), 0.0)))
@@ -165,7 +165,7 @@ def bar(first: Any, run: np.ndarray, seed: int, kept: int) -> Bar:
     return Bar(level(gains, seed, run, 1.0 - FREE_SHARE), max(LEAST_GAIN, float(rest)), kept)
 
 
-def _strengths(first: Any, task: Task, reached: Bar) -> dict[str, Strength]:
+def _strengths(first: Round, task: Task, reached: Bar) -> dict[str, Strength]:
     """Return by name what the first round says of the strengths of effects that have one."""
     found = {}
     for s in first.scored:
@@ -186,7 +186,7 @@ def _how(before: judge.Judged) -> str:
     )
 
 
-def _partial(judged: Judgement, entries: list[dict[str, Any]], first: Any) -> dict[str, Any] | None:
+def _partial(judged: Judgement, entries: list[dict[str, Any]], first: Round) -> dict[str, Any] | None:
     """Return what came nearest where nothing was added: its terms, share and errors on the runs kept back."""
     before, after = judged.before, judged.after
     if before is None or after is None:

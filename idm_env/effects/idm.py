@@ -51,7 +51,10 @@ def free_accel(driver: Driver, speed: Tensor) -> Tensor:
 
 
 def gap_for(accel: Tensor, speed: Tensor, closing_speed: Tensor, driver: Driver) -> Tensor:
-    """Return the gap (m) at which IDM accelerates so: ``s = s* / √(1 − (v/v0)⁴ − A/a)``, at most FAR."""
+    """Return the gap (m) at which IDM accelerates so: ``s = s* / √(1 − (v/v0)⁴ − A/a)``, at most FAR.
+
+    Where IDM accelerates so at no gap, because what is under the root is not positive, that is 10⁶ s*, and at most FAR.
+    """
     wanted = desired_gap(driver, speed, closing_speed)
     square = (speed / driver.desired_speed).square()
     left = 1.0 - square * square - accel / driver.max_accel

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from idm_env.data import episodes, synthetic
 from idm_env.discovery import discover
-from idm_env.discovery.power import Bar, Planted, strength_of
-from idm_env.discovery.score import ALPHA, level, westfall_young
-from idm_env.effects import make
+from idm_env.discovery.model import SPREAD
+from idm_env.discovery.power import CLOSE, Bar, Planted, reach, strength_of
+from idm_env.discovery.score import ALPHA, FAINT, level, westfall_young
+from idm_env.effects import ALL, make
 
 
 def planted(units: int, curvature: float, pull: float, bar: Bar, sizes: int = 1) -> Planted:
@@ -40,17 +43,18 @@ def test_more_noise_fewer_units_and_a_higher_bar_hide_more() -> None:
 
 
 def test_the_level_is_where_a_further_candidate_becomes_significant() -> None:
-    """Against the test itself, with the candidate in the list: 8 runs, 30 candidates of chance."""
-    random, share, run = np.random.default_rng(3), 0.8, np.arange(8)
-    others = 0.003 * random.standard_normal((30, 8))
-    wanted = level(others, 0, run, share)
-    wrong = 0
-    for gain in np.linspace(1e-4, 0.02, 40):
-        gains = np.vstack((gain * np.linspace(0.5, 1.5, 8), others))
-        p = westfall_young(gains, 0, run).p_value[0] / share
-        statistic = np.sqrt(gains[0]).sum() / np.sqrt(gains[0].sum() + 0.003 * 8)
-        wrong += (p < ALPHA) != (statistic >= wanted)
-    assert wrong <= 2
+    """Against the test itself, with the candidate in the list: 8 runs, 30 candidates of chance.
+
+    Of gains g shape the statistic t is g A² = t² (g B + 8 FAINT), with A the sum of shape's roots and B that of shape.
+    """
+    share, run, shape = 0.8, np.arange(8), np.linspace(0.5, 1.5, 8)
+    for seed in range(5):
+        others = 0.003 * np.random.default_rng(seed + 1).standard_normal((30, 8))
+        wanted = level(others, 0, run, share)
+        for statistic, significant in ((wanted - 1e-6, False), (wanted + 1e-6, True)):
+            gain = statistic**2 * FAINT * 8 / (np.sqrt(shape).sum() ** 2 - statistic**2 * shape.sum())
+            p = westfall_young(np.vstack((gain * shape, others)), 0, run).p_value[0] / share
+            assert (p < ALPHA) == significant
 
 
 def test_drivers_with_their_own_drift_not_turned_do_again_what_they_did() -> None:
@@ -72,6 +76,15 @@ def test_drivers_with_their_own_drift_not_turned_do_again_what_they_did() -> Non
     assert sum(e.speed_mps.mean() for e in episodes(slower)) < sum(e.speed_mps.mean() for e in found.records.episodes)
 
 
+def test_what_no_strength_would_show_is_not_planted() -> None:
+    from benchmarks import planted as benchmark
+
+    excluded = [{"effect": "lag", "would_be_found": None}, {"effect": "drag", "would_be_found": 1e-3},
+                {"effect": "grade", "would_be_found": None}]  # fmt: skip
+    assert benchmark.told(excluded, []) == (["drag"], ["lag"])
+    assert benchmark.told(excluded, ["drag"]) == (["drag"], [])
+
+
 def test_a_latency_below_one_step_is_nobody_s() -> None:
     """It becomes part of the null, so that it is never found, however sure it is."""
     found = discover(synthetic.generate(6, runs=4, followers=2, seconds=60.0)[0], effects=["lag", "drag"])
@@ -80,3 +93,29 @@ def test_a_latency_below_one_step_is_nobody_s() -> None:
     strength = strength_of(at.solution, found.task, "lag", Bar(-np.inf, 0.0, 0))
     assert strength is not None and found.records.dt < strength.seen < 2.0 * found.records.dt
     assert strength.seen > found.records.dt + 0.4 * (strength.high - strength.estimate)
+    # Where the search goes to half of what a higher bar asks for, no strength would have been found.
+    bar = Bar(-np.inf, 1.0, 0)
+    strength = strength_of(at.solution, found.task, "lag", bar)
+    assert strength is not None and 3.0 * found.records.dt < strength.seen < strength.parameter.high
+    model = at.solution.model
+    for share, seen in ((1.2, strength.seen), (0.5, np.inf)):
+        shorter = replace(strength.parameter, default=0.1, high=share * strength.seen)
+        lag = replace(model.terms[-1], parameters=(shorter,))
+        within = replace(at.solution, model=replace(model, terms=(*model.terms[:-1], lag)))
+        told = strength_of(within, found.task, "lag", bar)
+        assert told is not None and told.seen == pytest.approx(seen, rel=CLOSE - 1.0)
+
+
+def test_no_strength_beyond_its_bounds_would_have_been_found() -> None:
+    """Towards the default, to which strengths are planted; a wave has both signs. What is usual is always in reach."""
+    weight, zone = make("second_leader").parameters[0], make("speed_zone").parameters[0]
+    assert (weight.low, weight.high) == (-0.5, 1.0) and zone.null == 1.0
+    assert reach(weight, False) == 1.0 and reach(weight, True) == 0.5
+    assert reach(zone, False) == 1.0 - zone.low and zone.default < 1.0
+    slower = replace(weight, default=-0.2)
+    assert reach(slower, False) == 0.5
+    for effect in map(make, ALL):
+        strengths = [p for p in effect.parameters if p.role == "strength" and p.null is not None]
+        if effect.sought == "profile":
+            assert abs(effect.strength_of(SPREAD)) <= reach(strengths[0], True)
+        assert all(abs(p.default - (p.null or 0.0)) <= reach(p, False) for p in strengths)
