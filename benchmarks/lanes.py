@@ -11,12 +11,14 @@ beside SUMO's and what is published, or with one behaviour changed at a time (``
 ``python -m benchmarks.lanes laws [vehicle-steps]`` counts what breaks a law in random traffic (``lanes_laws.py``).
 ``python -m benchmarks.lanes gradients [scenes]`` tells how good gradients through choices are (``lanes_gradients``).
 
-Flow, drop and capacity keep their rows under ``out/``, do not drive them again, and take ``--executor`` and ``--jobs``.
+Flow, drop and capacity keep their rows under ``out/``, do not drive again what has not changed in their lists of rows
+(after another change remove the file), and take ``--executor``, ``--jobs`` and ``--ray-address``.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 
 import torch
 from rich.console import Console
@@ -41,16 +43,41 @@ def laws(steps: float) -> None:
     print(lanes_laws.table(found))
 
 
+WORDS = {"speed": ("rollouts", "highway"), "drop": ("published", "behaviours"), "flow": (), "merge": (), "capacity": ()}
+NUMBERS = {"laws": (1000.0, 1e9), "gradients": (20.0, 50.0)}
+"""Which words may follow; or the least number that may (in fewer scenes MOBIL may not matter) and the usual one."""
+IN_PARTS = ("flow", "drop", "capacity")
+
+
+def _checked(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Raise where something was asked for that would not be heeded."""
+    what, more = given.what, given.more
+    if what not in IN_PARTS and (given.executor, given.jobs, given.ray_address) != ("serial", None, None):
+        parser.error(f"'{what}' runs in one piece: leave out --executor, --jobs and --ray-address.")
+    if more is None:
+        return
+    if what in WORDS and more not in WORDS[what]:
+        cure = f"Take {' or '.join(WORDS[what])}, or leave it out." if WORDS[what] else "Leave it out."
+        parser.error(f"'{what} {more}': '{more}' is unknown. {cure}")
+    if what in NUMBERS:
+        least, usual = NUMBERS[what]
+        try:
+            number = float(more)
+        except ValueError:
+            number = math.nan
+        if not least <= number < math.inf:
+            parser.error(f"'{what} {more}': '{more}' is no number of {least:g} or more. Usual is {what} {usual:g}.")
+
+
 def main() -> None:
     """Run what is asked for."""
     torch.set_num_threads(1)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "what", nargs="?", default="speed", choices=("speed", "flow", "drop", "merge", "capacity", "laws", "gradients")
-    )
+    parser.add_argument("what", nargs="?", default="speed", choices=(*WORDS, *NUMBERS))
     parser.add_argument("more", nargs="?", help="what of it, or how much")
     workers.add(parser)
     arguments = parser.parse_args()
+    _checked(parser, arguments)
     more = arguments.more
     if arguments.what == "speed":
         lanes_speed.table(more or "rollouts,highway")
@@ -58,18 +85,16 @@ def main() -> None:
         lanes_flow.table(arguments)
     elif arguments.what == "drop":
         drops = {None: lane_drop.main, "published": lane_drop.published, "behaviours": lane_drop.behaviours}
-        if more not in drops:
-            parser.error(f"unknown lane drop '{more}'. Take published or behaviours, or leave it out.")
         drops[more](arguments)
     elif arguments.what == "merge":
         lanes_merge.table()
     elif arguments.what == "capacity":
         lanes_capacity.table(arguments)
     elif arguments.what == "laws":
-        laws(float(more or 1e9))
+        laws(float(more or NUMBERS["laws"][1]))
     else:
         with progress.shown(Console(stderr=True)) as on_progress:
-            lanes_gradients.table(int(more or 50), on_progress)
+            lanes_gradients.table(int(float(more or NUMBERS["gradients"][1])), on_progress)
 
 
 if __name__ == "__main__":

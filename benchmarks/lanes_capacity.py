@@ -3,9 +3,11 @@
 ``python -m benchmarks.lanes capacity``: two lanes, and a ramp from which one merges between 3000 and 3200 m, 400 m
 before the end. Demand rises by 25 vehicles an hour each minute, a fifth of it on the ramp. Traffic has broken down when
 on the 400 m before the ramp the mean speed falls below 15 m/s and stays there for five minutes. Flow is counted 200 m
-behind the ramp, in the five minutes before that and from five minutes after it on, for 15 minutes or until the hour is
-over: so neither is chosen for being high or low. Every row changes one thing; SUMO (``libsumo``: IDM without noise,
-LC2013) drives the same road with the same departures. Rows are kept in ``out/lanes-capacity.jsonl``.
+behind the ramp, for five minutes that end five minutes before that (flow there falls before speed upstream does), and
+from five minutes after it on, for 15 minutes or until the hour is over: so neither is chosen for being high or low. A
+run that breaks down before its road is filled and these minutes have passed is too early to be counted. Every row
+changes one thing; SUMO (``libsumo``: IDM without noise, LC2013) drives the same road with departures by the same law,
+of a demand that begins lower, because its traffic breaks down earlier. Rows are kept in ``out/lanes-capacity.jsonl``.
 
 Beside it, without any merging: what comes out of a standing queue on one lane, over the largest flow of equal gaps and
 speeds (Treiber, Hennecke and Helbing 2000 call the former the dynamic capacity).
@@ -38,8 +40,9 @@ from idm_env.types import State, Trips
 FIRST, LAST, MINUTES = 2800.0, 4300.0, 60
 """Demand at the beginning and in the end (vehicles/h)."""
 BEGIN, END, ENTRY, COUNTED, LENGTH = 3000.0, 3200.0, 2700.0, 3400.0, 3600.0
-BEFORE, AFTER, LEAST, WAIT, STAYS = 5, 15, 5, 5, 5
-"""Minutes that are counted before a breakdown, after it (at most, at least), that pass between, and that it lasts."""
+FILLS, BEFORE, AFTER, LEAST, WAIT, STAYS = 3, 5, 15, 5, 5, 5
+"""Minutes until the road is filled, that are counted before a breakdown, after it (at most, at least), that pass
+between each of these and the breakdown, and that it lasts."""
 SLOW = 15.0
 DT, SEEDS, SPEED, NOISE = 0.2, 6, 20.0, 0.2
 KEPT = Path("out/lanes-capacity.jsonl")
@@ -47,12 +50,17 @@ KEPT = Path("out/lanes-capacity.jsonl")
 
 @dataclass(frozen=True)
 class Case:
-    """Drivers of one row: parameters that differ from ``DRIVER``, further effects, and whether anything is random."""
+    """Drivers of one row: parameters that differ from ``DRIVER``, further effects, and whether anything is random.
+
+    And their demand in the beginning (vehicles/h), and in how many runs they drive.
+    """
 
     changed: Mapping[str, float] = field(default_factory=dict)
     more: tuple[Effect, ...] = ()
     alike: bool = False
     differ: float = 0.0
+    first: float = FIRST
+    seeds: int = SEEDS
 
 
 PUSH = {"mobil.safe_decel": 9.0, "mandatory_change.safe_decel": 9.0}
@@ -63,19 +71,19 @@ CASES: dict[str, Case] = {
     "`Courtesy`, b_safe 9 m/s²": Case(PUSH, LET_IN),
     "… a 0.8 m/s²": Case({**PUSH, "idm.max_accel": 0.8}, LET_IN),
     "… a 0.5 m/s²": Case({**PUSH, "idm.max_accel": 0.5}, LET_IN),
-    "… a 0.8, no noise, even departures": Case({**PUSH, "idm.max_accel": 0.8}, LET_IN, alike=True),
+    "… a 0.8, no noise, even departures": Case({**PUSH, "idm.max_accel": 0.8}, LET_IN, alike=True, seeds=1),
     "… a 0.8, v0 and T differ by 15 %": Case({**PUSH, "idm.max_accel": 0.8}, LET_IN, differ=0.15),
     "… a 0.8, MOBIL threshold 1 m/s²": Case({**PUSH, "idm.max_accel": 0.8, "mobil.threshold": 1.0}, LET_IN),
 }
-THEIRS = {"a 1.5 m/s²": Case(), "a 0.8 m/s²": Case({"idm.max_accel": 0.8}), "a 0.5 m/s²": Case({"idm.max_accel": 0.5})}
+THEIRS = {f"a {a:g} m/s²": Case({"idm.max_accel": a}, first=2000.0) for a in (1.5, 0.8, 0.5)}
 
 
-def departures(seed: int, alike: bool) -> Trips:
+def departures(seed: int, alike: bool, begins: float = FIRST) -> Trips:
     """Return trips of a demand that rises evenly; at random, or evenly spaced."""
     draw, total = torch.Generator().manual_seed(seed), 60.0 * MINUTES
     departs, lanes = [], []
     for lane, share in {0: RAMP, 1: 0.5 * (1.0 - RAMP), 2: 0.5 * (1.0 - RAMP)}.items():
-        first, rise = share * FIRST / 3600.0, share * (LAST - FIRST) / 3600.0 / total
+        first, rise = share * begins / 3600.0, share * (LAST - FIRST) / 3600.0 / total
         most = 2 * int(share * LAST / 3600.0 * total)
         each = torch.ones(most) if alike else torch.empty(most).exponential_(generator=draw)
         number = each.double().cumsum(0)
@@ -91,11 +99,12 @@ def departures(seed: int, alike: bool) -> Trips:
     return Trips(when, torch.full_like(when, math.inf), lane, torch.full_like(when, SPEED), none, none.clone())
 
 
-def ours(case: Case, seeds: int = SEEDS) -> list[dict[str, Any]]:
+def ours(case: Case) -> list[dict[str, Any]]:
     """Return what was counted in each run, minute by minute."""
+    seeds = case.seeds
     road = Lanes(3, length=LENGTH, ends=(on_ramp(0, begin=BEGIN, end=END, entry=ENTRY),))
     simulator = Simulator(road, (IDM(), Noise(), Mobil(), MandatoryChange(), *case.more, Brakes()), dt=DT)
-    each = [departures(seed, case.alike) for seed in range(1, seeds + 1)]
+    each = [departures(seed, case.alike, case.first) for seed in range(1, seeds + 1)]
     most = max(len(given.departs) for given in each)
     given = Trips(*(torch.stack(column) for column in zip(*(_filled(one, most) for one in each), strict=True)))
     params = simulator.defaults(dtype=torch.float32)
@@ -150,9 +159,9 @@ def _pace(state: State) -> torch.Tensor:
     return (state.speed * there).sum(-1) / there.sum(-1)
 
 
-def sumo(case: Case, seeds: int = SEEDS) -> list[dict[str, Any]] | None:
+def sumo(case: Case) -> list[dict[str, Any]] | None:
     """Return the same of SUMO; None without ``libsumo``."""
-    found = [_of_sumo(case, seed) for seed in range(1, seeds + 1)]
+    found = [_of_sumo(case, seed) for seed in range(1, case.seeds + 1)]
     return None if None in found else found  # type: ignore[return-value]
 
 
@@ -165,7 +174,7 @@ EDGES = (
 
 def _of_sumo(case: Case, seed: int) -> dict[str, Any] | None:
     values = {**DRIVER, **{name.removeprefix("idm."): x for name, x in case.changed.items() if name.startswith("idm.")}}
-    given = departures(seed, case.alike)
+    given = departures(seed, case.alike, case.first)
     cars = "".join(
         f'<vehicle id="v{i}" type="t" route="{"r" if lane == 0 else "m"}" depart="{when:.2f}" '
         f'departLane="{max(lane - 1, 0)}" departSpeed="{SPEED}"/>'
@@ -202,31 +211,31 @@ class Part(NamedTuple):
     """One row of the table."""
 
     who: str
-    label: str
+    case: Case
 
 
 def drive(part: Part, on_progress: OnProgress) -> list[dict[str, Any]] | None:
     """Return what was counted in every run of a row; None without ``libsumo``."""
-    return ours(CASES[part.label]) if part.who == "ours" else sumo(THEIRS[part.label])
+    return ours(part.case) if part.who == "ours" else sumo(part.case)
 
 
 def broken(speed: list[float]) -> int | None:
     """Return the minute in which traffic breaks down; None where it does not, or too late to be counted after it."""
-    for minute in range(BEFORE + WAIT, len(speed) - WAIT - LEAST + 1):
+    for minute in range(len(speed) - WAIT - LEAST + 1):
         if all(v < SLOW for v in speed[minute : minute + STAYS]):
             return minute
     return None
 
 
 def drops(runs: list[dict[str, Any]]) -> list[tuple[float, float, float]]:
-    """Return flow before and after the breakdown, and the most in as many minutes before, of runs that have one."""
+    """Return flow before and after the breakdown, and the most in as many minutes before, of runs that have both."""
     found = []
     for run in runs:
-        minute = broken(run["speed"])
-        if minute is not None:
-            after = run["flow"][minute + WAIT : minute + WAIT + AFTER]
-            most = max(_running(run["flow"][:minute]))
-            found.append((float(np.mean(run["flow"][minute - BEFORE : minute])), float(np.mean(after)), most))
+        minute, flow = broken(run["speed"]), run["flow"]
+        if minute is not None and minute >= FILLS + BEFORE + WAIT:
+            before = flow[minute - WAIT - BEFORE : minute - WAIT]
+            after = flow[minute + WAIT : minute + WAIT + AFTER]
+            found.append((float(np.mean(before)), float(np.mean(after)), max(_running(flow[:minute]))))
     return found
 
 
@@ -236,18 +245,21 @@ def _mean(values: list[float], form: str) -> str:
     return f"{np.mean(values):{form}}" + ("" if math.isnan(error) else f" ± {error:{form.lstrip('+')}}")
 
 
-def _row(name: str, runs: list[dict[str, Any]] | None) -> str:
+COLUMNS = ("", "broke down", "too early", "most in 5 min before", "flow before", "out of the jam", "change", "queued")
+
+
+def _row(name: str, runs: list[dict[str, Any]] | None) -> list[str]:
     if runs is None:
-        return f"| {name} | libsumo is not installed | | | | |"
-    found = drops(runs)
-    broke = f"{len(found)} of {len(runs)}"
+        return [name, "libsumo is not installed", *[""] * (len(COLUMNS) - 2)]
+    found, broke = drops(runs), sum(broken(run["speed"]) is not None for run in runs)
+    head = [name, f"{broke} of {len(runs)}", str(broke - len(found))]
     queued = f"{np.mean([run['queued'] for run in runs]):.0f}"
     if not found:
-        most = _mean([max(_running(run["flow"])) for run in runs], ".0f")
-        return f"| {name} | {broke} | {most} | – | – | – | {queued} |"
+        most = "–" if broke else _mean([max(_running(run["flow"])) for run in runs], ".0f") + " in the hour"
+        return [*head, most, "–", "–", "–", queued]
     change = [100.0 * (after / before - 1.0) for before, after, _ in found]
     before, after, most = (_mean([row[k] for row in found], ".0f") for k in (0, 1, 2))
-    return f"| {name} | {broke} | {most} | {before} | {after} | {_mean(change, '+.1f')} % | {queued} |"
+    return [*head, most, before, after, f"{_mean(change, '+.1f')} %", queued]
 
 
 def _running(flow: list[int]) -> list[float]:
@@ -283,7 +295,7 @@ def queue(
 def picture(found: dict[str, list[dict[str, Any]] | None], path: Path) -> None:
     """Draw one run with a breakdown over time, and flow before and after it in all rows."""
     figure, axes = page.figure(1, 2, size=(10.0, 3.8))
-    shown = next((r for r in found["… a 0.8 m/s²"] or [] if broken(r["speed"]) is not None), None)
+    shown = next((r for r in found["… a 0.8 m/s²"] or [] if drops([r])), None)
     if shown is not None:
         minute = broken(shown["speed"])
         assert minute is not None
@@ -292,7 +304,7 @@ def picture(found: dict[str, list[dict[str, Any]] | None], path: Path) -> None:
         first.plot(np.arange(len(flow)) + 0.5 * BEFORE, flow, color="#1e5adc")
         first.plot((0, MINUTES), (FIRST, LAST), "--", color="#9aa0a8")
         second.plot(np.arange(MINUTES) + 0.5, shown["speed"], color="#d1495b", lw=1)
-        for begin, end in ((minute - BEFORE, minute), (minute + WAIT, minute + WAIT + AFTER)):
+        for begin, end in ((minute - WAIT - BEFORE, minute - WAIT), (minute + WAIT, minute + WAIT + AFTER)):
             first.axvspan(begin, end, color="#e8a33d", alpha=0.2, lw=0)
         first.set(xlabel="minute", ylabel="flow behind the ramp (vehicles/h)", ylim=(1500, LAST))
         first.yaxis.label.set_color("#1e5adc")
@@ -319,11 +331,11 @@ def table(arguments: argparse.Namespace, path: Path = Path("out/lanes-capacity.p
     print("| a (m/s²) | static maximum | out of a queue | with noise |\n| --- | --- | --- | --- |")
     for accel, most, plain, noisy in queue():
         print(f"| {accel:g} | {most:.0f} | {plain:.0f} ({plain / most:.2f}) | {noisy:.0f} ({noisy / most:.2f}) |")
-    parts = {name: Part("ours", name) for name in CASES} | {f"SUMO, {name}": Part("sumo", name) for name in THEIRS}
+    parts = {name: Part("ours", case) for name, case in CASES.items()}
+    parts |= {f"SUMO, {name}": Part("sumo", case) for name, case in THEIRS.items()}
     found = workers.named(drive, parts, KEPT, arguments)
-    print("\n| | broke down | most in 5 min | flow before | out of the jam | change | queued in the end |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print(f"\n| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}")
     for name, runs in found.items():
-        print(_row(name, runs))
+        print(f"| {' | '.join(_row(name, runs))} |")
     picture(found, path)
     print(f"Picture: {path}")

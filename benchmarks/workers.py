@@ -34,14 +34,18 @@ def of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
 
 
 def named(work: Work[P, Any], parts: Mapping[str, P], out: Path, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what every part gives, by name; each is kept in a file when it is done, and not done again."""
+    """Return what every part gives, by name; each is kept in a file when it is done, and not done again.
+
+    What a part says of itself (``repr``) is kept beside it: where that differs, or is missing, it is done anew.
+    """
     done = kept(out, "name")
-    todo = [name for name in parts if name not in done]
+    todo = [name for name, part in parts.items() if done.get(name, {}).get("part") != repr(part)]
     out.parent.mkdir(parents=True, exist_ok=True)
     with of(arguments) as executor, out.open("a") as file:
         for i, found in executor.map(work, [parts[name] for name in todo]):
-            done[todo[i]] = json.loads(json.dumps({"name": todo[i], "found": found}))
-            file.write(json.dumps(done[todo[i]]) + "\n")
+            line = json.dumps({"name": todo[i], "part": repr(parts[todo[i]]), "found": found})
+            done[todo[i]] = json.loads(line)
+            file.write(line + "\n")
             file.flush()
             print(f"{todo[i]}: done, kept in {out}", file=sys.stderr, flush=True)
     return {name: done[name]["found"] for name in parts}

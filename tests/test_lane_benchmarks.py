@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import lanes_capacity, workers
+from benchmarks import lanes, lanes_capacity, workers
 from benchmarks.lanes_sumo import Edge, net
 from idm_env.progress import OnProgress
 
@@ -27,10 +27,30 @@ def test_demand_rises_evenly(alike: bool) -> None:
 
 def test_a_breakdown_is_counted_before_and_after_it() -> None:
     speed = [25.0] * 19 + [5.0, 25.0] + [5.0] * 39  # a minute that is slow by itself is no breakdown
-    flow = [3000] * 21 + [2800] * 5 + [2700] * 15 + [9999] * 19
+    # Behind the ramp less flows some minutes before speed falls upstream of it: these do not count as "before".
+    flow = [3000] * 16 + [2800] * 10 + [2700] * 15 + [9999] * 19
     assert lanes_capacity.broken(speed) == 21
     assert lanes_capacity.drops([{"flow": flow, "speed": speed}]) == [(3000.0, 2700.0, 3000.0)]
     assert lanes_capacity.drops([{"flow": flow, "speed": [25.0] * 60}]) == []
+
+
+@pytest.mark.parametrize(("breaks", "counted"), [(6, 0), (12, 0), (13, 1), (50, 1)])
+def test_a_breakdown_that_nothing_can_be_counted_before_is_too_early(breaks: int, counted: int) -> None:
+    """It was looked for from minute 10 on, so that a jam that stood already was counted as flow before."""
+    run = {"flow": [3000] * 60, "speed": [25.0] * breaks + [5.0] * (60 - breaks), "queued": 0}
+    assert lanes_capacity.broken(run["speed"]) == breaks
+    assert len(lanes_capacity.drops([run])) == counted
+    row = lanes_capacity._row("name", [run])
+    assert row[1:3] == ["1 of 1", str(1 - counted)]
+    assert row[-2] == ("+0.0 %" if counted else "–")
+
+
+def test_rows_have_a_cell_per_column() -> None:
+    calm = {"flow": [3000] * 60, "speed": [25.0] * 60, "queued": 0}
+    early = {"flow": [3000] * 60, "speed": [5.0] * 60, "queued": 0}
+    for runs in (None, [calm], [early]):
+        assert len(lanes_capacity._row("name", runs)) == len(lanes_capacity.COLUMNS)
+    assert lanes_capacity._row("name", [calm])[3] == "3000 in the hour"
 
 
 def test_lanes_go_on_where_the_next_edge_has_them() -> None:
@@ -50,5 +70,35 @@ def _refused(part: int, on_progress: OnProgress) -> int:
 def test_rows_are_kept_and_not_done_again(tmp_path: Path) -> None:
     given = argparse.Namespace(executor="serial", jobs=None, ray_address=None)
     rows = {"two": 2, "three": 3}
+    at = tmp_path / "out" / "rows.jsonl"
     for work in (_squared, _refused):
-        assert workers.named(work, rows, tmp_path / "out" / "rows.jsonl", given) == {"two": 4, "three": 9}
+        assert workers.named(work, rows, at, given) == {"two": 4, "three": 9}
+    with pytest.raises(AssertionError, match="was done before"):
+        workers.named(_refused, {"two": 5}, at, given)  # the same name, other settings
+    assert workers.named(_squared, {"two": 5, "three": 3}, at, given) == {"two": 25, "three": 9}
+    assert workers.named(_refused, {"two": 5, "three": 3}, at, given) == {"two": 25, "three": 9}
+    at.write_text('{"name": "three", "found": 7}\n')  # as files were written before
+    assert workers.named(_squared, rows, at, given) == {"two": 4, "three": 9}
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("laws x", "'laws x': 'x' is no number of 1000 or more. Usual is laws 1e+09."),
+        ("laws nan", "'laws nan': 'nan' is no number of 1000 or more. Usual is laws 1e+09."),
+        ("gradients x", "'gradients x': 'x' is no number of 20 or more. Usual is gradients 50."),
+        ("flow fast", "'flow fast': 'fast' is unknown. Leave it out."),
+        ("merge published", "'merge published': 'published' is unknown. Leave it out."),
+        ("capacity 3", "'capacity 3': '3' is unknown. Leave it out."),
+        ("speed rings", "'speed rings': 'rings' is unknown. Take rollouts or highway, or leave it out."),
+        ("merge --executor processes", "'merge' runs in one piece: leave out --executor, --jobs and --ray-address."),
+        ("laws --jobs 2", "'laws' runs in one piece: leave out --executor, --jobs and --ray-address."),
+    ],
+)
+def test_what_would_not_be_heeded_is_refused_in_one_line(
+    words: str, says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["lanes", *words.split()])
+    with pytest.raises(SystemExit, match="2"):
+        lanes.main()
+    assert capsys.readouterr().err.splitlines()[-1].endswith(says)
