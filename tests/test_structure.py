@@ -33,7 +33,7 @@ ALLOWED = {
     },
     "simulator": {"types", "parameters", "step", "instead"},
     "scalar": {"types", "effects", "roads", "history", "step", "modules", "changes"},
-    "kernels": {"types", "effects", "roads", "history", "step", "simulator", "instead", "scalar", "changes",
+    "kernels": {"types", "effects", "roads", "history", "step", "simulator", "instead", "scalar", "checks", "changes",
         "decisions", "population",
     },
     "fonts": set(),
