@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import os
 import sys
 import time
@@ -312,12 +311,9 @@ def main() -> None:
         j for j in jobs(arguments.sets, arguments.clean, arguments.first_seed, arguments.few) if arguments.only in j.key
     ]
     missing = [j for j in wanted if j.key not in done]
-    with workers.of(arguments) as executor, arguments.out.open("a") as file:
-        for number, (_, row) in enumerate(executor.map(measure, missing), 1):
-            done[row["key"]] = row
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-            print(f"{number}/{len(missing)} {row['key']}: {row['verdict']} {row['found']}", file=sys.stderr)
+    for number, row in enumerate(workers.rows(measure, missing, arguments.out, arguments), 1):
+        done[row["key"]] = row
+        print(f"{number}/{len(missing)} {row['key']}: {row['verdict']} {row['found']}", file=sys.stderr)
     print(table([done[j.key] for j in wanted if j.key in done]))
 
 

@@ -12,7 +12,6 @@ if need be, so that a run goes on where it stopped.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -159,12 +158,10 @@ def main() -> None:
     done = workers.kept(arguments.out, "key")
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.sets)
     wanted = [(s, arguments.alone) for s in seeds if not arguments.alone or HIDDEN[s % len(HIDDEN)][1]]
-    with workers.of(arguments) as executor:
-        for _, row in executor.map(scored, [part for part in wanted if key(part) not in done]):
-            done[row["key"]] = json.loads(json.dumps(row))
-            with arguments.out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
-            print(f"{row['key']}: {row['hidden']}, told {row['one_of']}", file=sys.stderr, flush=True)
+    missing = [part for part in wanted if key(part) not in done]
+    for row in workers.rows(scored, missing, arguments.out, arguments):
+        done[row["key"]] = row
+        print(f"{row['key']}: {row['hidden']}, told {row['one_of']}", file=sys.stderr, flush=True)
     print(table([done[key(part)] for part in wanted]))
 
 

@@ -85,9 +85,7 @@ def main() -> None:
     parser.add_argument("--folds", type=int, default=1000, help="parts of the runs to leave out; default: one run each")
     arguments = parser.parse_args()
     begin = time.process_time()
-    trajectories = load(arguments.file)
-    for condition in arguments.where:
-        trajectories = trajectories.where(condition)
+    trajectories = load(arguments.file).where(arguments.where)
     followers = trajectories.table.drop_nulls("leader_id")
     values = followers[arguments.per].unique().sort().to_list() if arguments.per else [None]
     parts = []

@@ -141,9 +141,7 @@ def main() -> None:
     parser.add_argument("--longest", type=float, default=200.0, help="of a place (m)")
     arguments = parser.parse_args()
     begin = time.process_time()
-    trajectories = load(arguments.file)
-    for condition in arguments.where:
-        trajectories = trajectories.where(condition)
+    trajectories = load(arguments.file).where(arguments.where)
     # What the road is like is not told: it is to be found.
     trajectories = replace(trajectories, table=trajectories.table.drop("grade", "altitude_m", strict=False))
     runs = trajectories.table.drop_nulls("leader_id").group_by(arguments.per).agg(pl.col("run_id").n_unique())

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import os
 import sys
 import time
@@ -59,9 +58,7 @@ def run(folder: Path, case: dict[str, Any]) -> Discovery:
     if not case.get("known"):
         hidden = [c for c in ("grade", "altitude_m") if c in trajectories.table.columns]
         trajectories = dataclasses.replace(trajectories, table=trajectories.table.drop(hidden))
-    for condition in case.get("where", ()):
-        trajectories = trajectories.where(condition)
-    return discover(trajectories, place=case.get("place"), known=case.get("known", ()))
+    return discover(trajectories.where(case.get("where", ())), place=case.get("place"), known=case.get("known", ()))
 
 
 def timed(part: tuple[str, Path, dict[str, Any]], _: OnProgress = silent) -> dict[str, Any]:
@@ -158,12 +155,9 @@ def main() -> None:
     done = workers.kept(arguments.out, "case")
     wanted = {n: c for n, c in cases(arguments.data).items() if arguments.only in n}
     missing = [(name, arguments.data, case) for name, case in wanted.items() if name not in done]
-    with workers.of(arguments) as executor:
-        for _, found in executor.map(timed, missing):
-            done[found["case"]] = found
-            with arguments.out.open("a") as file:
-                file.write(json.dumps(found) + "\n")
-            print(f"{found['case']}: {found['verdict']}", file=sys.stderr)
+    for found in workers.rows(timed, missing, arguments.out, arguments):
+        done[found["case"]] = found
+        print(f"{found['case']}: {found['verdict']}", file=sys.stderr)
     print(table([done[n] for n in wanted if n in done]))
 
 

@@ -13,7 +13,6 @@ found are left out, and named. One line of JSON per set is kept, so that a run g
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -142,8 +141,7 @@ def fitted(seed: int, ou: float, runs: int, file: Path | None, where: tuple[str,
            ) -> tuple[Discovery, tuple[float, float]]:  # fmt: skip
     """Return what ``explain`` finds on the data themselves, and the noise of their positions (m) and speeds (m/s)."""
     trajectories = synthetic.generate(seed, ou=ou, runs=runs)[0] if file is None else load(file)
-    for condition in where:
-        trajectories = trajectories.where(condition)
+    trajectories = trajectories.where(where)
     raw = list(episodes(trajectories))
     noise = [float(np.median([noise_sigma(x) for x in each])) for each in (
         [e.position_m for e in raw], [e.speed_mps for e in raw],
@@ -228,12 +226,10 @@ def main() -> None:
         if hidden:
             print(f"set {number}: not planted, as seen at no strength: {', '.join(hidden)}", file=sys.stderr)
         wanted += [(n, float(t), number, data) for n in names for t in arguments.times.split(",")]
-    with workers.of(arguments) as executor:
-        for _, row in executor.map(measure, [job for job in wanted if key(job) not in done]):
-            done[row["key"]] = json.loads(json.dumps(row))
-            with arguments.out.open("a") as out:
-                out.write(json.dumps(row) + "\n")
-            print(f"{row['key']}: {row['verdict']} {row['found']}", file=sys.stderr, flush=True)
+    missing = [job for job in wanted if key(job) not in done]
+    for row in workers.rows(measure, missing, arguments.out, arguments):
+        done[row["key"]] = row
+        print(f"{row['key']}: {row['verdict']} {row['found']}", file=sys.stderr, flush=True)
     print(table([done[key(job)] for job in wanted]))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -31,6 +31,16 @@ def kept(out: Path, column: str) -> dict[Any, dict[str, Any]]:
 def of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
     """Give the executor that the arguments name."""
     return opened(arguments.executor, arguments.jobs, arguments.ray_address)
+
+
+def rows(work: Work[P, Any], parts: Sequence[P], out: Path, arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Give the row of every part when it is done, as ``kept`` will read it; by then it is a line of the file."""
+    with of(arguments) as executor, out.open("a") as file:
+        for _, row in executor.map(work, parts):
+            line = json.dumps(row)
+            file.write(line + "\n")
+            file.flush()
+            yield json.loads(line)
 
 
 def named(work: Work[P, Any], parts: Mapping[str, P], out: Path, arguments: argparse.Namespace) -> dict[str, Any]:
