@@ -41,6 +41,7 @@ from idm_env.tasks.ring import RingTask
 STEPS = 3000
 JUDGED = 1000
 SPEED_RATIO, SPEED_STD, TIME_GAP, IN_A_ROW = 0.97, 0.15, 0.8, 5
+FOLLOW_REWARD, STRETCHES = 0.88, 16
 TEST: dict[str, dict[str, Any]] = {
     "ring": {"shock": 4.0},
     "follow": {},
@@ -166,15 +167,17 @@ def worst(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 # -- following a record ----------------------------------------------------------------------------------------------
 
 
-def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int = 16) -> dict[str, Any]:
-    """Return the figures of a policy behind ``count`` stretches of the recorded leaders, 100 s each.
+def evaluate_follow(
+    act: Act | None, environment: Mapping[str, Any], count: int = STRETCHES, draws: Sequence[int] = (0,)
+) -> dict[str, Any]:
+    """Return the figures of a policy behind ``count`` stretches of the recorded leaders in each draw, 100 s each.
 
     ``reward``: mean per step; ``litres`` and ``litres_behind``: fuel per 100 km of the first controlled vehicle and of
     all vehicles from it to the last, by the model of Kamal et al., ``…_circles`` by that of CIRCLES; ``energy``: at its
     wheels (J/kg per metre); the same of the recorded leader as ``leader_…``; ``time_gap``: its smallest (s);
-    ``collisions``: stretches with one; ``spacing``: its mean gap (m).
+    ``collisions``: stretches with one; ``spacing``: its mean gap (m); ``passed``: reward ≥ 0.88, no collision.
     """
-    start = episodes_start(environment, count)
+    start = episodes_start(environment, count, draws=draws)
     task = start.task
     driven = drive(start, act, task.horizon or STEPS)
     first = task.agents[0]
@@ -188,8 +191,9 @@ def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int 
 
     crashed = gap[..., 1:].amin((0, 2)) <= 0.0
     time_gap = metrics.time_gap(task.pick(gap), task.pick(speed)).amin((0, 2))
+    reward = float(driven.reward.double().mean())
     return {
-        "reward": float(driven.reward.double().mean()),
+        "reward": reward,
         "litres": litres(slice(first, first + 1)),
         "litres_behind": litres(slice(first, None)),
         "leader_litres": litres(slice(0, 1)),
@@ -201,7 +205,7 @@ def evaluate_follow(act: Act | None, environment: Mapping[str, Any], count: int 
         "time_gap": float(time_gap.min()),
         "spacing": float(gap[..., first].mean()),
         "collisions": int(crashed.sum()),
-        "passed": bool(not crashed.any()),
+        "passed": reward >= FOLLOW_REWARD and not bool(crashed.any()),
     }
 
 
@@ -261,13 +265,16 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
 # -- any task --------------------------------------------------------------------------------------------------------
 
 
-def evaluate(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures of a policy in the environment of its test (``as_judged``); None is the human driver."""
+def evaluate(act: Act | None, environment: Mapping[str, Any], **options: Any) -> dict[str, Any]:
+    """Return the figures of a policy in the environment of its test (``as_judged``); None is the human driver.
+
+    ``options`` are those of the task's own function, such as ``draws``.
+    """
     tests: dict[str, Callable[..., dict[str, Any]]] = {
         "ring": evaluate_ring, "follow": evaluate_follow, "open_highway": evaluate_lanes,
         "merge": evaluate_lanes, "bottleneck": evaluate_lanes,
     }  # fmt: skip
-    return tests[environment.get("task", "ring")](act, environment)
+    return tests[environment.get("task", "ring")](act, environment, **options)
 
 
 def score(row: Mapping[str, Any]) -> float:

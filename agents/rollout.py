@@ -160,14 +160,14 @@ def uniform_speed(start: Start) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _episodes_start(environment: str, count: int, times: int) -> Start:
+def _episodes_start(environment: str, count: int, times: int, draws: tuple[int, ...]) -> Start:
     task = task_of(json.loads(environment))
     params = task.params(torch.float32, "cpu")
-    seeds = tuple(range(SEED, SEED + count)) * times
+    seeds = tuple(SEED + 1000 * k + i for k in draws for i in range(count)) * times
     draw = Draw.of(torch.tensor(seeds), torch.zeros(len(seeds), dtype=torch.int64))
     return Start(task, task.reset(draw, params), seeds, params)
 
 
-def episodes_start(environment: Mapping[str, Any], count: int, times: int = 1) -> Start:
-    """Return ``count`` episodes of a task as they begin, of seeds that training does not use, so many times over."""
-    return _episodes_start(json.dumps(dict(environment), sort_keys=True), count, times)
+def episodes_start(environment: Mapping[str, Any], count: int, times: int = 1, draws: Sequence[int] = (0,)) -> Start:
+    """Return ``count`` episodes of a task and draw as they begin, of seeds unused in training, ``times`` over."""
+    return _episodes_start(json.dumps(dict(environment), sort_keys=True), count, times, tuple(draws))

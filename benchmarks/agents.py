@@ -1,8 +1,9 @@
 """Agents side by side: equal searches, ten seeds of the best, held-out rings and drivers.
 
-    python benchmarks/agents.py reference [--rings failsafe-shock] [--out runs/benchmark]
+    python benchmarks/agents.py reference [--tests failsafe-shock follow] [--out runs/benchmark]
     python benchmarks/agents.py run [--only ring-ppo] [--trial 0] [--seeds 3] [--times 10] [--executor ray]
     python benchmarks/agents.py table [--out runs/benchmark]
+    python benchmarks/agents.py picture [--out runs/benchmark]
     python benchmarks/agents.py takeover [--out runs/benchmark]
 
 ``reference`` has what learns nothing, ``run`` the searches and the seeds of each best trial (or of the one that is
@@ -42,9 +43,9 @@ from idm_env.progress import OnProgress  # noqa: E402
 LIMIT = 150.0
 """CPU seconds after which a training ends that has updates left."""
 EVERY = 3.0
-RINGS = ("failsafe", "failsafe-shock", "brakes", "brakes-shock")
-"""Of the reference rows (``benchmarks.agents_reference.rings``)."""
-SEARCH_SEEDS, SEEDS, FEW = (100, 101), tuple(range(10)), tuple(range(5))
+TESTS = ("failsafe", "failsafe-shock", "brakes", "brakes-shock", "follow")
+"""Of the reference rows (``benchmarks.agents_reference.tests``)."""
+SEARCH_SEEDS, SEEDS = (100, 101), tuple(range(10))
 
 Options = dict[str, Any]
 SEARCH: dict[str, list[Options]] = {
@@ -74,6 +75,8 @@ SEARCH: dict[str, list[Options]] = {
     "ring-brakes-apg": [{}],
     "follow-apg": [{}],
     "follow-ppo": [{}],
+    "follow-sac": [{}],
+    "follow-shac": [{}],
 }
 """Trials of each algorithm: five where searches are equal; what one does not name is as in its configuration file."""
 MODULES = {"apg": "agents.apg", "ppo": "agents.ppo", "sac": "agents.ppo", "shac": "agents.shac"}
@@ -161,7 +164,7 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
 def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool) -> dict[str, Any]:
     """Return what a training came to: evaluations, last and best checkpoint, the last one on held-out traffic too."""
     from agents.common import load
-    from agents.evaluate import as_judged, evaluate_ring, held_out, solved_at
+    from agents.evaluate import as_judged, evaluate, held_out, solved_at
     from agents.rollout import FRESH
 
     if not (training / "last.pt").exists() or not (training / "best.pt").exists():
@@ -175,10 +178,9 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
     untrained, history = history[0], history[1:]
     # What ended before its time has solved nothing.
     first = solved_at(history) if done.returncode == 0 else None
-    on_ring = content["task"] == "ring"
-    # A last policy must pass on the fresh rings too.
-    fresh = {"fresh_last": evaluate_ring(policy, environment, draws=FRESH)} if on_ring else {}
-    if not all(row["passed"] for row in fresh.values()):
+    # A last policy must pass on fresh draws too.
+    fresh = evaluate(policy, environment, draws=FRESH)
+    if not fresh["passed"]:
         first = None
     summary = {
         "solved": first is not None,
@@ -196,10 +198,11 @@ def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool
         "history": history,
         "last": history[-1],
         "best": at_best["training"]["history"][-1],
-        **fresh,
+        "fresh_last": fresh,
     }
-    if unseen and on_ring:
-        result["fresh_best"] = evaluate_ring(best, environment, draws=FRESH)
+    if unseen:
+        result["fresh_best"] = evaluate(best, environment, draws=FRESH)
+    if unseen and content["task"] == "ring":
         result["held_out"] = held_out(policy, environment)
     return result
 
@@ -258,7 +261,7 @@ def run(
             print(f"{config}: another process is still searching.")
             continue
         best = SEARCH[config][trial]
-        wanted += [Job(config, trial, best, s, times) for s in (SEEDS if config.startswith("ring") else FEW)[:seeds]]
+        wanted += [Job(config, trial, best, s, times) for s in SEEDS[:seeds]]
     deque(executor.map(train, [Training(job, out) for job in wanted]), 0)
 
 
@@ -267,9 +270,9 @@ def main() -> None:
     import argparse
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["reference", "run", "table", "takeover"])
+    parser.add_argument("what", choices=["reference", "run", "table", "picture", "takeover"])
     parser.add_argument("--only", nargs="*", default=list(SEARCH))
-    parser.add_argument("--rings", nargs="*", default=list(RINGS), choices=RINGS, help="of the reference rows")
+    parser.add_argument("--tests", nargs="*", default=list(TESTS), choices=TESTS, help="of the reference rows")
     parser.add_argument("--trial", type=int, help="train the seeds of this trial, without a search")
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train no more seeds than that")
     parser.add_argument("--times", type=int, default=1, help="train the seeds for so many times the updates")
@@ -281,6 +284,10 @@ def main() -> None:
         from benchmarks.agents_tables import show
 
         show(options.out, SEARCH, SEARCH_SEEDS, SEEDS, default_data())
+    elif options.what == "picture":
+        from benchmarks.agents_pictures import draw
+
+        draw(options.out, SEEDS, ROOT / "docs" / "agents_survival.png")
     elif options.what == "takeover":
         from benchmarks.agents_tables import takeover_table
 
@@ -288,7 +295,7 @@ def main() -> None:
     elif options.what == "reference":
         from benchmarks import agents_reference
 
-        agents_reference.show(options.out.resolve(), options.rings, once)
+        agents_reference.show(options.out.resolve(), options.tests, once)
     else:
         with workers.of(options) as executor:
             run(options.only, options.out.resolve(), options.seeds, options.trial, executor, options.times)

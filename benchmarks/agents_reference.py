@@ -1,4 +1,4 @@
-"""What tests of agents are worth: rows of policies that learn nothing or next to nothing, on four rings.
+"""What tests of agents are worth: rows of policies that learn nothing or next to nothing, on rings and behind a leader.
 
 ``python benchmarks/agents.py reference`` does what is missing, a family and a ring at a time, and prints the table.
 """
@@ -13,7 +13,9 @@ import torch
 
 from agents import apg, common
 from agents.common import Policy
-from agents.reference import RANDOM, Family, alone, families, networks, singles, tried
+from agents.evaluate import evaluate_follow
+from agents.reference import HIDDEN, RANDOM, alone, families, networks, random_policies, singles, tried
+from agents.rollout import FRESH, Act
 from benchmarks.agents_tables import Row, environment_of, ring, table
 
 UNTRAINED = range(8)
@@ -24,8 +26,8 @@ Once = Callable[[Path, Callable[[], Row]], "Row | None"]
 """Folder and what makes its result → the result, kept there; None where another process makes it."""
 
 
-def rings() -> dict[str, Row]:
-    """Return the environments by name: behind a failsafe and with real brakes, without and with a shock."""
+def tests() -> dict[str, Row]:
+    """Return the environments by name: rings behind a failsafe or with real brakes, with a shock or without; follow."""
     guarded = environment_of("ring-apg")
     free = {**guarded, "failsafe": 0.0, "max_command": [-4.5, 2.6]}
     shock = {"shock": 4.0}
@@ -34,15 +36,16 @@ def rings() -> dict[str, Row]:
         "failsafe-shock": {**guarded, **shock},
         "brakes": free,
         "brakes-shock": {**free, **shock},
+        "follow": environment_of("follow-apg"),
     }
 
 
-def begun(environment: Row, folder: Path, updates: int) -> Family:
-    """Return the policies of ``configs/ring-apg.yaml`` before any update, or after one."""
+def begun(environment: Row, folder: Path, updates: int) -> list[Policy]:
+    """Return the policies of APG's configuration for this task before any update, or after one."""
     made: list[Policy] = []
     root = Path(__file__).resolve().parents[1]
     for seed in UNTRAINED:
-        arguments = common.load_agent(root / "configs" / "ring-apg.yaml", apg.Arguments, "apg")
+        arguments = common.load_agent(root / "configs" / f"{environment['task']}-apg.yaml", apg.Arguments, "apg")
         arguments.environment, arguments.seed, arguments.updates = environment, seed, 1
         arguments.out = folder / f"seed{seed}"
         torch.manual_seed(seed)
@@ -52,10 +55,14 @@ def begun(environment: Row, folder: Path, updates: int) -> Family:
             made.append(common.load(arguments.out / "last.pt")[0])
         else:
             made.append(common.begin(arguments, "apg")[0])
-    return networks(made, [f"seed {seed}" for seed in UNTRAINED])
+    return made
 
 
-def makers(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
+BEGUN = {"APG before any update": 0, "APG after one update": 1}
+SEEDS = [f"seed {seed}" for seed in UNTRAINED]
+
+
+def on_ring(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
     """Return what makes each row of a ring, by name."""
     made: dict[str, Callable[[], Row]] = {
         name: lambda make=make: alone(make, environment) for name, make in singles(environment).items()
@@ -64,8 +71,32 @@ def makers(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
         made[name] = lambda family=family: tried(family(), environment)
     # Trained on the ring without a shock, as agents are.
     training = {k: v for k, v in environment.items() if k != "shock"}
-    for updates, name in ((0, "APG before any update"), (1, "APG after one update")):
-        made[name] = lambda updates=updates: tried(begun(training, folder / "one_update", updates), environment)
+    for name, updates in BEGUN.items():
+        made[name] = lambda updates=updates: tried(networks(begun(training, folder, updates), SEEDS), environment)
+    return made
+
+
+def behind_leader(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
+    """Return what makes each row behind a recorded leader, by name. Policies begin as clones of IDM there."""
+
+    def judged(acts: Sequence[Act | None], names: Sequence[str]) -> Row:
+        with torch.no_grad():
+            first = [evaluate_follow(act, environment) for act in acts]
+            six = [i for i, row in enumerate(first) if row["passed"]]
+            both = [i for i in six if evaluate_follow(acts[i], environment, draws=FRESH)["passed"]]
+        best = max(range(len(first)), key=lambda i: first[i]["reward"])
+        return {
+            "tried": len(first), "six": len(six), "passed": [names[i] for i in both],
+            "best": names[best], "figures": first[best],
+        }  # fmt: skip
+
+    made: dict[str, Callable[[], Row]] = {"IDM (a human driver more)": lambda: judged([None], [""])}
+    for name, hidden in zip(RANDOM, HIDDEN, strict=True):
+        made[name] = lambda hidden=hidden: judged(
+            random_policies(environment, 200, hidden), [str(i) for i in range(200)]
+        )
+    for name, updates in BEGUN.items():
+        made[name] = lambda updates=updates: judged(begun(environment, folder, updates), SEEDS)
     return made
 
 
@@ -73,15 +104,19 @@ def show(out: Path, names: Sequence[str], once: Once) -> None:
     """Do what is missing, and print the table."""
     columns: dict[str, dict[str, Row | None]] = {}
     for name in names:
-        environment, folder = rings()[name], out / "reference" / name
+        environment, folder = tests()[name], out / "reference" / name
         columns[name] = {}
         # With and without a shock policies are trained alike.
         trained = out / "reference" / name.removesuffix("-shock")
-        for i, (row, make) in enumerate(makers(environment, trained).items()):
+        makers = on_ring if environment["task"] == "ring" else behind_leader
+        for i, (row, make) in enumerate(makers(environment, trained / "one_update").items()):
             print(f"{name}: {row}", flush=True)
             columns[name][row] = once(folder / f"row{i}", lambda make=make, row=row: {"row": row, **make()})
-    rows = [[row, *(told(columns[n][row]) for n in names)] for row in next(iter(columns.values()))]
-    table(("passed of tried; the best: ratio/std/time gap/collisions", *names), rows)
+    every = dict.fromkeys(row for column in columns.values() for row in column)
+    rows = [[row, *(told(columns[n][row]) if row in columns[n] else "" for n in names)] for row in every]
+    table(
+        ("passed of tried; the best: ratio/std/time gap/collisions, of follow reward/time gap/collisions", *names), rows
+    )
     for name in names:
         found = [columns[name][row] for row in RANDOM]
         done = [r for r in found if r is not None]
@@ -98,4 +133,10 @@ def told(row: Row | None) -> str:
     """Return a cell."""
     if row is None:
         return "another process works on it"
-    return f"{len(row['passed'])} of {row['tried']}; {'/'.join(ring(row['figures']))}"
+    figures = row["figures"]
+    best = (
+        "/".join(ring(figures))
+        if "speed_ratio" in figures
+        else "{reward:.3f}/{time_gap:.2f}/{collisions}".format(**figures)
+    )
+    return f"{len(row['passed'])} of {row['tried']}; {best}"

@@ -130,7 +130,7 @@ def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tm
         easy = ["1", "2"] if not environment.get("shock") else []
         return {name: lambda name=name: row(name, easy) for name in ("constants", *agents_reference.RANDOM)}
 
-    monkeypatch.setattr(agents_reference, "makers", makers)
+    monkeypatch.setattr(agents_reference, "on_ring", makers)
     for _ in range(2):
         agents_reference.show(tmp_path, ("failsafe", "failsafe-shock"), benchmark.once)
     assert len(made) == 6 and {shock for _, shock in made} == {0.0, 4.0}
@@ -138,7 +138,40 @@ def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tm
     assert "| constants | 2 of 10; 1.000/0.10/1.00/0 | 0 of 10; 1.000/0.10/1.00/0 |" in printed
     assert "failsafe: 4 of 20 random policies pass, so it is no test." in printed
     assert "failsafe-shock: 0 of 20 random policies pass, so it is a test." in printed
-    assert set(benchmark.RINGS) == set(agents_reference.rings())
+    assert set(benchmark.TESTS) == set(agents_reference.tests())
+
+
+def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark, monkeypatch):
+    from agents import evaluate
+    from agents.common import Policy
+    from benchmarks import agents_reference
+
+    asked = []
+
+    def judge(act, environment, draws=(0,)):
+        asked.append(tuple(draws))
+        reward = 0.7 if act is None else 0.9
+        return {"reward": reward, "time_gap": 1.0, "collisions": 0, "passed": reward >= evaluate.FOLLOW_REWARD}
+
+    monkeypatch.setattr(agents_reference, "evaluate_follow", judge)
+    monkeypatch.setattr(agents_reference, "random_policies", lambda environment, count, hidden: [Policy(3)] * 2)
+    rows = agents_reference.behind_leader(agents_reference.tests()["follow"], Path())
+    alone = rows["IDM (a human driver more)"]()
+    assert (alone["tried"], alone["passed"]) == (1, [])
+    assert rows["random networks"]()["passed"] == ["0", "1"] and asked == [(0,)] * 3 + [(1, 2, 3, 4, 5)] * 2
+
+
+def test_the_share_not_solved_yet_counts_those_that_never_solve(tmp_path):
+    import matplotlib.pyplot as plt
+
+    from benchmarks.agents_pictures import curve
+
+    rows = [{"summary": {"solved": s < 9.0, "cpu_seconds": s, "spent": 20.0}} for s in (2.0, 4.0, 9.0, 9.0)]
+    _, axes = plt.subplots()
+    curve(axes, rows, "X", "red")
+    line = axes.lines[0]
+    assert list(zip(line.get_xdata(), line.get_ydata(), strict=True)) == [(1, 1), (2, 0.75), (4, 0.5), (20, 0.5)]
+    assert line.get_label() == "X: 2 of 4 seeds"
 
 
 def test_longer_trainings_have_as_many_times_the_updates_and_a_place_of_their_own(benchmark, tmp_path):

@@ -1,0 +1,53 @@
+"""The picture of docs/agents.md on how soon agents solve a test: ``python benchmarks/agents.py picture``.
+
+For each task and agent the share of seeds that have not solved it yet, against the CPU seconds of training (Kaplan
+and Meier 1958): a seed that never solves counts as long as it was trained. The longest trainings of an agent are shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from scipy.stats import CensoredData, ecdf
+
+from benchmarks.agents_tables import Row, results
+
+AGENTS = {"apg": "#1e5adc", "shac": "#1a7850", "ppo": "#b2182b", "sac": "#ef8a62"}
+TASKS = {"ring": "ring with a shock", "follow": "behind a recorded leader"}
+
+
+def longest(out: Path, config: str, seeds: Sequence[int]) -> list[Row]:
+    """Return the results of a configuration's seeds with the most updates."""
+    found = [r for r in results(out, config) if r["seed"] in seeds]
+    most = max((r.get("times", 1) for r in found), default=1)
+    return [r for r in found if r.get("times", 1) == most]
+
+
+def curve(axes: Axes, rows: Sequence[Row], name: str, colour: str) -> None:
+    """Draw the share of seeds that are not solved yet."""
+    summaries = [r["summary"] for r in rows]
+    solved = [s["cpu_seconds"] for s in summaries if s["solved"]]
+    spent = [s["spent"] for s in summaries if not s["solved"]]
+    left = ecdf(CensoredData(uncensored=solved, right=spent)).sf
+    x, y = [1.0, *left.quantiles], [1.0, *left.probabilities]
+    axes.step(x, y, where="post", color=colour, label=f"{name}: {len(solved)} of {len(rows)} seeds")
+    axes.plot(spent, left.evaluate(spent), "|", color=colour, markersize=10)
+
+
+def draw(out: Path, seeds: Sequence[int], path: Path) -> None:
+    """Write the picture, a panel per task."""
+    figure, panels = plt.subplots(1, len(TASKS), figsize=(10, 3.6), sharey=True, layout="constrained")
+    for axes, (task, title) in zip(panels, TASKS.items(), strict=True):
+        for agent, colour in AGENTS.items():
+            rows = longest(out, f"{task}-{agent}", seeds)
+            if rows:
+                curve(axes, rows, agent.upper(), colour)
+        axes.set(title=title, xscale="log", xlabel="CPU seconds of training", ylim=(-0.03, 1.03))
+        axes.legend(frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("share of seeds not solved yet")
+    figure.savefig(path, dpi=110)
+    print(path)
