@@ -301,9 +301,14 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, steps: int,
     save_video(frames, str(path.parent), name_prefix=path.stem, fps=10, episode_trigger=lambda _: True)
 
 
-def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: int, steps: int, seed: int = 0) -> None:
-    """Draw the space-time diagram of one episode: ``human`` steps of human driving, then ``steps`` with the policy."""
-    from idm_env.diagrams import space_time
+def picture(
+    path: Path, environment: Mapping[str, Any], policy: Policy | None, human: int, steps: int, seed: int = 0
+) -> None:
+    """Draw the space-time diagram of one episode: ``human`` steps of human driving, then ``steps`` with the policy.
+
+    Roads of several lanes get a panel for each.
+    """
+    from idm_env.diagrams import lane_panels, rollout_panel, space_time
 
     chosen: dict[str, Any] = {**environment, "warmup_pool": 0, "max_episode_steps": -1}
     task = task_of(environment)
@@ -314,13 +319,23 @@ def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: i
     observation, _ = env.reset(seed=seed)
     states = []
     for step in range(human + steps):
-        observation, *_ = env.step(None if step < human else policy.predict(observation)[0])
+        action = None if policy is None or step < human else policy.predict(observation)[0]
+        observation, _, terminated, *_ = env.step(action)
         states.append(env.state)
-    motion = Motion(*(torch.cat([getattr(s, name) for s in states]) for name in Motion._fields))
-    ring = float((states[0].gap + states[0].length).sum()) if env.task.name == "ring" else None
+        if terminated:
+            break
     dt = env.task.simulator.dt
-    title = f"human drivers; from {human * dt:.0f} s on the agent drives the blue vehicle"
-    space_time(motion, dt=dt, ring_length=ring, marked=env.task.agents, title=title).savefig(path)
+    motion = Motion(*(torch.cat([getattr(s, name) for s in states]) for name in Motion._fields))
+    if states[0].links is None:
+        ring = float((states[0].gap + states[0].length).sum()) if env.task.name == "ring" else None
+        drawn = [rollout_panel(motion, dt=dt, ring_length=ring, marked=env.task.agents)]
+    else:
+        lane = torch.cat([s.links.lane for s in states if s.links is not None])
+        present = torch.cat([s.present for s in states if s.present is not None])
+        drawn = lane_panels(motion, lane, present, dt=dt, marked=env.task.agents)
+    first = f"human drivers; from {human * dt:.0f} s on the" if human else "the"
+    title = "human drivers" if policy is None else f"{first} agent drives what is blue"
+    space_time(drawn, title=title).savefig(path)
 
 
 class Motion(NamedTuple):

@@ -245,6 +245,17 @@ def test_a_saved_policy_is_evaluated_and_filmed(tmp_path, capsys, monkeypatch):
     assert film.stat().st_size > 1000 and (tmp_path / "a.png").stat().st_size > 1000
 
 
+def test_a_road_of_several_lanes_is_drawn_with_a_panel_for_each(tmp_path, monkeypatch):
+    from idm_env import diagrams
+
+    drawn = []
+    space_time = diagrams.space_time
+    monkeypatch.setattr(diagrams, "space_time", lambda panels, **k: drawn.extend(panels) or space_time(panels, **k))
+    evaluate.picture(tmp_path / "a.png", {"task": "merge"}, None, 0, 30)
+    assert [p.title.split(",")[0] for p in drawn] == ["lane 2", "lane 1", "lane 0"]
+    assert any(line.marked for panel in drawn for line in panel.lines) and (tmp_path / "a.png").exists()
+
+
 def test_a_wrong_file_is_told_in_one_line(tmp_path):
     with pytest.raises(SystemExit, match=r"error: .*none\.pt is not a file"):
         evaluate.main([str(tmp_path / "none.pt")])
