@@ -5,10 +5,6 @@ and through the traffic. After W steps the graph is cut and the episodes go on (
 long enough for an action's effect to come round to the vehicle: on a ring of 22 vehicles about a minute. The name is
 that of Freeman et al. 2021 (Brax, arXiv 2106.13281).
 
-The first updates may be in an easier environment (``first``), such as one with a failsafe. What that failsafe cuts off
-a command has no gradient through the traffic, so ``heed`` makes it cost something: then a policy learns to brake by
-itself while nothing can happen, and the failsafe can be taken away.
-
 ``python -m agents.apg --config configs/ring-apg.yaml --seed 1``
 """
 
@@ -16,18 +12,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
-from torch import Tensor
 
 from agents import common, environments
 from agents.monitor import Monitor
-from idm_env.envs.vector import DiffIDMVectorEnv
-from idm_env.tasks import Task
 
 
 @dataclass
@@ -39,10 +31,6 @@ class Arguments(common.Arguments):
         window: Steps through which gradients go.
         explore: Standard deviation of what is added to the actions of each environment throughout a window, falling
             with the learning rate. Without it a vehicle that stands never feels what driving on is worth.
-        first: Keywords of the environment that differ in the first updates; only in YAML.
-        first_updates: How many updates these are.
-        heed: Reward per step that an agent loses for each m/s² of its command that the failsafe of the first updates
-            would cut off, as far as its brakes could do better; it grows to that over the first updates.
     """
 
     out: Path = Path("runs/apg")
@@ -50,35 +38,6 @@ class Arguments(common.Arguments):
     count: int = 64
     window: int = 600
     explore: float = 0.02
-    first: Annotated[dict[str, Any], tyro.conf.Suppress] = field(default_factory=dict)
-    first_updates: int = 0
-    heed: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.heed < 0.0:
-            raise ValueError(f"heed = {self.heed:g} must be at least 0.")
-        if self.heed and not {**self.environment, **self.first}.get("failsafe"):
-            raise ValueError(
-                f"heed = {self.heed:g} is for what a failsafe cuts off, and there is none. Give a failsafe in "
-                "'environment' or 'first', or leave heed out."
-            )
-
-
-def stage(arguments: Arguments, update: int) -> dict[str, Any]:
-    """Return the keywords of the environment of an update."""
-    return {**arguments.environment, **(arguments.first if update < arguments.first_updates else {})}
-
-
-def beyond(guard: Task, env: DiffIDMVectorEnv, action: Tensor) -> Tensor:
-    """Return by how much commands exceed what the failsafe of ``guard`` lets pass (m/s²), ``(n, agents)``.
-
-    Nobody can heed it beyond his brakes. What is safe has no gradient: it is a target.
-    """
-    world = env.batch.world
-    assert world is not None
-    safe = guard.safe_command(world).detach().clamp_min(guard.command_limits[0])
-    return torch.relu(guard.command(action) - safe)
 
 
 def train(arguments: Arguments) -> list[dict[str, Any]]:
@@ -87,9 +46,8 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     torch.manual_seed(arguments.seed)
     policy, saved = common.begin(arguments, "apg")
     done = saved.get("update", -1) + 1
-    env = environments.make_env(stage(arguments, done), arguments.count, output="torch")
+    env = environments.make_env(arguments.environment, arguments.count, output="torch")
     env.reset(seed=environments.first_seed(arguments.seed, arguments.count))
-    guard = environments.task_of(stage(arguments, -1)) if arguments.heed else None
     optimiser = torch.optim.Adam(policy.parameters(), lr=arguments.learning_rate)
     if saved:
         optimiser.load_state_dict(saved["optimiser"])
@@ -100,10 +58,6 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         if not saved:
             monitor.untrained(policy)
         for update in range(done, arguments.updates):
-            if update == arguments.first_updates > done:
-                episodes = environments.snapshot(env)
-                env = environments.make_env(stage(arguments, update), arguments.count, output="torch")
-                observation = environments.restore(env, episodes)
             rate = common.fall(arguments.learning_rate, update, arguments.updates)
             optimiser.param_groups[0]["lr"] = rate
             env.detach()
@@ -111,14 +65,9 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             # Seeded by the update, so that a resumed training repeats it.
             torch.manual_seed(environments.first_seed(arguments.seed, update))
             share = rate / arguments.learning_rate
-            # It grows while the failsafe is there: first a vehicle learns to drive, then to brake by itself.
-            heed = arguments.heed * min((update + 1) / max(arguments.first_updates, 1), 1.0)
             push = arguments.explore * share * torch.randn(arguments.count, len(env.task.agents))
             for _ in range(arguments.window):
-                action = policy(observation) + push
-                if guard is not None:
-                    total = total - heed * beyond(guard, env, action).mean()
-                observation, reward, *_ = env.step(action)
+                observation, reward, *_ = env.step(policy(observation) + push)
                 total = total + reward.mean()
             loss = -total / arguments.window
             norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)

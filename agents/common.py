@@ -29,7 +29,7 @@ SCHEMA = 2
 """Version of the layout of checkpoints."""
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
-MAY_BE_ZERO = {"seed", "clone", "critic_first", "first_updates", "learning_starts"}
+MAY_BE_ZERO = {"seed", "clone", "critic_first", "learning_starts"}
 POSITIVE = {"learning_rate", "clip"}
 KEPT = ("last.pt", "best.pt", "model.zip", "returns.pkl", "replay.pkl")
 """What trainings keep in ``out``, beside their logs."""

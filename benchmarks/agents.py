@@ -72,14 +72,20 @@ SEARCH: dict[str, list[Options]] = {
     ],
     "ring-shac": [{}],
     "ring-drivers-apg": [{}],
-    "ring-brakes-apg": [{}],
+    "ring-brakes-distil": [{"evaluate_every": 0}],
     "follow-apg": [{}],
     "follow-ppo": [{}],
     "follow-sac": [{}],
     "follow-shac": [{}],
 }
 """Trials of each algorithm: five where searches are equal; what one does not name is as in its configuration file."""
-MODULES = {"apg": "agents.apg", "ppo": "agents.ppo", "sac": "agents.ppo", "shac": "agents.shac"}
+MODULES = {
+    "apg": "agents.apg",
+    "ppo": "agents.ppo",
+    "sac": "agents.ppo",
+    "shac": "agents.shac",
+    "distil": "agents.distil",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +111,9 @@ class Job:
         words += ["--out", str(out), "--cpu-seconds", str(LIMIT * self.times)]
         words += ["--evaluate-every", str(EVERY * self.times**0.5)]
         options = dict(self.options)
+        teacher = out.parents[3] / f"ring-apg/trial0/seed{self.seed}/training/last.pt"
+        if module == MODULES["distil"] and (teacher.parents[1] / "result.json").exists():
+            options["teacher"] = teacher
         if self.times > 1:
             given = read_yaml(ROOT / "configs" / f"{self.config}.yaml")
             options["updates"] = self.times * options.get("updates", given["updates"])

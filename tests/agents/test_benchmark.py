@@ -50,6 +50,17 @@ def test_every_trial_is_trained_once(benchmark, tmp_path):
     assert len(benchmark.trained) == 5 * 2 + 4
 
 
+def test_a_policy_is_distilled_from_the_same_seeds_teacher_where_there_is_one(benchmark, tmp_path):
+    """Else the configuration's teacher is trained first."""
+    benchmark.run(["ring-brakes-distil"], tmp_path, 1)
+    benchmark.run(["ring-apg"], tmp_path, 2, given=0)
+    benchmark.run(["ring-brakes-distil"], tmp_path, 2)
+    first, second = (c for c in benchmark.trained if "agents.distil" in c)
+    assert "--teacher" not in first
+    teacher = tmp_path / "ring-apg" / "trial0" / "seed1" / "training" / "last.pt"
+    assert second[second.index("--teacher") + 1] == str(teacher)
+
+
 def test_trainings_are_parts_of_an_executor(benchmark, tmp_path):
     """All trials of all searches at once, then all seeds: so many workers as there are have something to do."""
     given = []
@@ -80,9 +91,10 @@ def test_what_another_process_works_on_is_left_to_it(benchmark, tmp_path):
 def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
     compared = ("ring-apg", "ring-ppo", "ring-sac")
     assert {len(benchmark.SEARCH[c]) for c in compared} == {5}
-    from agents import apg, ppo, shac
+    from agents import apg, distil, ppo, shac
 
     kinds = {"apg": apg.Arguments, "ppo": ppo.Arguments, "sac": ppo.Arguments, "shac": shac.Arguments}
+    kinds["distil"] = distil.Arguments
     for config, trials in benchmark.SEARCH.items():
         assert (ROOT / "configs" / f"{config}.yaml").exists()
         for options in trials:

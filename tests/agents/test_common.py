@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from agents import apg, classical, common, environments, evaluate, imitation, ppo, shac
+from agents import apg, classical, common, distil, environments, evaluate, imitation, ppo, shac
 from agents.common import DivergedError, Policy
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-KINDS = {"apg": apg.Arguments, "shac": shac.Arguments, "ppo": ppo.Arguments, "imitation": imitation.Arguments}
+KINDS = {module.__name__.split(".")[-1]: module.Arguments for module in (apg, shac, ppo, imitation, distil)}
 AGENTS = sorted(p for p in CONFIGS.glob("*-*.yaml"))
 
 

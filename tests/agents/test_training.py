@@ -67,49 +67,6 @@ def test_apg_resumes_exactly(quick, tmp_path):
     assert same(weights(tmp_path / "whole" / "last.pt"), weights(whole.out / "last.pt"))
 
 
-def test_apg_loses_the_failsafe_of_the_first_updates_and_resumes_across_that(quick, tmp_path, monkeypatch):
-    made = []
-    plain = environments.make_env
-
-    def make_env(environment, *rest, **keywords):
-        made.append(environment.get("failsafe", 0.0))
-        return plain(environment, *rest, **keywords)
-
-    monkeypatch.setattr(apg.environments, "make_env", make_env)
-    staged = {**quick, **SMALL, "first": {"failsafe": 3.0}, "first_updates": 2, "heed": 5.0}
-    staged["environment"] |= {"max_command": [-4.5, 2.6]}
-    whole = apg.Arguments(**staged)
-    apg.train(dataclasses.replace(whole, out=tmp_path / "whole"))
-    assert [x for x in made if x] == [3.0] and made[-1] == 0.0
-    for _ in range(4):
-        apg.train(dataclasses.replace(whole, cpu_seconds=1e-9, resume=(whole.out / "last.pt").exists()))
-    assert same(weights(tmp_path / "whole" / "last.pt"), weights(whole.out / "last.pt"))
-
-
-def test_what_a_failsafe_cuts_off_costs_and_is_felt(ring):
-    """``max(u − max(u_safe, hardest braking), 0)``, with a gradient in the command although the failsafe cuts it."""
-    env = environments.make_env({**ring, "failsafe": 3.0, "max_command": [-4.5, 2.6]}, 3, output="torch")
-    env.reset(seed=0)
-    for _ in range(40):  # to where the failsafe acts
-        env.step(torch.ones(3, 1))
-    env.detach()
-    guard = env.task
-    action = torch.ones(3, 1, requires_grad=True)
-    safe = guard.safe_command(env.batch.world)
-    assert bool((safe < 2.6).all())
-    cut = apg.beyond(guard, env, action)
-    assert torch.allclose(cut, 2.6 - safe.clamp_min(-4.5))
-    assert torch.equal(torch.autograd.grad(cut.sum(), action)[0], torch.full((3, 1), 2.6))
-    assert not apg.beyond(guard, env, guard.action(safe.clamp_min(-4.5))).gt(1e-6).any()
-
-
-def test_heeding_a_failsafe_that_is_nowhere_is_refused(quick):
-    with pytest.raises(ValueError, match="heed = 1 is for what a failsafe cuts off"):
-        apg.Arguments(**quick, heed=1.0)
-    with pytest.raises(ValueError, match="heed = -1 must be at least 0"):
-        apg.Arguments(**quick, heed=-1.0)
-
-
 @pytest.mark.parametrize("file", ["model.zip", "returns.pkl"])
 def test_a_broken_file_of_stable_baselines3_is_one_line(file, quick):
     module, kind, small = AGENTS["ppo"]

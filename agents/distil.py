@@ -1,0 +1,142 @@
+"""Distillation: a policy learns to do by itself what it does behind a failsafe, so that the failsafe can go.
+
+A failsafe cuts commands, and what it cuts has no gradient: a policy trained behind one never learns to brake. But the
+two together are a teacher, which nobody has written for this task. Dataset aggregation (DAgger; Ross, Gordon, Bagnell
+2011, AISTATS, arXiv 1011.0686) fits the policy by least squares to what both would command: first where they drive,
+then, round by round, where it drives by itself.
+
+``python -m agents.distil --config configs/ring-brakes-distil.yaml`` trains the teacher first; ``--teacher
+runs/ring-apg/last.pt`` takes one that is there.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from agents import apg, common, environments
+from agents.common import DivergedError, Policy
+from agents.monitor import Monitor
+from idm_env import keep
+from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.tasks import Task
+
+
+@dataclass
+class Arguments(common.Arguments):
+    """Arguments of distillation; ``updates`` are rounds. The policy has the teacher's layout.
+
+    Args:
+        teacher: Checkpoint of a policy that was trained behind a failsafe; or a file of APG, such as
+            configs/ring-apg.yaml: its training comes first, with the same seed, in the folder teacher of ``out``.
+        count: Environments that run together; all begin an episode with each round.
+        steps: Steps of a round: the braking after the take-over, and calm driving after that.
+        fits: Steps of regression in a round, on the data of all rounds so far.
+    """
+
+    out: Path = Path("runs/distil")
+    updates: int = 8
+    evaluate_every: float = 0.0
+    teacher: Path = Path("configs/ring-apg.yaml")
+    count: int = 64
+    steps: int = 900
+    fits: int = 1500
+
+
+def taught(arguments: Arguments) -> tuple[Policy, dict[str, Any]]:
+    """Return the teacher and its checkpoint; it is trained, or trained to its end, if a file says how.
+
+    ValueError, in one line, for a teacher of another task or observation, or without a failsafe.
+    """
+    path = arguments.teacher
+    for name in common.KEPT:
+        keep.not_an_input(arguments.out / name, (path,))
+    if path.suffix != ".pt":
+        chosen = common.load_agent(path, apg.Arguments, "apg")
+        path = arguments.out / "teacher" / "last.pt"
+        begun = path.exists()
+        if not begun or common.load(path)[1]["training"]["update"] + 1 < chosen.updates:
+            apg.train(replace(chosen, seed=arguments.seed, out=path.parent, resume=begun))
+    task = environments.task_of(arguments.environment)
+    policy, content = common.load(path, task.name)
+    before = environments.task_of(content["environment"])
+    if not before.failsafe:
+        raise ValueError(f"{path} was trained without a failsafe: there is nothing to distil. Give another --teacher.")
+    if (before.bounds.names, before.scales) != (task.bounds.names, task.scales):
+        raise ValueError(f"{path} was trained on other observations than this environment's. Give another --teacher.")
+    return policy, content
+
+
+def watch(
+    policy: Policy | None, teacher: Policy, guarded: Task, env: DiffIDMVectorEnv, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Return what agents observe in ``steps`` steps, and the actions that teacher and failsafe would take there.
+
+    The policy drives; None leaves it to the teacher behind the failsafe. ``guarded`` is the task with that failsafe,
+    whose actions may have other limits than those of ``env``. Shapes ``(samples, features)`` and ``(samples,)``.
+    """
+    task, seen, wanted = env.task, [], []
+    with torch.no_grad():
+        for _ in range(steps):
+            world = env.batch.world
+            assert world is not None
+            observation = task.observe(world).flatten(1)
+            action = task.action(guarded.limit(world, guarded.command(teacher(observation))))
+            seen.append(observation.reshape(-1, len(task.bounds.names)))
+            wanted.append(action.flatten())
+            env.step(action if policy is None else policy(observation))
+    return torch.cat(seen), torch.cat(wanted)
+
+
+def train(arguments: Arguments) -> list[dict[str, Any]]:
+    """Fit a policy to its teacher and the failsafe; return the evaluations, CPU seconds with those of the teacher.
+
+    ValueError and DivergedError say what went wrong, in one line.
+    """
+    teacher, content = taught(arguments)
+    began = time.process_time()
+    torch.manual_seed(arguments.seed)
+    policy, saved = copy.deepcopy(teacher), {k: content["training"][k] for k in ("steps", "cpu_seconds")}
+    guarded = environments.task_of(content["environment"])
+    seen: list[Tensor] = []
+    wanted: list[Tensor] = []
+    if arguments.resume:
+        policy, saved = common.begin(arguments, "distil")
+        seen, wanted = [saved["seen"]], [saved["wanted"]]
+    done = saved.get("update", -1) + 1
+    env = environments.make_env(arguments.environment, arguments.count, output="torch")
+    with Monitor("distil", arguments, began, saved) as monitor:
+        if not done:
+            monitor.untrained(policy)
+        for update in range(done, arguments.updates):
+            # Seeded by the round, so that a resumed training repeats it.
+            first = environments.first_seed(arguments.seed, update * arguments.count)
+            torch.manual_seed(first)
+            env.reset(seed=first)
+            new = watch(policy if update else None, teacher, guarded, env, arguments.steps)
+            seen, wanted = [torch.cat((*seen, new[0]))], [torch.cat((*wanted, new[1]))]
+            error = common.clone(policy, seen[0], wanted[0], arguments.fits)
+            if not math.isfinite(error):
+                advice = common.last_good(monitor.last, update)
+                raise DivergedError(f"update {update}: the error {error:g} must be finite. {advice}.")
+            kept = {"seen": seen[0], "wanted": wanted[0]}
+            if not monitor.after(update, arguments.steps * arguments.count, policy, kept, {"error": error}):
+                break
+    return monitor.history
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Train as the command line says."""
+    common.command_line(train, Arguments, "distil", argv)
+
+
+if __name__ == "__main__":
+    main()
