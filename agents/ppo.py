@@ -107,6 +107,44 @@ class Desynchronised(SB3VecEnv):
         return np.asarray(environments.desynchronise(cast(DiffIDMVectorEnv, self.vector_env)))
 
 
+class Shared(Desynchronised):
+    """The adapter with every agent of every environment a row of its own: one policy, and the reward of their team."""
+
+    def __init__(self, vector_env: DiffIDMVectorEnv) -> None:
+        super().__init__(vector_env)
+        self.worlds, self.agents = vector_env.num_envs, len(vector_env.task.agents)
+        self.num_envs = self.worlds * self.agents
+        bounds = vector_env.task.bounds
+        self.observation_space = gymnasium.spaces.Box(
+            np.array(bounds.low, np.float32), np.array(bounds.high, np.float32)
+        )
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the environments, one after the other."""
+        self._seeds = [None if seed is None else seed + i for i in range(self.worlds)]
+        return self._seeds
+
+    def reset(self) -> np.ndarray:
+        """Begin episodes at different clocks."""
+        return super().reset().reshape(self.num_envs, -1)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for ``step_wait``."""
+        super().step_async(actions.reshape(self.worlds, self.agents))
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step, and reset what ended; return observations, rewards, dones and infos of every agent."""
+        observation, reward, done, infos = super().step_wait()
+        told: list[dict[str, Any]] = []
+        for info in infos:
+            last = info.get("terminal_observation")
+            rows = [None] * self.agents if last is None else last.reshape(self.agents, -1)
+            told += [info if row is None else {**info, "terminal_observation": row} for row in rows]
+        reward, done = (np.repeat(x, self.agents) for x in (reward, done))
+        return observation.reshape(self.num_envs, -1), reward, done, told
+
+
 def make_model(arguments: Arguments, env: VecEnv, policy: Policy) -> BaseAlgorithm:
     """Return SB3's algorithm, its actor of the size and the normalisation of ``policy``."""
     net: dict[str, Any] = {
@@ -169,7 +207,9 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     name = arguments.algorithm
     squash = "tanh" if name == "sac" else "clip"
     policy, saved = common.begin(arguments, name, activation=arguments.activation, squash=squash)
-    vector = Desynchronised(environments.make_env(arguments.environment, arguments.count, output="numpy"))
+    made = environments.make_env(arguments.environment, arguments.count, output="numpy")
+    agents = len(made.task.agents)
+    vector = Desynchronised(made) if agents == 1 else Shared(made)
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
     file, moments, memory = (arguments.out / f for f in ("model.zip", "returns.pkl", "replay.pkl"))
@@ -184,10 +224,10 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         if arguments.clone:
             for mine, other in layers(model, policy):
                 other.load_state_dict(mine.state_dict())
-    chunk = arguments.n_steps * arguments.count
+    chunk = arguments.n_steps * vector.num_envs
     done = model.num_timesteps // chunk
     if saved:  # an interruption between two files leaves the model one chunk ahead
-        saved |= {"update": done - 1, "steps": done * chunk}
+        saved |= {"update": done - 1, "steps": done * chunk // agents}
     # Making or loading a model seeds its environments; these are the seeds of all agents, new ones after a resume.
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
 
@@ -211,7 +251,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
                 raise
             copy_actor(model, policy, update, monitor.last)
             figures = {k: float(v) for k, v in model.logger.name_to_value.items() if "loss" in k or "std" in k}
-            if not monitor.after(update, chunk, policy, {}, {**figures, "learning_rate": rate}, store):
+            if not monitor.after(update, chunk // agents, policy, {}, {**figures, "learning_rate": rate}, store):
                 break
     return monitor.history
 

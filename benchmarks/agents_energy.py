@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from agents import apg, common
 from agents.environments import task_of
@@ -26,7 +27,7 @@ from agents.imitation import default_data, observe
 from agents.rollout import Act
 from benchmarks.agents_tables import table
 from idm_env import metrics
-from idm_env.data import Episode, episodes, load
+from idm_env.data import Episode, Trajectories, episodes, load
 from idm_env.data.samples import VEHICLES
 from idm_env.effects import Control
 from idm_env.effects.idm import equilibrium_gap
@@ -35,47 +36,75 @@ from idm_env.fitting.fit import base_simulator, fit
 from idm_env.types import Command, Params, Record
 
 Row = dict[str, Any]
-BEHIND, LENGTH, SHORTEST = 10, 5.0, 300
-"""Vehicles behind vehicle 1, their length (m), and steps of the shortest stretch that agents are trained on."""
+BEHIND, LENGTH, WINDOW = 10, 5.0, 600
+"""Vehicles behind vehicle 1, their length (m), and steps of the stretches that agents are trained on."""
+
+
+class Platoon:
+    """Vehicle 1 and those behind it in their queue behind every leader, as they begin; nobody has moved yet.
+
+    ``kind`` is recorded, idm or agent: who drives vehicle 1.
+    """
+
+    def __init__(self, items: Sequence[Episode], params: Params, kind: str) -> None:
+        batch, vehicles = Batch.of(items, substeps=1), BEHIND + 2
+        simulator = base_simulator(items[0].dt)
+        self.simulator = simulator.adding(Control()) if kind == "agent" else simulator
+        self.params: Params = {**self.simulator.defaults(dtype=torch.float64), **params}
+        motions = (batch.position, batch.all_speed, batch.accel)
+        lead, own = ([x[..., VEHICLES.index(who)] for x in motions] for who in ("leader", "driver"))
+        speed = torch.stack([lead[1][0], *[own[1][0]] * (BEHIND + 1)], -1)
+        length = torch.tensor([[e.leader.length_m, *[LENGTH] * (BEHIND + 1)] for e in items], dtype=torch.float64)
+        gaps = equilibrium_gap(self.simulator.base.driver(self.params["idm"]), speed[:, 2:])
+        position = torch.cat((lead[0][0, :, None], own[0][0, :, None] - torch.cat(
+            (torch.zeros(len(items), 1), (gaps + LENGTH).cumsum(-1)), -1)), -1)  # fmt: skip
+        self.state = self.simulator.state(position, speed, self.params, length=length)
+        self.active = torch.arange(vehicles) == 1
+        self.valid = batch.valid[1:] > 0
+        # The record of every step's end, time first.
+        columns = (torch.stack([a[1:], *[b[1:]] * (BEHIND + 1)], -1) for a, b in zip(lead, own, strict=True))
+        self.record = Record(*columns, torch.arange(vehicles) < (2 if kind == "recorded" else 1))
+
+    @property
+    def steps(self) -> int:
+        """Steps of the longest record."""
+        return len(self.valid)
+
+    def rolled(self, command: Tensor | None = None) -> Row:
+        """Return what ``driven`` does, vehicle 1 commanded throughout ``(steps, leaders)`` (m/s²)."""
+        active = self.record.active.expand(self.steps, -1)
+        inputs: dict[str, Any] = {"replay": self.record._replace(active=active.unsqueeze(1))}
+        if command is not None:
+            everybody = command.unsqueeze(-1).expand(-1, -1, BEHIND + 2)
+            inputs["control"] = Command(everybody, self.active.expand(self.steps, 1, -1))
+        _, kept = self.simulator.rollout(self.state, inputs, self.params, self.steps)
+        found = {"speed": kept.speed, "accel": kept.accel, "gap": kept.gap}
+        return {**{name: x[..., 1:] for name, x in found.items()}, "valid": self.valid}
 
 
 @torch.no_grad()
 def driven(items: Sequence[Episode], params: Params, kind: str, act: Act | None, limits: tuple[float, float]) -> Row:
     """Return speeds, accelerations and gaps of vehicle 1 and those behind it, ``(steps, leaders, vehicles)``.
 
-    ``kind`` is recorded, idm or agent; beyond the end of a record, which ``valid`` tells, nothing is judged.
+    ``kind`` as for ``Platoon``; beyond the end of a record, which ``valid`` tells, nothing is judged.
     """
-    batch, vehicles = Batch.of(items, substeps=1), BEHIND + 2
-    simulator = base_simulator(items[0].dt)
-    agent = kind == "agent"
-    if agent:
-        simulator = simulator.adding(Control())
-    params = {**simulator.defaults(dtype=torch.float64), **params}
-
-    motions = (batch.position, batch.all_speed, batch.accel)
-    lead, own = ([x[..., VEHICLES.index(who)] for x in motions] for who in ("leader", "driver"))
-    speed = torch.stack([lead[1][0], *[own[1][0]] * (BEHIND + 1)], -1)
-    length = torch.tensor([[e.leader.length_m, *[LENGTH] * (BEHIND + 1)] for e in items], dtype=torch.float64)
-    gaps = equilibrium_gap(simulator.base.driver(params["idm"]), speed[:, 2:])
-    position = torch.cat((lead[0][0, :, None], own[0][0, :, None] - torch.cat(
-        (torch.zeros(len(items), 1), (gaps + LENGTH).cumsum(-1)), -1)), -1)  # fmt: skip
-    state = simulator.state(position, speed, params, length=length)
-    replayed = torch.arange(vehicles) < (2 if kind == "recorded" else 1)
-    kept = []
-    for t in range(1, len(batch.gap)):
-        columns = (torch.stack([a[t], *[b[t]] * (BEHIND + 1)], -1) for a, b in zip(lead, own, strict=True))
-        record = Record(*columns, replayed)
-        inputs: dict[str, Any] = {"replay": record}
-        if agent:
-            assert act is not None
-            seen = observe(state.speed[:, 1], state.speed[:, 0], state.gap[:, 1]).float()
-            action = act(seen).clamp(-1.0, 1.0).double()
-            command = torch.where(action < 0.0, -action * limits[0], action * limits[1])
-            inputs["control"] = Command(command.expand(-1, vehicles), torch.arange(vehicles) == 1)
-        state = simulator.step(state, inputs, params)
+    platoon = Platoon(items, params, kind)
+    if act is None:
+        return platoon.rolled()
+    state, kept = platoon.state, []
+    for t in range(platoon.steps):
+        seen = observe(state.speed[:, 1], state.speed[:, 0], state.gap[:, 1]).float()
+        action = act(seen).clamp(-1.0, 1.0).double()
+        command = torch.where(action < 0.0, -action * limits[0], action * limits[1])
+        now = platoon.record
+        inputs = {
+            "replay": now._replace(position=now.position[t], speed=now.speed[t], accel=now.accel[t]),
+            "control": Command(command.expand(-1, BEHIND + 2), platoon.active),
+        }
+        state = platoon.simulator.step(state, inputs, platoon.params)
         kept.append(tuple(x[:, 1:] for x in (state.speed, state.accel, state.gap)))
     v, a, gap = (torch.stack(column) for column in zip(*kept, strict=True))
-    return {"speed": v, "accel": a, "gap": gap, "valid": batch.valid[1:] > 0}
+    return {"speed": v, "accel": a, "gap": gap, "valid": platoon.valid}
 
 
 def judged(run: Row) -> Row:
@@ -97,11 +126,26 @@ def judged(run: Row) -> Row:
     }
 
 
-def environment_of(training: Path, idm: Row, weight: float) -> Row:
-    """Return the keywords of task ``follow`` behind the training pairs' leaders, with a weight of fuel."""
+def pairs(data: Path) -> tuple[Trajectories, list[Episode], dict[str, float]]:
+    """Return the training pairs, the held-out episodes, and IDM calibrated on the former."""
+    training, test = load(data).where("in_manifest=true").split("split=test")
+    found = fit(episodes(training, max_gap=None), by="all")
+    idm = {name.removeprefix("idm."): float(x) for name, x in zip(found.names, found.values()[0], strict=True)}
+    print("IDM, calibrated on the training pairs:", {name: round(x, 3) for name, x in idm.items()})
+    return training, list(episodes(test, max_gap=None, smooth=True)), idm
+
+
+def parameters(idm: Mapping[str, float]) -> Params:
+    """Return them as tensors."""
+    return {"idm": {name: torch.tensor(x, dtype=torch.float64) for name, x in idm.items()}}
+
+
+def environment_of(training: Path, idm: Row, weight: float, lag: float = 0.0) -> Row:
+    """Return the keywords of task ``follow`` behind the training pairs' leaders, with weights of fuel and lag."""
     return {
         "task": "follow", "leader": str(training), "vehicles": BEHIND + 2, "max_command": 3.0, "crash_cost": 50.0,
-        "max_episode_steps": SHORTEST, "parameters": {"idm": idm}, "fuel_weight": weight,
+        "max_episode_steps": WINDOW, "parameters": {"idm": idm}, "fuel_weight": weight,
+        "lag_weight": lag,
     }  # fmt: skip
 
 
@@ -122,31 +166,29 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--updates", type=int, default=30)
     parser.add_argument("--fuel-weight", type=float, default=0.1, help="reward per US gallon per hour in training")
+    parser.add_argument(
+        "--lag-weight", type=float, default=0.0, help="reward per m/s that it is slower than its leader"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/energy"))
     parser.add_argument("--data", type=Path, default=default_data())
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
-    trajectories = load(options.data).where("in_manifest=true")
-    training, test = trajectories.split("split=test")
-    found = fit(episodes(training, max_gap=None), by="all")
-    idm = {name.removeprefix("idm."): float(x) for name, x in zip(found.names, found.values()[0], strict=True)}
-    print("IDM, calibrated on the training pairs:", {name: round(x, 3) for name, x in idm.items()})
+    training, items, idm = pairs(options.data)
     leaders = options.out / "training.parquet"
     training.table.write_parquet(leaders)
-    environment = environment_of(leaders, idm, options.fuel_weight)
-    items = list(episodes(test, max_gap=None, smooth=True))
-    params = {"idm": {name: torch.tensor(x, dtype=torch.float64) for name, x in idm.items()}}
+    environment = environment_of(leaders, idm, options.fuel_weight, options.lag_weight)
+    params = parameters(idm)
     limits = task_of(environment).command_limits
     base = judged(driven(items, params, "recorded", None, limits))
     rows = [told("recorded follower", base, base)]
     rows.append(told("calibrated IDM", judged(driven(items, params, "idm", None, limits)), base))
     for seed in range(options.seeds):
-        folder = options.out / f"fuel{options.fuel_weight:g}" / f"seed{seed}"
+        folder = options.out / f"fuel{options.fuel_weight:g}-lag{options.lag_weight:g}" / f"seed{seed}"
         if not (folder / "done").exists():
             apg.train(
                 apg.Arguments(
-                    environment=environment, out=folder, seed=seed, updates=options.updates, count=16, window=SHORTEST,
+                    environment=environment, out=folder, seed=seed, updates=options.updates, count=16, window=WINDOW,
                     clone=500, learning_rate=1e-2, evaluate_every=1e9, resume=(folder / "last.pt").exists(),
                 )
             )  # fmt: skip
@@ -154,7 +196,7 @@ def main() -> None:
         policy = common.load(folder / "last.pt", "follow")[0]
         rows.append(
             told(
-                f"agent, w = {options.fuel_weight:g}, seed {seed}",
+                f"agent, fuel {options.fuel_weight:g}, lag {options.lag_weight:g}, seed {seed}",
                 judged(driven(items, params, "agent", policy, limits)),
                 base,
             )

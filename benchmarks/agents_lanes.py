@@ -1,15 +1,17 @@
 """Tasks ``merge`` and ``bottleneck``: what vehicles that have learned nothing do there, beside what Flow has published.
 
-    python -m benchmarks.agents_lanes [--out runs/lanes] [--trained runs/merge-apg/last.pt …]
+    python -m benchmarks.agents_lanes [--out runs/lanes] [--train 30] [--seeds 1] [--trained runs/merge-apg/last.pt …]
 
 A tenth of the vehicles is controlled, behind a failsafe of 3 m/s², with commands from −4.5 to 2.6 m/s²; lanes are left
 to their drivers. Every row is eight episodes of 300 s, the same for all, of which the last 200 s count. Families of
-policies that are there are not driven again.
+policies that are there are not driven again. ``--train`` also trains APG and PPO on both tasks, one policy for all
+agents, for so many updates of 16 environments × 300 steps; a training goes on where it was stopped.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from agents import common
+from agents import apg, common, ppo
 from agents.common import Policy
 from agents.environments import first_seed, human_driving, task_of
 from agents.evaluate import evaluate_lanes, judge_lanes
@@ -35,8 +37,7 @@ TASKS: dict[str, Row] = {
     "bottleneck, 1900 an hour": {"task": "bottleneck", "inflow": 1900.0, **CONTROL},
 }
 CONSTANTS = (-0.2, -0.05, 0.0, 0.05, 0.2, 1.0)
-NETWORKS, EPISODES = 10, 8
-
+NETWORKS, EPISODES, STEPS = 10, 8, 300
 
 Family = dict[str, Act]
 """Policies by the names of their rows, which drive together."""
@@ -79,7 +80,26 @@ def networks(environment: Row) -> Family:
 def trained(environment: Row, paths: Sequence[Path]) -> Family:
     """Return the agents among these checkpoints that were trained on the task."""
     loaded = {path.parent.name: common.load(path) for path in paths}
-    return {f"trained: {name}": policy for name, (policy, c) in loaded.items() if c["task"] == environment["task"]}
+    return {
+        f"trained: {name}, {c['training']['cpu_seconds']:.0f} CPU s": policy
+        for name, (policy, c) in loaded.items()
+        if c["task"] == environment["task"]
+    }
+
+
+def train(name: str, agent: str, seed: int, updates: int, folder: Path) -> Path:
+    """Return the checkpoint of an agent trained on a task, trained now or on as far as it is not yet."""
+    last = folder / "last.pt"
+    done = common.load(last)[1]["training"]["update"] + 1 if last.exists() else 0
+    shared: Row = {
+        "environment": TASKS[name], "out": folder, "seed": seed, "updates": updates, "count": 16,
+        "evaluate_every": 1e9, "resume": done > 0,
+    }  # fmt: skip
+    if done < updates and agent == "apg":
+        apg.train(apg.Arguments(**shared, window=STEPS, learning_rate=3e-3))
+    elif done < updates:
+        ppo.train(ppo.Arguments(**shared, n_steps=STEPS, batch_size=4800, gamma=0.99, n_epochs=5))
+    return last
 
 
 def driven(family: Family, environment: Row) -> dict[str, Row]:
@@ -106,8 +126,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/lanes"))
     parser.add_argument("--trained", nargs="*", type=Path, default=[], help="checkpoints of agents, as further rows")
+    parser.add_argument("--train", type=int, metavar="UPDATES", help="also train agents for so many updates")
+    parser.add_argument("--seeds", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if options.train:
+        options.trained += [
+            train(name, agent, seed, options.train, options.out / "trained" / name / f"{agent}-seed{seed}")
+            for seed, name, agent in itertools.product(range(options.seeds), ("merge", "bottleneck"), ("apg", "ppo"))
+        ]
     rows = []
     for name, environment in TASKS.items():
         makers: dict[str, Callable[[], Family]] = {

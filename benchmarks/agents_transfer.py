@@ -1,42 +1,69 @@
-"""Does closing the loop pay in control? Policies trained on a plain and on a corrected model, judged in the truth.
+"""Does closing the loop pay in control? Policies trained on plain and on corrected models, judged elsewhere.
 
-    python benchmarks/agents_transfer.py [--out runs/transfer] [--seeds 10] [--executor processes --jobs 8]
+    python -m benchmarks.agents_transfer [--case delay] [--out runs/transfer] [--seeds 10]
+        [--data ngsim_i80_pairs.parquet] [--executor processes --jobs 8]
 
-Platoons are generated whose drivers react with a hidden delay. From the same data come plain IDM, calibrated, and the
-model of ``discover``, which has the effect that it found; both are saved as ``model.yaml``. One APG policy per model
-and seed is trained on a ring of that model, and a third kind on the truth itself. All are judged on rings of the
-generated drivers, whose parameters and delay are known, also with a failsafe. What is done is kept and skipped.
+Case ``delay``: platoons are generated whose drivers react with a hidden delay; ``two``: with that delay, and they
+brake harder than they accelerate. From the same data come plain IDM, calibrated, and the model of ``discover``, which
+has the effects that it found; both are saved as ``model.yaml``. One APG policy per model and seed is trained on a ring
+of that model, and a third kind on the truth itself. All are judged on rings of the generated drivers, whose parameters
+and effects are known, also with a failsafe.
+
+Case ``i80``: measured drivers, of whom there is no truth. From half of the pairs come plain IDM, the model of
+``discover``, and that with the wandering time gap that ``idm_env.drift`` estimates; all are judged among the *other*
+half's drivers, each a driver of his own, with what ``discover`` and drift say of that half. What is done is kept.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import dataclasses
 import os
-import sys
-from collections import deque
+import statistics
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
     os.environ.setdefault(variable, "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import torch  # noqa: E402 (threads are set before torch starts)
-from scipy.stats import mannwhitneyu  # noqa: E402
+import numpy as np  # noqa: E402 (threads are set before torch starts)
+import torch  # noqa: E402
+from scipy.stats import bootstrap, mannwhitneyu  # noqa: E402
 
 from agents import apg, common  # noqa: E402
 from agents.classical import PISaturation, no_command  # noqa: E402
 from agents.evaluate import evaluate_ring  # noqa: E402
+from agents.imitation import default_data  # noqa: E402
 from agents.rollout import FRESH, LENGTHS, Act  # noqa: E402
 from benchmarks import workers  # noqa: E402
-from idm_env.progress import OnProgress  # noqa: E402
+from benchmarks.agents import once  # noqa: E402
+from benchmarks.agents_tables import table  # noqa: E402
+from benchmarks.drift import CHOSEN, thinned  # noqa: E402
+from idm_env.config import load_model, save_model  # noqa: E402
+from idm_env.data import Trajectories, episodes, load, synthetic  # noqa: E402
+from idm_env.discovery import discover, write_report  # noqa: E402
+from idm_env.drift.kinds import tell  # noqa: E402
+from idm_env.effects import Wander  # noqa: E402
+from idm_env.fitting.drivers import Estimates  # noqa: E402
+from idm_env.fitting.fit import fit  # noqa: E402
+from idm_env.fitting.job import model_of  # noqa: E402
+from idm_env.progress import OnProgress, silent  # noqa: E402
 from idm_env.tasks import make_task  # noqa: E402
 
 Row = dict[str, Any]
-EFFECT, STRENGTH, DATA_SEED = "delay", 0.5, 5
-FAILSAFE = 3.0
+CASES: dict[str, dict[str, dict[str, float]]] = {
+    "delay": {"delay": {"delay": 0.5}},
+    "two": {"delay": {"delay": 0.5}, "asymmetry": {"strength": 0.5}},
+    "i80": {},
+}
+"""The hidden effects of a case, and their parameters; the one parameter is the generator's strength."""
+DATA_SEED, FAILSAFE, TRUTH, UPDATES = 5, 3.0, "truth", 16
+LONGER = (280.0, 300.0, 320.0, 340.0, 360.0, 380.0)
+"""Rings for the measured drivers, who keep longer gaps: they are as slow there as on I-80."""
+DRIFTERS = 60
+"""Drivers at most on whom drift is estimated, as by the command."""
 HEAD = (
     "trained on", "seed", "worst speed ratio", "worst std (m/s)", "smallest time gap (s)", "collisions",
     "with a failsafe: ratio, std, collisions", "in its own model: ratio, std, collisions",
@@ -48,104 +75,184 @@ RING = {
 }  # fmt: skip
 
 
-def models(out: Path) -> dict[str, Any]:
-    """Return the environments of plain, corrected and true drivers; models are written to ``out`` once."""
-    from idm_env.config import save_model
-    from idm_env.data import episodes, synthetic
-    from idm_env.discovery import discover, write_report
-    from idm_env.fitting.drivers import Estimates
-    from idm_env.fitting.fit import fit
-    from idm_env.fitting.job import model_of
+@dataclass(frozen=True)
+class Part:
+    """A row: a policy trained in an environment, or one that learns nothing; where it is judged, and its folder."""
 
-    trajectories, truth = synthetic.generate(DATA_SEED, effect=EFFECT, strength=STRENGTH)
+    name: str
+    out: Path
+    judged_in: dict[str, Row]
+    lengths: tuple[float, ...]
+    trained_in: Row | None = None
+    seed: int = 0
+
+    def __str__(self) -> str:
+        return str(self.out)
+
+
+def learnt(trajectories: Trajectories, out: Path) -> tuple[Path, Path]:
+    """Return the files of plain and corrected drivers of these records, made once."""
     plain, corrected = out / "plain.yaml", out / "corrected" / "model.yaml"
     out.mkdir(parents=True, exist_ok=True)
     if not plain.exists():
         save_model(plain, model_of(Estimates.of(fit(episodes(trajectories, max_gap=None, smooth=True), by="all"))))
     if not corrected.exists():
         write_report(discover(trajectories, seed=DATA_SEED), corrected.parent)
+    return plain, corrected
+
+
+def unsteady(trajectories: Trajectories, corrected: Path, out: Path) -> Path:
+    """Return the file of a corrected model whose drivers' time gap wanders as in these records, made once."""
+    if not out.exists():
+        both = [list(episodes(trajectories, max_gap=None, smooth=smooth)) for smooth in (True, False)]
+        chosen = np.linspace(0, len(both[0]) - 1, min(DRIFTERS, len(both[0]))).astype(int)
+        smooth, measured = ([thinned(found[i]) for i in chosen] for found in both)
+        # With the noise for which forecasts on I-80 have been checked (docs/drift.md).
+        found = tell(smooth, measured, (Wander(),), noise=CHOSEN["wander"]).found["wander"].settings
+        drift = {"wander": {"sigma": float(found.sigma[0]), "memory_time": float(found.memory_time[0])}}
+        model = load_model(corrected)
+        save_model(
+            out,
+            dataclasses.replace(
+                model, effects=(*model.effects, Wander()), parameters={**model.parameters, **drift}, fitted_on={}
+            ),
+        )
+    return out
+
+
+def generated(case: str, out: Path) -> dict[str, Row]:
+    """Return the environments of plain, corrected and true drivers of a case; the last is where all are judged."""
+    effects = CASES[case]
+    strengths = {name: next(iter(values.values())) for name, values in effects.items()}
+    trajectories, truth = synthetic.generate(DATA_SEED, effect=strengths)
+    plain, corrected = learnt(trajectories, out)
     drivers = truth.drivers[:22]
+    own = {"idm": {name: drivers[name].to_list() for name in NAMES}}
     return {
         "plain IDM": {**RING, "effects": str(plain)},
         "corrected model": {**RING, "effects": str(corrected)},
-        "the truth": {
-            **RING,
-            "effects": [EFFECT],
-            "parameters": {"idm": {name: drivers[name].to_list() for name in NAMES}, EFFECT: {EFFECT: STRENGTH}},
-        },
+        TRUTH: {**RING, "effects": list(effects), "parameters": {**own, **effects}},
     }
 
 
-@dataclass(frozen=True)
-class Training:
-    """A policy to be trained: in which environment, with which seed, into which folder."""
-
-    environment: Row
-    seed: int
-    out: Path
-
-    def __str__(self) -> str:
-        return str(self.out)
-
-
-def train(part: Training, on_progress: OnProgress) -> None:
-    """Train a policy, unless it is there."""
-    if not (part.out / "done").exists():
-        apg.train(
-            apg.Arguments(
-                environment=part.environment, out=part.out, seed=part.seed, updates=16, evaluate_every=1e9, explore=0.0
-            )
-        )
-        (part.out / "done").touch()
+def measured(data: Path, out: Path) -> dict[str, Row]:
+    """Return the environments of the models of half of the measured drivers, and of the other half's."""
+    ring = {**RING, "length": [min(LONGER), max(LONGER)]}
+    pairs = load(data)
+    ours, theirs = pairs.where(["in_manifest=true", "split=train"]), pairs.where("in_manifest=false")
+    plain, corrected = learnt(ours, out)
+    drifting = unsteady(ours, corrected, out / "drifting.yaml")
+    others = unsteady(theirs, learnt(theirs, out / "others")[1], out / "others" / "drifting.yaml")
+    return {
+        "plain IDM": {**ring, "effects": str(plain)},
+        "corrected model": {**ring, "effects": str(corrected)},
+        "corrected model with drift": {**ring, "effects": str(drifting)},
+        TRUTH: {**ring, "drivers": str(others)},
+    }
 
 
-def judge(act: Act | None, environment: dict[str, Any]) -> Row:
-    """Return the figures on six lengths and five draws, from a take-over after the warm-up of the training on."""
-    return evaluate_ring(act, environment, warmup=RING["warmup"], draws=FRESH)
+def parts_of(case: str, environments: dict[str, Row], out: Path, seeds: int) -> list[Part]:
+    """Return all rows of a case, seed after seed, so that what is there at any time can be compared."""
+    truth = environments[TRUTH]
+    there = {"truth": truth, "guarded": {**truth, "failsafe": FAILSAFE}}
+    lengths = LONGER if case == "i80" else LENGTHS
+    rows = [Part(name, out / name.replace(" ", "-"), there, lengths) for name in UNTRAINED]
+    for seed in range(seeds):
+        for name, environment in environments.items():
+            folder = out / name.replace(" ", "-") / f"seed{seed}"
+            rows.append(Part(name, folder, {**there, "own": environment}, lengths, environment, seed))
+    return rows
+
+
+UNTRAINED: dict[str, Callable[[Row], Act | None]] = {
+    "human drivers": lambda environment: None,
+    "no command": lambda environment: no_command,
+    "PI with saturation": lambda environment: PISaturation(make_task(**environment)),
+}
+
+
+def row(part: Part, on_progress: OnProgress = silent) -> Row | None:
+    """Return the figures of a row, its policy trained now if it is not there; None if another process is at it."""
+
+    def make() -> Row:
+        if part.trained_in is None:
+            acts = {where: UNTRAINED[part.name](environment) for where, environment in part.judged_in.items()}
+        else:
+            last = part.out / "last.pt"
+            arguments = apg.Arguments(
+                environment=part.trained_in, out=part.out, seed=part.seed, updates=UPDATES, evaluate_every=1e9,
+                explore=0.0, resume=last.exists(),
+            )  # fmt: skip
+            if not last.exists() or common.load(last, "ring", "apg")[1]["training"]["update"] + 1 < UPDATES:
+                apg.train(arguments)
+            acts = dict.fromkeys(part.judged_in, common.load(last, "ring", "apg")[0])
+        # From a take-over after the warm-up of the training on.
+        return {
+            where: evaluate_ring(acts[where], environment, part.lengths, RING["warmup"], FRESH)
+            for where, environment in part.judged_in.items()
+        }
+
+    return once(part.out, make)
+
+
+def cells(part: Part, found: Row) -> list[str]:
+    """Return the cells of a row: in the truth, there with a failsafe, and in the model of the training."""
+    r = found["truth"]
+    seed = "" if part.trained_in is None else str(part.seed)
+    figures = [f"{r['speed_ratio']:.3f}", f"{r['speed_std']:.2f}", f"{r['time_gap']:.2f}", str(r["collisions"])]
+    others = [found.get(where) for where in ("guarded", "own")]
+    return [part.name, seed, *figures] + [
+        f"{x['speed_ratio']:.3f}, {x['speed_std']:.2f}, {x['collisions']}" if x else "–" for x in others
+    ]
+
+
+def told(name: str, rows: Sequence[Row], plain: Sequence[Row], rings: int) -> str:
+    """Return what the seeds of a kind say together: collisions with their interval, and ranks against plain IDM's."""
+    counts = [100.0 * r["collisions"] / rings for r in rows]
+    reach = ""
+    if len(counts) > 1:
+        found = bootstrap((counts,), np.mean, method="percentile", rng=0).confidence_interval
+        reach = f" ({found.low:.0f} to {found.high:.0f})"
+    middle = {key: statistics.median(r[key] for r in rows) for key in ("speed_ratio", "speed_std")}
+    ranks = [
+        f"{key} {mannwhitneyu([r[key] for r in plain], [r[key] for r in rows]).pvalue:.4f}"
+        for key in ("collisions", "speed_ratio", "speed_std")
+    ]
+    return (
+        f"{name}: {sum(r['collisions'] for r in rows)} of {rings * len(rows)} rings with a collision, "
+        f"{statistics.mean(counts):.0f} %{reach}, {len(rows)} seeds; median ratio {middle['speed_ratio']:.3f}, "
+        f"deviation {middle['speed_std']:.2f}; Mann-Whitney p against plain IDM: {', '.join(ranks)}"
+    )
 
 
 def main() -> None:
-    """Train what is missing, judge all in the truth, print the table."""
+    """Train and judge what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", choices=CASES, default="delay")
     parser.add_argument("--out", type=Path, default=Path("runs/transfer"))
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--kinds", nargs="*", help="what policies are trained on, such as 'plain IDM'; default: all")
+    parser.add_argument("--data", type=Path, default=default_data(), help="I-80 pairs, for case i80")
     workers.add(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    out = options.out.resolve()
-    environments = models(out)
-    parts = {
-        name: [Training(where, seed, out / name.replace(" ", "-") / f"seed{seed}") for seed in range(options.seeds)]
-        for name, where in environments.items()
-    }
+    out = options.out.resolve() / options.case
+    environments = measured(options.data, out) if options.case == "i80" else generated(options.case, out)
+    parts = parts_of(options.case, environments, out, options.seeds)
+    if options.kinds is not None:
+        parts = [part for part in parts if part.trained_in is None or part.name in options.kinds]
     with workers.of(options) as executor:
-        deque(executor.map(train, [part for some in parts.values() for part in some]), 0)
-    truth = environments["the truth"]
-    guarded = {**truth, "failsafe": FAILSAFE}
-    print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD))
-    show("human drivers", "", judge(None, truth), None, None)
-    show("no command", "", judge(no_command, truth), judge(no_command, guarded), None)
-    by_hand = (judge(PISaturation(make_task(**RING)), where) for where in (truth, guarded))
-    show("PI with saturation", "", *by_hand, None)
-    touched: dict[str, list[int]] = {}
-    for name, environment in environments.items():
-        for part in parts[name]:
-            policy = common.load(part.out / "last.pt", "ring", "apg")[0]
-            judged = [judge(policy, where) for where in (truth, guarded, environment)]
-            show(name, str(part.seed), *judged)
-            touched.setdefault(name, []).append(judged[0]["collisions"])
-    for name, counts in touched.items():
-        p = mannwhitneyu(touched["plain IDM"], counts).pvalue
-        rings = len(counts) * len(FRESH) * len(LENGTHS)
-        print(f"{name}: {sum(counts)} of {rings} rings with a collision, {len(counts)} seeds; Mann-Whitney p {p:.4f}")
-    print(json.dumps({"effect": EFFECT, "strength": STRENGTH, "data_seed": DATA_SEED}))
-
-
-def show(name: str, seed: str, r: Row, guarded: Row | None, own: Row | None) -> None:
-    """Print one row: in the truth, there with a failsafe, and in the model of the training."""
-    figures = f"{r['speed_ratio']:.3f} | {r['speed_std']:.2f} | {r['time_gap']:.2f} | {r['collisions']}"
-    others = [f"{x['speed_ratio']:.3f}, {x['speed_std']:.2f}, {x['collisions']}" if x else "–" for x in (guarded, own)]
-    print(f"| {name} | {seed} | {figures} | {others[0]} | {others[1]} |", flush=True)
+        done = {i: found for i, found in executor.map(row, parts) if found is not None}
+    order = [*UNTRAINED, *environments]
+    shown = sorted(done, key=lambda i: (order.index(parts[i].name), parts[i].seed))
+    table(HEAD, [cells(parts[i], done[i]) for i in shown])
+    judged = {
+        name: [found["truth"] for i, found in done.items() if parts[i].trained_in and parts[i].name == name]
+        for name in environments
+    }
+    for name, rows in judged.items():
+        if rows and judged["plain IDM"]:
+            print(told(name, rows, judged["plain IDM"], len(FRESH) * len(LENGTHS)))
 
 
 if __name__ == "__main__":

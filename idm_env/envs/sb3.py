@@ -44,7 +44,7 @@ class SB3VecEnv(VecEnv):
         options = self._options[0] if self._options and self._options[0] else None
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         observation, info = self.vector_env.reset(seed=seeds, options=options)  # type: ignore[arg-type]
-        self.reset_infos = [row(info, i) for i in range(self.num_envs)]
+        self.reset_infos = [row(info, i) for i in range(self.vector_env.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return np.asarray(observation)
@@ -57,7 +57,7 @@ class SB3VecEnv(VecEnv):
         """Step, and reset what ended; return observations, rewards, dones and one info per environment."""
         observation, reward, terminated, truncated, info = self.vector_env.step(self._actions)
         done = terminated | truncated
-        infos = [row(info, i) for i in range(self.num_envs)]
+        infos = [row(info, i) for i in range(self.vector_env.num_envs)]
         if done.any():
             last = info["final_obs"] if self._same_step else observation
             for i in np.flatnonzero(done).tolist():

@@ -29,6 +29,8 @@ SEEN = Features(("speed", "lead_speed", "gap"), (40.0, 40.0, 100.0), (0.0, 0.0, 
 KNEE, LOWEST, HIGHEST = -2.0, -4.0, 1.0
 """Reward from which it saturates, and what it never leaves."""
 _NEAREST, _FARTHEST, _SHORTEST = 7.0, 120.0, 1.0
+_CLOSING = 20.0
+"""Difference of speeds (m/s) up to which losing or gaining ground counts."""
 _GALLONS_PER_HOUR = 0.951
 """1 mL/s in US gallons per hour."""
 
@@ -57,14 +59,17 @@ class FollowTask(Task):
     Reward, per agent: ``1 − w fuel − 0.002 u² − 2 p``; w is ``fuel_weight``, 0.1 in the source, fuel the mean rate of
     the agent and everybody behind it (US gallons per hour; the source's own energy model is not public, ``fuel_model``
     stands in), u its command (m/s²), p in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap
-    below 1 s. Below −2 it saturates towards −4 (``floored``). Terminated where vehicles touch, which pays
-    ``−crash_cost`` instead: 5001 by default, so that a crash is worse than any survival (``idm_env.tasks.crash``); the
-    source takes 50. Truncated at the end of the record, and after ``max_episode_steps``: 1000, or what the longest
-    record has.
+    below 1 s; less ``lag_weight`` times what the agent is slower than its leader (m/s, within ±20): over an episode
+    that is the ground that it has lost, however it drove in between. Below −2 it saturates towards −4 (``floored``).
+    Terminated where vehicles touch, which pays ``−crash_cost`` instead: 5001 by default, so that a crash is worse than
+    any survival (``idm_env.tasks.crash``); the source takes 50. Truncated at the end of the record, and after
+    ``max_episode_steps``: 1000, or what the longest record has.
 
     Args:
         fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
         fuel_weight: Reward per US gallon per hour: with 0.1 hardly anything is gained by saving.
+        lag_weight: Reward per m/s that an agent is slower than its leader; 0 leaves it out. Saving fuel by falling back
+            then costs what it takes from others.
         leader: A trajectory file; every leader that somebody follows in it may be drawn. None is the project's own
             made-up trace.
     """
@@ -82,12 +87,14 @@ class FollowTask(Task):
     max_command: float | Sequence[float] = 3.0
     fuel_model: str = "kamal"
     fuel_weight: float = 0.1
+    lag_weight: float = 0.0
     leader: str | None = None
 
     def __post_init__(self) -> None:
         whole("vehicles", self.vehicles, 2)
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
         at_least("fuel_weight", self.fuel_weight, 0.0)
+        at_least("lag_weight", self.lag_weight, 0.0)
         super().__post_init__()
         longest = self._longest
         if (self.max_episode_steps or 0) > longest:
@@ -119,8 +126,8 @@ class FollowTask(Task):
 
     @property
     def pay(self) -> Pay:
-        """From −4 to 1."""
-        return Pay(LOWEST, HIGHEST)
+        """From −4 to 1, more where an agent may catch up."""
+        return Pay(LOWEST, HIGHEST + _CLOSING * self.lag_weight)
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return a queue in equilibrium behind a drawn stretch of a drawn leader."""
@@ -175,6 +182,9 @@ class FollowTask(Task):
         gap, speed = self.pick(state.gap), self.pick(state.speed)
         penalty = headway_penalty(gap, speed)
         reward = 1.0 - self.fuel_weight * self.pick(behind) - 0.002 * command * command - 2.0 * penalty
+        if self.lag_weight:
+            lag = self.lead_speed(state) - self.pick(state.speed)
+            reward = reward - self.lag_weight * lag.clamp(-_CLOSING, _CLOSING)
         return floored(reward, KNEE, LOWEST)
 
     def ended(self, world: World) -> Ended:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import agents_energy
+from benchmarks import agents_energy, agents_energy_oracle
 from idm_env import metrics
 from idm_env.data import episodes, synthetic
 
@@ -56,3 +56,26 @@ def test_fuel_of_steady_driving_is_that_of_the_models():
     dearer = {**steady, "kamal": 2.0 * steady["kamal"], "speed": 0.9 * steady["speed"]}
     cells = agents_energy.told("x", steady, dearer)
     assert cells[1].endswith("; +50.0 %, 1 of 1") and cells[2].endswith("; +0.0 %, 0 of 1") and cells[3] == "+11.1 %"
+
+
+def test_a_vehicle_that_knows_the_future_saves_within_what_is_admissible(items):
+    with torch.no_grad():
+        reference = agents_energy.Platoon(items, PARAMS, "idm").rolled()
+    found = agents_energy_oracle.planned(items, PARAMS, "kamal", 60, reference)
+    before, after = (agents_energy.judged(run) for run in (reference, found))
+    assert bool((after["kamal"] < 0.98 * before["kamal"]).all())
+    assert bool(((after["speed"] / before["speed"] - 1.0).abs() <= 0.02).all()) and after["collisions"] == 0
+    own, gap, usual = found["speed"][..., 0], found["gap"][..., 0], reference["gap"][..., 0]
+    least = torch.minimum((0.8 * own).clamp_min(2.0), usual)
+    assert bool(((gap >= least - 1e-6) & (gap <= 120.0) | ~found["valid"]).all())
+    # What is kept is a run of the simulator: those behind have answered to it.
+    again = agents_energy.Platoon(items, PARAMS, "agent").rolled(found["accel"][..., 0])
+    torch.testing.assert_close(again["speed"], found["speed"], atol=1e-6, rtol=0.0)
+
+
+def test_where_no_plan_is_admissible_the_reference_stays(items, monkeypatch):
+    monkeypatch.setattr(agents_energy_oracle, "FARTHEST", 0.0)
+    with torch.no_grad():
+        reference = agents_energy.Platoon(items, PARAMS, "idm").rolled()
+    found = agents_energy_oracle.planned(items, PARAMS, "circles", 2, reference)
+    assert all(torch.equal(found[name], reference[name]) for name in ("speed", "accel", "gap"))

@@ -8,8 +8,8 @@ from functools import partial
 import pytest
 import torch
 
-from agents import apg, common, evaluate
-from agents.environments import human_driving, task_of
+from agents import apg, common, evaluate, ppo
+from agents.environments import human_driving, make_env, task_of
 from agents.rollout import episodes_start
 from benchmarks import agents_lanes, agents_shared
 
@@ -118,3 +118,30 @@ def test_a_ring_of_twice_the_vehicles_is_twice_as_long(monkeypatch):
     for vehicles in (22, 44):
         evaluate.evaluate_ring(None, {"task": "ring", "vehicles": vehicles, "length": 1000.0}, (220.0, 270.0))
     assert made == [[220.0, 270.0], [440.0, 540.0]]
+
+
+def test_ppo_learns_one_policy_for_all_agents_of_an_environment(quick, monkeypatch):
+    """Every agent is a row of its own, with what it observes; the team's reward goes to all."""
+    monkeypatch.setattr(common, "human_driving", partial(human_driving, count=2, steps=60))
+    environment = {**FREE, "vehicles": 24, "controlled": [4, 5, 6], "max_episode_steps": 30}
+    vector = make_env(environment, 2, output="numpy")
+    rows = ppo.Shared(vector)
+    rows.seed(3)
+    seen = rows.reset()
+    assert seen.shape == (6, len(vector.task.bounds.names)) and rows.observation_space.contains(seen[4])
+    together = vector.task.observe(vector.batch.world).reshape(6, -1)
+    assert torch.equal(torch.as_tensor(seen), together)
+    ended = 0
+    for _ in range(35):
+        seen, reward, done, infos = rows.step(0.1 * torch.arange(6).reshape(6, 1).numpy())
+        assert reward.shape == done.shape == (6,) and len(infos) == 6
+        for world in (slice(0, 3), slice(3, 6)):
+            assert len(set(reward[world])) == 1 and len(set(done[world])) == 1
+        ended += int(done.sum())
+        assert all(infos[i]["terminal_observation"].shape == seen[i].shape for i in done.nonzero()[0])
+    assert ended >= 6
+    arguments = {**quick, "environment": environment, "updates": 2}
+    history = ppo.train(ppo.Arguments(**arguments, count=2, n_steps=10, batch_size=30, n_epochs=1))
+    assert [row["steps"] for row in history] == [0, 20, 40]
+    policy, _ = common.load(quick["out"] / "last.pt")
+    assert all(bool(torch.isfinite(x).all()) for x in policy.parameters())

@@ -50,17 +50,22 @@ def test_follow_replays_its_leader_from_a_drawn_start():
     assert float(worlds[1].state.accel[:, 1:].abs().max()) < 0.3
 
 
-@pytest.mark.parametrize("weight", [0.1, 0.7])
-def test_follow_rewards_what_is_written(weight):
-    task = make_task("follow", vehicles=3, **({} if weight == 0.1 else {"fuel_weight": weight}))
+@pytest.mark.parametrize(
+    ("weight", "lag", "accel"), [(0.1, 0.0, 0.7), (0.7, 0.0, 0.7), (0.1, 0.3, 0.7), (0.1, 0.3, -0.7)]
+)
+def test_follow_rewards_what_is_written(weight, lag, accel):
+    keywords = {**({} if weight == 0.1 else {"fuel_weight": weight}), **({"lag_weight": lag} if lag else {})}
+    task = make_task("follow", vehicles=3, **keywords)
     world, params = start(task, 1)
-    command = torch.tensor([[0.7]], dtype=torch.float64)
+    command = torch.tensor([[accel]], dtype=torch.float64)
     after = task.step(world, command, None, params)
     fuel = 0.951 * metrics.fuel(after.state.speed, after.state.accel)[0, 1:].mean()
     gap, speed = float(after.state.gap[0, 1]), float(after.state.speed[0, 1])
     assert gap > 7.0
     short = min(max((1.0 - gap / speed) / 0.2, 0.0), 1.0)
-    expected = 1.0 - weight * float(fuel) - 0.002 * 0.49 - 2.0 * short
+    slower = float(after.state.speed[0, 0]) - speed
+    assert slower * accel < 0.0  # it starts as fast as its leader
+    expected = 1.0 - weight * float(fuel) - 0.002 * 0.49 - 2.0 * short - lag * slower
     assert float(task.reward(world, command, after)) == pytest.approx(expected)
 
 

@@ -15,6 +15,7 @@ CASES = {
     "follow": {"task": "follow"},
     "follow, hard": {"task": "follow", "max_command": 30.0, "controlled": 2},
     "follow, thrifty": {"task": "follow", "fuel_weight": 2.0},
+    "follow, in time": {"task": "follow", "lag_weight": 2.0},
     "platoon": {"task": "platoon", "controlled": 2},
     "replay": {"task": "replay"},
     "replay lanes": {"task": "replay_lanes", "controlled": 2, "lane_commands": True},
