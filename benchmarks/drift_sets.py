@@ -1,17 +1,20 @@
 """Known drift found again: generated drivers of whom nothing is known, and drivers who do not drift.
 
     python -m benchmarks.drift_sets [--sets 60] [--out drift_sets.jsonl] [--first-seed 1000] [--alone]
+                                    [--drivers 20] [--seconds 90]
 
 A set is 20 drivers of 90 s, sampled every 0.2 s with errors of 0.1 m and 0.05 m/s, whose parameters differ by 20 %
 about others than those that the estimate takes for usual; leaders change their speed every 12 s or so. The sorts of
 drift take turns, then none. ``tell`` sees them as it sees a file; with ``--alone`` only the sort that is hidden is
-estimated, on sets with drift, which is a fifth of the work. One line of JSON per set is kept, both kinds in one file
-if need be, so that a run goes on where it stopped.
+estimated, on sets with drift, which is a fifth of the work. "Foreseen" is the median error that the sets' own
+intervals speak for. One line of JSON per set is kept, all kinds in one file if need be, so that a run goes on where it
+stopped.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import time
@@ -24,6 +27,7 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import polars as pl  # noqa: E402
 import torch  # noqa: E402
+from scipy.stats import t as student  # noqa: E402
 
 from benchmarks import workers  # noqa: E402
 from idm_env.data import Trajectories, episodes  # noqa: E402
@@ -36,6 +40,8 @@ from idm_env.progress import OnProgress, silent  # noqa: E402
 from idm_env.types import Record  # noqa: E402
 
 DT, SECONDS, DRIVERS = 0.2, 90.0, 20
+MEDIAN = 0.674
+"""Median error over the standard deviation, where errors are normal."""
 GAP_NOISE, SPEED_NOISE = 0.1, 0.05
 CENTRE, SPREAD = np.log([1.4, 1.8, 1.3, 2.2, 30.0]), np.array([0.2, 0.2, 0.2, 0.2, 0.1])
 HIDDEN: tuple[tuple[Effect, float, float], ...] = (
@@ -48,14 +54,14 @@ HIDDEN: tuple[tuple[Effect, float, float], ...] = (
 """Drift, σ and τ (s); σ of a set is up to a half more or less."""
 
 
-def leaders(random: np.random.Generator, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def leaders(random: np.random.Generator, steps: int, drivers: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return position, speed and acceleration [steps + 1, drivers] of vehicles that now and then want another speed."""
     fine, every = 0.025, round(DT / 0.025)
-    speed = random.uniform(8.0, 16.0, DRIVERS)
-    position, accel, target = np.zeros(DRIVERS), np.zeros(DRIVERS), speed.copy()
+    speed = random.uniform(8.0, 16.0, drivers)
+    position, accel, target = np.zeros(drivers), np.zeros(drivers), speed.copy()
     kept = [(position, speed, accel)]
     for k in range(steps * every):
-        target = np.where(random.random(DRIVERS) < fine / 12.0, random.uniform(3.0, 22.0, DRIVERS), target)
+        target = np.where(random.random(drivers) < fine / 12.0, random.uniform(3.0, 22.0, drivers), target)
         accel = accel + fine * (np.clip((target - speed) / 2.5, -2.5, 1.3) - accel)
         faster = np.maximum(speed + accel * fine, 0.0)
         position, speed = position + 0.5 * fine * (speed + faster), faster
@@ -65,24 +71,26 @@ def leaders(random: np.random.Generator, steps: int) -> tuple[np.ndarray, np.nda
     return found[0], found[1], found[2]
 
 
-def made(seed: int, drift: Effect, sigma: float, memory_time: float) -> Trajectories:
+def made(
+    seed: int, drift: Effect, sigma: float, memory_time: float, drivers: int = DRIVERS, seconds: float = SECONDS
+) -> Trajectories:
     """Return the trajectories of a set."""
     random, simulator = np.random.default_rng(seed), behind_a_record(DT, drift)
-    theta = CENTRE + SPREAD * random.normal(size=(DRIVERS, len(CENTRE)))
+    theta = CENTRE + SPREAD * random.normal(size=(drivers, len(CENTRE)))
     params = simulator.defaults(dtype=torch.float64)
     for i, name in enumerate(IDM_NAMES):
         params["idm"][name.removeprefix("idm.")] = torch.tensor(np.exp(theta[:, i])).unsqueeze(-1)
     params[drift.name] = {"sigma": torch.tensor(sigma).double(), "memory_time": torch.tensor(memory_time).double()}
-    steps = round(SECONDS / DT)
-    x, v, a = leaders(random, steps)
+    steps = round(seconds / DT)
+    x, v, a = leaders(random, steps, drivers)
     gap = np.exp(theta[:, 3]) + v[0] * np.exp(theta[:, 2])
     both = [torch.tensor(np.stack((y, np.zeros_like(y)), -1)) for y in (x, v, a)]
-    record = Record(*(y[1:] for y in both), torch.tensor([True, False]).expand(steps, DRIVERS, 2))
+    record = Record(*(y[1:] for y in both), torch.tensor([True, False]).expand(steps, drivers, 2))
     position = torch.tensor(np.stack((x[0], x[0] - 5.0 - gap), -1))
     start = simulator.state(position, torch.tensor(np.stack((v[0], v[0]), -1)), params, accel=both[2][0], seed=seed)
     _, kept = simulator.rollout(start, {"replay": record}, params, steps, seed=seed + 1)
     tables = []
-    for i in range(DRIVERS):
+    for i in range(drivers):
         for vehicle in (0, 1):
             noise = vehicle * random.normal(size=(2, steps))
             measured = kept.gap[:, i, 1].numpy() + GAP_NOISE * noise[0] if vehicle else np.full(steps, np.nan)
@@ -96,15 +104,19 @@ def made(seed: int, drift: Effect, sigma: float, memory_time: float) -> Trajecto
     return Trajectories.from_frame(table, source=f"set {seed}")
 
 
-def scored(part: tuple[int, bool], on_progress: OnProgress = silent) -> dict[str, Any]:
-    """Return what ``tell`` says of a set (seed), beside what is hidden in it; alone: the estimate of what is hidden."""
-    seed, alone = part
+Part = tuple[int, bool, int, float]
+"""Seed, whether only what is hidden is estimated, drivers, and seconds of each."""
+
+
+def scored(part: Part, on_progress: OnProgress = silent) -> dict[str, Any]:
+    """Return what ``tell`` says of a set, beside what is hidden in it; alone: the estimate of what is hidden."""
+    seed, alone, drivers, seconds = part
     drift, sigma, memory_time = HIDDEN[seed % len(HIDDEN)]
     sigma *= float(np.exp(np.random.default_rng(seed).uniform(-0.4, 0.4)))
-    begin, trajectories = time.process_time(), made(seed, drift, sigma, memory_time)
+    begin, trajectories = time.process_time(), made(seed, drift, sigma, memory_time, drivers, seconds)
     smooth, measured = list(episodes(trajectories, smooth=True)), list(episodes(trajectories))
     row: dict[str, Any] = {
-        "key": key(part), "seed": seed, "hidden": drift.name if sigma else "none",
+        "key": key(part), "seed": seed, "drivers": drivers, "hidden": drift.name if sigma else "none",
         "sigma": sigma, "memory_time": memory_time, "one_of": None, "gain": {},
     }  # fmt: skip
     if alone:
@@ -118,32 +130,45 @@ def scored(part: tuple[int, bool], on_progress: OnProgress = silent) -> dict[str
     return row | {"cpu_s": time.process_time() - begin}
 
 
-def key(part: tuple[int, bool]) -> str:
-    """Return what a set (seed, alone) is called in the file of results."""
-    seed, alone = part
-    return f"{seed}|alone" if alone else str(seed)
+def key(part: Part) -> str:
+    """Return what a set is called in the file of results."""
+    seed, alone, drivers, seconds = part
+    size = "" if (drivers, seconds) == (DRIVERS, SECONDS) else f"|{drivers} drivers of {seconds:g} s"
+    return f"{seed}{size}|alone" if alone else f"{seed}{size}"
 
 
 def table(sets: list[dict[str, Any]]) -> str:
-    """Return what came out, by sort."""
+    """Return what came out, by sort and of all."""
     lines = [
-        "hidden | sets | right name alone | among those named | sigma: median error, covered | "
-        "tau: median error, covered",
+        "hidden | sets | right name alone | among those named | sigma: median error (foreseen); estimate / true, "
+        "median; covered | tau: the same",
         "--- | --- | --- | --- | --- | ---",
     ]
-    for name in dict.fromkeys(s["hidden"] for s in sets):
-        rows = [s for s in sets if s["hidden"] == name]
-        if name == "none":
-            lines.append(f"none | {len(rows)} | {sum(not s['one_of'] for s in rows)} | – | – | –")
-            continue
-        told = [s["one_of"] for s in rows if s["one_of"] is not None]
-        texts = [f"{sum(t == [name] for t in told)}", f"{sum(name in t for t in told)}"] if told else ["–", "–"]
-        for i, key in enumerate(("sigma", "memory_time")):
-            error = [abs(s["estimates"][i]["estimate"] / s[key] - 1.0) for s in rows]
-            inside = [s["estimates"][i]["low"] <= s[key] <= s["estimates"][i]["high"] for s in rows]
-            texts.append(f"{100 * np.median(error):.0f} %, {sum(inside)} of {len(rows)}")
+    drifting = [s for s in sets if s["hidden"] != "none"]
+    for name in dict.fromkeys([*(s["hidden"] for s in drifting), "all"]):
+        rows = [s for s in drifting if name in (s["hidden"], "all")]
+        told = [s for s in rows if s["one_of"] is not None]
+        alone, among = sum(s["one_of"] == [s["hidden"]] for s in told), sum(s["hidden"] in s["one_of"] for s in told)
+        texts = [str(alone), str(among)] if told else ["–", "–"]
+        texts += [recovered(rows, i, number) for i, number in enumerate(("sigma", "memory_time"))]
         lines.append(f"{name} | {len(rows)} | {' | '.join(texts)}")
+    steady = [not s["one_of"] for s in sets if s["hidden"] == "none"]
+    if steady:
+        lines.append(f"none | {len(steady)} | {sum(steady)} | – | – | –")
     return "\n".join([*lines, f"CPU seconds per set, median: {np.median([s['cpu_s'] for s in sets]):.0f}"])
+
+
+def recovered(rows: list[dict[str, Any]], i: int, number: str) -> str:
+    """Return how well a number, the estimate ``i``, is known of sets: error, foreseen error, ratio and coverage."""
+    if not rows:
+        return "–"
+    ratio = np.array([r["estimates"][i]["estimate"] / r[number] for r in rows])
+    inside = [r["estimates"][i]["low"] <= r[number] <= r["estimates"][i]["high"] for r in rows]
+    width = [0.5 * math.log(r["estimates"][i]["high"] / r["estimates"][i]["low"]) for r in rows]
+    reach = [float(student.ppf(0.975, r.get("drivers", DRIVERS) - 1)) for r in rows]
+    foreseen = MEDIAN * np.median(np.array(width) / reach)
+    error = np.median(np.abs(ratio - 1.0))
+    return f"{100 * error:.0f} % ({100 * foreseen:.0f} %); {np.median(ratio):.2f}; {sum(inside)} of {len(rows)}"
 
 
 def main() -> None:
@@ -152,12 +177,15 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=60)
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--out", type=Path, default=Path("drift_sets.jsonl"))
+    parser.add_argument("--drivers", type=int, default=DRIVERS)
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of every driver")
     parser.add_argument("--alone", action="store_true", help="estimate only what is hidden, on sets with drift")
     workers.add(parser)
     arguments = parser.parse_args()
     done = workers.kept(arguments.out, "key")
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.sets)
-    wanted = [(s, arguments.alone) for s in seeds if not arguments.alone or HIDDEN[s % len(HIDDEN)][1]]
+    seeds_wanted = [s for s in seeds if not arguments.alone or HIDDEN[s % len(HIDDEN)][1]]
+    wanted = [(s, arguments.alone, arguments.drivers, arguments.seconds) for s in seeds_wanted]
     missing = [part for part in wanted if key(part) not in done]
     for row in workers.rows(scored, missing, arguments.out, arguments):
         done[row["key"]] = row
