@@ -157,13 +157,18 @@ def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> 
     return float(0.5 * np.log(squares[0] / squares[1]))
 
 
-def everywhere(records: Records, task: Task, solution: Solution) -> places.Responses:
-    """Return the responses of a model in windows of all records: φ as it stands, θ fitted, the noise of ``task``."""
+def in_windows(records: Records, task: Task, solution: Solution) -> tuple[Task, Solution]:
+    """Return a model in windows of all records, and its task: φ as it stands, θ fitted, the noise of ``task``."""
     assert task.noise is not None
     rows = windows(records)
     there = Task(rows, replace(task.noise, weight=np.ones(len(rows))), replace(task.prior, free=False))
     start = np.tile(task.prior.centre, (there.groups, 1))
-    return places.respond(there, solve(there, Frozen(solution.model, solution.values), start, np.zeros(0)))
+    return there, solve(there, Frozen(solution.model, solution.values), start, np.zeros(0))
+
+
+def everywhere(records: Records, task: Task, solution: Solution) -> places.Responses:
+    """Return the responses of a model in windows of all records."""
+    return places.respond(*in_windows(records, task, solution))
 
 
 def halves(rows: Rows) -> np.ndarray:

@@ -30,10 +30,8 @@ FACTORS = (1e-3, 1e2)
 """Strengths, in units of the usual one, between which the smallest is sought."""
 CLOSE = 1.05
 BEYOND_LINES = 1.5
-"""What lines leave out. Candidates that show the same effect raise the level of the test along with it, and errors on
-runs kept back have their say, so that of 13 effects planted into simulations 5 were found at what lines say, and of
-12 none at half of that, from which this was chosen (``benchmarks.planted --times 0.667,0.333 --seed 4242 --repeats
-1``, as strengths are now told times this)."""
+"""What lines leave out: candidates that show the same effect raise the level of the test along with it, and errors on
+runs kept back have their say. Held against simulations by ``benchmarks.planted`` (docs/closing-the-loop.md)."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +141,10 @@ class Planted:
 class Strength:
     """What data say of an absent effect's strength: estimate, its 95 % interval, and what would have been found.
 
-    ``seen`` is the smallest distance from the null that is found four times in five by lines, times ``BEYOND_LINES``
-    (54 % measured: docs/closing-the-loop.md); infinite where the parameter's bounds do not reach so far. ``typical`` is
-    the distance of the catalogue's default. Of an unknown profile, with a strength at each of its ``knots``,
-    ``estimate`` is that furthest from the null, with the interval of all; ``seen`` the height of a wave.
+    ``seen`` is the smallest distance from the null that is found four times in five by lines, times ``BEYOND_LINES``;
+    infinite where the parameter's bounds do not reach so far. ``typical`` is the distance of the catalogue's default.
+    Of an unknown profile, with a strength at each of its ``knots``, ``estimate`` is that furthest from the null, with
+    the interval of all; ``seen`` the height of a wave.
     """
 
     parameter: Parameter

@@ -12,7 +12,8 @@ from idm_env.discovery import discover
 from idm_env.discovery.model import SPREAD
 from idm_env.discovery.power import CLOSE, Bar, Planted, reach, strength_of
 from idm_env.discovery.score import ALPHA, FAINT, level, westfall_young
-from idm_env.effects import ALL, make
+from idm_env.effects import ALL, IDM, make
+from idm_env.fitting.batch import Batch
 
 
 def planted(units: int, curvature: float, pull: float, bar: Bar, sizes: int = 1) -> Planted:
@@ -74,6 +75,26 @@ def test_drivers_with_their_own_drift_not_turned_do_again_what_they_did() -> Non
     assert len(made[True].drivers or ()) == len(found.records.episodes)
     slower = benchmark.planted(found, (0.0, 0.0), drag, {"coefficient": 5e-3}, 0, False)
     assert sum(e.speed_mps.mean() for e in episodes(slower)) < sum(e.speed_mps.mean() for e in found.records.episodes)
+
+
+def test_planted_drivers_are_not_bent_by_their_drift() -> None:
+    """Free simulation takes drift for parameters; what is left of accelerations then answers to the scene."""
+    from benchmarks import planted as benchmark
+
+    trajectories, truth = synthetic.generate(6000, runs=5, followers=2, seconds=120.0, ou=0.1)
+    found = discover(trajectories, effects=["drag"])
+    true = {(d["run_id"], d["vehicle_id"]): d for d in truth.drivers.iter_rows(named=True)}
+    names = [p.name for p in IDM().declared]
+    off = {"predictions": benchmark.drivers(found)[found.records.group].log().numpy()}
+    saved = found.models["model.yaml"].drivers
+    off["free"] = np.log([[saved[found.records.groups[g]]["idm"][n] for n in names] for g in found.records.group])
+    own = np.log([[true[e.run_id, e.vehicle_id][n] for n in names] for e in found.records.episodes])
+    error = {name: np.abs(x - own).mean() for name, x in off.items()}
+    assert error["predictions"] < 0.8 * error["free"]
+    batch = Batch.of(found.records.episodes, substeps=1)
+    left = benchmark.beside_the_model(found, batch).numpy()
+    inner = [left[20 : len(e) - 20, i] for i, e in enumerate(batch.episodes)]
+    assert np.concatenate(inner).std() == pytest.approx(0.1, rel=0.1)
 
 
 def test_what_no_strength_would_show_is_not_planted() -> None:
