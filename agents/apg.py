@@ -31,6 +31,7 @@ class Arguments(common.Arguments):
         window: Steps through which gradients go.
         explore: Standard deviation of what is added to the actions of each environment throughout a window, falling
             with the learning rate. Without it a vehicle that stands never feels what driving on is worth.
+        start: Checkpoint whose policy training begins with, of the same task and observation; else it is a new one.
     """
 
     out: Path = Path("runs/apg")
@@ -38,6 +39,7 @@ class Arguments(common.Arguments):
     count: int = 64
     window: int = 600
     explore: float = 0.02
+    start: Path | None = None
 
 
 def train(arguments: Arguments) -> list[dict[str, Any]]:
@@ -45,6 +47,8 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     began = time.process_time()
     torch.manual_seed(arguments.seed)
     policy, saved = common.begin(arguments, "apg")
+    if arguments.start is not None and not saved:
+        policy = common.load_for(arguments.start, environments.task_of(arguments.environment))[0]
     done = saved.get("update", -1) + 1
     env = environments.make_env(arguments.environment, arguments.count, output="torch")
     env.reset(seed=environments.first_seed(arguments.seed, arguments.count))

@@ -24,6 +24,7 @@ from agents.environments import first_seed, human_driving, task_of
 from idm_env import keep
 from idm_env.checks import finite, nearest, shown
 from idm_env.config import load_environment, number, read_yaml
+from idm_env.tasks import Task
 
 SCHEMA = 2
 """Version of the layout of checkpoints."""
@@ -110,7 +111,7 @@ def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
     text = f"{kind.__doc__}\n\n--config FILE reads a YAML file first, such as configs/ring-apg.yaml."
     found = tyro.cli(kind, default=default, args=rest, description=text)
     for path in (found.out / name for name in KEPT):
-        keep.not_an_input(path, (known.config, getattr(found, "data", None)))
+        keep.not_an_input(path, (known.config, *(getattr(found, name, None) for name in ("data", "start", "teacher"))))
         if path.suffix == ".pt" and path.exists() and not found.resume and _content(path) is None:
             raise ValueError(
                 f"{path} is not a checkpoint of an agent, or is broken. Move or delete it, or give another --out."
@@ -162,7 +163,8 @@ def load_agent(path: str | Path, kind: type[A], agent: str) -> A:
 
 
 def _as(name: str, value: Any, like: Any) -> Any:
-    """Return a value of YAML in the type of the default; YAML reads 3e-3 as text."""
+    """Return a value of YAML in the type of the default, a path where that is None; YAML reads 3e-3 as text."""
+    like = Path() if like is None else like
     if isinstance(like, bool) or isinstance(value, bool):
         if not (isinstance(value, bool) and isinstance(like, bool)):
             rule = "true or false" if isinstance(like, bool) else "no bool"
@@ -292,6 +294,17 @@ def load(path: str | Path, task: str | None = None, agent: str | None = None) ->
         )
     policy = Policy(**content["policy"]["made"])
     policy.load_state_dict(content["policy"]["state"])
+    return policy, content
+
+
+def load_for(path: str | Path, task: Task) -> tuple[Policy, dict[str, Any]]:
+    """Return what ``load`` does, of a policy that observes what ``task`` gives: its agents and roads may differ.
+
+    ValueError, in one line, for a policy of another task or other observations.
+    """
+    policy, content = load(path, task.name)
+    if (content["features"], content["scales"]) != (list(task.bounds.names), list(task.scales)):
+        raise ValueError(f"{path} was trained on other observations than this environment's. Give another checkpoint.")
     return policy, content
 
 

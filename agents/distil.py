@@ -25,7 +25,6 @@ from torch import Tensor
 from agents import apg, common, environments
 from agents.common import DivergedError, Policy
 from agents.monitor import Monitor
-from idm_env import keep
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.tasks import Task
 
@@ -57,21 +56,15 @@ def taught(arguments: Arguments) -> tuple[Policy, dict[str, Any]]:
     ValueError, in one line, for a teacher of another task or observation, or without a failsafe.
     """
     path = arguments.teacher
-    for name in common.KEPT:
-        keep.not_an_input(arguments.out / name, (path,))
     if path.suffix != ".pt":
         chosen = common.load_agent(path, apg.Arguments, "apg")
         path = arguments.out / "teacher" / "last.pt"
         begun = path.exists()
         if not begun or common.load(path)[1]["training"]["update"] + 1 < chosen.updates:
             apg.train(replace(chosen, seed=arguments.seed, out=path.parent, resume=begun))
-    task = environments.task_of(arguments.environment)
-    policy, content = common.load(path, task.name)
-    before = environments.task_of(content["environment"])
-    if not before.failsafe:
+    policy, content = common.load_for(path, environments.task_of(arguments.environment))
+    if not environments.task_of(content["environment"]).failsafe:
         raise ValueError(f"{path} was trained without a failsafe: there is nothing to distil. Give another --teacher.")
-    if (before.bounds.names, before.scales) != (task.bounds.names, task.scales):
-        raise ValueError(f"{path} was trained on other observations than this environment's. Give another --teacher.")
     return policy, content
 
 

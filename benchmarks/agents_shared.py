@@ -4,21 +4,26 @@
         [--out runs/shared]
 
 Judged as one agent is: rings of 10 to 12.3 m per vehicle, five fresh draws of each of six lengths, a human who brakes
-with 4 m/s² for 2 s two minutes after the take-over. Policies of one agent among 22 drive as they are. What is done is
-kept.
+with 4 m/s² for 2 s two minutes after the take-over. Policies of one agent among 22 drive as they are. Beside them: IDM
+for all, and oracles that are told each ring's uniform speed. What is done is kept.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from agents import common
+from agents.classical import Seen
 from agents.evaluate import evaluate_ring
-from agents.rollout import FRESH
+from agents.reference import told
+from agents.rollout import FRESH, LENGTHS, Act, Start, ring_start, uniform_speed
 from benchmarks.agents import once
 from benchmarks.agents_tables import environment_of, ring, table
 
@@ -34,6 +39,54 @@ def environment(vehicles: int, agents: int) -> Row:
     return {**environment_of("ring-apg"), "vehicles": vehicles, "length": length, "controlled": agents, "shock": 4.0}
 
 
+@dataclass
+class Oracle:
+    """Several agents that are told the uniform speed U of their ring: ``k (f U − v)`` behind Krauß's safe speed.
+
+    Args:
+        start: The worlds that they drive, once.
+        first: f at the beginning.
+        last: f in the end.
+        after: Time (s) at which f begins to grow to ``last``, over a minute.
+        gain: k (1/s).
+    """
+
+    start: Start
+    first: float
+    last: float
+    after: float = 0.0
+    gain: float = 0.1
+    _steps: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self._uniform = uniform_speed(self.start).unsqueeze(-1)
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        """Return the actions of all agents."""
+        task = self.start.task
+        seconds, self._steps = self._steps * task.simulator.dt, self._steps + 1
+        grown = min(max((seconds - self.after) / 60.0, 0.0), 1.0)
+        share = self.first + (self.last - self.first) * grown
+        own = observation.unflatten(-1, (len(task.agents), -1)) * observation.new_tensor(task.scales)
+        speed, relative, headway = own.unbind(-1)
+        view = Seen(speed, speed + relative, headway - task.vehicle_length)
+        return task.action(told(task, view, self._uniform, torch.tensor(self.gain), torch.tensor(share)))
+
+
+ORACLES: dict[str, tuple[float, float, float]] = {
+    "oracle: 1.0 U": (1.0, 1.0, 0.0),
+    "oracle: 0.8 U": (0.8, 0.8, 0.0),
+    "oracle: 0.5 U for 120 s, then up to 0.95 U": (0.5, 0.95, 120.0),
+}
+"""What oracles do with the uniform speed U that they are told: ``first``, ``last`` and ``after`` of each."""
+
+
+def oracle(name: str, environment: Row) -> Oracle:
+    """Return an oracle that has not driven yet, for the fresh rings."""
+    longer = environment["vehicles"] / 22
+    return Oracle(ring_start(environment, [x * longer for x in LENGTHS], draws=FRESH), *ORACLES[name])
+
+
 def main() -> None:
     """Judge what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -41,22 +94,26 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/shared"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    policies: dict[str, Path | None] = {"IDM for all": None}
+    made: dict[str, Callable[[Row], Act | None]] = {"IDM for all": lambda environment: None}
+    for name in ORACLES:
+        made[name] = lambda environment, name=name: oracle(name, environment)
     for path in options.checkpoints:
-        policies["/".join(path.parts[-5:-2])] = path
+        made["/".join(path.parts[-5:-2])] = lambda environment, path=path: common.load(path, "ring")[0]
     rows = []
     for vehicles, agents in RINGS:
-        for name, path in policies.items():
-            if path is None and (vehicles, agents) in ((110, 5), (110, 11), (110, 22)):
+        for name, make in made.items():
+            if name == "IDM for all" and (vehicles, agents) in ((110, 5), (110, 11), (110, 22)):
                 continue  # nobody is controlled: the ring with two agents has the row
 
-            def judge(path: Path | None = path, vehicles: int = vehicles, agents: int = agents) -> Row:
-                act = None if path is None else common.load(path, "ring")[0]
-                return evaluate_ring(act, environment(vehicles, agents), draws=FRESH)
+            def judge(make: Callable[[Row], Act | None] = make, vehicles: int = vehicles, agents: int = agents) -> Row:
+                chosen = environment(vehicles, agents)
+                return evaluate_ring(make(chosen), chosen, draws=FRESH)
 
-            found = once(options.out / f"{vehicles}-{agents}" / name.replace("/", "-").replace(" ", "-"), judge)
+            found = once(
+                options.out / f"{vehicles}-{agents}" / name.replace("/", "-").replace(" ", "-").replace(":", ""), judge
+            )
             if found is not None:
-                share = "" if path is None else f"{agents} ({100.0 * agents / vehicles:.1f} %)"
+                share = "" if name == "IDM for all" else f"{agents} ({100.0 * agents / vehicles:.1f} %)"
                 passed = "yes" if found["passed"] else "no"
                 rows.append([str(vehicles), share, name, *ring(found), passed])
                 print(*rows[-1], sep=" | ", flush=True)

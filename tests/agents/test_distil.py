@@ -106,5 +106,5 @@ def test_what_cannot_teach_is_told_in_one_line(small, quick, tmp_path):
 
 def test_a_teacher_is_not_overwritten(small):
     teacher = small.teacher.rename(small.teacher.with_name("last.pt"))
-    with pytest.raises(ValueError, match=r"is an input, and .* would overwrite it"):
-        distil.train(dataclasses.replace(small, out=teacher.parent, teacher=teacher))
+    with pytest.raises(SystemExit, match=r"is an input, and .* would overwrite it"):
+        distil.main(["--teacher", str(teacher), "--out", str(teacher.parent)])

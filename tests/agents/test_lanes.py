@@ -10,7 +10,7 @@ import torch
 
 from agents import apg, common, evaluate, ppo
 from agents.environments import human_driving, make_env, task_of
-from agents.rollout import episodes_start
+from agents.rollout import episodes_start, ring_start, uniform_speed
 from benchmarks import agents_lanes, agents_shared
 
 FREE = {"task": "bottleneck", "inflow": 720.0, "vehicles": 40, "controlled": [4], "failsafe": 3.0}
@@ -100,14 +100,29 @@ def test_shared_policies_are_judged_on_rings_as_long_as_their_vehicles_need(tmp_
         return {"speed_ratio": 1.0, "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}
 
     monkeypatch.setattr(agents_shared, "evaluate_ring", judge)
+    monkeypatch.setattr(agents_shared, "oracle", lambda name, environment: name)
     monkeypatch.setattr(agents_shared.common, "load", lambda path, task: (path, {}))
     path = tmp_path / "ring-apg/trial0/seed1/training/last.pt"
     monkeypatch.setattr("sys.argv", ["agents_shared", "--out", str(tmp_path), "--checkpoints", str(path)])
     for _ in range(2):
         agents_shared.main()
-    assert judged.count((110, 2, True)) == judged.count((110, 5, False)) == 1 and (110, 5, True) not in judged
+    assert judged.count((110, 2, True)) == 1 and (110, 5, True) not in judged
+    assert judged.count((110, 5, False)) == 1 + len(agents_shared.ORACLES)
     assert "| 110 | 5 (4.5 %) | ring-apg/trial0/seed1 | 1.000 | 0.10 | 1.00 | 0 | yes |" in capsys.readouterr().out
     assert json.loads((tmp_path / "22-1/IDM-for-all/result.json").read_text())["passed"]
+
+
+def test_an_oracle_is_slow_first_and_then_faster_behind_krauss():
+    environment = {"task": "ring", "vehicles": 8, "controlled": 2, "length": [80.0, 90.0], "failsafe": 3.0}
+    start = ring_start(environment, (80.0, 90.0), warmup=20)
+    task, uniform = start.task, uniform_speed(start).unsqueeze(-1)
+    act = agents_shared.Oracle(start, first=0.5, last=1.0, after=1.0, gain=0.1)
+    seen = torch.tensor([[0.4, 0.0, 9.0, 0.4, 0.0, 9.0]] * 2)  # 2 m/s, far behind a leader who is as fast
+    shares = [(task.command(act(seen)) / 0.1 + 2.0) / uniform for _ in range(700)]
+    for step, share in ((0, 0.5), (10, 0.5), (310, 0.75), (610, 1.0), (699, 1.0)):
+        assert torch.allclose(shares[step], torch.full((2, 2), share), atol=1e-4)
+    close = torch.tensor([[0.4, 0.0, 0.5, 0.4, 0.0, 9.0]] * 2)  # the first of both has touched its leader
+    assert task.command(act(close))[:, 0].tolist() == [-1.0, -1.0]
 
 
 def test_a_ring_of_twice_the_vehicles_is_twice_as_long(monkeypatch):

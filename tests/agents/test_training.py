@@ -67,6 +67,26 @@ def test_apg_resumes_exactly(quick, tmp_path):
     assert same(weights(tmp_path / "whole" / "last.pt"), weights(whole.out / "last.pt"))
 
 
+def test_training_may_begin_with_a_policy_of_another_road(quick, tmp_path):
+    """As a shared policy does: alone on a short ring first, then two on a long one; what is resumed goes on."""
+    first = apg.Arguments(**quick, **SMALL)
+    apg.train(first)
+    start = first.out / "last.pt"
+    several = {**quick["environment"], "vehicles": 16, "controlled": 2, "length": [120.0, 150.0]}
+    given = dataclasses.replace(first, environment=several, start=start, out=tmp_path / "several", learning_rate=1e-12)
+    apg.train(dataclasses.replace(given, updates=1))
+    begun = weights(given.out / "last.pt")
+    assert all(torch.allclose(begun[k], weights(start)[k], atol=1e-9) for k in begun)
+    apg.train(dataclasses.replace(given, learning_rate=1e-2, updates=3, resume=True))
+    assert not same(begun, weights(given.out / "last.pt"))
+    file = tmp_path / "several.yaml"
+    file.write_text(f"configures: agent\nagent: apg\nstart: {start}\n")
+    assert common.load_agent(file, apg.Arguments, "apg").start == start
+    raw = {**quick["environment"], "observation": "raw"}
+    with pytest.raises(ValueError, match="on other observations than this environment's"):
+        apg.train(dataclasses.replace(given, environment=raw, out=tmp_path / "raw"))
+
+
 @pytest.mark.parametrize("file", ["model.zip", "returns.pkl"])
 def test_a_broken_file_of_stable_baselines3_is_one_line(file, quick):
     module, kind, small = AGENTS["ppo"]
