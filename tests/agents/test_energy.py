@@ -79,3 +79,16 @@ def test_where_no_plan_is_admissible_the_reference_stays(items, monkeypatch):
         reference = agents_energy.Platoon(items, PARAMS, "idm").rolled()
     found = agents_energy_oracle.planned(items, PARAMS, "circles", 2, reference)
     assert all(torch.equal(found[name], reference[name]) for name in ("speed", "accel", "gap"))
+
+
+def test_the_thriftiest_driver_on_the_grid_is_as_fast_and_saves(items, monkeypatch):
+    usual = {name: IDM[name] for name in agents_energy_oracle.GRID}
+    monkeypatch.setattr(agents_energy_oracle, "GRID", {"max_accel": (IDM["max_accel"], 0.5), "time_gap": (1.4, 30.0)})
+    found = agents_energy_oracle.thriftiest(items, PARAMS)
+    assert found == {"max_accel": 0.5, "time_gap": 1.4}  # a time gap of 30 s saves more, and falls back
+    with torch.no_grad():
+        same = agents_energy_oracle.driving(items, PARAMS, usual)
+        soft = agents_energy_oracle.driving(items, PARAMS, found)
+        reference = agents_energy.Platoon(items, PARAMS, "idm").rolled()
+    torch.testing.assert_close(same["speed"], reference["speed"])
+    assert float(agents_energy.judged(soft)["kamal"].mean()) < float(agents_energy.judged(same)["kamal"].mean())
