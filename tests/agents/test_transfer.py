@@ -64,7 +64,8 @@ def test_rows_are_done_once_and_an_interrupted_training_goes_on(quick, ring, tmp
     small = {"updates": 1, "hidden": (4, 4), "count": 2, "window": 10, "evaluate_every": 1e9, "explore": 0.0}
     arguments = apg.Arguments
     monkeypatch.setattr(transfer.apg, "Arguments", lambda **given: arguments(**{**given, **small, "updates": 2}))
-    part = transfer.parts_of("two", {"plain IDM": ring, transfer.TRUTH: ring}, tmp_path, 1)[3]
+    *untrained, part, _ = transfer.parts_of("two", {"plain IDM": ring, transfer.TRUTH: ring}, tmp_path, 1)
+    assert [other.name for other in untrained] == [*transfer.UNTRAINED, "human drivers: plain IDM"]
     assert part.name == "plain IDM" and part.trained_in == ring
     apg.train(arguments(environment=ring, out=part.out, **small))  # interrupted after the first of two updates
     found = transfer.row(part)
@@ -72,6 +73,8 @@ def test_rows_are_done_once_and_an_interrupted_training_goes_on(quick, ring, tmp
     _, content = transfer.common.load(part.out / "last.pt")
     assert content["training"]["update"] == 1
     assert transfer.row(part) == found and len(judged) == 3
+    alone = transfer.row(untrained[-1])
+    assert judged[3] == ring and transfer.cells(untrained[-1], alone)[1:] == ["", *"––––", "–", "0.900, 0.10, 4"]
     assert transfer.cells(part, found)[:2] == ["plain IDM", "0"] and transfer.cells(part, found)[5] == "1"
 
 
