@@ -59,9 +59,11 @@ def taught(arguments: Arguments) -> tuple[Policy, dict[str, Any]]:
     if path.suffix != ".pt":
         chosen = common.load_agent(path, apg.Arguments, "apg")
         path = arguments.out / "teacher" / "last.pt"
-        begun = path.exists()
-        if not begun or common.load(path)[1]["training"]["update"] + 1 < chosen.updates:
-            apg.train(replace(chosen, seed=arguments.seed, out=path.parent, resume=begun))
+        kept = common.load(path)[1]["training"] if path.exists() else {}
+        if kept.get("arguments", {}).get("seed") != arguments.seed:
+            kept = {}  # another seed's
+        if kept.get("update", -1) + 1 < chosen.updates:
+            apg.train(replace(chosen, seed=arguments.seed, out=path.parent, resume=bool(kept)))
     policy, content = common.load_for(path, environments.task_of(arguments.environment))
     if not environments.task_of(content["environment"]).failsafe:
         raise ValueError(f"{path} was trained without a failsafe: there is nothing to distil. Give another --teacher.")

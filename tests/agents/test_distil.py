@@ -93,6 +93,8 @@ def test_a_teacher_may_be_a_training_that_comes_first(small, tmp_path):
     found = common.load(trained)[1]["training"]
     assert found["update"] == 1  # it was trained to its end
     assert history[0]["steps"] == found["steps"]
+    distil.train(dataclasses.replace(small, seed=1))  # another seed has a teacher of its own
+    assert common.load(trained)[1]["training"]["arguments"]["seed"] == 1
 
 
 def test_what_cannot_teach_is_told_in_one_line(small, quick, tmp_path):
