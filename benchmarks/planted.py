@@ -51,7 +51,7 @@ def drivers(found: Discovery) -> Tensor:
     """Return every driver's own parameters [groups, P] as predictions of 5 s fit them.
 
     Not those of free simulation, which drift bends: what is then left of the measured accelerations answers to the
-    scene, and at another time of the record it is noise, which made errors 5 s ahead 1.3 to 1.7 times as large.
+    scene, and at another time of the record it is noise, which made errors 5 s ahead 1.3 to 1.8 times as large.
     """
     return torch.from_numpy(np.exp(judge.in_windows(found.records, found.task, found.null)[1].theta))
 
