@@ -97,6 +97,12 @@ def behind_leader(environment: Row, folder: Path) -> dict[str, Callable[[], Row]
         )
     for name, updates in BEGUN.items():
         made[name] = lambda updates=updates: judged(begun(environment, folder, updates), SEEDS)
+
+    def always(action: float) -> Act:
+        return lambda observation: observation.new_full((len(observation), 1), action)
+
+    actions = [round(0.1 * i - 1.0, 1) for i in range(21)]
+    made["constants"] = lambda: judged([always(x) for x in actions], [f"{x:g} of the range" for x in actions])
     return made
 
 

@@ -171,6 +171,7 @@ def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark
     alone = rows["IDM (a human driver more)"]()
     assert (alone["tried"], alone["passed"]) == (1, [])
     assert rows["random networks"]()["passed"] == ["0", "1"] and asked == [(0,)] * 3 + [(1, 2, 3, 4, 5)] * 2
+    assert rows["constants"]()["tried"] == 21
 
 
 def test_the_share_not_solved_yet_counts_those_that_never_solve(tmp_path):
