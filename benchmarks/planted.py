@@ -7,8 +7,9 @@ says of every effect which strength it would have found: four times in five by l
 drivers are simulated behind their measured leaders with that strength (times ``--times``) of the effect, with
 measurement noise, and with their own drift: what every driver's measured acceleration has beside the model as fitted to
 predictions of 5 s, begun at a random time of the record. ``explain`` sees the result as it sees a file. Effects of
-which no strength would have been found are left out, and named. One line of JSON per set is kept, so that a run goes on
-where it stopped.
+which no strength would have been found are left out, and named. Beside what is found stands what is told: an effect
+that passes the test, and is refused because an error on the runs kept back rises, is ``unexplained`` by name, and no
+``none``. One line of JSON per set is kept, so that a run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -175,11 +176,14 @@ def measure(job: tuple[str, float, int, tuple[Any, ...]], on_progress: OnProgres
     names = [f["effect"] or f["label"] for f in report["found"]]
     others = [n for f in report["found"] for n in f["equivalent"]]
     alike = {name} | ({"delay", "lag"} if name in ("delay", "lag") else set())
+    # What errors on runs kept back have refused stands in the report, too: no "none" comes out.
+    partial = report["partial"] or {"terms": []}
+    refused = {t["effect"] for t in partial["terms"]} if report["verdict"] == "unexplained" else set()
     first = next((c for c in report["candidates"] if c["effect"] == name), None)
     return {
         "key": key(job), "effect": name, "times": times, "strength": strength, "would": said["would_be_found"],
         "verdict": report["verdict"], "why": report["reason"], "found": names,
-        "right": bool(alike & {*names, *others}), "partial": (report["partial"] or {}).get("effect"),
+        "right": bool(alike & {*names, *others}), "told": bool(alike & {*names, *others, *refused}),
         "first": first and {k: first[k] for k in ("p_value", "held_out_gain")},
         "ratio": {k: h["ratio"] for k, h in report["helps"].items()},
         "before": report["error"]["before"], "measured": found.report["error"]["before"],
@@ -201,16 +205,17 @@ def key(job: tuple[str, float, int, tuple[Any, ...]]) -> str:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return by effect and strength how often it was found."""
+    """Return by effect and strength how often it was found, and how often found or refused by name."""
     times = sorted({r["times"] for r in rows}, reverse=True)
-    lines = [" | ".join(["planted", *(f"{t:g} times what is said: found" for t in times)])]
+    lines = [" | ".join(["planted", *(f"{t:g} times what is said: found, or told" for t in times)])]
     lines.append(" | ".join(["---"] * (1 + len(times))))
     for name in [*dict.fromkeys(r["effect"] for r in rows), "all"]:
         cells = []
         for t in times:
             mine = [r for r in rows if r["times"] == t and name in (r["effect"], "all")]
             usual = float(np.median([abs(r["would"] * t) for r in mine])) if name != "all" and mine else None
-            cells.append(f"{sum(r['right'] for r in mine)} of {len(mine)}" + (f" ({usual:.2g})" if usual else ""))
+            found, seen = (sum(r[which] for r in mine) for which in ("right", "told"))
+            cells.append(f"{found}, {seen} of {len(mine)}" + (f" ({usual:.2g})" if usual else ""))
         lines.append(" | ".join([name, *cells]))
     return "\n".join(lines)
 
