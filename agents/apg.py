@@ -32,6 +32,7 @@ class Arguments(common.Arguments):
         explore: Standard deviation of what is added to the actions of each environment throughout a window, falling
             with the learning rate. Without it a vehicle that stands never feels what driving on is worth.
         start: Checkpoint whose policy training begins with, of the same task and observation; else it is a new one.
+            ``hidden`` is then that policy's, and nothing is cloned.
     """
 
     out: Path = Path("runs/apg")

@@ -28,7 +28,7 @@ from idm_env.tasks import Task
 
 
 class Seen(NamedTuple):
-    """The observation of the ring in SI units, each ``(n, 1)``: speed, leader's speed (m/s), gap (m)."""
+    """The observation of the ring in SI units, each ``(n, agents)``: speed, leader's speed (m/s), gap (m)."""
 
     speed: Tensor
     lead_speed: Tensor
@@ -36,9 +36,10 @@ class Seen(NamedTuple):
 
 
 def seen(observation: Tensor, vehicle_length: float, scales: Sequence[float]) -> Seen:
-    """Return what ``RingTask.observe`` packs into an observation ``(n, 3)``, over ``RingTask.scales``."""
-    speed, relative, headway = (observation * observation.new_tensor(scales)).unbind(-1)
-    return Seen(*(x.unsqueeze(-1) for x in (speed, speed + relative, headway - vehicle_length)))
+    """Return what ``RingTask.observe`` packs into an observation ``(n, agents · 3)``, over ``RingTask.scales``."""
+    own = observation.unflatten(-1, (-1, len(scales))) * observation.new_tensor(scales)
+    speed, relative, headway = own.unbind(-1)
+    return Seen(speed, speed + relative, headway - vehicle_length)
 
 
 @dataclass

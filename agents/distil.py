@@ -35,7 +35,8 @@ class Arguments(common.Arguments):
 
     Args:
         teacher: Checkpoint of a policy that was trained behind a failsafe; or a file of APG, such as
-            configs/ring-apg.yaml: its training comes first, with the same seed, in the folder teacher of ``out``.
+            configs/ring-apg.yaml: its training comes first, with the same seed, in the folder teacher of ``out``. Its
+            CPU seconds count; ``cpu_seconds`` ends the rounds and not that training.
         count: Environments that run together; all begin an episode with each round.
         steps: Steps of a round: the braking after the take-over, and calm driving after that.
         fits: Steps of regression in a round, on the data of all rounds so far.
@@ -57,13 +58,15 @@ def taught(arguments: Arguments) -> tuple[Policy, dict[str, Any]]:
     """
     path = arguments.teacher
     if path.suffix != ".pt":
-        chosen = common.load_agent(path, apg.Arguments, "apg")
         path = arguments.out / "teacher" / "last.pt"
+        chosen = common.load_agent(arguments.teacher, apg.Arguments, "apg")
+        chosen = replace(chosen, seed=arguments.seed, out=path.parent)
         kept = common.load(path)[1]["training"] if path.exists() else {}
-        if kept.get("arguments", {}).get("seed") != arguments.seed:
-            kept = {}  # another seed's
+        before, now = kept.get("arguments", {}), common.choices(chosen)
+        if any(before.get(name) != now[name] for name in now.keys() - {"out", "resume", "updates"}):
+            kept = {}  # of another seed or file
         if kept.get("update", -1) + 1 < chosen.updates:
-            apg.train(replace(chosen, seed=arguments.seed, out=path.parent, resume=bool(kept)))
+            apg.train(replace(chosen, resume=bool(kept)))
     policy, content = common.load_for(path, environments.task_of(arguments.environment))
     if not environments.task_of(content["environment"]).failsafe:
         raise ValueError(f"{path} was trained without a failsafe: there is nothing to distil. Give another --teacher.")
@@ -105,7 +108,8 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     wanted: list[Tensor] = []
     if arguments.resume:
         policy, saved = common.begin(arguments, "distil")
-        seen, wanted = [saved["seen"]], [saved["wanted"]]
+        seen.append(saved["seen"])
+        wanted.append(saved["wanted"])
     done = saved.get("update", -1) + 1
     env = environments.make_env(arguments.environment, arguments.count, output="torch")
     with Monitor("distil", arguments, began, saved) as monitor:
@@ -117,13 +121,14 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             torch.manual_seed(first)
             env.reset(seed=first)
             new = watch(policy if update else None, teacher, guarded, env, arguments.steps)
-            seen, wanted = [torch.cat((*seen, new[0]))], [torch.cat((*wanted, new[1]))]
-            error = common.clone(policy, seen[0], wanted[0], arguments.fits)
+            seen.append(new[0])
+            wanted.append(new[1])
+            data = {"seen": torch.cat(seen), "wanted": torch.cat(wanted)}
+            error = common.clone(policy, *data.values(), arguments.fits)
             if not math.isfinite(error):
                 advice = common.last_good(monitor.last, update)
                 raise DivergedError(f"update {update}: the error {error:g} must be finite. {advice}.")
-            kept = {"seen": seen[0], "wanted": wanted[0]}
-            if not monitor.after(update, arguments.steps * arguments.count, policy, kept, {"error": error}):
+            if not monitor.after(update, arguments.steps * arguments.count, policy, data, {"error": error}):
                 break
     return monitor.history
 

@@ -112,7 +112,9 @@ class Job:
         words += ["--evaluate-every", str(EVERY * self.times**0.5)]
         options = dict(self.options)
         teacher = out.parents[3] / f"ring-apg/trial0/seed{self.seed}/training/last.pt"
-        if module == MODULES["distil"] and (teacher.parents[1] / "result.json").exists():
+        # What was begun with a teacher of its own goes on with that.
+        begun = (out / "teacher").exists()
+        if module == MODULES["distil"] and not begun and (teacher.parents[1] / "result.json").exists():
             options["teacher"] = teacher
         if self.times > 1:
             given = read_yaml(ROOT / "configs" / f"{self.config}.yaml")

@@ -129,9 +129,9 @@ def thriftiest(items: Sequence[Episode], params: Params) -> dict[str, float]:
     for values in itertools.product(*GRID.values()):
         change = dict(zip(GRID, values, strict=True))
         r = judged(driving(items, params, change))
-        slower = abs(float(r["speed"].mean() / base["speed"].mean()) - 1.0)
+        off = abs(float(r["speed"].mean() / base["speed"].mean()) - 1.0)
         saved = sum(float((1.0 - r[model] / base[model]).median()) for model in metrics.FUELS)
-        if slower <= SLACK and r["farthest"] <= FARTHEST and not r["collisions"] and saved > most:
+        if off <= SLACK and r["farthest"] <= FARTHEST and not r["collisions"] and saved > most:
             most, best = saved, change
     return best
 

@@ -79,11 +79,11 @@ def networks(environment: Row) -> Family:
 
 def trained(environment: Row, paths: Sequence[Path]) -> Family:
     """Return the agents among these checkpoints that were trained on the task."""
-    loaded = {path.parent.name: common.load(path) for path in paths}
+    loaded = [(path.parent.name, *common.load(path)) for path in paths]
     return {
-        f"trained: {name}, {c['training']['cpu_seconds']:.0f} CPU s": policy
-        for name, (policy, c) in loaded.items()
-        if c["task"] == environment["task"]
+        f"trained: {name}, {content['training']['cpu_seconds']:.0f} CPU s": policy
+        for name, policy, content in loaded
+        if content["task"] == environment["task"]
     }
 
 

@@ -1,7 +1,8 @@
 """The picture of docs/agents.md on how soon agents solve a test: ``python benchmarks/agents.py picture``.
 
 For each task and agent the share of seeds that have not solved it yet, against the CPU seconds of training (Kaplan
-and Meier 1958): a seed that never solves counts as long as it was trained. The longest trainings of an agent are shown.
+and Meier 1958): a seed that never solves counts as long as it was trained. Of an agent's trials the one is shown whose
+trainings were longest.
 """
 
 from __future__ import annotations
@@ -13,17 +14,16 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from scipy.stats import CensoredData, ecdf
 
-from benchmarks.agents_tables import Row, results
+from benchmarks.agents_tables import Row, groups
 
 AGENTS = {"apg": "#1e5adc", "shac": "#1a7850", "ppo": "#b2182b", "sac": "#ef8a62"}
 TASKS = {"ring": "ring with a shock", "follow": "behind a recorded leader"}
 
 
 def longest(out: Path, config: str, seeds: Sequence[int]) -> list[Row]:
-    """Return the results of a configuration's seeds with the most updates."""
-    found = [r for r in results(out, config) if r["seed"] in seeds]
-    most = max((r.get("times", 1) for r in found), default=1)
-    return [r for r in found if r.get("times", 1) == most]
+    """Return the results of a configuration's seeds in the trial whose trainings were longest, without failures."""
+    parts = [[r for r in part if r["history"]] for part in groups(out, config, seeds).values()]
+    return max(parts, key=lambda part: max((r["summary"]["spent"] for r in part), default=0.0), default=[])
 
 
 def curve(axes: Axes, rows: Sequence[Row], name: str, colour: str) -> None:

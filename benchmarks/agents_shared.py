@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from agents import common
-from agents.classical import Seen
+from agents.classical import seen
 from agents.evaluate import evaluate_ring
 from agents.reference import told
 from agents.rollout import FRESH, LENGTHS, Act, Start, ring_start, uniform_speed
@@ -67,9 +67,7 @@ class Oracle:
         seconds, self._steps = self._steps * task.simulator.dt, self._steps + 1
         grown = min(max((seconds - self.after) / 60.0, 0.0), 1.0)
         share = self.first + (self.last - self.first) * grown
-        own = observation.unflatten(-1, (len(task.agents), -1)) * observation.new_tensor(task.scales)
-        speed, relative, headway = own.unbind(-1)
-        view = Seen(speed, speed + relative, headway - task.vehicle_length)
+        view = seen(observation, task.vehicle_length, task.scales)
         return task.action(told(task, view, self._uniform, torch.tensor(self.gain), torch.tensor(share)))
 
 

@@ -72,7 +72,7 @@ def summary_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> No
         done = [r["summary"] for r in part if r["summary"]["solved"]]
         rows.append([
             config, name, f"{len(done)} of {len(part)}", str(sum(r["summary"]["ever"] for r in part)),
-            spread([r["summary"]["spent"] for r in part], ".0f"),
+            spread([r["summary"]["spent"] for r in part if r["history"]], ".0f"),
             spread([d["cpu_seconds"] for d in done], ".1f"), spread([d["steps"] / 1000 for d in done], ".0f"),
         ])  # fmt: skip
     table(

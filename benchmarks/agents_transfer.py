@@ -9,9 +9,9 @@ has the effects that it found; both are saved as ``model.yaml``. One APG policy 
 of that model, and a third kind on the truth itself. All are judged on rings of the generated drivers, whose parameters
 and effects are known, also with a failsafe.
 
-Case ``i80``: measured drivers, of whom there is no truth. From half of the pairs come plain IDM, the model of
+Case ``i80``: measured drivers, of whom there is no truth. From the 100 training pairs come plain IDM, the model of
 ``discover``, and that with the wandering time gap that ``idm_env.drift`` estimates; all are judged among the *other*
-half's drivers, each a driver of his own, with what ``discover`` and drift say of that half. What is done is kept.
+108 drivers, each a driver of his own, with what ``discover`` and drift say of those. What is done is kept.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from benchmarks.drift import CHOSEN, thinned  # noqa: E402
 from idm_env.config import load_model, save_model  # noqa: E402
 from idm_env.data import Trajectories, episodes, load, synthetic  # noqa: E402
 from idm_env.discovery import discover, write_report  # noqa: E402
+from idm_env.drift.job import evenly  # noqa: E402
 from idm_env.drift.kinds import tell  # noqa: E402
 from idm_env.effects import CANDIDATES, Wander  # noqa: E402
 from idm_env.fitting.drivers import Estimates  # noqa: E402
@@ -65,8 +66,6 @@ LONGER = (280.0, 300.0, 320.0, 340.0, 360.0, 380.0)
 IMAGINED = ("gap_bias",)
 """Not looked for among those in whose traffic all are judged. The other half's drivers are said to see gaps as 4 m
 longer: behind a record that is hardly told from asymmetry, and on a ring they drive into each other by themselves."""
-DRIFTERS = 60
-"""Drivers at most on whom drift is estimated, as by the command."""
 HEAD = (
     "trained on", "seed", "worst speed ratio", "worst std (m/s)", "smallest time gap (s)", "collisions",
     "with a failsafe: ratio, std, collisions", "in its own model: ratio, std, collisions",
@@ -109,7 +108,7 @@ def unsteady(trajectories: Trajectories, corrected: Path, out: Path) -> Path:
     """Return the file of a corrected model whose drivers' time gap wanders as in these records, made once."""
     if not out.exists():
         both = [list(episodes(trajectories, max_gap=None, smooth=smooth)) for smooth in (True, False)]
-        chosen = np.linspace(0, len(both[0]) - 1, min(DRIFTERS, len(both[0]))).astype(int)
+        chosen = evenly(len(both[0]))
         smooth, measured = ([thinned(found[i]) for i in chosen] for found in both)
         # With the noise for which forecasts on I-80 have been checked (docs/drift.md).
         found = tell(smooth, measured, (Wander(),), noise=CHOSEN["wander"]).found["wander"].settings
@@ -250,6 +249,9 @@ def main() -> None:
     out = options.out.resolve() / options.case
     environments = measured(options.data, out) if options.case == "i80" else generated(options.case, out)
     parts = parts_of(options.case, environments, out, options.seeds)
+    unknown = set(options.kinds or ()) - set(environments)
+    if unknown:
+        parser.error(f"--kinds '{min(unknown)}' is unknown. Choose of {', '.join(environments)}.")
     if options.kinds is not None:
         parts = [part for part in parts if part.trained_in is None or part.name in options.kinds]
     with workers.of(options) as executor:

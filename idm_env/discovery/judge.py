@@ -157,7 +157,7 @@ def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> 
     return float(0.5 * np.log(squares[0] / squares[1]))
 
 
-def in_windows(records: Records, task: Task, solution: Solution) -> tuple[Task, Solution]:
+def windowed(records: Records, task: Task, solution: Solution) -> tuple[Task, Solution]:
     """Return a model in windows of all records, and its task: φ as it stands, θ fitted, the noise of ``task``."""
     assert task.noise is not None
     rows = windows(records)
@@ -168,7 +168,7 @@ def in_windows(records: Records, task: Task, solution: Solution) -> tuple[Task, 
 
 def everywhere(records: Records, task: Task, solution: Solution) -> places.Responses:
     """Return the responses of a model in windows of all records."""
-    return places.respond(*in_windows(records, task, solution))
+    return places.respond(*windowed(records, task, solution))
 
 
 def halves(rows: Rows) -> np.ndarray:

@@ -22,8 +22,17 @@ from idm_env.progress import OnProgress, silent
 WRITTEN = ("model.yaml", "report.json")
 
 
+DRIVERS = 60
+"""Drivers at most on whom drift is estimated."""
+
+
+def evenly(count: int, most: int = DRIVERS) -> np.ndarray:
+    """Return the places of at most so many of ``count``, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+
 def drift_file(
-    source: Source, out: Path, *, drivers: int = 60, on_progress: OnProgress | None = None
+    source: Source, out: Path, *, drivers: int = DRIVERS, on_progress: OnProgress | None = None
 ) -> dict[str, Any]:
     """Say how the drivers of a file drift, and return the report; write it and ``model.yaml``.
 
@@ -34,7 +43,7 @@ def drift_file(
         progress("reading", 0, 0, source.path.name)
         trajectories = source.trajectories()
         smooth, measured = (replace(source, smooth=x).episodes(trajectories) for x in (True, False))
-        chosen = np.unique(np.linspace(0, len(smooth) - 1, min(drivers, len(smooth))).astype(int))
+        chosen = evenly(len(smooth), drivers)
         pair = [[found[i] for i in chosen] for found in (smooth, measured)]
         told = tell(*pair, on_progress=lambda name, done, total, _: progress(name, done, total, ""))
         best = told.found[told.one_of[0]] if told.one_of else told.steady

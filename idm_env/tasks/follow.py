@@ -27,7 +27,7 @@ HORIZON = 1000
 SEEN = Features(("speed", "lead_speed", "gap"), (40.0, 40.0, 100.0), (0.0, 0.0, -10.0), (100.0, 100.0, 1000.0))
 """What an agent behind a record observes, here and in ``replay``: speeds up to 100 m/s, gaps up to 1000 m."""
 KNEE, LOWEST, HIGHEST = -2.0, -4.0, 1.0
-"""Reward from which it saturates, and what it never leaves."""
+"""Reward from which it saturates, and what it never leaves without ``lag_weight``."""
 _NEAREST, _FARTHEST, _SHORTEST = 7.0, 120.0, 1.0
 _CLOSING = 20.0
 """Difference of speeds (m/s) up to which losing or gaining ground counts."""
@@ -60,10 +60,10 @@ class FollowTask(Task):
     the agent and everybody behind it (US gallons per hour; the source's own energy model is not public, ``fuel_model``
     stands in), u its command (m/s²), p in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap
     below 1 s; less ``lag_weight`` times what the agent is slower than its leader (m/s, within ±20): over an episode
-    that is the ground that it has lost, however it drove in between. Below −2 it saturates towards −4 (``floored``).
-    Terminated where vehicles touch, which pays ``−crash_cost`` instead: 5001 by default, so that a crash is worse than
-    any survival (``idm_env.tasks.crash``); the source takes 50. Truncated at the end of the record, and after
-    ``max_episode_steps``: 1000, or what the longest record has.
+    that is the ground that it has lost, as long as no step saturates. Below −2 it saturates towards −4 (``floored``).
+    Terminated where vehicles touch, which pays ``−crash_cost`` instead: 5001 by default, more with ``lag_weight``, so
+    that a crash is worse than any survival (``idm_env.tasks.crash``); the source takes 50. Truncated at the end of the
+    record, and after ``max_episode_steps``: 1000, or what the longest record has.
 
     Args:
         fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
@@ -173,7 +173,7 @@ class FollowTask(Task):
         return self.clip(seen)
 
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
-        """Return ``1 − w fuel − 0.002 u² − 2 p``, saturated below −2."""
+        """Return ``1 − w fuel − 0.002 u² − 2 p − l clip(v_lead − v, ±20)``, saturated below −2."""
         state = after.state
         fuel = metrics.fuel(state.speed, state.accel, self.fuel_model) * _GALLONS_PER_HOUR
         # Running means from the back: of every vehicle and those behind it.
@@ -183,7 +183,7 @@ class FollowTask(Task):
         penalty = headway_penalty(gap, speed)
         reward = 1.0 - self.fuel_weight * self.pick(behind) - 0.002 * command * command - 2.0 * penalty
         if self.lag_weight:
-            lag = self.lead_speed(state) - self.pick(state.speed)
+            lag = self.lead_speed(state) - speed
             reward = reward - self.lag_weight * lag.clamp(-_CLOSING, _CLOSING)
         return floored(reward, KNEE, LOWEST)
 

@@ -57,6 +57,11 @@ def test_a_policy_is_distilled_from_the_same_seeds_teacher_where_there_is_one(be
     benchmark.run(["ring-brakes-distil"], tmp_path, 2)
     first, second = (c for c in benchmark.trained if "agents.distil" in c)
     assert "--teacher" not in first
+    job = benchmark.Job("ring-brakes-distil", 0, {}, 1)
+    begun = tmp_path / job.name / "training"
+    assert "--teacher" in job.command(begun)
+    (begun / "teacher").mkdir(parents=True)
+    assert "--teacher" not in job.command(begun)  # it goes on with its own
     teacher = tmp_path / "ring-apg" / "trial0" / "seed1" / "training" / "last.pt"
     assert second[second.index("--teacher") + 1] == str(teacher)
 
@@ -172,6 +177,18 @@ def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark
     assert (alone["tried"], alone["passed"]) == (1, [])
     assert rows["random networks"]()["passed"] == ["0", "1"] and asked == [(0,)] * 3 + [(1, 2, 3, 4, 5)] * 2
     assert rows["constants"]()["tried"] == 21
+
+
+def test_the_longest_trainings_are_drawn_without_failures(tmp_path):
+    from benchmarks.agents_pictures import longest
+
+    for trial, seed, spent in ((0, 0, 40.0), (0, 1, 50.0), (1, 0, 90.0), (1, 1, 0.0)):
+        folder = tmp_path / "ring-ppo" / f"trial{trial}" / f"seed{seed}"
+        folder.mkdir(parents=True)
+        row = {"trial": trial, "seed": seed, "summary": {"spent": spent}, "history": [LAST] if spent else []}
+        (folder / "result.json").write_text(json.dumps(row))
+    assert [(r["trial"], r["seed"]) for r in longest(tmp_path, "ring-ppo", range(10))] == [(1, 0)]
+    assert longest(tmp_path, "ring-sac", range(10)) == []
 
 
 def test_the_share_not_solved_yet_counts_those_that_never_solve(tmp_path):

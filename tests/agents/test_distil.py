@@ -95,6 +95,9 @@ def test_a_teacher_may_be_a_training_that_comes_first(small, tmp_path):
     assert history[0]["steps"] == found["steps"]
     distil.train(dataclasses.replace(small, seed=1))  # another seed has a teacher of its own
     assert common.load(trained)[1]["training"]["arguments"]["seed"] == 1
+    file.write_text(file.read_text().replace("window: 20", "window: 10"))
+    distil.train(dataclasses.replace(small, seed=1))  # and another file
+    assert common.load(trained)[1]["training"]["arguments"]["window"] == 10
 
 
 def test_what_cannot_teach_is_told_in_one_line(small, quick, tmp_path):

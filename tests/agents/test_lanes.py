@@ -30,6 +30,16 @@ def test_in_free_traffic_what_comes_goes(short):
     assert found["outflow"] == pytest.approx(sum(found["outflows"]) / 2)
 
 
+def test_agents_of_one_name_are_rows_of_their_own_tasks(tmp_path):
+    """Folders are ``trained/merge/apg-seed0`` and ``trained/bottleneck/apg-seed0``."""
+    paths = []
+    for task, seconds in (("merge", 3.0), ("bottleneck", 4.0)):
+        paths.append(tmp_path / task / "apg-seed0" / "last.pt")
+        common.save(paths[-1], common.Policy(3, (4,)), "apg", {"task": task}, {"cpu_seconds": seconds})
+    rows = [list(agents_lanes.trained({"task": task}, paths)) for task in ("merge", "bottleneck")]
+    assert rows == [["trained: apg-seed0, 3 CPU s"], ["trained: apg-seed0, 4 CPU s"]]
+
+
 def test_policies_that_drive_together_drive_as_alone(monkeypatch):
     monkeypatch.setattr(evaluate, "STEPS", 300)
     monkeypatch.setattr(evaluate, "JUDGED", 100)
