@@ -166,6 +166,18 @@ def test_following_is_judged_against_leader_and_human():
     assert human["leader_litres"] == pytest.approx(human["litres"], rel=0.2)
     stopping = evaluate.evaluate_follow(lambda o: -torch.ones(len(o), 1), follow, count=2)
     assert stopping["reward"] < human["reward"] and stopping["spacing"] > human["spacing"]
+    # IDM does not pass: it keeps less than the task's distances.
+    assert not human["passed"] and human["reward"] < evaluate.FOLLOW_REWARD
+
+
+def test_fresh_stretches_are_others(monkeypatch):
+    starts = []
+    drive = evaluate.drive
+    monkeypatch.setattr(evaluate, "drive", lambda start, *rest: starts.append(start) or drive(start, *rest))
+    for draws in ((0,), (1, 2)):
+        evaluate.evaluate_follow(None, {"task": "follow", "max_command": 3.0, "max_episode_steps": 20}, 3, draws)
+    one, two = (start.seeds for start in starts)
+    assert (len(one), len(two)) == (3, 6) and not set(one) & set(two) and len(set(two)) == 6
 
 
 def test_a_task_without_a_test_is_told():

@@ -97,6 +97,29 @@ def test_planted_drivers_are_not_bent_by_their_drift() -> None:
     assert np.concatenate(inner).std() == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.parametrize(
+    ("verdict", "tried", "told"),
+    [("unexplained", "drag", True), ("unexplained", "delay", False), ("none", "drag", False)],
+)
+def test_what_is_refused_by_name_is_told(monkeypatch: pytest.MonkeyPatch, verdict: str, tried: str, told: bool) -> None:
+    from types import SimpleNamespace
+
+    from benchmarks import planted as benchmark
+
+    said = [{"effect": "drag", "parameter": "coefficient", "would_be_found": 1e-3}]
+    measured = SimpleNamespace(report={"excluded": said, "error": {"before": {}}})
+    report = {
+        "verdict": verdict, "reason": "", "found": [], "candidates": [], "helps": {}, "error": {"before": {}},
+        "partial": {"terms": [{"effect": tried}]},
+    }  # fmt: skip
+    monkeypatch.setattr(benchmark, "fitted", lambda *data: (measured, (0.0, 0.0)))
+    monkeypatch.setattr(benchmark, "parameters", lambda found, name: {})
+    monkeypatch.setattr(benchmark, "planted", lambda *given: None)
+    monkeypatch.setattr(benchmark, "discover", lambda data: SimpleNamespace(report=report))
+    row = benchmark.measure(("drag", 1.0, 0, (1, 0.1, 10, None, ())))
+    assert (row["right"], row["told"]) == (False, told)
+
+
 def test_what_no_strength_would_show_is_not_planted() -> None:
     from benchmarks import planted as benchmark
 
