@@ -124,7 +124,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             seen.append(new[0])
             wanted.append(new[1])
             data = {"seen": torch.cat(seen), "wanted": torch.cat(wanted)}
-            error = common.clone(policy, *data.values(), arguments.fits)
+            error = common.clone(policy, data["seen"], data["wanted"], arguments.fits)
             if not math.isfinite(error):
                 advice = common.last_good(monitor.last, update)
                 raise DivergedError(f"update {update}: the error {error:g} must be finite. {advice}.")
