@@ -343,9 +343,14 @@ def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[s
         policy, content = load(arguments.out / "last.pt", task.name, agent)
         before, now = content["training"].get("arguments", {}), choices(arguments)
         for name in before:
-            if name not in MAY_CHANGE and before[name] != now.get(name):
+            if name not in now:
                 raise ValueError(
-                    f"{name} = {now.get(name)} cannot be resumed: {arguments.out} was begun with {before[name]}. "
+                    f"{arguments.out} was begun with {name} = {before[name]}, an option that {agent} does not have any "
+                    "more. Give another --out."
+                )
+            if name not in MAY_CHANGE and before[name] != now[name]:
+                raise ValueError(
+                    f"{name} = {now[name]} cannot be resumed: {arguments.out} was begun with {before[name]}. "
                     "Give that, or another --out."
                 )
         return policy, content["training"]

@@ -126,6 +126,18 @@ def test_a_training_is_not_resumed_as_another(name, change, quick):
     module.train(dataclasses.replace(begun, updates=2, learning_rate=1e-4, resume=True))
 
 
+def test_what_was_begun_with_an_option_that_is_gone_is_told(quick):
+    module, kind, small = AGENTS["apg"]
+    begun = kind(**{**quick, "updates": 1}, **small)
+    module.train(begun)
+    last = begun.out / "last.pt"
+    policy, content = common.load(last)
+    content["training"]["arguments"]["heed"] = 5.0
+    common.save(last, policy, "apg", content["environment"], content["training"])
+    with pytest.raises(ValueError, match=r"was begun with heed = 5.0, an option that apg does not have any more"):
+        module.train(dataclasses.replace(begun, updates=2, resume=True))
+
+
 def test_a_model_one_chunk_ahead_of_its_checkpoint_is_resumed(quick):
     module, kind, small = AGENTS["ppo"]
     whole = kind(**quick, **small)
