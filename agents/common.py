@@ -363,6 +363,15 @@ def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[s
     return policy, {}
 
 
+def completed(train: Callable[[A], Any], arguments: A) -> Path:
+    """Return the last checkpoint of a training: done now, or to its end, as far as its updates are not there yet."""
+    last = arguments.out / "last.pt"
+    done = load(last)[1]["training"]["update"] + 1 if last.exists() else 0
+    if done < arguments.updates:
+        train(dataclasses.replace(arguments, resume=done > 0))
+    return last
+
+
 def choices(arguments: Arguments) -> dict[str, Any]:
     """Return the arguments as plain values, as a checkpoint keeps them."""
     return {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(arguments).items()}

@@ -61,12 +61,12 @@ def taught(arguments: Arguments) -> tuple[Policy, dict[str, Any]]:
         path = arguments.out / "teacher" / "last.pt"
         chosen = common.load_agent(arguments.teacher, apg.Arguments, "apg")
         chosen = replace(chosen, seed=arguments.seed, out=path.parent)
-        kept = common.load(path)[1]["training"] if path.exists() else {}
-        before, now = kept.get("arguments", {}), common.choices(chosen)
+        before = common.load(path)[1]["training"].get("arguments", {}) if path.exists() else {}
+        now = common.choices(chosen)
         if any(before.get(name) != now[name] for name in now.keys() - {"out", "resume", "updates"}):
-            kept = {}  # of another seed or file
-        if kept.get("update", -1) + 1 < chosen.updates:
-            apg.train(replace(chosen, resume=bool(kept)))
+            apg.train(chosen)  # none is there, or that of another seed or file
+        else:
+            common.completed(apg.train, chosen)
     policy, content = common.load_for(path, environments.task_of(arguments.environment))
     if not environments.task_of(content["environment"]).failsafe:
         raise ValueError(f"{path} was trained without a failsafe: there is nothing to distil. Give another --teacher.")

@@ -185,15 +185,11 @@ def main() -> None:
     rows.append(told("calibrated IDM", judged(driven(items, params, "idm", None, limits)), base))
     for seed in range(options.seeds):
         folder = options.out / f"fuel{options.fuel_weight:g}-lag{options.lag_weight:g}" / f"seed{seed}"
-        if not (folder / "done").exists():
-            apg.train(
-                apg.Arguments(
-                    environment=environment, out=folder, seed=seed, updates=options.updates, count=16, window=WINDOW,
-                    clone=500, learning_rate=1e-2, evaluate_every=1e9, resume=(folder / "last.pt").exists(),
-                )
-            )  # fmt: skip
-            (folder / "done").touch()
-        policy = common.load(folder / "last.pt", "follow")[0]
+        arguments = apg.Arguments(
+            environment=environment, out=folder, seed=seed, updates=options.updates, count=16, window=WINDOW,
+            clone=500, learning_rate=1e-2, evaluate_every=1e9,
+        )  # fmt: skip
+        policy = common.load(common.completed(apg.train, arguments), "follow")[0]
         rows.append(
             told(
                 f"agent, fuel {options.fuel_weight:g}, lag {options.lag_weight:g}, seed {seed}",

@@ -89,17 +89,14 @@ def trained(environment: Row, paths: Sequence[Path]) -> Family:
 
 def train(name: str, agent: str, seed: int, updates: int, folder: Path) -> Path:
     """Return the checkpoint of an agent trained on a task, trained now or on as far as it is not yet."""
-    last = folder / "last.pt"
-    done = common.load(last)[1]["training"]["update"] + 1 if last.exists() else 0
     shared: Row = {
         "environment": TASKS[name], "out": folder, "seed": seed, "updates": updates, "count": 16,
-        "evaluate_every": 1e9, "resume": done > 0,
+        "evaluate_every": 1e9,
     }  # fmt: skip
-    if done < updates and agent == "apg":
-        apg.train(apg.Arguments(**shared, window=STEPS, learning_rate=3e-3))
-    elif done < updates:
-        ppo.train(ppo.Arguments(**shared, n_steps=STEPS, batch_size=4800, gamma=0.99, n_epochs=5))
-    return last
+    if agent == "apg":
+        return common.completed(apg.train, apg.Arguments(**shared, window=STEPS, learning_rate=3e-3))
+    arguments = ppo.Arguments(**shared, n_steps=STEPS, batch_size=4800, gamma=0.99, n_epochs=5)
+    return common.completed(ppo.train, arguments)
 
 
 def driven(family: Family, environment: Row) -> dict[str, Row]:

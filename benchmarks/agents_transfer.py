@@ -187,13 +187,11 @@ def row(part: Part, on_progress: OnProgress = silent) -> Row | None:
             driver = UNTRAINED[part.name.partition(":")[0]]
             acts = {where: driver(environment) for where, environment in part.judged_in.items()}
         else:
-            last = part.out / "last.pt"
             arguments = apg.Arguments(
                 environment=part.trained_in, out=part.out, seed=part.seed, updates=UPDATES, evaluate_every=1e9,
-                explore=0.0, resume=last.exists(),
+                explore=0.0,
             )  # fmt: skip
-            if not last.exists() or common.load(last, "ring", "apg")[1]["training"]["update"] + 1 < UPDATES:
-                apg.train(arguments)
+            last = common.completed(apg.train, arguments)
             acts = dict.fromkeys(part.judged_in, common.load(last, "ring", "apg")[0])
         # From a take-over after the warm-up of the training on.
         return {
