@@ -180,27 +180,33 @@ def judge(
     return found
 
 
-def tried(family: Family, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return how many of a family pass on six rings, how many of these on the thirty fresh ones, and the best of all.
+def passing(
+    names: Sequence[str], judged: Callable[[Sequence[int], Sequence[int]], list[dict[str, Any]]]
+) -> dict[str, Any]:
+    """Return how many policies pass the test, how many of these on its fresh draws too, and the best of all.
 
-    The best is that with the highest ``evaluate.score`` on the six, which ``figures`` tell.
+    ``judged(draws, chosen)`` gives the figures of some of them. The best is that with the highest ``evaluate.score``
+    on draw 0, which ``figures`` tell.
     """
-    first = judge(family, environment, (0,), range(len(family.names)))
+    first = judged((0,), range(len(names)))
     passed = [i for i, row in enumerate(first) if row["passed"]]
-    fresh = judge(family, environment, FRESH, passed)
+    fresh = judged(FRESH, passed)
     both = [i for i, row in zip(passed, fresh, strict=True) if row["passed"]]
     best = max(range(len(first)), key=lambda i: score(first[i]))
     return {
-        "tried": len(first), "six": len(passed), "passed": [family.names[i] for i in both],
-        "best": family.names[best], "figures": first[best],
+        "tried": len(first), "six": len(passed), "passed": [names[i] for i in both],
+        "best": names[best], "figures": first[best],
     }  # fmt: skip
 
 
+def tried(family: Family, environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``passing`` of a family: on six rings, and on thirty fresh ones."""
+    return passing(family.names, lambda draws, chosen: judge(family, environment, draws, chosen))
+
+
 def alone(make: Callable[[], Act | None], environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return as ``tried`` what a single policy comes to; ``make`` gives it anew, for it may have a memory."""
-    first, fresh = (evaluate_ring(make(), environment, draws=draws) for draws in ((0,), FRESH))
-    both = first["passed"] and fresh["passed"]
-    return {"tried": 1, "six": int(first["passed"]), "passed": [""] if both else [], "best": "", "figures": first}
+    """Return ``passing`` of a single policy; ``make`` gives it anew, for it may have a memory."""
+    return passing([""], lambda draws, chosen: [evaluate_ring(make(), environment, draws=draws) for _ in chosen])
 
 
 def singles(environment: Mapping[str, Any]) -> dict[str, Callable[[], Act | None]]:

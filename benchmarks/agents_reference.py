@@ -14,8 +14,8 @@ import torch
 from agents import apg, common
 from agents.common import Policy
 from agents.evaluate import evaluate_follow
-from agents.reference import HIDDEN, RANDOM, alone, families, networks, random_policies, singles, tried
-from agents.rollout import FRESH, Act
+from agents.reference import HIDDEN, RANDOM, alone, families, networks, passing, random_policies, singles, tried
+from agents.rollout import Act
 from benchmarks.agents_tables import Row, environment_of, ring, table
 
 UNTRAINED = range(8)
@@ -79,22 +79,13 @@ def on_ring(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
 def behind_leader(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
     """Return what makes each row behind a recorded leader, by name. Policies begin as clones of IDM there."""
 
-    def judged(acts: Sequence[Act | None], names: Sequence[str]) -> Row:
-        with torch.no_grad():
-            first = [evaluate_follow(act, environment) for act in acts]
-            six = [i for i, row in enumerate(first) if row["passed"]]
-            both = [i for i in six if evaluate_follow(acts[i], environment, draws=FRESH)["passed"]]
-        best = max(range(len(first)), key=lambda i: first[i]["reward"])
-        return {
-            "tried": len(first), "six": len(six), "passed": [names[i] for i in both],
-            "best": names[best], "figures": first[best],
-        }  # fmt: skip
+    def judged(acts: Sequence[Act | None], names: Sequence[str] = ()) -> Row:
+        names = names or [str(i) for i in range(len(acts))]
+        return passing(names, lambda draws, some: [evaluate_follow(acts[i], environment, draws=draws) for i in some])
 
     made: dict[str, Callable[[], Row]] = {"IDM (a human driver more)": lambda: judged([None], [""])}
     for name, hidden in zip(RANDOM, HIDDEN, strict=True):
-        made[name] = lambda hidden=hidden: judged(
-            random_policies(environment, 200, hidden), [str(i) for i in range(200)]
-        )
+        made[name] = lambda hidden=hidden: judged(random_policies(environment, 200, hidden))
     for name, updates in BEGUN.items():
         made[name] = lambda updates=updates: judged(begun(environment, folder, updates), SEEDS)
 
