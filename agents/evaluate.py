@@ -41,7 +41,7 @@ from idm_env.tasks.ring import RingTask
 STEPS = 3000
 JUDGED = 1000
 SPEED_RATIO, SPEED_STD, TIME_GAP, IN_A_ROW = 0.97, 0.15, 0.8, 5
-FOLLOW_REWARD, STRETCHES = 0.88, 16
+FOLLOW_REWARD = 0.88
 TEST: dict[str, dict[str, Any]] = {
     "ring": {"shock": 4.0},
     "follow": {},
@@ -92,6 +92,17 @@ def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
     }
 
 
+def judged_rings(
+    environment: Mapping[str, Any],
+    lengths: Sequence[float] = LENGTHS,
+    warmup: int = WARMUP,
+    draws: Sequence[int] = (0,),
+) -> Start:
+    """Return the rings of the test. Lengths are those of 22 vehicles; with more of them rings are as much longer."""
+    share = task_of(environment).vehicles / 22
+    return ring_start(environment, [length * share for length in lengths], warmup, draws)
+
+
 def evaluate_ring(
     act: Act | None,
     environment: Mapping[str, Any],
@@ -99,12 +110,8 @@ def evaluate_ring(
     warmup: int = WARMUP,
     draws: Sequence[int] = (0,),
 ) -> dict[str, Any]:
-    """Return the figures of a policy on rings of these lengths, from a take-over after ``warmup`` steps on.
-
-    Lengths are those of 22 vehicles; with more of them rings are as much longer.
-    """
-    share = task_of(environment).vehicles / 22
-    start = ring_start(environment, [length * share for length in lengths], warmup, draws)
+    """Return the figures of a policy on ``judged_rings``, from a take-over after ``warmup`` steps on."""
+    start = judged_rings(environment, lengths, warmup, draws)
     return judge_ring(start, drive(start, act, STEPS))
 
 
@@ -168,7 +175,7 @@ def worst(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def evaluate_follow(
-    act: Act | None, environment: Mapping[str, Any], count: int = STRETCHES, draws: Sequence[int] = (0,)
+    act: Act | None, environment: Mapping[str, Any], count: int = 16, draws: Sequence[int] = (0,)
 ) -> dict[str, Any]:
     """Return the figures of a policy behind ``count`` stretches of the recorded leaders in each draw, 100 s each.
 
@@ -301,9 +308,7 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, steps: int,
     save_video(frames, str(path.parent), name_prefix=path.stem, fps=10, episode_trigger=lambda _: True)
 
 
-def picture(
-    path: Path, environment: Mapping[str, Any], policy: Policy | None, human: int, steps: int, seed: int = 0
-) -> None:
+def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: int, steps: int, seed: int = 0) -> None:
     """Draw the space-time diagram of one episode: ``human`` steps of human driving, then ``steps`` with the policy.
 
     Roads of several lanes get a panel for each.
@@ -319,8 +324,7 @@ def picture(
     observation, _ = env.reset(seed=seed)
     states = []
     for step in range(human + steps):
-        action = None if policy is None or step < human else policy.predict(observation)[0]
-        observation, _, terminated, *_ = env.step(action)
+        observation, _, terminated, *_ = env.step(None if step < human else policy.predict(observation)[0])
         states.append(env.state)
         if terminated:
             break
@@ -334,8 +338,7 @@ def picture(
         present = torch.cat([s.present for s in states if s.present is not None])
         drawn = lane_panels(motion, lane, present, dt=dt, marked=env.task.agents)
     first = f"human drivers; from {human * dt:.0f} s on the" if human else "the"
-    title = "human drivers" if policy is None else f"{first} agent drives what is blue"
-    space_time(drawn, title=title).savefig(path)
+    space_time(drawn, title=f"{first} agent drives what is blue").savefig(path)
 
 
 class Motion(NamedTuple):

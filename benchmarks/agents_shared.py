@@ -21,9 +21,9 @@ from torch import Tensor
 
 from agents import common
 from agents.classical import seen
-from agents.evaluate import evaluate_ring
+from agents.evaluate import evaluate_ring, judged_rings
 from agents.reference import told
-from agents.rollout import FRESH, LENGTHS, Act, Start, ring_start, uniform_speed
+from agents.rollout import FRESH, Act, Start, uniform_speed
 from benchmarks.agents import once
 from benchmarks.agents_tables import environment_of, ring, table
 
@@ -81,8 +81,7 @@ ORACLES: dict[str, tuple[float, float, float]] = {
 
 def oracle(name: str, environment: Row) -> Oracle:
     """Return an oracle that has not driven yet, for the fresh rings."""
-    longer = environment["vehicles"] / 22
-    return Oracle(ring_start(environment, [x * longer for x in LENGTHS], draws=FRESH), *ORACLES[name])
+    return Oracle(judged_rings(environment, draws=FRESH), *ORACLES[name])
 
 
 def main() -> None:

@@ -76,6 +76,13 @@ RING = {
     "tailgating": 5.0, "tailgating_below": 1.0, "max_command": 3.0,
 }  # fmt: skip
 
+HUMANS = "human drivers"
+UNTRAINED: dict[str, Callable[[Row], Act | None]] = {
+    HUMANS: lambda environment: None,
+    "no command": lambda environment: no_command,
+    "PI with saturation": lambda environment: PISaturation(make_task(**environment)),
+}
+
 
 @dataclass(frozen=True)
 class Part:
@@ -169,14 +176,6 @@ def parts_of(case: str, environments: dict[str, Row], out: Path, seeds: int) -> 
             folder = out / name.replace(" ", "-") / f"seed{seed}"
             rows.append(Part(name, folder, {**there, "own": environment}, lengths, environment, seed))
     return rows
-
-
-HUMANS = "human drivers"
-UNTRAINED: dict[str, Callable[[Row], Act | None]] = {
-    HUMANS: lambda environment: None,
-    "no command": lambda environment: no_command,
-    "PI with saturation": lambda environment: PISaturation(make_task(**environment)),
-}
 
 
 def row(part: Part, on_progress: OnProgress = silent) -> Row | None:

@@ -10,6 +10,7 @@ import torch
 from agents import common, evaluate
 from agents.classical import FollowerStopper, PISaturation, Seen, controllers, no_command, seen
 from agents.common import Policy
+from agents.environments import task_of
 from agents.evaluate import solved_at
 from agents.rollout import Driven, drive, moments, ring_start, uniform_speed
 from idm_env.effects.idm import equilibrium_speed
@@ -263,7 +264,8 @@ def test_a_road_of_several_lanes_is_drawn_with_a_panel_for_each(tmp_path, monkey
     drawn = []
     space_time = diagrams.space_time
     monkeypatch.setattr(diagrams, "space_time", lambda panels, **k: drawn.extend(panels) or space_time(panels, **k))
-    evaluate.picture(tmp_path / "a.png", {"task": "merge"}, None, 0, 30)
+    policy = Policy(len(task_of({"task": "merge"}).bounds.names), (4,))
+    evaluate.picture(tmp_path / "a.png", {"task": "merge"}, policy, 0, 30)
     assert [p.title.split(",")[0] for p in drawn] == ["lane 2", "lane 1", "lane 0"]
     assert any(line.marked for panel in drawn for line in panel.lines) and (tmp_path / "a.png").exists()
 
