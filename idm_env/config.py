@@ -226,17 +226,17 @@ def numbers(values: Mapping[str, Any]) -> Numbers:
     return {e: {n: number(f"{e}.{n}", x) for n, x in part.items()} for e, part in nested(values).items()}
 
 
-def nested(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return parameters as effect → parameter → value, from that or from full names with a dot."""
+def nested(values: Mapping[str, Any], of: str = "parameters") -> dict[str, dict[str, Any]]:
+    """Return parameters as effect → parameter → value, from that or from full names with a dot; ``of`` is the key."""
     result: dict[str, dict[str, Any]] = {}
-    for key, value in _mapping("parameters", values).items():
+    for key, value in _mapping(of, values).items():
         if isinstance(value, Mapping):
             part, effect = {str(name): x for name, x in value.items()}, str(key)
         elif "." in str(key):
             effect, name = str(key).split(".", 1)
             part = {name: value}
         else:
-            raise ValueError(f"parameters.{shown(key)} = {shown(value)} must be a mapping, such as {{time_gap: 1.2}}.")
+            raise ValueError(f"{of}.{shown(key)} = {shown(value)} must be a mapping, such as {{time_gap: 1.2}}.")
         for name in part:
             if name in result.get(effect, {}):
                 raise ValueError(f"parameter {shown(f'{effect}.{name}')} is given twice. Remove one of them.")
@@ -297,7 +297,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def _harmless(yaml: Any, text: str, loader: Any) -> None:
-    """Raise ValueError for aliases, deep nesting and long numbers, by which a small file grows, and for equal keys."""
+    """Raise ValueError for what makes a small file grow (aliases, deep nesting, long numbers) and for bad keys."""
     keys: list[set[str] | None] = []  # of every open collection; None for a list
     waits: list[bool] = []  # whether the next node in it is a key
     for event in yaml.parse(text, loader):
@@ -319,6 +319,8 @@ def _harmless(yaml: Any, text: str, loader: Any) -> None:
                 raise ValueError(f"{line}: nested deeper than {DEEPEST}.")
         elif event.style is None and len(event.value) > LONGEST:
             raise ValueError(f"{line}: a value of {len(event.value)} characters; quote it.")
+        elif known is not None and not event.value.isprintable():
+            raise ValueError(f"{line}: key {shown(event.value)} must be printable: errors name it. Rename it.")
         elif known is not None and event.value in known:
             raise ValueError(f"{line}: key {shown(event.value)} is there twice. Remove one of them.")
         elif known is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -23,7 +23,7 @@ from idm_env.effects import Control, Effect, Noise
 from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import agents_of, at_least, limits_of, whole
+from idm_env.tasks.checks import agents_of, at_least, limits_of, ranges_of, whole
 from idm_env.tasks.crash import contact, lawful_cost
 from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.nouns import Advance, Bounds, Ended, Features, Pay, World
@@ -53,6 +53,9 @@ class Task(abc.ABC):
         drivers: Path of a ``model.yaml`` with single drivers, such as ``idm-env fit --by driver`` writes; it is used as
             in ``effects``, and in every episode every vehicle drives as one of them, drawn anew. What ``parameters``
             names is everybody's.
+        randomise: Ranges from which every episode draws parameters anew, evenly and for all its drivers alike (domain
+            randomisation): ``{"idm": {"time_gap": [0.8, 1.2]}}`` or ``{"idm.time_gap": [0.8, 1.2]}``; over
+            ``parameters`` and ``drivers``.
         noise: Standard deviation of the drivers' noise N, added as ``accel += √Δt N(0, noise²)`` (m/s² per √s); 0 is
             none.
         warmup: Steps before an episode begins, in which nobody is controlled.
@@ -82,6 +85,7 @@ class Task(abc.ABC):
     effects: str | Sequence[str | Mapping[str, Any] | Effect] = ()
     parameters: Mapping[str, Any] | None = None
     drivers: str | None = None
+    randomise: Mapping[str, Any] | None = None
     noise: float = 0.0
     warmup: int = 0
     warmup_pool: int = 0
@@ -115,6 +119,7 @@ class Task(abc.ABC):
         at_least("failsafe_time", self.failsafe_time, 0.0, "s")
         self._check_episode()
         self.params(torch.float64, "cpu")
+        _ = self._ranges
 
     def _check_episode(self) -> None:
         """Check what every task says of its episodes, observations and crashes."""
@@ -243,6 +248,18 @@ class Task(abc.ABC):
         self.simulator.check(values)
         return values
 
+    @cached_property
+    def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
+        """What is drawn for every episode, and the ends of its range."""
+        found = ranges_of(self.randomise)
+        for end in (0, 1):
+            values = {effect: dict(part) for effect, part in self._behaviour.parameters.items()}
+            for (effect, name), ends in found.items():
+                values.setdefault(effect, {})[name] = ends[end]
+            ends_of = replace(self._behaviour, parameters=values)
+            self.simulator.check(ends_of.params(self.vehicles, torch.float64, "cpu"))
+        return found
+
     def _is_agent(self) -> list[bool]:
         return [i in self.agents for i in range(self.vehicles)]
 
@@ -276,23 +293,31 @@ class Task(abc.ABC):
         return world
 
     def _who(self, draw: Draw) -> dict[str, Tensor]:
-        """Return which of the drivers every vehicle is in these episodes, where they are drawn."""
-        if not self._behaviour.drivers:
-            return {}
-        count = len(next(iter(self._behaviour.drivers.values())))
-        share = draw.stream("drivers").uniforms(0, self.vehicles, torch.float64)
-        return {"driver": (share * count).long()}
+        """Return which of the drivers every vehicle is in these episodes, and where in their ranges parameters are."""
+        found = {}
+        if self._behaviour.drivers:
+            count = len(next(iter(self._behaviour.drivers.values())))
+            share = draw.stream("drivers").uniforms(0, self.vehicles, torch.float64)
+            found["driver"] = (share * count).long()
+        if self._ranges:
+            found["randomised"] = draw.stream("randomise").uniforms(0, len(self._ranges), torch.float64)
+        return found
 
     def driven(self, episode: Mapping[str, Tensor], params: Params) -> Params:
-        """Return the parameters of a step in these episodes: each vehicle's driver's, where drivers are drawn."""
-        who = episode.get("driver")
-        if who is None:
+        """Return the parameters of a step in these episodes: each vehicle's driver's, and what episodes have drawn."""
+        who, where = episode.get("driver"), episode.get("randomised")
+        if who is None and where is None:
             return params
         made = {effect: dict(values) for effect, values in params.items()}
         dtype = next(iter(params[self.simulator.base.name].values())).dtype
-        for (effect, name), values in self._behaviour.drivers.items():
-            table = self.constant(f"drivers' {effect}.{name}", np.array(values), who.device, dtype)
-            made[effect][name] = table[who]
+        if who is not None:
+            for (effect, name), values in self._behaviour.drivers.items():
+                table = self.constant(f"drivers' {effect}.{name}", np.array(values), who.device, dtype)
+                made[effect][name] = table[who]
+        if where is not None:
+            for i, ((effect, name), (low, high)) in enumerate(self._ranges.items()):
+                drawn = (low + (high - low) * where[:, i : i + 1]).to(dtype)
+                made.setdefault(effect, {})[name] = drawn.expand(-1, self.vehicles)
         return made
 
     def _unsteady(self, world: World, draw: Draw) -> World:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from idm_env.checks import at_least, finite, shown, whole
+from idm_env.config import nested
 
 __all__ = ["KeywordError", "agents_of", "at_least", "limits_of", "span", "whole"]
 
@@ -19,12 +21,24 @@ class KeywordError(TypeError, ValueError):
 def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
     """Return a range from one number or from ``[lowest, highest]``."""
     ends = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value, value]
+    told = f" ({unit})" if unit else ""
     if len(ends) != 2:
-        raise ValueError(f"{name} = {shown(value)} must be one number or [lowest, highest] ({unit}).")
+        raise ValueError(f"{name} = {shown(value)} must be one number or [lowest, highest]{told}.")
     first, last = (at_least(name, end, low, unit) for end in ends)
     if first > last:
-        raise ValueError(f"{name} = {shown(value)} must rise: write [{last:g}, {first:g}] ({unit}).")
+        raise ValueError(f"{name} = {shown(value)} must rise: write [{last:g}, {first:g}]{told}.")
     return first, last
+
+
+def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return what episodes draw parameters from, by effect and name."""
+    found = {}
+    for effect, part in nested(randomise or {}, "randomise").items():
+        for name, value in part.items():
+            if isinstance(value, str) or not isinstance(value, Sequence):
+                raise ValueError(f"randomise.{effect}.{name} = {shown(value)} must be [lowest, highest].")
+            found[effect, name] = span(f"randomise.{effect}.{name}", value, -math.inf, "")
+    return found
 
 
 def limits_of(max_command: Any) -> tuple[float, float]:

@@ -1,0 +1,90 @@
+"""Parameters that every episode draws anew from ranges, for all its drivers alike: domain randomisation."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import idm_env  # noqa: F401 (registers the environments)
+from idm_env.config import Model, save_model
+from idm_env.effects import IDM, Brakes
+from idm_env.tasks import Draw, make_task
+
+RANGES = {"idm": {"time_gap": [0.8, 1.2]}, "idm.max_accel": [0.7, 1.4]}
+
+
+@pytest.mark.parametrize("name", ["ring", "follow", "platoon", "highway", "merge"])
+def test_all_drivers_of_an_episode_have_what_it_has_drawn(name: str) -> None:
+    task = make_task(name, randomise=RANGES)
+    params, seeds = task.params(torch.float64, "cpu"), torch.arange(400)
+    world = task.reset(Draw.of(seeds, torch.zeros_like(seeds)), params)
+    made = task.driven(world.episode, params)["idm"]
+    for parameter, (low, high) in (("time_gap", (0.8, 1.2)), ("max_accel", (0.7, 1.4))):
+        drawn = made[parameter]
+        assert drawn.shape == (400, task.vehicles) and bool((drawn == drawn[:, :1]).all())
+        # Evenly: mean and deviation of 400 draws, within four standard errors.
+        assert abs(float(drawn[:, 0].mean()) - (low + high) / 2) < 4 * (high - low) / 12**0.5 / 20
+        assert abs(float(drawn[:, 0].std()) - (high - low) / 12**0.5) < 0.1 * (high - low)
+        assert low <= float(drawn.min()) and float(drawn.max()) <= high
+    pair = torch.stack([made["time_gap"][:, 0], made["max_accel"][:, 0]])
+    assert abs(float(torch.corrcoef(pair)[0, 1])) < 0.2  # one does not tell the other
+    assert torch.equal(made["min_gap"], params["idm"]["min_gap"])
+    inputs = task.inputs(world, None, {n: x[0] for n, x in task.normals(
+        Draw.of(seeds, torch.zeros_like(seeds)), world.state.step, 1, torch.float64).items()})  # fmt: skip
+    full = {**params, "idm": {**params["idm"], **{n: made[n] for n in ("time_gap", "max_accel")}}}
+    after, usual = (task.simulator.step(world.state, inputs, p).speed for p in (full, params))
+    normals = {k: v for k, v in inputs.items() if k in task.simulator.draws}
+    assert torch.equal(task.step(world, None, normals, params).state.speed, after) and not torch.equal(after, usual)
+
+
+def test_episodes_draw_anew_as_single_environments_do_and_compiled_loops_as_torch() -> None:
+    keywords = {
+        "task": "ring", "randomise": RANGES, "vehicles": 8, "length": 170.0, "max_episode_steps": 5, "warmup": 10,
+        "warmup_pool": 4,
+    }  # fmt: skip
+    both = [gymnasium.make_vec("DiffIDM-v0", num_envs=3, output=o, **keywords) for o in ("numpy", "torch")]
+    alone = gymnasium.make("DiffIDM-v0", **keywords)
+    seen = [np.asarray(env.reset(seed=[4, 5, 6])[0]) for env in both]
+    np.testing.assert_array_equal(alone.reset(seed=5)[0], seen[0][1])
+    drawn = []
+    for _ in range(12):
+        rows = [env.step(u(torch.zeros(3, 1))) for env, u in zip(both, (torch.Tensor.numpy, torch.clone), strict=True)]
+        np.testing.assert_allclose(np.asarray(rows[0][0]), np.asarray(rows[1][0].detach()), atol=2e-6)
+        told = alone.step(np.zeros(1, np.float32))
+        np.testing.assert_array_equal(alone.reset()[0] if told[3] else told[0], rows[0][0][1])
+        drawn.append(both[0].unwrapped.batch.world.episode["randomised"].clone())
+    assert len({x.numpy().tobytes() for x in drawn}) > 1  # episodes of one pool differ
+
+
+def test_ranges_stand_over_parameters_and_single_drivers(tmp_path: Path) -> None:
+    file = tmp_path / "model.yaml"
+    single = {str(t): {"idm": {"time_gap": t, "min_gap": 2.0 + t}} for t in (1.3, 1.7)}
+    save_model(file, Model((IDM(), Brakes()), {}, drivers=single))
+    task = make_task("ring", drivers=str(file), parameters={"idm.max_accel": 1.1}, randomise={"idm.time_gap": [0.9, 1]})
+    params, seeds = task.params(torch.float64, "cpu"), torch.arange(9)
+    made = task.driven(task.reset(Draw.of(seeds, seeds), params).episode, params)["idm"]
+    assert bool((made["time_gap"] <= 1.0).all()) and set(made["min_gap"].flatten().tolist()) == {3.3, 3.7}
+    assert float(made["max_accel"]) == 1.1
+
+
+@pytest.mark.parametrize(
+    ("randomise", "message"),
+    [
+        ({"idm": {"time_gap": 1.0}}, r"randomise\.idm\.time_gap = 1\.0 must be \[lowest, highest\]"),
+        ({"idm": {"time_gap": [1.0]}}, r"must be one number or \[lowest, highest\]\."),
+        ({"idm": {"time_gap": [2.0, 1.0]}}, r"= \[2\.0, 1\.0\] must rise: write \[1, 2\]\."),
+        ({"idm": {"time_gap": [1.0, float("inf")]}}, r"must be a finite number"),
+        ({"idm.max_accel": [-1.0, 1.0]}, r"max_accel = -1 m/s² is outside \[0\.1, 10\] m/s²"),
+        ({"idm.max_accel": [1.0, 11.0]}, r"max_accel = 11 m/s² is outside \[0\.1, 10\] m/s²"),
+        ({"idm": {"time_gab": [1.0, 2.0]}}, r"Did you mean 'idm\.time_gap'"),
+        ({"nobody": {"time_gap": [1.0, 2.0]}}, r"unknown effect 'nobody'"),
+        ({"time_gap": [1.0, 2.0]}, r"randomise\.'time_gap' = .* must be a mapping"),
+        ([1.0, 2.0], r"randomise = \[1\.0, 2\.0\] must be a mapping"),
+    ],
+)
+def test_what_cannot_be_drawn_is_said_in_one_line(randomise: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as told:
+        make_task("ring", randomise=randomise)
+    assert "\n" not in str(told.value)
