@@ -20,6 +20,8 @@ import torch
 
 from agents import common, environments
 from agents.monitor import Monitor
+from agents.policy import Driving, Past
+from idm_env.checks import finite, shown
 
 
 @dataclass
@@ -32,7 +34,9 @@ class Arguments(common.Arguments):
         explore: Standard deviation of what is added to the actions of each environment throughout a window, falling
             with the learning rate. Without it a vehicle that stands never feels what driving on is worth.
         start: Checkpoint whose policy training begins with, of the same task and observation; else it is a new one.
-            ``hidden`` is then that policy's, and nothing is cloned.
+            ``hidden``, ``history`` and ``recurrent`` are then that policy's, and nothing is cloned.
+        history: Times (s) of running means of what is observed, which the policy sees too (``agents.policy``).
+        recurrent: Numbers that a gated recurrent unit of the policy remembers; 0 is none.
     """
 
     out: Path = Path("runs/apg")
@@ -41,13 +45,27 @@ class Arguments(common.Arguments):
     window: int = 600
     explore: float = 0.02
     start: Path | None = None
+    history: tuple[float, ...] = ()
+    recurrent: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if any(not finite("history", x, "s") > 0.0 for x in self.history):
+            raise ValueError(f"history = {shown(self.history)} must be times above 0 (s).")
+        if self.clone and (self.history or self.recurrent):
+            raise ValueError(
+                f"clone = {self.clone} fits single observations, and a policy with a memory has more to go by. Leave "
+                "clone, or history and recurrent, out."
+            )
 
 
 def train(arguments: Arguments) -> list[dict[str, Any]]:
     """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
     began = time.process_time()
     torch.manual_seed(arguments.seed)
-    policy, saved = common.begin(arguments, "apg")
+    dt = environments.task_of(arguments.environment).simulator.dt
+    times = [seconds / dt for seconds in arguments.history]
+    policy, saved = common.begin(arguments, "apg", history=times, recurrent=arguments.recurrent)
     if arguments.start is not None and not saved:
         policy = common.load_for(arguments.start, environments.task_of(arguments.environment))[0]
     done = saved.get("update", -1) + 1
@@ -59,6 +77,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         observation = environments.restore(env, saved["episodes"])
     else:
         observation = environments.desynchronise(env)
+    driving = Driving(policy, Past(*saved["past"]) if saved.get("past") else None)
     with Monitor("apg", arguments, began, saved) as monitor:
         if not saved:
             monitor.untrained(policy)
@@ -66,17 +85,22 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             rate = common.fall(arguments.learning_rate, update, arguments.updates)
             optimiser.param_groups[0]["lr"] = rate
             env.detach()
+            driving.detach()
             observation, total = observation.detach(), torch.zeros(())
             # Seeded by the update, so that a resumed training repeats it.
             torch.manual_seed(environments.first_seed(arguments.seed, update))
             share = rate / arguments.learning_rate
             push = arguments.explore * share * torch.randn(arguments.count, len(env.task.agents))
             for _ in range(arguments.window):
-                observation, reward, *_ = env.step(policy(observation) + push)
+                observation, reward, terminated, truncated, _ = env.step(driving(observation) + push)
+                driving.begin(terminated | truncated)
                 total = total + reward.mean()
             loss = -total / arguments.window
             norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)
-            training = {"optimiser": optimiser.state_dict(), "episodes": environments.snapshot(env)}
+            training = {
+                "optimiser": optimiser.state_dict(), "episodes": environments.snapshot(env),
+                "past": None if driving.past is None else [x.detach() for x in driving.past],
+            }  # fmt: skip
             steps = arguments.window * arguments.count
             figures = {"reward": -loss.item(), "norm": norm, "learning_rate": rate}
             if not monitor.after(update, steps, policy, training, figures):

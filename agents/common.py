@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import io
-import itertools
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,13 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
 import torch
 import tyro
 from torch import Tensor, nn
 
 import idm_env
 from agents.environments import first_seed, human_driving, task_of
+from agents.policy import Policy
 from idm_env import keep
 from idm_env.checks import finite, nearest, shown
 from idm_env.config import load_environment, number, read_yaml
@@ -28,9 +27,8 @@ from idm_env.tasks import Task
 
 SCHEMA = 2
 """Version of the layout of checkpoints."""
-ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU}
 
-MAY_BE_ZERO = {"seed", "clone", "critic_first", "learning_starts"}
+MAY_BE_ZERO = {"recurrent", "seed", "clone", "critic_first", "learning_starts"}
 POSITIVE = {"learning_rate", "clip"}
 KEPT = ("last.pt", "best.pt", "model.zip", "returns.pkl", "replay.pkl")
 """What trainings keep in ``out``, beside their logs."""
@@ -180,59 +178,12 @@ def _as(name: str, value: Any, like: Any) -> Any:
     if isinstance(like, tuple):
         if not isinstance(value, list):
             raise ValueError(f"{name} = {shown(value)} must be a list, such as {list(like)}.")
-        return tuple(_as(f"{name}[{i}]", x, like[0]) for i, x in enumerate(value))
+        return tuple(_as(f"{name}[{i}]", x, like[0] if like else 0.0) for i, x in enumerate(value))
     if isinstance(like, str) and not isinstance(value, (str, int, float)):
         raise ValueError(f"{name} = {shown(value)} must be a text.")
     if isinstance(like, Path) and not isinstance(value, str):
         raise ValueError(f"{name} = {shown(value)} must be a path.")
     return value if isinstance(like, dict) else type(like)(value)
-
-
-# -- policy ----------------------------------------------------------------------------------------------------------
-
-
-class Policy(nn.Module):
-    """``action = squash(W φ(… φ(W₁ (o − m)/s)))``: one small network, the same for every agent of an environment.
-
-    ``observation`` has shape ``(…, agents · features)``, actions ``(…, agents)`` in [−1, 1]. ``squash`` is ``tanh`` or
-    ``clip``. The normalisation m, s is fixed: that of human drivers.
-    """
-
-    mean: Tensor
-    scale: Tensor
-
-    def __init__(
-        self, features: int, hidden: Sequence[int] = (32, 32), activation: str = "tanh", squash: str = "tanh"
-    ) -> None:
-        super().__init__()
-        self.made = {"features": features, "hidden": list(hidden), "activation": activation, "squash": squash}
-        self.register_buffer("mean", torch.zeros(features))
-        self.register_buffer("scale", torch.ones(features))
-        widths = [features, *hidden]
-        layers: list[nn.Module] = []
-        for before, after in itertools.pairwise(widths):
-            layers += [nn.Linear(before, after), ACTIVATIONS[activation]()]
-        self.body = nn.Sequential(*layers, nn.Linear(widths[-1], 1))
-        last = self.body[-1]
-        assert isinstance(last, nn.Linear)
-        with torch.no_grad():
-            # A policy begins by commanding almost nothing.
-            last.weight.mul_(0.01)
-            last.bias.zero_()
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions."""
-        one = observation.unflatten(-1, (-1, len(self.mean)))
-        action = self.body((one - self.mean) / self.scale).squeeze(-1)
-        return torch.tanh(action) if self.made["squash"] == "tanh" else action.clamp(-1.0, 1.0)
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[np.ndarray, Any]:
-        """Return actions as Stable-Baselines3's ``predict`` does: arrays, and the state of a network without memory."""
-        with torch.no_grad():
-            seen = torch.as_tensor(np.asarray(observation), dtype=torch.float32)
-            return self(seen).numpy().astype(np.float32), state
 
 
 # -- checkpoints -----------------------------------------------------------------------------------------------------

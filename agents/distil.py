@@ -23,8 +23,9 @@ import torch
 from torch import Tensor
 
 from agents import apg, common, environments
-from agents.common import DivergedError, Policy
+from agents.common import DivergedError
 from agents.monitor import Monitor
+from agents.policy import Policy
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.tasks import Task
 
@@ -70,6 +71,8 @@ def taught(arguments: Arguments) -> tuple[Policy, dict[str, Any]]:
     policy, content = common.load_for(path, environments.task_of(arguments.environment))
     if not environments.task_of(content["environment"]).failsafe:
         raise ValueError(f"{path} was trained without a failsafe: there is nothing to distil. Give another --teacher.")
+    if policy.remembers:
+        raise ValueError(f"{path} has a memory, and what is fitted has none. Give another --teacher.")
     return policy, content
 
 

@@ -18,8 +18,9 @@ import torch
 import tyro
 from torch import Tensor
 
-from agents.common import Policy, load, one_line
+from agents.common import load, one_line
 from agents.environments import task_of
+from agents.policy import Policy
 from agents.rollout import (
     LENGTHS,
     SEED,
@@ -298,9 +299,10 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, steps: int,
 
     env = DiffIDMEnv(**{**environment, "warmup_pool": 0}, render_mode="rgb_array")
     observation, _ = env.reset(seed=seed)
-    frames = []
+    frames, past = [], None
     for step in range(steps):
-        observation, _, terminated, truncated, _ = env.step(policy.predict(observation)[0])
+        action, past = policy.predict(observation, past)
+        observation, _, terminated, truncated, _ = env.step(action)
         if step % 2 == 0:
             frames.append(env.render())
         if terminated or truncated:
@@ -322,9 +324,10 @@ def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: i
         chosen |= {"length": 250.0, "shock_after": task.shock_after + human * task.simulator.dt}
     env = DiffIDMEnv(**chosen)
     observation, _ = env.reset(seed=seed)
-    states = []
+    states, past = [], None
     for step in range(human + steps):
-        observation, _, terminated, *_ = env.step(None if step < human else policy.predict(observation)[0])
+        action, past = (None, None) if step < human else policy.predict(observation, past)
+        observation, _, terminated, *_ = env.step(action)
         states.append(env.state)
         if terminated:
             break

@@ -29,9 +29,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from agents import common
-from agents.common import Policy
 from agents.environments import task_of
 from agents.monitor import make_logger
+from agents.policy import Policy
 from idm_env.data import Episode, Trajectories, episodes, load
 from idm_env.data.episode import windows
 from idm_env.effects import Control

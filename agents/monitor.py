@@ -11,8 +11,9 @@ from stable_baselines3.common.logger import Logger, configure
 from tqdm import tqdm
 
 from agents import common
-from agents.common import Arguments, Policy
+from agents.common import Arguments
 from agents.evaluate import as_judged, evaluate, score
+from agents.policy import Policy
 
 
 def make_logger(arguments: Arguments, done: int) -> Logger:

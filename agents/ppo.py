@@ -27,8 +27,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
 
 from agents import common, environments
-from agents.common import ACTIVATIONS, DivergedError, Policy
+from agents.common import DivergedError
 from agents.monitor import Monitor
+from agents.policy import ACTIVATIONS, Policy
 from idm_env import keep
 from idm_env.checks import nearest
 from idm_env.envs.sb3 import SB3VecEnv

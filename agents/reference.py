@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.func import functional_call, stack_module_state, vmap
 
 from agents.classical import FollowerStopper, PISaturation, Seen, seen
-from agents.common import Policy
 from agents.environments import first_seed, human_driving, task_of
 from agents.evaluate import STEPS, evaluate_ring, judge_ring, score
+from agents.policy import Policy
 from agents.rollout import FRESH, LENGTHS, Act, Driven, Start, drive, ring_start, uniform_speed
 from idm_env.tasks import Task, World
 from idm_env.tasks.failsafe import safe_accel

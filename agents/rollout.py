@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from agents.environments import task_of
+from agents.policy import Driving, Policy
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.envs.batch import Batch
 from idm_env.envs.settings import settings
@@ -66,10 +67,15 @@ class Moment(NamedTuple):
     after: World
 
 
+def begun(act: Act | None) -> Act | None:
+    """Return what acts at the beginning of a rollout: a policy with nothing remembered, others as they are."""
+    return Driving(act) if isinstance(act, Policy) else act
+
+
 def moments(start: Start, act: Act | None, steps: int) -> Iterator[Moment]:
     """Roll a policy out from given worlds, a step at a time; ``act`` None leaves everybody to the human drivers."""
     task, world, _, params = start
-    draw = start.draw
+    draw, act = start.draw, begun(act)
     for t in range(steps):
         with torch.no_grad():
             if t % BLOCK == 0:
@@ -91,7 +97,7 @@ def drive(start: Start, act: Act | None, steps: int) -> Driven:
     batch = Batch(settings(task=task, info="none"), rows)
     batch.seed(range(rows), start.seeds)
     batch.reset()
-    batch.world = start.world
+    batch.world, act = start.world, begun(act)
     seen = task.observe(start.world).flatten(1)
     none = torch.zeros(rows, len(task.agents))
     kept: list[tuple[Tensor, ...]] = []

@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from agents import apg, common, ppo
-from agents.common import Policy
 from agents.environments import first_seed, human_driving, task_of
 from agents.evaluate import evaluate_lanes, judge_lanes
+from agents.policy import Policy
 from agents.rollout import Act, episodes_start
 from benchmarks.agents import once
 from benchmarks.agents_tables import table

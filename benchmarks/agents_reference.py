@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 
 from agents import apg, common
-from agents.common import Policy
 from agents.evaluate import evaluate_follow
+from agents.policy import Policy
 from agents.reference import HIDDEN, RANDOM, alone, families, networks, passing, random_policies, singles, tried
 from agents.rollout import Act
 from benchmarks.agents_tables import Row, environment_of, ring, table

@@ -16,11 +16,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import idm_env  # noqa: F401
 from agents import apg, common
+from agents.policy import Policy
 from idm_env import checks, cli
 from idm_env.config import load_environment, load_model
 from idm_env.data import synthetic
@@ -247,6 +248,7 @@ KEYS = st.sampled_from(
 
 
 @given(st.dictionaries(KEYS, VALUES, max_size=4))
+@example({"parameters": {"\n": {"": None}}})
 @QUICK
 def test_any_model_is_read_or_refused_in_one_line(data: Path, tmp_path: Path, content: dict[str, Any]) -> None:
     import yaml
@@ -355,7 +357,7 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(data: Path, tmp_path: Pat
 
 def test_a_hollow_checkpoint_of_an_agent_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "last.pt"
-    policy = common.Policy(3)
+    policy = Policy(3)
     common.save(path, policy, "apg", {"task": "ring"}, {"update": 3})
     whole, content = path.read_bytes(), torch.load(path, weights_only=True)
     hollow: list[Any] = [{key: value for key, value in content.items() if key != name} for name in content]

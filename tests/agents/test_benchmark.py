@@ -108,7 +108,8 @@ def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
 
 def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, monkeypatch, capsys):
     from agents import evaluate
-    from agents.common import Policy, save
+    from agents.common import save
+    from agents.policy import Policy
     from benchmarks.agents_tables import environment_of, takeover_table
 
     judged = []
@@ -160,7 +161,7 @@ def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tm
 
 def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark, monkeypatch):
     from agents import evaluate
-    from agents.common import Policy
+    from agents.policy import Policy
     from benchmarks import agents_reference
 
     asked = []

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from agents import apg, classical, common, distil, environments, evaluate, imitation, ppo, shac
-from agents.common import DivergedError, Policy
+from agents.common import DivergedError
+from agents.policy import Policy
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 KINDS = {module.__name__.split(".")[-1]: module.Arguments for module in (apg, shac, ppo, imitation, distil)}

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from agents import apg, common, distil, environments
-from agents.common import Policy
+from agents.policy import Policy
 
 LIMITS = [-4.5, 2.6]
 

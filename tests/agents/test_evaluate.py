@@ -9,9 +9,9 @@ import torch
 
 from agents import common, evaluate
 from agents.classical import FollowerStopper, PISaturation, Seen, controllers, no_command, seen
-from agents.common import Policy
 from agents.environments import task_of
 from agents.evaluate import solved_at
+from agents.policy import Policy
 from agents.rollout import Driven, drive, moments, ring_start, uniform_speed
 from idm_env.effects.idm import equilibrium_speed
 from idm_env.tasks import make_task

@@ -10,6 +10,7 @@ import torch
 
 from agents import apg, common, evaluate, ppo
 from agents.environments import human_driving, make_env, task_of
+from agents.policy import Policy
 from agents.rollout import episodes_start, ring_start, uniform_speed
 from benchmarks import agents_lanes, agents_shared
 
@@ -35,7 +36,7 @@ def test_agents_of_one_name_are_rows_of_their_own_tasks(tmp_path):
     paths = []
     for task, seconds in (("merge", 3.0), ("bottleneck", 4.0)):
         paths.append(tmp_path / task / "apg-seed0" / "last.pt")
-        common.save(paths[-1], common.Policy(3, (4,)), "apg", {"task": task}, {"cpu_seconds": seconds})
+        common.save(paths[-1], Policy(3, (4,)), "apg", {"task": task}, {"cpu_seconds": seconds})
     rows = [list(agents_lanes.trained({"task": task}, paths)) for task in ("merge", "bottleneck")]
     assert rows == [["trained: apg-seed0, 3 CPU s"], ["trained: apg-seed0, 4 CPU s"]]
 

@@ -9,8 +9,8 @@ import torch
 
 from agents import evaluate, reference
 from agents.classical import no_command
-from agents.common import Policy
 from agents.evaluate import SPEED_RATIO, as_judged, evaluate_ring
+from agents.policy import Policy
 from agents.rollout import ring_start
 
 GUARDED: dict[str, Any] = {"task": "ring", "failsafe": 3.0}

@@ -12,7 +12,8 @@ import torch
 from stable_baselines3.common.save_util import load_from_pkl
 
 from agents import apg, common, environments, ppo, shac
-from agents.common import DivergedError, Policy
+from agents.common import DivergedError
+from agents.policy import Policy
 from idm_env.tasks.ring import RingTask
 from tests.agents.conftest import PASSED
 
