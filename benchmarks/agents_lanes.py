@@ -1,11 +1,13 @@
 """Tasks ``merge`` and ``bottleneck``: what vehicles that have learned nothing do there, beside what Flow has published.
 
-    python -m benchmarks.agents_lanes [--out runs/lanes] [--train 30] [--seeds 1] [--trained runs/merge-apg/last.pt …]
+    python -m benchmarks.agents_lanes [--out runs/lanes] [--train 30] [--agents apg] [--seeds 1]
+        [--trained runs/merge-apg/last.pt …]
 
 A tenth of the vehicles is controlled, behind a failsafe of 3 m/s², with commands from −4.5 to 2.6 m/s²; lanes are left
 to their drivers. Every row is eight episodes of 300 s, the same for all, of which the last 200 s count. Families of
-policies that are there are not driven again. ``--train`` also trains APG and PPO on both tasks, one policy for all
-agents, for so many updates of 16 environments × 300 steps; a training goes on where it was stopped.
+policies that are there are not driven again. ``--train`` also trains APG and PPO on both tasks, among drivers who let
+nobody in and among such who do (``Courtesy``), one policy for all agents, for so many updates of 16 environments × 300
+steps; a training goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -30,12 +32,21 @@ from benchmarks.agents_tables import table
 
 Row = dict[str, Any]
 CONTROL: Row = {"controlled": 0.1, "failsafe": 3.0, "max_command": [-4.5, 2.6]}
+LET_IN: Row = {"effects": ["courtesy"]}
 TASKS: dict[str, Row] = {
     "merge": {"task": "merge", **CONTROL},
     "merge, 3000 + 800 an hour": {"task": "merge", "inflow": 3000.0, "ramp_inflow": 800.0, **CONTROL},
     "bottleneck": {"task": "bottleneck", **CONTROL},
     "bottleneck, 1900 an hour": {"task": "bottleneck", "inflow": 1900.0, **CONTROL},
-}
+    "merge, drivers let in": {"task": "merge", **LET_IN, **CONTROL},
+    "merge, 3000 + 800 an hour, drivers let in": {
+        "task": "merge", "inflow": 3000.0, "ramp_inflow": 800.0, **LET_IN, **CONTROL,
+    },
+    "bottleneck, drivers let in": {"task": "bottleneck", **LET_IN, **CONTROL},
+    "bottleneck, 1900 an hour, drivers let in": {"task": "bottleneck", "inflow": 1900.0, **LET_IN, **CONTROL},
+}  # fmt: skip
+TRAINED = ("merge", "bottleneck", "merge, drivers let in", "bottleneck, drivers let in")
+"""Tasks that agents are trained on; they are judged where demand differs, too."""
 CONSTANTS = (-0.2, -0.05, 0.0, 0.05, 0.2, 1.0)
 NETWORKS, EPISODES, STEPS = 10, 8, 300
 
@@ -78,12 +89,12 @@ def networks(environment: Row) -> Family:
 
 
 def trained(environment: Row, paths: Sequence[Path]) -> Family:
-    """Return the agents among these checkpoints that were trained on the task."""
+    """Return the agents among these checkpoints that were trained on the task, among drivers of this kind."""
     loaded = [(path.parent.name, *common.load(path)) for path in paths]
     return {
         f"trained: {name}, {content['training']['cpu_seconds']:.0f} CPU s": policy
         for name, policy, content in loaded
-        if content["task"] == environment["task"]
+        if (content["task"], content["environment"].get("effects")) == (environment["task"], environment.get("effects"))
     }
 
 
@@ -124,13 +135,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/lanes"))
     parser.add_argument("--trained", nargs="*", type=Path, default=[], help="checkpoints of agents, as further rows")
     parser.add_argument("--train", type=int, metavar="UPDATES", help="also train agents for so many updates")
+    parser.add_argument("--agents", nargs="+", choices=("apg", "ppo"), default=["apg", "ppo"])
     parser.add_argument("--seeds", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(1)
     if options.train:
         options.trained += [
-            train(name, agent, seed, options.train, options.out / "trained" / name / f"{agent}-seed{seed}")
-            for seed, name, agent in itertools.product(range(options.seeds), ("merge", "bottleneck"), ("apg", "ppo"))
+            train(
+                name,
+                agent,
+                seed,
+                options.train,
+                options.out / "trained" / name.replace(" ", "-") / f"{agent}-seed{seed}",
+            )
+            for seed, name, agent in itertools.product(range(options.seeds), TRAINED, options.agents)
         ]
     rows = []
     for name, environment in TASKS.items():

@@ -64,8 +64,8 @@ class Task(abc.ABC):
             ``[hardest braking, strongest acceleration]``, such as ``[-4.5, 2.6]``: actions below 0 are then in parts of
             the former, those above in parts of the latter, and an action of 0 commands 0 in any case.
         failsafe: Deceleration (m/s²) of a failsafe: commands that leave a vehicle no room to stop at it behind a leader
-            who brakes as hard are cut, and may then brake beyond ``max_command``; 0 is none. Rewards are for the
-            command as it was given. See ``idm_env.tasks.failsafe.safe_accel``.
+            who brakes as hard, or where its lane ends, are cut, and may then brake beyond ``max_command``; 0 is none.
+            Rewards are for the command as it was given. See ``idm_env.tasks.failsafe.safe_accel``.
         failsafe_time: Time (s) that the failsafe allows for before braking begins, as SUMO's tau.
         max_episode_steps: Steps after which an episode is cut off; None is the task's own number, −1 is no limit.
         observation: ``"scaled"``: each entry over a fixed scale that the task documents, about unit size; ``"raw"``: in
@@ -377,9 +377,14 @@ class Task(abc.ABC):
         That of ``safe_accel``, with ``failsafe`` and ``failsafe_time``.
         """
         state = world.state
-        speed, ahead, gap = self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)
+        return self._safe_behind(state, self.lead_speed(state), self.pick(state.gap))
+
+    def _safe_behind(self, state: State, lead_speed: Tensor, gap: Tensor) -> Tensor:
+        """Return what the failsafe allows behind a leader at these speeds (m/s) and gaps (m), ``(…, agents)``."""
         euler = self.simulator.integration == "euler"
-        return safe_accel(speed, ahead, gap, self.failsafe, self.failsafe_time, self.simulator.dt, euler)
+        return safe_accel(
+            self.pick(state.speed), lead_speed, gap, self.failsafe, self.failsafe_time, self.simulator.dt, euler
+        )
 
     def limit(self, world: World, command: Tensor) -> Tensor:
         """Return commands (m/s²) as far as the failsafe lets them pass."""

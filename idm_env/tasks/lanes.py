@@ -96,6 +96,19 @@ class LanesTask(Task):
         """Return the commanded accelerations (m/s²)."""
         return super().command(action[..., : len(self.agents)])
 
+    def safe_command(self, world: World) -> Tensor:
+        """Return what the failsafe allows: behind the leader, and before the end of a lane as if somebody stood there.
+
+        Both count, whichever is nearer: a leader may leave the lane.
+        """
+        found = super().safe_command(world)
+        if not self.road.closed:
+            return found
+        state = world.state
+        assert state.links is not None
+        room = self.pick(self.road.closed_at(state.links.lane, state.position) - state.position)
+        return torch.minimum(found, self._safe_behind(state, torch.zeros_like(room), room))
+
     def inputs(
         self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:

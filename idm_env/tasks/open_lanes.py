@@ -131,11 +131,24 @@ class OpenLanesTask(LanesTask):
 
     def crashed(self, world: World) -> Tensor:
         """Return whose episodes end in a crash: of all, where vehicles touch or one drives over the end of its lane."""
-        state = world.state
-        assert state.links is not None and state.present is not None
-        over = (state.position > self.road.closed_at(state.links.lane, state.position)) & (state.present > 0)
         crashed = super().crashed(world)
-        return crashed | over.any(-1, keepdim=True).expand_as(crashed)
+        return crashed | self._over(world.state).any(-1, keepdim=True).expand_as(crashed)
+
+    def _over(self, state: State) -> Tensor:
+        """Return which vehicles have driven over the end of their lane (bool)."""
+        assert state.links is not None and state.present is not None
+        return (state.position > self.road.closed_at(state.links.lane, state.position)) & (state.present > 0)
+
+    def crash_reason(self, world: World, row: int, agent: int | None = None) -> str:
+        """As ``Task`` says; or who has driven over the end of which lane, where nobody has touched anybody."""
+        state, over = world.state, self._over(world.state)[row]
+        if float(state.gap[row].min()) <= 0.0 or not bool(over.any()):
+            return super().crash_reason(world, row, agent)
+        vehicle = int(over.int().argmax())
+        assert state.links is not None
+        who = f"vehicle {vehicle}" + (" (an agent)" if vehicle in self.agents else "")
+        seconds = float(state.step[row]) * self.simulator.dt
+        return f"{who} drove over the end of lane {int(state.links.lane[row, vehicle])} after {seconds:.1f} s"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

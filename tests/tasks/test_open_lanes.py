@@ -72,10 +72,40 @@ def test_an_agent_that_drives_over_the_end_of_its_lane_has_crashed() -> None:
                    lane_commands=True)  # fmt: skip
     env.reset(seed=1)
     for step in range(400):  # noqa: B007
-        _, reward, terminated, _, _ = env.step(np.array([1.0, 0.0], np.float32))
+        _, reward, terminated, _, info = env.step(np.array([1.0, 0.0], np.float32))
         if terminated:
             break
     assert terminated and reward < -100 and 50 < step < 350
+    said = f"vehicle 0 (an agent) drove over the end of lane 0 after {(step + 1) * 0.1:.1f} s"
+    assert info["crash_reason"] == said
+
+
+def test_behind_a_failsafe_an_agent_stops_a_metre_before_its_lane_ends() -> None:
+    """It always accelerates and never leaves its lane, on which nobody is ahead of it."""
+    env = gym.make("DiffIDM-v0", task="bottleneck", inflow=400.0, vehicles=8, controlled=[0], max_command=3.0,
+                   lane_commands=True, failsafe=3.0)  # fmt: skip
+    env.reset(seed=1)
+    for _ in range(400):
+        _, _, terminated, _, _ = env.step(np.array([1.0, 0.0], np.float32))
+        assert not terminated
+    state = env.unwrapped.state  # type: ignore[attr-defined]
+    assert state.links.lane[0, 0] == 0 and float(state.speed[0, 0]) < 0.01
+    assert float(state.position[0, 0]) == pytest.approx(399.0, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["merge", "bottleneck"])
+def test_behind_a_failsafe_nobody_crashes_whatever_agents_command(name: str) -> None:
+    """Among drivers who cut in, and where lanes end."""
+    task = make_task(name, vehicles=40, controlled=0.25, failsafe=3.0, max_command=[-4.5, 2.6])
+    params = task.params(torch.float64, "cpu")
+    world = task.reset(Draw.of(torch.arange(3), torch.zeros(3, dtype=torch.int64)), params)
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for step in range(600):
+            if step % 20 == 0:
+                action = 4.0 * torch.rand((3, len(task.agents)), generator=generator, dtype=torch.float64) - 1.0
+            world = task.step(world, task.command(action), None, params)
+            assert not task.crashed(world).any()
 
 
 def test_gradients_of_the_reward_are_finite_differences() -> None:
