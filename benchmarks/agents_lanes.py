@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -47,11 +48,14 @@ TASKS: dict[str, Row] = {
 }  # fmt: skip
 TRAINED = ("merge", "bottleneck", "merge, drivers let in", "bottleneck, drivers let in")
 """Tasks that agents are trained on; they are judged where demand differs, too."""
+KINDS = ("idm", "constants", "uniform", "networks")
 CONSTANTS = (-0.2, -0.05, 0.0, 0.05, 0.2, 1.0)
 NETWORKS, EPISODES, STEPS = 10, 8, 300
 
 Family = dict[str, Act]
 """Policies by the names of their rows, which drive together."""
+Figures = dict[str, Row]
+"""Figures of a family by the same names."""
 
 
 def constants(environment: Row) -> Family:
@@ -129,6 +133,29 @@ def told(name: str, row: str, r: Row) -> list[str]:
     return [name, row, f"{r['speed']:.1f}", flow, f"{r['queued']:.0f}", f"{r['reward']:.3f}", str(r["collisions"])]
 
 
+def _driven(make: Callable[[], Family], environment: Row) -> dict[str, Row]:
+    return driven(make(), environment)
+
+
+def figures(out: Path, name: str, paths: Sequence[Path] = (), kinds: Sequence[str] = KINDS) -> dict[str, Figures]:
+    """Return the figures of a task's families by kind, and of agents among ``paths``: driven now if not kept in out."""
+    environment, folder = TASKS[name], out / name.replace(" ", "-")
+    makers: dict[str, Callable[[], Family]] = {
+        "idm": dict,
+        "constants": partial(constants, environment),
+        "uniform": partial(uniform, environment),
+        "networks": partial(networks, environment),
+    }
+    found: dict[str, Figures] = {}
+    for kind in kinds:
+        found[kind] = once(folder / kind, partial(_driven, makers[kind], environment)) or {}
+        print(f"{name}: {kind}", file=sys.stderr, flush=True)
+    for row, policy in trained(environment, paths).items():
+        kept = folder / row.replace(": ", "-").replace(", ", "-").replace(" ", "-")
+        found[row] = once(kept, partial(driven, {row: policy}, environment)) or {}
+    return found
+
+
 def main() -> None:
     """Drive what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -151,22 +178,10 @@ def main() -> None:
             for seed, name, agent in itertools.product(range(options.seeds), TRAINED, options.agents)
         ]
     rows = []
-    for name, environment in TASKS.items():
-        makers: dict[str, Callable[[], Family]] = {
-            "idm": dict,
-            "constants": partial(constants, environment),
-            "uniform": partial(uniform, environment),
-            "networks": partial(networks, environment),
-        }
-        found: dict[str, dict[str, Row] | None] = {}
-        for kind, make in makers.items():
-            folder = options.out / name.replace(" ", "-") / kind
-            found[kind] = once(folder, lambda make=make, environment=environment: driven(make(), environment))
-            print(f"{name}: {kind}", flush=True)
-        agents = trained(environment, options.trained)
-        found["trained"] = driven(agents, environment) if agents else None
+    for name in TASKS:
+        found = figures(options.out, name, options.trained)
         for kind, family in found.items():
-            shown = family or {}
+            shown = family
             if kind in ("constants", "networks") and family:
                 best = max(family, key=lambda row: family[row]["reward"])
                 shown = {f"best of {len(family)}: {best}": family[best]}

@@ -197,13 +197,18 @@ def _told(found: Any) -> str:
     return f"{found:.0f}" if isinstance(found, float) else f"{found[0]:.0f} ± {found[1]:.0f}"
 
 
-def published(arguments: argparse.Namespace, seeds: int = 4, minutes: int = 15) -> None:
-    """Print all rows on the published road: humans, ours without and with ``Courtesy``; then the controller."""
-    mine = {
+def on_the_published_road(seeds: int = 4, minutes: int = 15) -> dict[str, Part]:
+    """Return our parts of that table by name: humans, then the controller, each without and with ``Courtesy``."""
+    return {
         f"short, {name}, derived {derived}": Part("ours", LABELS, SHORT, minutes, seeds, derived, how)
         for derived in (False, True)
         for name, how in (("nobody lets in", AS_IT_STANDS), ("courtesy", COURTEOUS))
     }
+
+
+def published(arguments: argparse.Namespace, minutes: int = 15) -> None:
+    """Print all rows on the published road: humans, ours without and with ``Courtesy``; then the controller."""
+    mine = on_the_published_road(minutes=minutes)
     theirs = {
         f"zipper, {label}, derived {derived}": Part("zipper", [label], SHORT, minutes, derived=derived)
         for derived in (False, True)
