@@ -43,8 +43,11 @@ class Arguments(common.Arguments):
     Args:
         algorithm: ppo or sac.
         count: Environments that run together.
-        n_steps: Steps of each environment between updates (PPO), or in a chunk of learning (SAC).
-        gamma: Discount per step.
+        hold: Steps for which an action is held in training; what learns sees one decision, and the sum of their
+            rewards. Noise that is drawn anew at every step of 0.1 s moves no vehicle and is paid for in full. The
+            policy is judged deciding at every step.
+        n_steps: Decisions of each environment between updates (PPO), or in a chunk of learning (SAC).
+        gamma: Discount per decision.
         activation: tanh or relu.
         batch_size: Samples of a gradient step.
         gae_lambda: Of PPO's advantages.
@@ -52,6 +55,9 @@ class Arguments(common.Arguments):
         clip_range: Of PPO's ratio.
         ent_coef: Weight of entropy: a number, or auto for SAC.
         log_std_init: Logarithm of PPO's first standard deviation of actions.
+        anneal: The logarithm of that deviation falls evenly to ``log_std_last`` instead of being learned. What is
+            learned falls to nothing, for noise costs effort at once and pays later, if ever.
+        log_std_last: Logarithm of the last standard deviation, with ``anneal``.
         use_sde: Exploration that depends on the state instead of white noise.
         gradient_steps: Gradient steps of SAC per step of all environments.
         learning_starts: Samples that SAC collects before it learns.
@@ -62,6 +68,7 @@ class Arguments(common.Arguments):
     clip: float = 0.5
     algorithm: Literal["ppo", "sac"] = "ppo"
     count: int = 64
+    hold: int = 1
     n_steps: int = 300
     gamma: float = 0.999
     activation: str = "tanh"
@@ -71,6 +78,8 @@ class Arguments(common.Arguments):
     clip_range: float = 0.2
     ent_coef: str = "0.0"
     log_std_init: float = -1.0
+    anneal: bool = False
+    log_std_last: float = -3.0
     use_sde: bool = False
     gradient_steps: int = 1
     learning_starts: int = 6400
@@ -100,7 +109,25 @@ class Normalised(BaseFeaturesExtractor):
 
 
 class Desynchronised(SB3VecEnv):
-    """The adapter, with the clocks of the first episodes set apart as for the agents that differentiate."""
+    """The adapter, with the clocks of the first episodes set apart as for the agents that differentiate.
+
+    Every action is held for ``hold`` steps, whose rewards are summed. An episode that ends before them is over for the
+    learner at once; the next one begins under the action that is still held, unpaid.
+    """
+
+    def __init__(self, vector_env: DiffIDMVectorEnv, hold: int = 1) -> None:
+        super().__init__(vector_env)
+        self.hold = hold
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step ``hold`` times, and reset what ended; return observations, sums of rewards, dones and infos."""
+        observation, reward, done, infos = super().step_wait()
+        for _ in range(self.hold - 1):
+            observation, more, ended, told = super().step_wait()
+            reward = np.where(done, reward, reward + more)
+            infos = [before if over else now for over, before, now in zip(done, infos, told, strict=True)]
+            done = done | ended
+        return observation, reward, done, infos
 
     def reset(self) -> np.ndarray:
         """Begin episodes at different clocks."""
@@ -111,8 +138,8 @@ class Desynchronised(SB3VecEnv):
 class Shared(Desynchronised):
     """The adapter with every agent of every environment a row of its own: one policy, and the reward of their team."""
 
-    def __init__(self, vector_env: DiffIDMVectorEnv) -> None:
-        super().__init__(vector_env)
+    def __init__(self, vector_env: DiffIDMVectorEnv, hold: int = 1) -> None:
+        super().__init__(vector_env, hold)
         self.worlds, self.agents = vector_env.num_envs, len(vector_env.task.agents)
         self.num_envs = self.worlds * self.agents
         bounds = vector_env.task.bounds
@@ -184,6 +211,15 @@ def layers(model: BaseAlgorithm, policy: Policy) -> list[tuple[nn.Linear, nn.Lin
     return list(zip(ours, theirs, strict=True))
 
 
+def set_deviation(model: BaseAlgorithm, arguments: Arguments, update: int) -> None:
+    """Set PPO's standard deviation of actions for an update, where it is not learned."""
+    if isinstance(model, PPO) and arguments.anneal:
+        share = min(update / max(arguments.updates - 1, 1), 1.0)
+        log_std: Any = model.policy.log_std
+        log_std.requires_grad_(False)
+        log_std.fill_(arguments.log_std_init + share * (arguments.log_std_last - arguments.log_std_init))
+
+
 def check(model: BaseAlgorithm, update: int, kept: Path) -> None:
     """Raise DivergedError where a weight is not finite."""
     bad = [name for name, value in model.policy.named_parameters() if not bool(torch.isfinite(value).all())]
@@ -210,7 +246,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     policy, saved = common.begin(arguments, name, activation=arguments.activation, squash=squash)
     made = environments.make_env(arguments.environment, arguments.count, output="numpy")
     agents = len(made.task.agents)
-    vector = Desynchronised(made) if agents == 1 else Shared(made)
+    vector = (Desynchronised if agents == 1 else Shared)(made, arguments.hold)
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
     file, moments, memory = (arguments.out / f for f in ("model.zip", "returns.pkl", "replay.pkl"))
@@ -226,9 +262,10 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             for mine, other in layers(model, policy):
                 other.load_state_dict(mine.state_dict())
     chunk = arguments.n_steps * vector.num_envs
+    steps = arguments.n_steps * arguments.count * arguments.hold
     done = model.num_timesteps // chunk
     if saved:  # an interruption between two files leaves the model one chunk ahead
-        saved |= {"update": done - 1, "steps": done * chunk // agents}
+        saved |= {"update": done - 1, "steps": done * steps}
     # Making or loading a model seeds its environments; these are the seeds of all agents, new ones after a resume.
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
 
@@ -245,6 +282,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         for update in range(done, arguments.updates):
             rate = common.fall(arguments.learning_rate, update, arguments.updates)
             model.lr_schedule = FloatSchedule(rate)
+            set_deviation(model, arguments, update)
             try:
                 model.learn(chunk, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]
             except ValueError:  # SB3 meets weights that are not finite when it draws the next action
@@ -252,7 +290,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
                 raise
             copy_actor(model, policy, update, monitor.last)
             figures = {k: float(v) for k, v in model.logger.name_to_value.items() if "loss" in k or "std" in k}
-            if not monitor.after(update, chunk // agents, policy, {}, {**figures, "learning_rate": rate}, store):
+            if not monitor.after(update, steps, policy, {}, {**figures, "learning_rate": rate}, store):
                 break
     return monitor.history
 

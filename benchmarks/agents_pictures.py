@@ -1,8 +1,8 @@
 """The picture of docs/agents.md on how soon agents solve a test: ``python benchmarks/agents.py picture``.
 
 For each task and agent the share of seeds that have not solved it yet, against the CPU seconds of training (Kaplan
-and Meier 1958): a seed that never solves counts as long as it was trained. Of an agent's trials the one is shown whose
-trainings were longest.
+and Meier 1958): a seed that never solves counts as long as it was trained. Of an agent's trials the one is shown that
+solves most seeds, and of equals the one whose trainings were longest.
 """
 
 from __future__ import annotations
@@ -20,10 +20,15 @@ AGENTS = {"apg": "#1e5adc", "shac": "#1a7850", "ppo": "#b2182b", "sac": "#ef8a62
 TASKS = {"ring": "ring with a shock", "follow": "behind a recorded leader"}
 
 
-def longest(out: Path, config: str, seeds: Sequence[int]) -> list[Row]:
-    """Return the results of a configuration's seeds in the trial whose trainings were longest, without failures."""
+def shown(out: Path, config: str, seeds: Sequence[int]) -> list[Row]:
+    """Return the results, without failures, of the trial that solves most seeds; of equals the longest trainings."""
     parts = [[r for r in part if r["history"]] for part in groups(out, config, seeds).values()]
-    return max(parts, key=lambda part: max((r["summary"]["spent"] for r in part), default=0.0), default=[])
+
+    def rank(part: Sequence[Row]) -> tuple[int, float]:
+        summaries = [r["summary"] for r in part]
+        return sum(s["solved"] for s in summaries), max((s["spent"] for s in summaries), default=0.0)
+
+    return max(parts, key=rank, default=[])
 
 
 def curve(axes: Axes, rows: Sequence[Row], name: str, colour: str) -> None:
@@ -42,7 +47,7 @@ def draw(out: Path, seeds: Sequence[int], path: Path) -> None:
     figure, panels = plt.subplots(1, len(TASKS), figsize=(10, 3.6), sharey=True, layout="constrained")
     for axes, (task, title) in zip(panels, TASKS.items(), strict=True):
         for agent, colour in AGENTS.items():
-            rows = longest(out, f"{task}-{agent}", seeds)
+            rows = shown(out, f"{task}-{agent}", seeds)
             if rows:
                 curve(axes, rows, agent.upper(), colour)
         axes.set(title=title, xscale="log", xlabel="CPU seconds of training", ylim=(-0.03, 1.03))

@@ -103,7 +103,8 @@ def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
     for config, trials in benchmark.SEARCH.items():
         assert (ROOT / "configs" / f"{config}.yaml").exists()
         for options in trials:
-            assert set(options) <= set(kinds[config.split("-")[-1]].__dataclass_fields__)
+            names = {name.removeprefix("no_") for name in options}
+            assert names <= set(kinds[config.split("-")[-1]].__dataclass_fields__)
 
 
 def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, monkeypatch, capsys):
@@ -180,16 +181,20 @@ def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark
     assert rows["constants"]()["tried"] == 21
 
 
-def test_the_longest_trainings_are_drawn_without_failures(tmp_path):
-    from benchmarks.agents_pictures import longest
+def test_the_trial_that_solves_most_is_drawn_or_the_longest_without_failures(tmp_path):
+    from benchmarks.agents_pictures import shown
 
     for trial, seed, spent in ((0, 0, 40.0), (0, 1, 50.0), (1, 0, 90.0), (1, 1, 0.0)):
         folder = tmp_path / "ring-ppo" / f"trial{trial}" / f"seed{seed}"
         folder.mkdir(parents=True)
-        row = {"trial": trial, "seed": seed, "summary": {"spent": spent}, "history": [LAST] if spent else []}
+        summary = {"spent": spent, "solved": False}
+        row = {"trial": trial, "seed": seed, "summary": summary, "history": [LAST] if spent else []}
         (folder / "result.json").write_text(json.dumps(row))
-    assert [(r["trial"], r["seed"]) for r in longest(tmp_path, "ring-ppo", range(10))] == [(1, 0)]
-    assert longest(tmp_path, "ring-sac", range(10)) == []
+    assert [(r["trial"], r["seed"]) for r in shown(tmp_path, "ring-ppo", range(10))] == [(1, 0)]
+    assert shown(tmp_path, "ring-sac", range(10)) == []
+    row = {"trial": 0, "seed": 1, "summary": {"spent": 50.0, "solved": True}, "history": [LAST]}
+    (tmp_path / "ring-ppo/trial0/seed1/result.json").write_text(json.dumps(row))
+    assert [(r["trial"], r["seed"]) for r in shown(tmp_path, "ring-ppo", range(10))] == [(0, 0), (0, 1)]
 
 
 def test_the_share_not_solved_yet_counts_those_that_never_solve(tmp_path):
@@ -208,7 +213,7 @@ def test_the_share_not_solved_yet_counts_those_that_never_solve(tmp_path):
 def test_longer_trainings_have_as_many_times_the_updates_and_a_place_of_their_own(benchmark, tmp_path):
     benchmark.run(["ring-ppo", "ring-apg"], tmp_path, 1, given=4, times=3)
     given = [dict(zip(c[3::2], c[4::2], strict=False)) for c in benchmark.trained]
-    assert [g["--updates"] for g in given] == ["150", "132"]  # three times those of trial 4
+    assert [g["--updates"] for g in given] == ["180", "132"]  # three times those of trial 4
     assert {g["--cpu-seconds"] for g in given} == {str(3 * benchmark.LIMIT)}
     assert (tmp_path / "ring-ppo/trial4x3/seed0/result.json").exists()
     benchmark.run(["ring-drivers-apg"], tmp_path, 1, times=2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
 from pathlib import Path
 
@@ -21,7 +22,7 @@ SMALL = {"count": 4, "window": 20}
 AGENTS = {
     "apg": (apg, apg.Arguments, SMALL),
     "shac": (shac, shac.Arguments, {**SMALL, "critic_first": 1, "critic_epochs": 2}),
-    "ppo": (ppo, ppo.Arguments, {"count": 4, "n_steps": 16, "batch_size": 32, "n_epochs": 2}),
+    "ppo": (ppo, ppo.Arguments, {"count": 4, "n_steps": 16, "batch_size": 32, "n_epochs": 2, "hold": 2}),
     "sac": (ppo, ppo.Arguments, {
         "count": 4, "n_steps": 16, "batch_size": 32, "algorithm": "sac", "learning_starts": 16, "ent_coef": "auto",
     }),
@@ -148,7 +149,7 @@ def test_a_model_one_chunk_ahead_of_its_checkpoint_is_resumed(quick):
     (whole.out / "last.pt").write_bytes(before)  # as if killed between the two files
     history = module.train(dataclasses.replace(whole, updates=3, resume=True))
     assert [row["updates"] for row in history] == [0, 1, 3]
-    assert history[-1]["steps"] == 3 * small["n_steps"] * small["count"]
+    assert history[-1]["steps"] == 3 * small["n_steps"] * small["count"] * small["hold"]
 
 
 def test_nothing_to_resume_is_told(quick):
@@ -253,6 +254,53 @@ def test_the_copied_actor_is_the_baselines(name, quick):
     ppo.copy_actor(model, policy, 0, Path("kept"))
     seen = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32) * 0.1
     assert np.allclose(policy.predict(seen)[0], model.predict(seen, deterministic=True)[0], atol=1e-6)
+
+
+def test_a_held_action_earns_the_rewards_of_its_steps_and_none_of_the_next_episode(ring):
+    """Against the same vector stepped one by one; episodes of 7 steps end within an action that is held for 3."""
+    ring |= {"max_episode_steps": 7, "warmup_pool": 0}
+    plain, held = (environments.make_env(ring, 2, output="numpy") for _ in range(2))
+    rows = ppo.Desynchronised(held, hold=3)
+    rows.seed(5)
+    plain.reset(seed=5)
+    seen = environments.desynchronise(plain)
+    np.testing.assert_array_equal(rows.reset(), seen)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (5, 2, 1)).astype(np.float32)
+    ends = 0
+    for action in actions:
+        wanted, over, last = np.zeros(2), np.zeros(2, dtype=bool), [None, None]
+        for _ in range(3):
+            seen, reward, terminated, truncated, info = plain.step(action)
+            wanted += np.where(over, 0.0, reward)
+            for i in np.flatnonzero((terminated | truncated) & ~over):
+                last[i] = info["final_obs"][i]
+            over |= terminated | truncated
+        observation, reward, done, infos = rows.step(action)
+        np.testing.assert_array_equal(observation, seen)
+        np.testing.assert_allclose(reward, wanted, rtol=1e-6)
+        np.testing.assert_array_equal(done, over)
+        for i in range(2):
+            assert ("terminal_observation" in infos[i]) == over[i]
+            if over[i]:
+                np.testing.assert_array_equal(infos[i]["terminal_observation"], last[i])
+                assert infos[i]["TimeLimit.truncated"]
+        ends += int(over.sum())
+    assert ends == 4
+
+
+def test_the_deviation_of_actions_falls_as_told_and_is_not_learned(quick):
+    given = {**AGENTS["ppo"][2], "anneal": True, "log_std_init": -1.0, "log_std_last": -4.0, "learning_rate": 0.1}
+    half = ppo.Arguments(**{**quick, "cpu_seconds": 1e-9}, **given)
+    ppo.train(half)
+    ppo.train(dataclasses.replace(half, cpu_seconds=0.0, resume=True))
+    rows = [row for part in ("", "from1") for row in table(quick["out"] / "log" / part / "progress.csv")]
+    deviations = [float(row["train/std"]) for row in rows if row["train/std"]]
+    assert deviations == pytest.approx(np.exp([-1.0, -2.0, -3.0, -4.0]).tolist(), rel=1e-5)
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.mark.parametrize("name", ["ppo", "sac"])
