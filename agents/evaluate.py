@@ -142,20 +142,27 @@ def mixed(environment: Mapping[str, Any]) -> dict[str, Any]:
     return {**environment, "parameters": {"idm": drawn}}
 
 
+def kinds(environment: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return environments in which one IDM parameter of all human drivers is 20 % lower or higher, ten, by name."""
+    idm = drivers_of(environment)
+    return {
+        f"{name} {sign}20 %": {**environment, "parameters": {"idm": {**idm, name: value * factor}}}
+        for name, value in idm.items()
+        for sign, factor in (("−", 0.8), ("+", 1.2))
+    }
+
+
 def held_out(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures on ring lengths and drivers that training has not seen, on a fresh draw, without any tuning.
 
-    ``lengths``: 200–300 m in steps of 10. ``drivers``: the six lengths of the test with one IDM parameter of all human
-    drivers 20 % lower or higher, ten cases; the worst of each figure. ``mixed``: every driver's every parameter drawn
-    from ±20 %. Ratios are to the uniform speed of those drivers.
+    ``lengths``: 200–300 m in steps of 10. ``drivers``: the six lengths of the test among each of ``kinds``; the worst
+    of each figure. ``mixed``: every driver's every parameter drawn from ±20 %. Ratios are to the uniform speed of those
+    drivers.
     """
-    idm = drivers_of(environment)
-    cases = {
-        f"{name} {sign}20 %": {name: idm[name] * factor} for name in idm for sign, factor in (("−", 0.8), ("+", 1.2))
-    }
+    cases = kinds(environment)
     result = {"lengths": evaluate_ring(act, environment, UNSEEN, draws=(1,))}
-    for name, change in cases.items():
-        result[name] = evaluate_ring(act, {**environment, "parameters": {"idm": {**idm, **change}}}, draws=(1,))
+    for name, among in cases.items():
+        result[name] = evaluate_ring(act, among, draws=(1,))
     result["mixed"] = evaluate_ring(act, mixed(environment), draws=(1,))
     result["drivers"] = worst([result[name] for name in cases])
     return result

@@ -5,6 +5,7 @@
     python benchmarks/agents.py table [--out runs/benchmark]
     python benchmarks/agents.py picture [--out runs/benchmark]
     python benchmarks/agents.py takeover [--out runs/benchmark]
+    python benchmarks/agents.py unshocked [--only ring-brakes-distil]
 
 ``reference`` has what learns nothing, ``run`` the searches and the seeds of each best trial (or of the one that is
 given, without a search). Every training is one process with one thread and one file of results; what is done is
@@ -76,7 +77,6 @@ SEARCH: dict[str, list[Options]] = {
         {"learning_rate": 1e-3, "ent_coef": "0.002", "gradient_steps": 2, "updates": 48},
     ],
     "ring-shac": [{}],
-    "ring-drivers-apg": [{}],
     "ring-brakes-distil": [{"evaluate_every": 0}],
     "follow-apg": [{}],
     "follow-ppo": [{}],
@@ -286,7 +286,7 @@ def main() -> None:
     import argparse
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["reference", "run", "table", "picture", "takeover"])
+    parser.add_argument("what", choices=["reference", "run", "table", "picture", "takeover", "unshocked"])
     parser.add_argument("--only", nargs="*", default=list(SEARCH))
     parser.add_argument("--tests", nargs="*", default=list(TESTS), choices=TESTS, help="of the reference rows")
     parser.add_argument("--trial", type=int, help="train the seeds of this trial, without a search")
@@ -308,6 +308,10 @@ def main() -> None:
         from benchmarks.agents_tables import takeover_table
 
         takeover_table(options.out, [c for c in SEARCH if c.startswith("ring")], SEEDS[: options.seeds])
+    elif options.what == "unshocked":
+        from benchmarks.agents_tables import unshocked_table
+
+        unshocked_table(options.out, [c for c in options.only if c.startswith("ring")], SEEDS[: options.seeds])
     elif options.what == "reference":
         from benchmarks import agents_reference
 

@@ -161,6 +161,25 @@ def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> N
     )  # fmt: skip
 
 
+def unshocked_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print what the last checkpoints do on the thirty fresh rings of their test without its shock."""
+    from agents.common import load
+    from agents.evaluate import as_judged, evaluate
+    from agents.rollout import FRESH
+
+    rows = []
+    for config in configs:
+        for path in (p for seed in seeds for p in sorted((out / config).glob(f"trial*/seed{seed}/training/last.pt"))):
+            policy, content = load(path)
+            test = as_judged(content["environment"], content["training"]["arguments"]["judged_in"])
+            found = evaluate(policy, {**test, "shock": 0.0}, draws=FRESH)
+            rows.append([config, *path.parts[-4:-2], *ring(found), "yes" if found["passed"] else "no"])
+    table(
+        ("agent", "trial", "seed", "worst ratio", "worst deviation", "smallest time gap", "collisions, of 30 rings",
+         "passes"), rows,
+    )  # fmt: skip
+
+
 def environment_of(config: str) -> Row:
     """Return the environment of one of APG's configurations; the other agents of a task have the same."""
     from agents import apg

@@ -216,8 +216,8 @@ def test_longer_trainings_have_as_many_times_the_updates_and_a_place_of_their_ow
     assert [g["--updates"] for g in given] == ["180", "132"]  # three times those of trial 4
     assert {g["--cpu-seconds"] for g in given} == {str(3 * benchmark.LIMIT)}
     assert (tmp_path / "ring-ppo/trial4x3/seed0/result.json").exists()
-    benchmark.run(["ring-drivers-apg"], tmp_path, 1, times=2)
-    assert benchmark.trained[-1][-1] == "64"  # twice those of its file
+    benchmark.run(["follow-apg"], tmp_path, 1, times=2)
+    assert benchmark.trained[-1][-1] == "68"  # twice those of its file
 
 
 def test_an_interrupted_training_is_resumed(benchmark, tmp_path):
