@@ -1,7 +1,7 @@
 """Does closing the loop pay in control? Policies trained on plain and on corrected models, judged elsewhere.
 
     python -m benchmarks.agents_transfer [--case delay] [--out runs/transfer] [--seeds 10]
-        [--data ngsim_i80_pairs.parquet] [--executor processes --jobs 8]
+        [--data ngsim_i80_pairs.parquet] [--guarded] [--executor processes --jobs 8]
 
 Case ``delay``: platoons are generated whose drivers react with a hidden delay; ``two``: with that delay, and they
 brake harder than they accelerate. From the same data come plain IDM, calibrated, and the model of ``discover``, which
@@ -11,7 +11,10 @@ and effects are known, also with a failsafe.
 
 Case ``i80``: measured drivers, of whom there is no truth. From the 100 training pairs come plain IDM, the model of
 ``discover``, and that with the wandering time gap that ``idm_env.drift`` estimates; all are judged among the *other*
-108 drivers, each a driver of his own, with what ``discover`` and drift say of those. What is done is kept.
+108 drivers, each a driver of his own, with what ``discover`` and drift say of those.
+
+``--guarded`` trains and judges behind a failsafe, policies that remember (running means), by windows of 120 s. What is
+done is kept.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ import dataclasses
 import os
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +79,10 @@ RING = {
     "tailgating": 5.0, "tailgating_below": 1.0, "max_command": 3.0,
 }  # fmt: skip
 
+GUARDED: Row = {"failsafe": FAILSAFE, "max_command": [-4.5, 2.6], "tailgating": 0.0}
+REMEMBERING: Row = {"history": (5.0, 30.0), "window": 1200, "explore": 0.02}
+"""What ``--guarded`` changes in environments and in APG."""
+
 HUMANS = "human drivers"
 UNTRAINED: dict[str, Callable[[Row], Act | None]] = {
     HUMANS: lambda environment: None,
@@ -94,6 +101,7 @@ class Part:
     lengths: tuple[float, ...]
     trained_in: Row | None = None
     seed: int = 0
+    options: Row = field(default_factory=dict)
 
     def __str__(self) -> str:
         return str(self.out)
@@ -161,10 +169,12 @@ def measured(data: Path, out: Path) -> dict[str, Row]:
     }
 
 
-def parts_of(case: str, environments: dict[str, Row], out: Path, seeds: int) -> list[Part]:
+def parts_of(case: str, environments: dict[str, Row], out: Path, seeds: int, options: Row | None = None) -> list[Part]:
     """Return all rows of a case, seed after seed, so that what is there at any time can be compared."""
     truth = environments[TRUTH]
-    there = {"truth": truth, "guarded": {**truth, "failsafe": FAILSAFE}}
+    there = {"truth": truth}
+    if not truth.get("failsafe"):
+        there["guarded"] = {**truth, "failsafe": FAILSAFE}
     lengths = LONGER if case == "i80" else LENGTHS
     rows = [Part(name, out / name.replace(" ", "-"), there, lengths) for name in UNTRAINED]
     for name, environment in environments.items():
@@ -174,7 +184,7 @@ def parts_of(case: str, environments: dict[str, Row], out: Path, seeds: int) -> 
     for seed in range(seeds):
         for name, environment in environments.items():
             folder = out / name.replace(" ", "-") / f"seed{seed}"
-            rows.append(Part(name, folder, {**there, "own": environment}, lengths, environment, seed))
+            rows.append(Part(name, folder, {**there, "own": environment}, lengths, environment, seed, options or {}))
     return rows
 
 
@@ -188,7 +198,7 @@ def row(part: Part, on_progress: OnProgress = silent) -> Row | None:
         else:
             arguments = apg.Arguments(
                 environment=part.trained_in, out=part.out, seed=part.seed, updates=UPDATES, evaluate_every=1e9,
-                explore=0.0,
+                **{"explore": 0.0, **part.options},
             )  # fmt: skip
             last = common.completed(apg.train, arguments)
             acts = dict.fromkeys(part.judged_in, common.load(last, "ring", "apg")[0])
@@ -240,12 +250,17 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--kinds", nargs="*", help="what policies are trained on, such as 'plain IDM'; default: all")
     parser.add_argument("--data", type=Path, default=default_data(), help="I-80 pairs, for case i80")
+    parser.add_argument("--guarded", action="store_true", help="behind a failsafe, with a memory and longer windows")
     workers.add(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     out = options.out.resolve() / options.case
     environments = measured(options.data, out) if options.case == "i80" else generated(options.case, out)
-    parts = parts_of(options.case, environments, out, options.seeds)
+    if options.guarded:
+        environments = {name: {**environment, **GUARDED} for name, environment in environments.items()}
+        parts = parts_of(options.case, environments, out / "guarded", options.seeds, REMEMBERING)
+    else:
+        parts = parts_of(options.case, environments, out, options.seeds)
     unknown = set(options.kinds or ()) - set(environments)
     if unknown:
         parser.error(f"--kinds '{min(unknown)}' is unknown. Choose of {', '.join(environments)}.")

@@ -78,6 +78,20 @@ def test_rows_are_done_once_and_an_interrupted_training_goes_on(quick, ring, tmp
     assert transfer.cells(part, found)[:2] == ["plain IDM", "0"] and transfer.cells(part, found)[5] == "1"
 
 
+def test_behind_a_failsafe_policies_remember_and_are_judged_with_it_only(ring, tmp_path, monkeypatch):
+    small = {"updates": 1, "hidden": (4, 4), "count": 2, "window": 10}
+    arguments, figures = apg.Arguments, {"speed_ratio": 0.9, "speed_std": 0.1, "time_gap": 1.0, "collisions": 0}
+    monkeypatch.setattr(transfer, "evaluate_ring", lambda act, *rest: {**figures, "collisions": int(act.remembers)})
+    monkeypatch.setattr(transfer.apg, "Arguments", lambda **given: arguments(**{**given, **small}))
+    environments = {name: {**ring, **transfer.GUARDED} for name in ("plain IDM", transfer.TRUTH)}
+    *_, part, last = transfer.parts_of("i80", environments, tmp_path, 1, transfer.REMEMBERING)
+    assert set(part.judged_in) == {"truth", "own"} and last.name == transfer.TRUTH
+    found = transfer.row(part)
+    assert found["truth"]["collisions"] == 1 and transfer.cells(part, found)[6] == "–"
+    content = transfer.common.load(part.out / "last.pt")[1]
+    assert content["environment"]["failsafe"] == 3.0 and content["policy"]["made"]["history"] == [50.0, 300.0]
+
+
 def test_what_seeds_say_together():
     def rows(*collisions):
         return [{"collisions": n, "speed_ratio": 0.9, "speed_std": 0.1} for n in collisions]
