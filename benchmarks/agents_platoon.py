@@ -38,7 +38,7 @@ from benchmarks.agents_energy import pairs
 from benchmarks.agents_tables import table
 from idm_env import metrics
 from idm_env.data import Episode, episodes
-from idm_env.tasks import Draw, Task, make_task
+from idm_env.tasks import Draw, Task, World, make_task
 
 Row = dict[str, Any]
 BEHIND, RECORDS, FADES, JUDGED_FROM = 40, 5, 5.0, 60.0
@@ -51,7 +51,7 @@ HEAD = (
 
 
 def chained(speeds: Sequence[np.ndarray], dt: float) -> list[np.ndarray]:
-    """Return chains of ``RECORDS`` records of speeds (m/s) each, every record once; what is left over is left out."""
+    """Return chains of ``RECORDS`` records of speeds (m/s) each, every record at most once, as long as the shortest."""
     left, chains = list(range(len(speeds))), []
     while len(left) >= RECORDS:
         made = speeds[left.pop(0)]
@@ -62,7 +62,7 @@ def chained(speeds: Sequence[np.ndarray], dt: float) -> list[np.ndarray]:
             fade = np.clip(1.0 - dt * np.arange(len(after)) / FADES, 0.0, 1.0)
             made = np.concatenate((made, np.maximum(after + (made[-1] - after[0]) * fade, 0.0)))
         chains.append(made)
-    return chains
+    return [made[: min(map(len, chains))] for made in chains]
 
 
 def write(path: Path, chains: Sequence[np.ndarray], dt: float) -> Path:
@@ -104,30 +104,39 @@ class Rule:
         return self.task.action((self.controller.wanted(view) - view.speed) / self.task.simulator.dt)
 
 
-def judged(make: Callable[[Task, float], Act | None], leaders: Sequence[Path], idm: Row, agents: int) -> Row:
-    """Return the figures of a policy behind each chain; ``make(task, mean speed of the leader)`` gives it anew.
+def whole(leaders: Path, idm: Row, agents: int) -> Start:
+    """Return one episode behind each of the leaders of a file, which are equally long, from first to last step."""
+    keywords = environment(leaders, idm, agents)
+    steps = task_of(keywords).leaders.steps  # type: ignore[attr-defined]
+    task = make_task(**{**keywords, "max_episode_steps": int(steps.max()) - 1})
+    params = task.params(torch.float32, "cpu")
+
+    def begun(seeds: Sequence[int]) -> World:
+        return task.reset(Draw.of(torch.tensor(seeds), torch.zeros(len(seeds), dtype=torch.int64)), params)
+
+    drawn = begun(range(SEED, SEED + 50 * len(steps))).episode["trace"].tolist()
+    seeds = tuple(SEED + drawn.index(i) for i in range(len(steps)))
+    return Start(task, begun(seeds), seeds, params)
+
+
+def judged(make: Callable[[Task, Tensor], Act | None], leaders: Path, idm: Row, agents: int) -> Row:
+    """Return the figures of a policy behind each chain; ``make(task, mean speed of each leader)`` gives it anew.
 
     ``speed``: mean of the forty (m/s); ``deviation``: the deviation of each vehicle's speed over time, mean over those
     behind the first agent (m/s); litres per 100 km of the forty by both models; ``nearest`` and ``farthest`` gap of
     agents (m); ``reward``: mean per step; ``collision``.
     """
-    rows: list[Row] = []
-    for path in leaders:
-        keywords = environment(path, idm, agents)
-        leader = task_of(keywords).leaders  # type: ignore[attr-defined]
-        steps = int(leader.steps[0]) - 1
-        task = make_task(**{**keywords, "max_episode_steps": steps})
-        params = task.params(torch.float32, "cpu")
-        draw = Draw.of(torch.tensor([SEED]), torch.tensor([0]))  # which draws nothing: the whole chain is driven
-        start = Start(task, task.reset(draw, params), (SEED,), params)
-        mean = float(leader.motion[0, :, 1].mean())
-        rows.append(_figures(task, drive(start, make(task, mean), steps)))
+    start = whole(leaders, idm, agents)
+    motion = start.task.leaders.motion  # type: ignore[attr-defined]
+    means = torch.as_tensor(motion[:, :, 1].mean(-1, keepdims=True), dtype=torch.float32)
+    driven = drive(start, make(start.task, means), motion.shape[1] - 1)
+    rows = [_figures(start.task, Driven(*(x[:, i] for x in driven))) for i in range(len(motion))]
     return {name: [r[name] for r in rows] for name in rows[0]}
 
 
 def _figures(task: Task, driven: Driven) -> Row:
     first = round(JUDGED_FROM / task.simulator.dt)
-    speed, accel = (x[first:, 0, 1:].double() for x in (driven.speed, driven.accel))
+    speed, accel = (x[first:, 1:].double() for x in (driven.speed, driven.accel))
     gap = task.pick(driven.gap)[first:]
     return {
         "speed": float(speed.mean()),
@@ -138,7 +147,7 @@ def _figures(task: Task, driven: Driven) -> Row:
         "nearest": float(gap.min()),
         "farthest": float(gap.max()),
         "reward": float(driven.reward[first:].mean()),
-        "collision": bool(driven.gap[:, 0, 1:].min() <= 0.0),
+        "collision": bool(driven.gap[:, 1:].min() <= 0.0),
     }  # fmt: skip
 
 
@@ -164,17 +173,17 @@ def train(agent: str, keywords: Row, seed: int, updates: int, folder: Path) -> P
     return common.completed(ppo.train, arguments)
 
 
-def _same(policy: Act, task: Task, speed: float) -> Act:
+def _same(policy: Act, task: Task, speed: Tensor) -> Act:
     return policy
 
 
-def makers(keywords: Row, mean: float) -> dict[str, Callable[[Task, float], Act | None]]:
+def makers(keywords: Row, mean: float) -> dict[str, Callable[[Task, Tensor], Act | None]]:
     """Return what makes each policy that nothing trains; ``mean`` is the mean speed of the training leaders (m/s)."""
 
-    def stopper(told_each: bool, task: Task, speed: float) -> Act:
+    def stopper(told_each: bool, task: Task, speed: Tensor) -> Act:
         return Rule(task, FollowerStopper(task, desired=speed if told_each else mean))
 
-    made: dict[str, Callable[[Task, float], Act | None]] = {
+    made: dict[str, Callable[[Task, Tensor], Act | None]] = {
         "IDM": lambda task, speed: None,
         "FollowerStopper, the training leaders' mean speed": partial(stopper, False),
         "FollowerStopper, told each leader's mean speed": partial(stopper, True),
@@ -185,12 +194,10 @@ def makers(keywords: Row, mean: float) -> dict[str, Callable[[Task, float], Act 
     return made
 
 
-def leaders_of(items: Sequence[Episode], name: Path) -> tuple[list[Path], float]:
-    """Return files of chains, all in one and each in one, and the mean speed of their leaders (m/s)."""
-    dt = items[0].dt
-    chains = chained([np.asarray(e.leader.speed_mps) for e in items], dt)
-    each = [write(name.with_name(f"{name.name}-{i}.parquet"), [one], dt) for i, one in enumerate(chains)]
-    return [write(name.with_suffix(".parquet"), chains, dt), *each], float(np.concatenate(chains).mean())
+def leaders_of(items: Sequence[Episode], path: Path) -> tuple[Path, float]:
+    """Return the file of the chains of these episodes' leaders, and their mean speed (m/s)."""
+    chains = chained([np.asarray(e.leader.speed_mps) for e in items], items[0].dt)
+    return write(path, chains, items[0].dt), float(np.concatenate(chains).mean())
 
 
 def main() -> None:
@@ -203,12 +210,12 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     training, held_out, idm = pairs(options.data)
-    together, mean = leaders_of(list(episodes(training, max_gap=None, smooth=True)), options.out / "training")
-    apart, _ = leaders_of(held_out, options.out / "held-out")
-    keywords = environment(together[0], idm, TRAINED_WITH)
+    leaders, mean = leaders_of(list(episodes(training, max_gap=None, smooth=True)), options.out / "training.parquet")
+    others, _ = leaders_of(held_out, options.out / "held-out.parquet")
+    keywords = environment(leaders, idm, TRAINED_WITH)
     policies = makers(keywords, mean)
-    for agent in ("apg", "ppo"):
-        for seed in range(options.seeds):
+    for seed in range(options.seeds):
+        for agent in ("apg", "ppo"):
             path = train(agent, keywords, seed, options.updates, options.out / f"{agent}-seed{seed}")
             policy, content = common.load(path, "follow")
             name = f"{agent.upper()}, seed {seed}, {content['training']['cpu_seconds']:.0f} CPU s"
@@ -218,7 +225,7 @@ def main() -> None:
         found: dict[str, Row] = {}
         for name, make in policies.items():
             folder = options.out / f"{agents}" / name.replace(", ", "-").replace(" ", "-")
-            r = once(folder, partial(judged, make, apart[1:], idm, agents))
+            r = once(folder, partial(judged, make, others, idm, agents))
             if r is not None and (name != "IDM" or agents == TRAINED_WITH):
                 found[name] = r
         drawn = [name for name in found if name.startswith("random network")]

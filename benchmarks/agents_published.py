@@ -82,7 +82,7 @@ def ring_rows(out: Path, checkpoints: Sequence[Path]) -> list[list[str]]:
         for i, length in enumerate(LENGTHS):
             each = [r["speeds"][i] for r in done]
             told = f"{statistics.median(each):.2f} ({min(each):.2f}–{max(each):.2f})" if each else "–"
-            differs = "the shock is ours" if name else DIFFERS
+            differs = "as above" if i else "the shock is ours" if name else DIFFERS
             rows.append([
                 f"ring of {length:.0f} m, m/s{name}", RINGS.get(length, "between these") if not name else "–",
                 f"{human['speeds'][i]:.2f}" if human else "–", told, differs,

@@ -69,21 +69,21 @@ def test_chains_have_every_record_once_and_no_jump():
     assert {round(x, 6) for end in ends for x in end} <= {round(float(x[0]), 6) for x in speeds}
 
 
-def test_behind_a_steady_leader_all_are_as_fast_and_only_agents_differ(tmp_path):
+def test_behind_steady_leaders_all_are_as_fast_and_only_agents_differ(tmp_path):
     idm = {"max_accel": 1.1, "comfort_decel": 1.2, "time_gap": 1.4, "min_gap": 2.2, "desired_speed": 35.0}
-    paths = [agents_platoon.write(tmp_path / f"{v:g}.parquet", [np.full(1202, v)], 0.1) for v in (6.0, 8.0)]
-    assert recorded_leaders(str(paths[1]), 0.1).motion[0, :, 1] == pytest.approx(np.full(1202, 8.0))
+    path = agents_platoon.write(tmp_path / "leaders.parquet", [np.full(1202, 6.0), np.full(1202, 8.0)], 0.1)
+    assert recorded_leaders(str(path), 0.1).motion[1, :, 1] == pytest.approx(np.full(1202, 8.0))
     means = []
 
     def human(task, mean):
         means.append(mean)
 
-    r = agents_platoon.judged(human, paths, idm, 4)
-    assert means == pytest.approx([6.0, 8.0])
+    r = agents_platoon.judged(human, path, idm, 4)
+    assert means[0].tolist() == [[pytest.approx(6.0)], [pytest.approx(8.0)]]
     assert r["speed"] == pytest.approx([6.0, 8.0], abs=1e-3) and max(r["deviation"]) < 1e-3
-    slower = agents_platoon.judged(lambda task, mean: lambda seen: -0.01 * torch.ones(1, 4), paths[1:], idm, 4)
-    assert slower["speed"][0] < 7.5 and slower["farthest"][0] > r["farthest"][1] + 10.0
-    task = make_task(**agents_platoon.environment(paths[0], idm, 4))
+    slower = agents_platoon.judged(lambda task, mean: lambda seen: -0.01 * torch.ones(2, 4), path, idm, 4)
+    assert slower["speed"][1] < 7.5 and slower["farthest"][1] > r["farthest"][1] + 10.0
+    task = make_task(**agents_platoon.environment(path, idm, 4))
     seen = torch.tensor([[[6.0, 5.0, 3.0]] * 4]) / torch.tensor(task.scales)  # nearer than its first zone: stop
     rule = agents_platoon.Rule(task, FollowerStopper(task, desired=8.0))
     assert task.command(rule(seen.flatten(1))).tolist() == [[-4.5] * 4]

@@ -93,10 +93,10 @@ def test_behind_a_failsafe_an_agent_stops_a_metre_before_its_lane_ends() -> None
     assert float(state.position[0, 0]) == pytest.approx(399.0, abs=0.01)
 
 
-@pytest.mark.parametrize("name", ["merge", "bottleneck"])
-def test_behind_a_failsafe_nobody_crashes_whatever_agents_command(name: str) -> None:
-    """Among drivers who cut in, and where lanes end."""
-    task = make_task(name, vehicles=40, controlled=0.25, failsafe=3.0, max_command=[-4.5, 2.6])
+@pytest.mark.parametrize(("name", "effects"), [("merge", []), ("bottleneck", []), ("merge", ["courtesy"])])
+def test_behind_a_failsafe_nobody_crashes_whatever_agents_command(name: str, effects: list[str]) -> None:
+    """Among drivers who cut in, or let in, and where lanes end."""
+    task = make_task(name, effects=effects, vehicles=40, controlled=0.25, failsafe=3.0, max_command=[-4.5, 2.6])
     params = task.params(torch.float64, "cpu")
     world = task.reset(Draw.of(torch.arange(3), torch.zeros(3, dtype=torch.int64)), params)
     generator = torch.Generator().manual_seed(5)
