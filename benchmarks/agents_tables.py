@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 Row = dict[str, Any]
 
 
@@ -66,41 +68,63 @@ def solved(rows: Sequence[Row]) -> int:
 
 
 def summary_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
-    """Print one row per agent: how many of its seeds solved the test, and how soon."""
+    """Print one row per agent: how many of its seeds solved the test, and how soon.
+
+    Vehicle-steps are steps of environments times the vehicles in one.
+    """
+    from agents.environments import task_of
+
     rows = []
     for config, name, part in ((c, n, p) for c in configs for n, p in groups(out, c, seeds).items()):
         done = [r["summary"] for r in part if r["summary"]["solved"]]
+        vehicles = task_of(environment_of(f"{config.split('-')[0]}-apg")).vehicles
         rows.append([
             config, name, f"{len(done)} of {len(part)}", str(sum(r["summary"]["ever"] for r in part)),
             spread([r["summary"]["spent"] for r in part if r["history"]], ".0f"),
             spread([d["cpu_seconds"] for d in done], ".1f"), spread([d["steps"] / 1000 for d in done], ".0f"),
+            spread([d["steps"] * vehicles / 1e6 for d in done], ".1f"),
         ])  # fmt: skip
     table(
-        ("agent", "trial", "solved", "ever passed", "CPU s trained", "CPU s to solved", "1000 steps to solved"), rows
+        ("agent", "trial", "solved", "ever passed", "CPU s trained", "CPU s to solved", "1000 steps to solved",
+         "million vehicle-steps to solved"), rows
     )  # fmt: skip
 
 
-def ratio_line(out: Path, ours: str, theirs: str, seeds: Sequence[int]) -> None:
-    """Print how much more another agent needs: medians, and the range over all pairs, of those that solved.
+def median_ratio(theirs: Sequence[float], ours: Sequence[float], draws: int = 10_000) -> tuple[float, float, float]:
+    """Return the ratio of two medians and its 95 % interval: percentiles of a bootstrap over seeds.
 
-    Of those that did not it is only known that they need more than they had.
+    Seeds that never solve are infinite: later than all others, whenever that would be.
+    """
+    generator = np.random.default_rng(0)
+    drawn = [np.median(generator.choice(x, (draws, len(x))), axis=1) for x in (theirs, ours)]
+    with np.errstate(invalid="ignore"):  # infinite over infinite says nothing
+        low, high = np.nanquantile(drawn[0] / drawn[1], (0.025, 0.975), method="nearest")
+        return float(np.median(theirs) / np.median(ours)), float(low), float(high)
+
+
+def ratio_line(out: Path, ours: str, theirs: str, seeds: Sequence[int]) -> None:
+    """Print how much more another agent needs: the ratio of medians over all seeds, with its interval.
+
+    There is none where half of the seeds do not solve; of those it is only known that they need more than they had.
     """
     one, others = groups(out, ours, seeds), groups(out, theirs, seeds)
     base = [r["summary"] for part in one.values() for r in part]
     for name, part in others.items():
         other = [r["summary"] for r in part]
         for key, what in (("cpu_seconds", "CPU seconds"), ("steps", "environment steps")):
-            a, b = ([s[key] for s in some if s["solved"]] for some in (base, other))
+            a, b = ([float(s[key]) if s["solved"] else float("inf") for s in some] for some in (base, other))
             told = f"\n{theirs} ({name}) / {ours}, {what} to solved: "
-            if a and b:
-                middle = statistics.median(b) / statistics.median(a)
-                print(f"{told}{middle:.1f} ({min(b) / max(a):.1f}–{max(b) / min(a):.1f})", end="")
+            if a and np.isfinite([np.median(a), np.median(b)]).all():
+                told += "{:.2f} ({:.2f}–{:.2f})".format(*median_ratio(b, a))
             else:
-                print(f"{told}no ratio", end="")
-            print(f"; {len(b)} of {len(other)} and {len(a)} of {len(base)} solved", end="")
+                told += "no ratio"
+            print(
+                f"{told}; {int(np.isfinite(b).sum())} of {len(b)} and {int(np.isfinite(a).sum())} of {len(a)} solved",
+                end="",
+            )
             spent = [s["spent"] for s in other if not s["solved"]]
-            if a and spent and key == "cpu_seconds":
-                print(f"; those not solved had {min(spent) / statistics.median(a):.0f} times {ours}'s median", end="")
+            if a and np.isfinite(np.median(a)) and spent and key == "cpu_seconds":
+                print(f"; those not solved had {min(spent) / np.median(a):.0f} times {ours}'s median", end="")
             print(".")
 
 

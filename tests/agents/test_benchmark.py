@@ -230,6 +230,17 @@ def test_an_interrupted_training_is_resumed(benchmark, tmp_path):
     assert ["--resume" in command for command in benchmark.trained] == [True, False]
 
 
+def test_a_ratio_of_medians_has_an_interval_and_counts_those_that_never_solve():
+    from benchmarks.agents_tables import median_ratio
+
+    far = float("inf")
+    assert median_ratio([20.0], [10.0, 10.0]) == (2.0, 2.0, 2.0)
+    # The median of two seeds is that of the pairs 1 1, 1 3, 3 1, 3 3: each a quarter.
+    assert median_ratio([1.0, 3.0], [1.0]) == (2.0, 1.0, 3.0)
+    assert median_ratio([1.0, 2.0, far], [1.0]) == (2.0, 1.0, far)
+    assert median_ratio([far, far, 2.0], [1.0])[0] == far
+
+
 def test_what_never_solved_is_told_with_what_it_had(tmp_path, capsys):
     from benchmarks.agents_tables import ratio_line
 
@@ -249,4 +260,4 @@ def test_what_never_solved_is_told_with_what_it_had(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "ring-ppo (0, 5 times) / ring-apg, CPU seconds to solved: no ratio; 0 of 3 and 3 of 3 solved; " in told
     assert "those not solved had 10 times ring-apg's median." in told
-    assert "ring-sac (0) / ring-apg, CPU seconds to solved: 1.0 (0.9–1.0); 1 of 1 and 3 of 3 solved." in told
+    assert "ring-sac (0) / ring-apg, CPU seconds to solved: 0.95 (0.91–1.00); 1 of 1 and 3 of 3 solved." in told
