@@ -153,7 +153,8 @@ def _figures(task: Task, driven: Driven) -> Row:
 
 def told(agents: str, name: str, r: Row) -> list[str]:
     """Return the cells of a row: means over chains, with the least and the most of fuel."""
-    fuel = [f"{statistics.mean(r[m]):.2f} ({min(r[m]):.2f}–{max(r[m]):.2f})" for m in metrics.FUELS]
+    stands = min(r["speed"]) < 0.1  # fuel per way means nothing
+    fuel = ["–" if stands else f"{statistics.mean(r[m]):.2f} ({min(r[m]):.2f}–{max(r[m]):.2f})" for m in metrics.FUELS]
     return [
         agents, name, f"{statistics.mean(r['speed']):.2f}", f"{statistics.mean(r['deviation']):.2f}", *fuel,
         f"{min(r['nearest']):.1f}–{max(r['farthest']):.1f}", f"{statistics.mean(r['reward']):.3f}",
