@@ -252,7 +252,7 @@ class Task(abc.ABC):
     def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
         """What is drawn for every episode, and the ends of its range."""
         found = ranges_of(self.randomise)
-        for end in (0, 1):
+        for end in (0, 1) if found else ():
             values = {effect: dict(part) for effect, part in self._behaviour.parameters.items()}
             for (effect, name), ends in found.items():
                 values.setdefault(effect, {})[name] = ends[end]
