@@ -5,8 +5,8 @@
 
 Vehicle 1 drives behind each held-out leader of the I-80 pairs, from where the recorded follower was; ten vehicles with
 IDM calibrated on the training pairs drive behind it, from equilibrium. Vehicle 1 is the recorded follower itself,
-another calibrated IDM, or an agent of task ``follow``, trained by gradients behind the training pairs' leaders.
-Trainings that are there are not done again.
+another calibrated IDM, one whose time gap wanders as that of the training pairs' drivers does (the mean of ten draws),
+or an agent of task ``follow``, trained by gradients behind the training pairs' leaders. What is there is kept.
 """
 
 from __future__ import annotations
@@ -25,31 +25,35 @@ from agents import apg, common
 from agents.environments import task_of
 from agents.imitation import default_data, observe
 from agents.rollout import Act
+from benchmarks.agents import once
 from benchmarks.agents_tables import table
+from benchmarks.agents_transfer import wandering
 from idm_env import metrics
 from idm_env.data import Episode, Trajectories, episodes, load
 from idm_env.data.samples import VEHICLES
-from idm_env.effects import Control
+from idm_env.effects import Control, Wander
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.fit import base_simulator, fit
-from idm_env.types import Command, Params, Record
+from idm_env.types import Command, Params, Record, State
 
 Row = dict[str, Any]
-BEHIND, LENGTH, WINDOW = 10, 5.0, 600
-"""Vehicles behind vehicle 1, their length (m), and steps of the stretches that agents are trained on."""
+BEHIND, LENGTH, WINDOW, DRAWS = 10, 5.0, 600, 10
+"""Vehicles behind vehicle 1, their length (m), steps of the stretches that agents are trained on, draws of drift."""
 
 
 class Platoon:
     """Vehicle 1 and those behind it in their queue behind every leader, as they begin; nobody has moved yet.
 
-    ``kind`` is recorded, idm or agent: who drives vehicle 1.
+    ``kind`` is recorded, idm, drift or agent: who drives vehicle 1. With drift its time gap wanders, as the parameters
+    of ``Wander`` say.
     """
 
     def __init__(self, items: Sequence[Episode], params: Params, kind: str) -> None:
         batch, vehicles = Batch.of(items, substeps=1), BEHIND + 2
         simulator = base_simulator(items[0].dt)
-        self.simulator = simulator.adding(Control()) if kind == "agent" else simulator
+        added = {"agent": Control(), "drift": Wander()}.get(kind)
+        self.simulator = simulator if added is None else simulator.adding(added)
         self.params: Params = {**self.simulator.defaults(dtype=torch.float64), **params}
         motions = (batch.position, batch.all_speed, batch.accel)
         lead, own = ([x[..., VEHICLES.index(who)] for x in motions] for who in ("leader", "driver"))
@@ -60,6 +64,9 @@ class Platoon:
             (torch.zeros(len(items), 1), (gaps + LENGTH).cumsum(-1)), -1)), -1)  # fmt: skip
         self.state = self.simulator.state(position, speed, self.params, length=length)
         self.active = torch.arange(vehicles) == 1
+        if kind == "drift":
+            wander = self.params["wander"]
+            self.params = {**self.params, "wander": {**wander, "sigma": wander["sigma"] * self.active}}
         self.valid = batch.valid[1:] > 0
         # The record of every step's end, time first.
         columns = (torch.stack([a[1:], *[b[1:]] * (BEHIND + 1)], -1) for a, b in zip(lead, own, strict=True))
@@ -70,14 +77,24 @@ class Platoon:
         """Steps of the longest record."""
         return len(self.valid)
 
+    def drifted(self, seed: int) -> Row:
+        """Return what ``driven`` does, vehicle 1 drifting as the seed says, from where it is in the long run."""
+        generator = torch.Generator().manual_seed(seed)
+        first, *normals = torch.randn(self.steps + 1, *self.state.speed.shape, generator=generator, dtype=torch.float64)
+        memory = {**self.state.memory, "wander": first}
+        return self._kept(self.state._replace(memory=memory), {"wander": torch.stack(normals)})
+
     def rolled(self, command: Tensor | None = None) -> Row:
         """Return what ``driven`` does, vehicle 1 commanded throughout ``(steps, leaders)`` (m/s²)."""
+        if command is None:
+            return self._kept(self.state, {})
+        everybody = command.unsqueeze(-1).expand(-1, -1, BEHIND + 2)
+        return self._kept(self.state, {"control": Command(everybody, self.active.expand(self.steps, 1, -1))})
+
+    def _kept(self, state: State, more: Mapping[str, Any]) -> Row:
         active = self.record.active.expand(self.steps, -1)
-        inputs: dict[str, Any] = {"replay": self.record._replace(active=active.unsqueeze(1))}
-        if command is not None:
-            everybody = command.unsqueeze(-1).expand(-1, -1, BEHIND + 2)
-            inputs["control"] = Command(everybody, self.active.expand(self.steps, 1, -1))
-        _, kept = self.simulator.rollout(self.state, inputs, self.params, self.steps)
+        inputs: dict[str, Any] = {"replay": self.record._replace(active=active.unsqueeze(1)), **more}
+        _, kept = self.simulator.rollout(state, inputs, self.params, self.steps)
         found = {"speed": kept.speed, "accel": kept.accel, "gap": kept.gap}
         return {**{name: x[..., 1:] for name, x in found.items()}, "valid": self.valid}
 
@@ -149,6 +166,17 @@ def environment_of(training: Path, idm: Row, weight: float, lag: float = 0.0) ->
     }  # fmt: skip
 
 
+def drifting(items: Sequence[Episode], params: Params, draws: int = DRAWS) -> Row:
+    """Return the figures of a vehicle 1 that drifts: means over draws, the worst of its gaps, all collisions."""
+    platoon = Platoon(items, params, "drift")
+    rows = [judged(platoon.drifted(seed)) for seed in range(draws)]
+    means = {name: torch.stack([r[name] for r in rows]).mean(0) for name in (*metrics.FUELS, "speed")}
+    return {
+        **means, "farthest": max(r["farthest"] for r in rows), "nearest": min(r["nearest"] for r in rows),
+        "collisions": sum(r["collisions"] for r in rows),
+    }  # fmt: skip
+
+
 def told(name: str, r: Row, base: Row) -> list[str]:
     """Return the cells of a row: pooled means, the median saving over leaders, and how many leaders save."""
     cells = [name]
@@ -183,6 +211,13 @@ def main() -> None:
     base = judged(driven(items, params, "recorded", None, limits))
     rows = [told("recorded follower", base, base)]
     rows.append(told("calibrated IDM", judged(driven(items, params, "idm", None, limits)), base))
+    drift = once(options.out / "drift", lambda: wandering(training))
+    if drift is not None:
+        wander = {name: torch.tensor(x, dtype=torch.float64) for name, x in drift.items()}
+        own = {**params, "wander": wander}
+        name = f"IDM with drift (σ {drift['sigma']:.2f}, τ {drift['memory_time']:.0f} s), {DRAWS} draws"
+        rows.append(told(name, drifting(items, own), base))
+        print(*rows[-1], sep=" | ", flush=True)
     for seed in range(options.seeds):
         folder = options.out / f"fuel{options.fuel_weight:g}-lag{options.lag_weight:g}" / f"seed{seed}"
         arguments = apg.Arguments(

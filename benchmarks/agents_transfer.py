@@ -119,15 +119,20 @@ def learnt(trajectories: Trajectories, out: Path, without: Sequence[str] = ()) -
     return plain, corrected
 
 
+def wandering(trajectories: Trajectories) -> dict[str, float]:
+    """Return the parameters of ``Wander`` for the time gap of the drivers of these records."""
+    both = [list(episodes(trajectories, max_gap=None, smooth=smooth)) for smooth in (True, False)]
+    chosen = evenly(len(both[0]))
+    smooth, measured = ([thinned(found[i]) for i in chosen] for found in both)
+    # With the noise for which forecasts on I-80 have been checked (docs/drift.md).
+    found = tell(smooth, measured, (Wander(),), noise=CHOSEN["wander"]).found["wander"].settings
+    return {"sigma": float(found.sigma[0]), "memory_time": float(found.memory_time[0])}
+
+
 def unsteady(trajectories: Trajectories, corrected: Path, out: Path) -> Path:
     """Return the file of a corrected model whose drivers' time gap wanders as in these records, made once."""
     if not out.exists():
-        both = [list(episodes(trajectories, max_gap=None, smooth=smooth)) for smooth in (True, False)]
-        chosen = evenly(len(both[0]))
-        smooth, measured = ([thinned(found[i]) for i in chosen] for found in both)
-        # With the noise for which forecasts on I-80 have been checked (docs/drift.md).
-        found = tell(smooth, measured, (Wander(),), noise=CHOSEN["wander"]).found["wander"].settings
-        drift = {"wander": {"sigma": float(found.sigma[0]), "memory_time": float(found.memory_time[0])}}
+        drift = {"wander": wandering(trajectories)}
         model = load_model(corrected)
         save_model(
             out,

@@ -46,6 +46,21 @@ def test_an_agent_commands_vehicle_1_within_its_limits(items):
     assert agents_energy.judged(run)["farthest"] > agents_energy.judged(idm)["farthest"]
 
 
+def test_only_vehicle_1_drifts_and_without_strength_it_is_idm(items):
+    idm = agents_energy.driven(items, PARAMS, "idm", None, (-3.0, 3.0))
+
+    def drifted(sigma, seed):
+        wander = {"sigma": torch.tensor(sigma).double(), "memory_time": torch.tensor(10.0).double()}
+        return agents_energy.Platoon(items, {**PARAMS, "wander": wander}, "drift").drifted(seed)
+
+    torch.testing.assert_close(drifted(0.0, 0)["speed"], idm["speed"], atol=1e-9, rtol=0.0)
+    strong = drifted(0.5, 1)
+    off = (strong["speed"] - idm["speed"]).abs()
+    assert float(off[0, :, 1:].max()) < 1e-9 < float(off[0, :, 0].min())  # those behind only follow it
+    assert not torch.equal(strong["speed"], drifted(0.5, 2)["speed"])
+    assert torch.equal(strong["speed"], drifted(0.5, 1)["speed"])
+
+
 def test_fuel_of_steady_driving_is_that_of_the_models():
     speed = torch.full((50, 1, 11), 12.0, dtype=torch.float64)
     run = {"speed": speed, "accel": 0.0 * speed, "gap": speed, "valid": torch.ones(50, 1, dtype=torch.bool)}
