@@ -5,7 +5,8 @@
 
 Judged as one agent is: rings of 10 to 12.3 m per vehicle, five fresh draws of each of six lengths, a human who brakes
 with 4 m/s² for 2 s two minutes after the take-over. Policies of one agent among 22 drive as they are. Beside them: IDM
-for all, and oracles that are told each ring's uniform speed. What is done is kept.
+for all, oracles that are told each ring's uniform speed, and, with 5 of 110, what has learned nothing: constants,
+FollowerStopper, PI with saturation and random networks. What is done is kept.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +22,10 @@ import torch
 from torch import Tensor
 
 from agents import common
-from agents.classical import seen
+from agents.classical import FollowerStopper, PISaturation, seen
+from agents.environments import task_of
 from agents.evaluate import evaluate_ring, judged_rings
-from agents.reference import told
+from agents.reference import random_policies, told
 from agents.rollout import FRESH, Act, Start, uniform_speed
 from benchmarks.agents import once
 from benchmarks.agents_tables import environment_of, ring, table
@@ -30,6 +33,7 @@ from benchmarks.agents_tables import environment_of, ring, table
 Row = dict[str, Any]
 RINGS = ((22, 1), (110, 2), (110, 5), (110, 11), (110, 22), (440, 20))
 """Vehicles, and how many of them agents drive."""
+NETWORKS = 10
 
 
 def environment(vehicles: int, agents: int) -> Row:
@@ -84,6 +88,32 @@ def oracle(name: str, environment: Row) -> Oracle:
     return Oracle(judged_rings(environment, draws=FRESH), *ORACLES[name])
 
 
+def constant(accel: float, environment: Row) -> Act:
+    """Return agents that always command the same acceleration (m/s²)."""
+    task = task_of(environment)
+    return lambda seen: task.action(seen.new_full((len(seen), len(task.agents)), accel))
+
+
+def stopper(environment: Row) -> Act:
+    """Return FollowerStopper, told 0.8 of the uniform speed of each ring."""
+    start = judged_rings(environment, draws=FRESH)
+    return FollowerStopper(start.task, desired=0.8 * uniform_speed(start).unsqueeze(-1))
+
+
+def network(number: int, environment: Row) -> Act:
+    """Return one of the random networks of ``agents.reference``."""
+    return random_policies(environment, number + 1, (32, 32))[number]
+
+
+UNTAUGHT: dict[str, Callable[[Row], Act | None]] = {
+    **{f"always {accel:g} m/s²": partial(constant, accel) for accel in (0.0, 0.025, 0.05, 0.3)},
+    "FollowerStopper, told 0.8 U": stopper,
+    "PI with saturation": lambda environment: PISaturation(task_of(environment)),
+    **{f"random network {i}": partial(network, i) for i in range(NETWORKS)},
+}
+"""What has learned nothing, judged with 5 of 110."""
+
+
 def main() -> None:
     """Judge what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -98,7 +128,7 @@ def main() -> None:
         made["/".join(path.parts[-5:-2])] = lambda environment, path=path: common.load(path, "ring")[0]
     rows = []
     for vehicles, agents in RINGS:
-        for name, make in made.items():
+        for name, make in {**made, **(UNTAUGHT if (vehicles, agents) == (110, 5) else {})}.items():
             if name == "IDM for all" and (vehicles, agents) in ((110, 5), (110, 11), (110, 22)):
                 continue  # nobody is controlled: the ring with two agents has the row
 

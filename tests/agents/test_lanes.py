@@ -112,15 +112,39 @@ def test_shared_policies_are_judged_on_rings_as_long_as_their_vehicles_need(tmp_
 
     monkeypatch.setattr(agents_shared, "evaluate_ring", judge)
     monkeypatch.setattr(agents_shared, "oracle", lambda name, environment: name)
+    monkeypatch.setattr(agents_shared, "UNTAUGHT", {"always 0 m/s²": lambda environment: "still"})
     monkeypatch.setattr(agents_shared.common, "load", lambda path, task: (path, {}))
     path = tmp_path / "ring-apg/trial0/seed1/training/last.pt"
     monkeypatch.setattr("sys.argv", ["agents_shared", "--out", str(tmp_path), "--checkpoints", str(path)])
     for _ in range(2):
         agents_shared.main()
     assert judged.count((110, 2, True)) == 1 and (110, 5, True) not in judged
-    assert judged.count((110, 5, False)) == 1 + len(agents_shared.ORACLES)
+    assert judged.count((110, 5, False)) == 2 + len(agents_shared.ORACLES)
     assert "| 110 | 5 (4.5 %) | ring-apg/trial0/seed1 | 1.000 | 0.10 | 1.00 | 0 | yes |" in capsys.readouterr().out
     assert json.loads((tmp_path / "22-1/IDM-for-all/result.json").read_text())["passed"]
+
+
+def test_what_has_learned_nothing_drives_every_agent(monkeypatch):
+    environment = {
+        "task": "ring",
+        "vehicles": 44,
+        "controlled": 3,
+        "length": [440.0, 540.0],
+        "failsafe": 3.0,
+        "warmup": 9,
+    }
+    monkeypatch.setattr(
+        agents_shared, "judged_rings", lambda *_, **__: ring_start(environment, (440.0, 500.0), warmup=9)
+    )
+    seen = ring_start(environment, (440.0, 500.0), warmup=9)
+    observed = seen.task.observe(seen.world).flatten(1)
+    for name, make in agents_shared.UNTAUGHT.items():
+        if name.startswith("random network") and name[-1] != "1":
+            continue
+        action = make(environment)(observed)
+        assert action.shape == (2, 3) and bool((action.abs() <= 1.0).all()), name
+    always = agents_shared.UNTAUGHT["always 0.3 m/s²"](environment)(observed)
+    assert torch.allclose(seen.task.command(always), torch.full((2, 3), 0.3))
 
 
 def test_an_oracle_is_slow_first_and_then_faster_behind_krauss():
