@@ -2,11 +2,12 @@
 
 For each task and agent the share of seeds that have not solved it yet, against the CPU seconds of training (Kaplan
 and Meier 1958): a seed that never solves counts as long as it was trained. Of an agent's trials the one is shown that
-solves most seeds, and of equals the one whose trainings were longest.
+solves most seeds, of equals the one with most of them, of these the one that solves soonest, or was trained longest.
 """
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,12 +22,14 @@ TASKS = {"ring": "ring with a shock", "follow": "behind a recorded leader"}
 
 
 def shown(out: Path, config: str, seeds: Sequence[int]) -> list[Row]:
-    """Return the results, without failures, of the trial that solves most seeds; of equals the longest trainings."""
+    """Return the results, without failures, of the trial that is shown."""
     parts = [[r for r in part if r["history"]] for part in groups(out, config, seeds).values()]
 
-    def rank(part: Sequence[Row]) -> tuple[int, float]:
+    def rank(part: Sequence[Row]) -> tuple[int, int, float]:
         summaries = [r["summary"] for r in part]
-        return sum(s["solved"] for s in summaries), max((s["spent"] for s in summaries), default=0.0)
+        took = [s["cpu_seconds"] for s in summaries if s["solved"]]
+        spent = max((s["spent"] for s in summaries), default=0.0)
+        return len(took), len(part), -statistics.median(took) if took else spent
 
     return max(parts, key=rank, default=[])
 
