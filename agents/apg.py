@@ -63,11 +63,11 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
     began = time.process_time()
     torch.manual_seed(arguments.seed)
-    dt = environments.task_of(arguments.environment).simulator.dt
-    times = [seconds / dt for seconds in arguments.history]
+    task = environments.task_of(arguments.environment)
+    times = [seconds / task.simulator.dt for seconds in arguments.history]
     policy, saved = common.begin(arguments, "apg", history=times, recurrent=arguments.recurrent)
     if arguments.start is not None and not saved:
-        policy = common.load_for(arguments.start, environments.task_of(arguments.environment))[0]
+        policy = common.load_for(arguments.start, task)[0]
     done = saved.get("update", -1) + 1
     env = environments.make_env(arguments.environment, arguments.count, output="torch")
     env.reset(seed=environments.first_seed(arguments.seed, arguments.count))
@@ -85,7 +85,6 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             rate = common.fall(arguments.learning_rate, update, arguments.updates)
             optimiser.param_groups[0]["lr"] = rate
             env.detach()
-            driving.detach()
             observation, total = observation.detach(), torch.zeros(())
             # Seeded by the update, so that a resumed training repeats it.
             torch.manual_seed(environments.first_seed(arguments.seed, update))
@@ -97,9 +96,10 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
                 total = total + reward.mean()
             loss = -total / arguments.window
             norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)
+            driving.detach()
             training = {
                 "optimiser": optimiser.state_dict(), "episodes": environments.snapshot(env),
-                "past": None if driving.past is None else [x.detach() for x in driving.past],
+                "past": None if driving.past is None else list(driving.past),
             }  # fmt: skip
             steps = arguments.window * arguments.count
             figures = {"reward": -loss.item(), "norm": norm, "learning_rate": rate}

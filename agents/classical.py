@@ -49,7 +49,7 @@ class Controller:
     task: Task
 
     def __call__(self, observation: Tensor) -> Tensor:
-        """Return actions ``(n, 1)``."""
+        """Return actions ``(n, agents)``."""
         view = seen(observation, self.task.vehicle_length, self.task.scales)
         return self.task.action((self.wanted(view) - view.speed) / self.task.simulator.dt)
 
@@ -118,8 +118,8 @@ def no_command(observation: Tensor) -> Tensor:
 
 
 def constant(accel: float, task: Task) -> Act:
-    """Return a controller that always commands this acceleration (m/s²): with a failsafe, that drives."""
-    return lambda observation: task.action(observation.new_full((len(observation), 1), accel))
+    """Return agents that always command this acceleration (m/s²): with a failsafe, that drives."""
+    return lambda observation: task.action(observation.new_full((len(observation), len(task.agents)), accel))
 
 
 def controllers(

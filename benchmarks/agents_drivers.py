@@ -25,15 +25,16 @@ from pathlib import Path
 import torch
 
 from agents import apg, common
-from agents.evaluate import evaluate_ring, held_out, kinds
+from agents.evaluate import TEST, as_judged, evaluate_ring, held_out, kinds, worst
 from agents.reference import families, judge
 from agents.rollout import FRESH, Act
 from benchmarks import workers
 from benchmarks.agents import once
 from benchmarks.agents_tables import Row, environment_of, ring, table
+from benchmarks.agents_transfer import LONGER
 from idm_env.progress import OnProgress
 
-SHOCK: Row = {"shock": 4.0}
+SHOCK = TEST["ring"]
 SLOWER: Row = {"parameters": {"idm": {"max_accel": 0.8}}}
 RANGES = {"max_accel": [0.75, 1.25], "time_gap": [0.75, 1.25], "min_gap": [1.5, 2.5], "comfort_decel": [1.1, 1.9]}
 """A quarter more and less: the kinds that judge lie within."""
@@ -54,8 +55,6 @@ VARIANTS: dict[str, tuple[Row, Row]] = {
     ),
 }  # fmt: skip
 """Keywords of the environment, and options of APG, that differ from ``configs/ring-apg.yaml``."""
-LONGER = (280.0, 300.0, 320.0, 340.0, 360.0, 380.0)
-"""Rings (m) for measured drivers, who keep longer gaps."""
 HEAD = (
     "trained among", "seed", "CPU s", "thirty fresh rings", "kinds passed, of 10", "worst kind", "200–300 m", "mixed",
     "without a shock: kinds passed", "worst kind",
@@ -64,7 +63,7 @@ HEAD = (
 
 def tested() -> Row:
     """Return the environment of the test."""
-    return {**environment_of("ring-apg"), **SHOCK}
+    return as_judged(environment_of("ring-apg"))
 
 
 def judged(act: Act | None) -> Row:
@@ -129,9 +128,9 @@ def passers(reference: Path, out: Path) -> dict[str, Row]:
     return found
 
 
-def worst(rows: Sequence[Row]) -> str:
-    """Return the lowest ratio and the highest deviation."""
-    return f"{min(r['speed_ratio'] for r in rows):.3f}/{max(r['speed_std'] for r in rows):.2f}"
+def short(row: Row) -> str:
+    """Return ratio and deviation."""
+    return "/".join(ring(row)[:2])
 
 
 def cells(row: Row) -> list[str]:
@@ -139,9 +138,9 @@ def cells(row: Row) -> list[str]:
     among = [x for name, x in row["shock"].items() if "20 %" in name]
     calm = list(row["calm"].values())
     return [
-        "/".join(ring(row["fresh"])[:2]), str(sum(x["passed"] for x in among)), worst(among),
-        *("/".join(ring(row["shock"][name])[:2]) for name in ("lengths", "mixed")),
-        str(sum(x["passed"] for x in calm)), worst(calm),
+        short(row["fresh"]), str(sum(x["passed"] for x in among)),
+        *(short(row["shock"][name]) for name in ("drivers", "lengths", "mixed")),
+        str(sum(x["passed"] for x in calm)), short(worst(calm)),
     ]  # fmt: skip
 
 
@@ -168,7 +167,7 @@ def main() -> None:
     table(
         ("reference policies that pass the test", "of", "kinds passed, of 10", "worst kind"),
         [
-            [f"{family}: {name}", str(found["of"]), str(sum(x["passed"] for x in figures)), worst(figures)]
+            [f"{family}: {name}", str(found["of"]), str(sum(x["passed"] for x in figures)), short(worst(figures))]
             for family, found in passers(options.reference, out).items()
             for name, figures in found["kinds"].items()
         ],

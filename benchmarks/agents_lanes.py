@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from agents import apg, common, ppo
+from agents.classical import constant
 from agents.environments import first_seed, human_driving, task_of
 from agents.evaluate import evaluate_lanes, judge_lanes
 from agents.policy import Policy
@@ -61,11 +62,7 @@ Figures = dict[str, Row]
 def constants(environment: Row) -> Family:
     """Return policies that always command the same acceleration (m/s²)."""
     task = task_of(environment)
-
-    def constant(accel: float) -> Act:
-        return lambda seen: task.action(seen.new_full((len(seen), len(task.agents)), accel))
-
-    return {f"always {accel:g} m/s²": constant(accel) for accel in CONSTANTS}
+    return {f"always {accel:g} m/s²": constant(accel, task) for accel in CONSTANTS}
 
 
 def uniform(environment: Row) -> Family:

@@ -12,9 +12,10 @@ FollowerStopper, PI with saturation and random networks. What is done is kept.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ import torch
 from torch import Tensor
 
 from agents import common
-from agents.classical import FollowerStopper, PISaturation, seen
+from agents.classical import FollowerStopper, PISaturation, constant, seen
 from agents.environments import task_of
 from agents.evaluate import evaluate_ring, judged_rings
+from agents.policy import Policy
 from agents.reference import random_policies, told
 from agents.rollout import FRESH, Act, Start, uniform_speed
 from benchmarks.agents import once
@@ -88,25 +90,27 @@ def oracle(name: str, environment: Row) -> Oracle:
     return Oracle(judged_rings(environment, draws=FRESH), *ORACLES[name])
 
 
-def constant(accel: float, environment: Row) -> Act:
-    """Return agents that always command the same acceleration (m/s²)."""
-    task = task_of(environment)
-    return lambda seen: task.action(seen.new_full((len(seen), len(task.agents)), accel))
-
-
 def stopper(environment: Row) -> Act:
     """Return FollowerStopper, told 0.8 of the uniform speed of each ring."""
     start = judged_rings(environment, draws=FRESH)
     return FollowerStopper(start.task, desired=0.8 * uniform_speed(start).unsqueeze(-1))
 
 
+@lru_cache(maxsize=1)
+def _networks(environment: str) -> list[Policy]:
+    return random_policies(json.loads(environment), NETWORKS, (32, 32))
+
+
 def network(number: int, environment: Row) -> Act:
-    """Return one of the random networks of ``agents.reference``."""
-    return random_policies(environment, number + 1, (32, 32))[number]
+    """Return one of the random networks of ``agents.reference``, all made at once."""
+    return _networks(json.dumps(environment))[number]
 
 
 UNTAUGHT: dict[str, Callable[[Row], Act | None]] = {
-    **{f"always {accel:g} m/s²": partial(constant, accel) for accel in (0.0, 0.025, 0.05, 0.3)},
+    **{
+        f"always {accel:g} m/s²": lambda environment, accel=accel: constant(accel, task_of(environment))
+        for accel in (0.0, 0.025, 0.05, 0.3)
+    },
     "FollowerStopper, told 0.8 U": stopper,
     "PI with saturation": lambda environment: PISaturation(task_of(environment)),
     **{f"random network {i}": partial(network, i) for i in range(NETWORKS)},
