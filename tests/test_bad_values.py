@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import idm_env  # noqa: F401
@@ -27,7 +27,7 @@ from idm_env.config import load_environment, load_model
 from idm_env.data import synthetic
 from idm_env.envs.pettingzoo import parallel_env
 
-QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+QUICK = settings(max_examples=60)
 
 
 def run(*arguments: object) -> tuple[int, str]:

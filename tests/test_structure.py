@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "idm_env"
@@ -180,3 +181,14 @@ def test_importing_the_package_imports_no_torch_and_registers_the_environment() 
         "assert 'DiffIDM-v0' in gymnasium.registry; idm_env.Simulator; assert 'torch' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_suite_has_one_profile_of_hypothesis() -> None:
+    """A busy machine fails no property: no deadline, no check of how quickly examples are drawn, in any test."""
+    whole = settings.default
+    assert whole is not None and whole.deadline is None
+    assert HealthCheck.too_slow in whole.suppress_health_check
+    tests = [path for path in sorted((ROOT / "tests").rglob("*.py")) if path.name != "conftest.py"]
+    own = [keyword.arg for path in tests for node in ast.walk(ast.parse(path.read_text()))
+           if isinstance(node, ast.Call) for keyword in node.keywords]  # fmt: skip
+    assert len(own) > 1000 and not {"deadline", "suppress_health_check"} & set(own)

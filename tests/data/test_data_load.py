@@ -11,16 +11,14 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from idm_env.data import DataError, Trajectories, episodes, load, schema
 from tests.data.tables import kinds, platoon, with_value
 
 FOOT = 0.3048
-quick = settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
+quick = settings(max_examples=25, derandomize=True)
 
 
 def write(table: pl.DataFrame, path: Path) -> Path:

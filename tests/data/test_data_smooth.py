@@ -16,7 +16,7 @@ def motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return 12 * TIME + 8 * np.sin(0.5 * TIME), 12 + 4 * np.cos(0.5 * TIME), -2 * np.sin(0.5 * TIME)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30, derandomize=True)
 @given(start=st.floats(-1e5, 1e5), speed=st.floats(-5, 40), accel=st.floats(-3, 3), length=st.integers(1, 50))
 def test_a_constant_acceleration_is_left_alone(start: float, speed: float, accel: float, length: int) -> None:
     time = TIME[:length]

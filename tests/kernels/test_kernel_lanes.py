@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from idm_env.effects import IDM, Brakes, Control, Noise, Replay, make
@@ -131,7 +131,7 @@ def compare(problem, **options):
         close(name, ours[name], autograds[name], problem.dtype, 4.0)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60)
 @given(problem=problems)
 def test_values_and_gradients_are_those_of_the_steps(problem):
     compare(problem)

@@ -46,7 +46,7 @@ ROADS = {
 }
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     road=st.sampled_from(sorted(ROADS)),
     count=st.integers(2, 5),

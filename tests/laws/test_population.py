@@ -41,7 +41,7 @@ def begun(
     return simulator, population.waiting(simulator, trips, params), params
 
 
-@settings(max_examples=5, deadline=None, phases=(Phase.explicit, Phase.generate))
+@settings(max_examples=5, phases=(Phase.explicit, Phase.generate))
 @example(road="drop", flow=2400, slots=20, seed=0)
 @given(
     road=st.sampled_from(sorted(ROADS)),

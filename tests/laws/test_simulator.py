@@ -200,7 +200,7 @@ def test_a_command_drives_only_where_it_is_active_and_within_the_brakes() -> Non
     torch.testing.assert_close(accel[3], torch.tensor(-9.0, dtype=DTYPE))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     gap=st.floats(-20, 200),
     speed=st.floats(0, 60),

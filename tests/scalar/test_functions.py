@@ -197,7 +197,7 @@ def test_functions_of_two_numbers(name: str) -> None:
         check(TWO[name], (x, y))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(name=st.sampled_from(sorted(ONE)), other=st.sampled_from(sorted(TWO)), x=st.floats(-6, 6), y=st.floats(-6, 6))
 def test_compositions_at_random(name: str, other: str, x: float, y: float) -> None:
     """A function of one number within one of two."""
