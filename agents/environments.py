@@ -12,9 +12,9 @@ from torch import Tensor
 from idm_env.envs.settings import KEYWORDS
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.tasks import Task, make_task
-from idm_env.types import Choices, Links, Moving, State, Trips
+from idm_env.types import Links, Moving, State, Trips
 
-PARTS: dict[str, Any] = {"links": Links, "trips": Trips, "choices": Choices, "moving": Moving}
+PARTS: dict[str, Any] = {"links": Links, "trips": Trips, "moving": Moving}
 """Parts of a state that are several tensors."""
 
 

@@ -9,7 +9,6 @@ beside SUMO's and what is published, or with one behaviour changed at a time (``
 ``python -m benchmarks.lanes capacity`` prints and draws flow before and after a breakdown at a ramp, beside SUMO's
 (``lanes_capacity.py``).
 ``python -m benchmarks.lanes laws [vehicle-steps]`` counts what breaks a law in random traffic (``lanes_laws.py``).
-``python -m benchmarks.lanes gradients [scenes]`` tells how good gradients through choices are (``lanes_gradients``).
 
 Flow, drop and capacity keep their rows under ``out/``, do not drive again what has not changed in their lists of rows
 (after another change remove the file), and take ``--executor``, ``--jobs`` and ``--ray-address``.
@@ -27,7 +26,6 @@ from benchmarks import (
     lane_drop,
     lanes_capacity,
     lanes_flow,
-    lanes_gradients,
     lanes_laws,
     lanes_merge,
     lanes_speed,
@@ -44,8 +42,8 @@ def laws(steps: float) -> None:
 
 
 WORDS = {"speed": ("rollouts", "highway"), "drop": ("published", "behaviours"), "flow": (), "merge": (), "capacity": ()}
-NUMBERS = {"laws": (1000.0, 1e9), "gradients": (20.0, 50.0)}
-"""Which words may follow; or the least number that may (in fewer scenes MOBIL may not matter) and the usual one."""
+NUMBERS = {"laws": (1000.0, 1e9)}
+"""Which words may follow; or the least number that may and the usual one."""
 IN_PARTS = ("flow", "drop", "capacity")
 
 
@@ -90,11 +88,8 @@ def main() -> None:
         lanes_merge.table()
     elif arguments.what == "capacity":
         lanes_capacity.table(arguments)
-    elif arguments.what == "laws":
-        laws(float(more or NUMBERS["laws"][1]))
     else:
-        with progress.shown(Console(stderr=True)) as on_progress:
-            lanes_gradients.table(int(float(more or NUMBERS["gradients"][1])), on_progress)
+        laws(float(more or NUMBERS["laws"][1]))
 
 
 if __name__ == "__main__":

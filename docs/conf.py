@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -69,5 +70,6 @@ def setup(app: Any) -> None:
 
 
 def _links(app: Any, name: str, text: list[str]) -> None:
-    """Let links to the README lead to the first page."""
+    """Let links to the README lead to the first page, and name studies, which are read in the checkout."""
     text[0] = text[0].replace("](../README.md)", "](index.md)").replace("(../README.md#", "(index.md#")
+    text[0] = re.sub(r"\[([^]]+)\]\((?:\.\./)+(studies/[^)]+)\)", r"\1: `\2`", text[0])

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from idm_env.choices import settled
 from idm_env.roads.lanes import Lanes
 from idm_env.roads.linked import Linked, standing, still_changing, without_absent
 from idm_env.types import FAR, Moving, Params, State, Trips
@@ -269,10 +268,6 @@ def _placed(stepping: Stepping, state: State, params: Params, entry: _Entry) -> 
         name: torch.where(new if x.dim() <= new.dim() else new[..., None, None], fresh[name], x)
         for name, x in state.memory.items()
     }
-    if begun.choices is not None:
-        fresh_choices = settled(after.lane, stepping.road.count, state.speed)  # type: ignore[attr-defined]
-        shares = torch.where(new.unsqueeze(-1), fresh_choices.shares, begun.choices.shares)
-        begun = begun._replace(choices=begun.choices._replace(shares=shares))
     if begun.moving is not None:
         fresh_moving = standing(begun)
         moving = (torch.where(new, x, y) for x, y in zip(fresh_moving, begun.moving, strict=True))

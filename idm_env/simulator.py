@@ -48,7 +48,7 @@ class Simulator(Stepping):
 
     def _covered(self, inputs: Inputs, steps: int) -> None:
         for name, value in inputs.items():
-            if name not in self.by_name and name not in self.draws:
+            if name not in self.by_name:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
             have = min(len(x) for x in _leaves(value) if x is not None)
             if have < steps:
@@ -158,7 +158,7 @@ class Compiled(Simulator):
 
     @cached_property
     def _compiled(self) -> Callable[[State, Inputs, Params], State]:
-        plain = Simulator(self.road, self.effects, self.dt, self.integration, self.decisions, self.temperature)
+        plain = Simulator(self.road, self.effects, self.dt, self.integration)
         # Filled here, because the tracer does not enter the lock of a cached property.
         _ = plain.by_name, plain._following, plain._hooks, plain._needs, plain._unspoken
         made: Callable[[State, Inputs, Params], State] = torch.compile(

@@ -16,8 +16,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from idm_env import changes, parameters, shares
-from idm_env.choices import DECISIONS, NOISE, Decisions
+from idm_env import changes, parameters
 from idm_env.decisions import decided
 from idm_env.effects.base import HOOKS, CarFollowing, Effect, Hook
 from idm_env.effects.limits import unspoken
@@ -42,9 +41,6 @@ class Stepping:
     scene taken half a step ahead, by the accelerations of the step before: second order for one evaluation a step. The
     other two act on the past half step, a hidden delay of Δt/2 that a search for missing effects would find.
 
-    ``decisions`` says how gradients go through choices of lanes (``decisions.py``): ``"pathwise"``, ``"surrogate"``,
-    ``"score"`` or ``"soft"``; the last three make them a logit of temperature ``temperature`` (m/s²).
-
     Where an effect can add to what the driver wants, the sum is held to what tyres can (``effects.Traction``, by its
     default unless it is named).
 
@@ -55,8 +51,6 @@ class Stepping:
     effects: tuple[Effect, ...]
     dt: float = 0.1
     integration: Integration = "ballistic"
-    decisions: Decisions = "pathwise"
-    temperature: float = 0.1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "effects", tuple(self.effects))
@@ -72,17 +66,8 @@ class Stepping:
         if self.integration not in INTEGRATORS:
             hint = parameters.nearest(self.integration, INTEGRATORS)
             raise ValueError(f"integration = '{self.integration}' is unknown.{hint}")
-        if self.decisions not in DECISIONS:
-            hint = parameters.nearest(self.decisions, DECISIONS)
-            raise ValueError(f"decisions = '{self.decisions}' is unknown.{hint}")
-        if self.decisions == "soft" and self.sees_mergers:
-            raise ValueError("decisions = 'soft': nobody signals, so that nobody can be let in. Leave that effect out.")
-        if getattr(self.road, "duration", 0.0) and self.decisions in ("soft", "surrogate"):
-            raise ValueError(f"decisions = '{self.decisions}' knows changes at a point only. Take Lanes(duration=0).")
         if self.decides_in_blocks and self.sees_mergers:
             raise ValueError("who takes turns to decide does not see who signals: leave stagger or that effect out.")
-        if not 0.0 < self.temperature < float("inf"):
-            raise ValueError(f"temperature = {self.temperature:g} m/s² must be above 0, and finite.")
         longest = next((p.high for p in self._following.parameters if p.name == "time_gap"), float("inf"))
         if not 0.0 < self.dt <= longest:
             raise ValueError(
@@ -166,9 +151,8 @@ class Stepping:
 
     @cached_property
     def draws(self) -> tuple[str, ...]:
-        """Names of the effects, and of decisions, whose input is one standard normal per vehicle and step."""
-        chosen = (NOISE,) if self.decisions == "score" and self.changes else ()
-        return (*(e.name for e in self.effects if e.draws), *chosen)
+        """Names of the effects whose input is one standard normal per vehicle and step."""
+        return tuple(e.name for e in self.effects if e.draws)
 
     @cached_property
     def _needs(self) -> frozenset[str]:
@@ -192,7 +176,7 @@ class Stepping:
                 f"{shortest:g} s: a driver must react within it. Take dt = {shortest:g} s or less."
             )
         for name in inputs or {}:
-            if name not in self.by_name and name not in self.draws:
+            if name not in self.by_name:
                 raise ValueError(f"input '{name}' belongs to no effect.{parameters.nearest(name, self.by_name)}")
 
     # -- the function --------------------------------------------------------------------------------------------
@@ -312,8 +296,6 @@ class Stepping:
     def _respond(self, state: State, inputs: Inputs, params: Params) -> tuple[Tensor, Scene, Driver]:
         scene = self.scene(state, inputs)
         accel, driver = self.answered(scene, params)
-        if state.choices is not None and self.decisions in ("soft", "surrogate"):
-            accel = shares.mixed(self, state, scene, params, accel)
         return accel, scene, driver
 
     def answered(self, scene: Scene, params: Params) -> tuple[Tensor, Driver]:

@@ -81,17 +81,6 @@ class Moving(NamedTuple):
     shadow: Tensor
 
 
-class Choices(NamedTuple):
-    """What is kept of choices of lanes for gradients through them (``decisions=`` of a simulator).
-
-    ``shares`` ``(..., vehicles, lanes)`` say how much of each vehicle is on each lane; ``log_probability``
-    ``(..., vehicles)`` sums the logarithms of the chances of all that was drawn.
-    """
-
-    shares: Tensor
-    log_probability: Tensor
-
-
 class State(NamedTuple):
     """Everything that a step carries over.
 
@@ -99,8 +88,8 @@ class State(NamedTuple):
     gradients with it. A step adds ``displacement[leader] - displacement`` instead. ``step`` is an integer
     tensor (scalar or one per batch row), so that time never forces a device to synchronise. ``links`` is None on roads
     whose order never changes; where lanes change, vehicles keep their slots and links say who leads whom. ``trips`` is
-    None where nobody comes: otherwise who is not present waits for his trip, or has made it. ``choices`` is None until
-    a decision about lanes is made whose choices are not frozen, ``moving`` until one is made that takes time to do.
+    None where nobody comes: otherwise who is not present waits for his trip, or has made it. ``moving`` is None until a
+    decision about lanes is made that takes time to do.
     """
 
     position: Tensor
@@ -113,7 +102,6 @@ class State(NamedTuple):
     memory: Memory
     links: Links | None = None
     trips: Trips | None = None
-    choices: Choices | None = None
     moving: Moving | None = None
 
     @property

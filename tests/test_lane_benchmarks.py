@@ -86,7 +86,6 @@ def test_rows_are_kept_and_not_done_again(tmp_path: Path) -> None:
     [
         ("laws x", "'laws x': 'x' is no number of 1000 or more. Usual is laws 1e+09."),
         ("laws nan", "'laws nan': 'nan' is no number of 1000 or more. Usual is laws 1e+09."),
-        ("gradients x", "'gradients x': 'x' is no number of 20 or more. Usual is gradients 50."),
         ("flow fast", "'flow fast': 'fast' is unknown. Leave it out."),
         ("merge published", "'merge published': 'published' is unknown. Leave it out."),
         ("capacity 3", "'capacity 3': '3' is unknown. Leave it out."),

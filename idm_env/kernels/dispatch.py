@@ -31,8 +31,6 @@ def found(simulator: Stepping, state: State, inputs: Inputs, params: Params) -> 
     if why is not None:
         return why
     if isinstance(simulator.road, Lanes):
-        if simulator.changes and simulator.decisions != "pathwise":
-            return f"decisions = '{simulator.decisions}': compiled decisions are pathwise"
         if simulator.changes and simulator.road.duration:
             return "compiled changes take no time, and Lanes has a duration"
         from idm_env.kernels.several import kernel_of

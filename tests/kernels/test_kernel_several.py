@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from idm_env import population
-from idm_env.choices import DECISIONS, Decisions
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
 from idm_env.kernels import dispatch
 from idm_env.roads import Lanes, lane_drop, off_ramp, on_ramp
@@ -202,15 +201,13 @@ def test_vehicles_come_and_go_in_compiled_rollouts(again: int | None, steps: tup
     assert gradient.abs().sum() > 0
 
 
-@pytest.mark.parametrize("how", DECISIONS)
-def test_compiled_decisions_are_pathwise(how: Decisions) -> None:
-    """Other ways to decide take the torch path, which is said; without effects that change lanes nothing is decided."""
-    simulator = Simulator(Lanes(2), (IDM(), Mobil(), Brakes()), decisions=how)
+def test_changes_that_take_time_are_not_compiled() -> None:
+    """They take the torch path, which is said; without effects that change lanes nothing is decided."""
+    simulator = Simulator(Lanes(2), (IDM(), Mobil(), Brakes()))
     params = simulator.defaults(dtype=torch.float64)
     here = torch.zeros(1, dtype=torch.float64)
     state = simulator.state(here, here, params, lane=0)
-    why = dispatch.refusal(simulator, state, {}, params)
-    assert why == (None if how == "pathwise" else f"decisions = '{how}': compiled decisions are pathwise")
+    assert dispatch.refusal(simulator, state, {}, params) is None
     assert dispatch.refusal(simulator.without("mobil"), state, {}, params) is None
     timed = Simulator(Lanes(2, duration=2.0), simulator.effects)
     assert dispatch.refusal(timed, state, {}, params) == "compiled changes take no time, and Lanes has a duration"

@@ -409,8 +409,6 @@ def test_timed_changes_on_mirrored_roads_and_with_trips() -> None:
 
 
 def test_durations_that_cannot_be_are_one_line() -> None:
-    """Below 0, or with choices that are shared."""
+    """Below 0."""
     with pytest.raises(ValueError, match="duration = -1 s must be a number of at least 0"):
         Lanes(2, duration=-1.0)
-    with pytest.raises(ValueError, match="'soft' knows changes at a point only"):
-        Simulator(Lanes(2, duration=1.0), (IDM(), Mobil()), decisions="soft")
