@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import math
 import signal
@@ -31,6 +32,8 @@ console = Console(stderr=True)
 EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
 """What ``explain`` writes."""
 PICTURES = (".png", ".svg", ".pdf")
+CHECKOUT = Path(__file__).resolve().parents[1]
+"""Where this package lies: a checkout, or the libraries of an installation."""
 
 
 def _version(wanted: bool) -> None:
@@ -705,21 +708,24 @@ def bench(
 ) -> None:
     """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine.
 
-    Writes report.html and performance.json.
+    Writes report.html and performance.json. It is a benchmark of the checkout, and no part of an installed wheel.
     """
+    if not (CHECKOUT / "benchmarks" / "bench").is_dir():
+        raise ValueError(
+            f"{CHECKOUT} has no benchmarks/: bench needs a checkout. Clone the project, then 'make bench'."
+        )
     numbers = [round(_number("--sizes", size, "no number of vehicles")) for size in sizes.split(",")]
     with shown(console) as report:
-        from idm_env import bench as benchmark
-        from idm_env.bench import tables
-
+        sys.path.insert(0, str(CHECKOUT))
+        benchmark = importlib.import_module("benchmarks.bench")
         _work_begins()
         result = benchmark.run(
             out, sizes=numbers, rounds=rounds, compiled=compiled, others=peers, on_progress=report,
             say=console.print if verbose else None,
         )  # fmt: skip
-    for title, rows, _ in tables.of(result)[: len(numbers) + 2]:  # the rest is in the report
+    for title, rows, _ in benchmark.tables.of(result)[: len(numbers) + 2]:  # the rest is in the report
         _show(title, rows)
-    _done(out, tables.absent(result))
+    _done(out, benchmark.tables.absent(result))
 
 
 def _number(option: str, text: str, wrong: str) -> float:

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from idm_env import bench
-from idm_env.bench import memory, peers, tables
-from idm_env.bench.measure import Case, measure
+from benchmarks import bench
+from benchmarks.bench import memory, peers, tables
+from benchmarks.bench.measure import Case, measure
 from tests.browser import check, there_is_one
 
 

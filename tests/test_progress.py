@@ -60,7 +60,7 @@ def test_a_log_that_ends_in_an_error_holds_the_error_alone() -> None:
 
 def test_there_is_one_protocol() -> None:
     """Whatever takes long takes ``on_progress: OnProgress | None``, and no module declares another."""
-    from idm_env import bench
+    from benchmarks import bench
     from idm_env.discovery.discover import discover
     from idm_env.fitting.fit import fit
     from idm_env.fitting.job import fit_file, simulate_file

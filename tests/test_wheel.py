@@ -92,10 +92,12 @@ def test_it_works_where_there_is_no_checkout(wheel: zipfile.ZipFile, tmp_path: P
     subprocess.run([*install, str(wheel.filename)], check=True)
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"IDM_ENV_CACHE": str(tmp_path / "c")}
 
+    def done(*command: object, **more: str) -> subprocess.CompletedProcess[str]:
+        words = [str(part) for part in command]
+        return subprocess.run(words, cwd=tmp_path, env=environment | more, text=True, capture_output=True)
+
     def call(*command: object, **more: str) -> str:
-        told = subprocess.run(
-            [str(part) for part in command], cwd=tmp_path, env=environment | more, text=True, capture_output=True
-        )
+        told = done(*command, **more)
         assert told.returncode == 0, told.stderr
         return told.stdout
 
@@ -109,3 +111,6 @@ def test_it_works_where_there_is_no_checkout(wheel: zipfile.ZipFile, tmp_path: P
     for typed, at, wanted in (("idm-env fi", "1", ["fit", "filter"]), ("idm-env fit --held", "2", ["--held-out"])):
         found = call(command, _IDM_ENV_COMPLETE="complete_bash", COMP_WORDS=typed, COMP_CWORD=at)
         assert found.split() == wanted
+    refused = done(command, "bench")
+    assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (1, "", 1)
+    assert "bench needs a checkout" in refused.stderr

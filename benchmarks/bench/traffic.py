@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from idm_env.bench.measure import Case
+from benchmarks.bench.measure import Case
 from idm_env.effects import IDM, Brakes
 from idm_env.kernels import dispatch
 from idm_env.roads import Lane

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.bench.measure import Case, measure
+from benchmarks.bench.measure import Case, measure
 from idm_env.effects import ALL, CANDIDATES, IDM, Brakes, Replay, make
 from idm_env.kernels import dispatch
 from idm_env.roads import Lane, Ring

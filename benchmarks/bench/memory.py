@@ -10,13 +10,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+ROOT = Path(__file__).resolve().parents[2]
 _STATUS = Path("/proc/self/status")
 
 _CHILD = """
 import json, sys
 import torch
-from idm_env.bench.memory import forget_peak, high_water
-from idm_env.bench.traffic import LANE, Traffic
+from benchmarks.bench.memory import forget_peak, high_water
+from benchmarks.bench.traffic import LANE, Traffic
 torch.set_num_threads(1)
 Traffic(LANE).ours(Traffic(LANE).simulator, True, True).run()
 forget_peak()
@@ -52,7 +53,7 @@ def peaks(sizes: Sequence[int], steps: int) -> dict[str, float]:
     found: dict[str, float] = {}
     for n in sizes:
         done = subprocess.run(
-            [sys.executable, "-c", _CHILD, str(n), str(steps)], check=True, capture_output=True, text=True
+            [sys.executable, "-c", _CHILD, str(n), str(steps)], check=True, capture_output=True, text=True, cwd=ROOT
         )
         found[str(n)] = json.loads(done.stdout.splitlines()[-1])
     low, high = sizes[0], sizes[-1]

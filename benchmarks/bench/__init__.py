@@ -13,9 +13,9 @@ from typing import Any
 
 import torch
 
+from benchmarks.bench import fits, memory, peers, tables, traffic
+from benchmarks.bench.measure import Case, machine, measure
 from idm_env import keep, kernels
-from idm_env.bench import fits, memory, peers, tables, traffic
-from idm_env.bench.measure import Case, machine, measure
 from idm_env.kernels import dispatch
 from idm_env.progress import OnProgress, silent
 from idm_env.report import write_json
@@ -91,7 +91,7 @@ def run(
     tell("gpu" if torch.cuda.is_available() else "the report")
     result["gpu"] = _gpu(sizes, rounds) if torch.cuda.is_available() else None
     if out is not None:
-        from idm_env.bench.picture import draw
+        from benchmarks.bench.picture import draw
 
         with keep.results(out, OUTPUT) as folder:
             write_json(folder / "performance.json", result)
