@@ -171,6 +171,17 @@ def test_discovery_knows_no_effect_by_name(path: Path) -> None:
     assert not words_of(path) & set(CANDIDATES)
 
 
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_a_path_is_never_taken_for_a_pattern(path: Path) -> None:
+    """polars reads ab.csv where a[b].csv is asked for, unless it is told that a path is a path."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in {
+            f"pl.{verb}_{kind}" for verb in ("read", "scan") for kind in ("csv", "parquet", "ipc", "ndjson")
+        }:
+            told = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+            assert told.get("glob") == "False", f"line {node.lineno} without glob=False"
+
+
 def test_importing_the_package_imports_no_torch_and_registers_the_environment() -> None:
     """Quick to import, ready for gym.make."""
     code = (

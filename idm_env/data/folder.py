@@ -102,7 +102,7 @@ def partition(folder: Path, file: str) -> dict[str, str]:
 
 def _scan(folder: Path, files: list[str]) -> pl.LazyFrame:
     hive = any("=" in file.removeprefix(str(folder)) for file in files)
-    return pl.scan_parquet(files, hive_partitioning=hive, include_file_paths=_FILE)
+    return pl.scan_parquet(files, glob=False, hive_partitioning=hive, include_file_paths=_FILE)
 
 
 def _run() -> pl.Expr:

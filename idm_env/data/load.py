@@ -124,7 +124,7 @@ def _pieces(path: Path, extension: str) -> Iterator[pl.DataFrame]:
             rows = file.readlines(BATCH_BYTES)
             while True:
                 text = io.BytesIO(head + b"".join(rows))
-                yield pl.read_csv(text, infer_schema_length=None, null_values=_MISSING)
+                yield pl.read_csv(text, infer_schema_length=None, null_values=_MISSING, glob=False)
                 rows = file.readlines(BATCH_BYTES)
                 if not rows:
                     return
@@ -210,8 +210,8 @@ def _first_lines(path: Path, count: int) -> list[str]:
 def _table(path: Path, extension: str, skip: int = 0) -> pl.DataFrame:
     try:
         if extension == ".parquet":
-            return pl.read_parquet(path)
-        return pl.read_csv(path, skip_rows=skip, infer_schema_length=None, null_values=_MISSING)
+            return pl.read_parquet(path.absolute(), glob=False)  # polars takes a leading ~ for a home
+        return pl.read_csv(path.absolute(), skip_rows=skip, infer_schema_length=None, null_values=_MISSING, glob=False)
     except _UNREADABLE as error:
         raise _unreadable(path, error) from None
 

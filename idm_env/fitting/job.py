@@ -164,8 +164,8 @@ def _write(
     found.parts.join(pieces.DRIVERS, out / "drivers.csv")
     found.parts.join(pieces.PARAMETERS, out / "parameters.parquet")
     if not many:
-        result["parameters"] = pl.read_parquet(out / "parameters.parquet").to_dicts()
-    table = pl.scan_parquet(found.parts.tables(pieces.DRIVERS)).head(drivers.MOST_ROWS).collect().to_dicts()
+        result["parameters"] = pl.read_parquet(out / "parameters.parquet", glob=False).to_dicts()
+    table = pl.scan_parquet(found.parts.tables(pieces.DRIVERS), glob=False).head(drivers.MOST_ROWS).collect().to_dicts()
     model = dataclasses.replace(model_of(estimates, options.by), substeps=options.substeps)
     if len(estimates.groups) <= MOST_DRIVERS:
         model = dataclasses.replace(model, fitted_on={"source": data["source"], "tracks": sorted(set(tracks))})

@@ -156,8 +156,8 @@ def join(parts: Parts, options: Options) -> Joined:
     if odd is not None:
         raise DataError(f"some runs have steps of {good[0]['dt']:g} s, others of {odd:g} s. Give one --dt.")
     simulator, fixed = options.simulator()
-    table = pl.concat([pl.read_parquet(path) for path in parts.tables(PARAMETERS)])
-    errors = pl.concat([pl.read_parquet(path) for path in parts.tables(ERRORS)])
+    table = pl.concat([pl.read_parquet(path, glob=False) for path in parts.tables(PARAMETERS)])
+    errors = pl.concat([pl.read_parquet(path, glob=False) for path in parts.tables(ERRORS)])
     estimates = drivers.Estimates.joined(table, simulator, good[0]["dt"], fixed)
     measures = Errors(*(torch.from_numpy(errors[name].to_numpy().copy()) for name in Errors._fields))
     return Joined(parts, estimates, measures, good, [summary for summary in told if "lost" in summary])

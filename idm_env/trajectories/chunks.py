@@ -158,7 +158,7 @@ def _table(filtered: Sequence[Filtered]) -> pl.DataFrame:
 
 def restored(parts: Parts, number: int, tracks: Sequence[Track]) -> list[Filtered]:
     """Return the filtered tracks of a finished part, so that the next chunk meets the same neighbours."""
-    table = pl.read_parquet(parts.path(number, TRAJECTORIES))
+    table = pl.read_parquet(parts.path(number, TRAJECTORIES), glob=False)
     by_key = dict(iter(table.group_by(["run_id", "vehicle_id", "piece"], maintain_order=True)))
     filtered = []
     for track in tracks:

@@ -142,7 +142,9 @@ def _run(
     parts.join(PARAMETERS, out / "parameters.parquet")
     report = _report(spool, told, settings, plan) | {"left_out_points": scored}
     drawn = pictures.space_time(out / "trajectories.parquet", spool, bridge)
-    write_report(out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet"), drawn)
+    write_report(
+        out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet", glob=False), drawn
+    )
     parts.remove()
     return report
 
@@ -301,7 +303,7 @@ def _shown(out: Path, spool: Spool, bridge: float | None) -> list[tuple[Track, M
     tracks = [track for track in tracks if len(track) >= 20] or tracks
     chosen = [tracks[i] for i in np.unique(np.linspace(0, len(tracks) - 1, SHOWN).round().astype(int))]
     pairs = []
-    written = pl.scan_parquet(out / "trajectories.parquet")
+    written = pl.scan_parquet(out / "trajectories.parquet", glob=False)
     for track in chosen:
         mine = (pl.col("run_id") == track.run_id) & (pl.col("vehicle_id") == track.vehicle_id)
         rows = written.filter(mine & (pl.col("piece") == track.piece)).collect()

@@ -53,7 +53,7 @@ class Shelf:
         """Return the table of some vehicles of a chunk."""
         files = sorted(self.folder.glob(f"vehicles-{number // self.per_bucket:03d}-*.parquet"))
         inside = pl.col("number").is_between(vehicles.start, vehicles.stop - 1)
-        frame = pl.scan_parquet(files, missing_columns="insert").filter(inside).collect()
+        frame = pl.scan_parquet(files, glob=False, missing_columns="insert").filter(inside).collect()
         frame, repairs = prepared(frame.sort("number", maintain_order=True).drop("number"))
         return Table(frame, tuple(repairs), self.source)
 
@@ -153,13 +153,13 @@ class Spool:
         """Mirror vehicles that drive against the others, in the pieces; return the index with their new runs."""
         vehicles = directions.against(index.filter(~pl.col("ring")))
         for path in files if vehicles.height else []:
-            keep.write(path, directions.mirrored(pl.read_parquet(path), vehicles).write_parquet)
+            keep.write(path, directions.mirrored(pl.read_parquet(path, glob=False), vehicles).write_parquet)
         self._counted.add(directions.repairs(vehicles))
         return directions.renamed(index, vehicles)
 
     def _led(self, raw: list[Path], index: pl.DataFrame) -> list[Path]:
         """Return files whose rows have leaders: the pieces themselves, or what is derived from lanes time by time."""
-        columns = pl.scan_parquet(raw, missing_columns="insert").collect_schema().names()
+        columns = pl.scan_parquet(raw, glob=False, missing_columns="insert").collect_schema().names()
         if "leader_id" in columns:
             return raw
         count = max(1, -(-int(index["rows"].sum()) // BUCKET_ROWS))
@@ -170,7 +170,7 @@ class Spool:
             files = sorted(parts.glob(f"times-{number:03d}-*.parquet"))
             if not files:
                 continue
-            frame, repairs = prepared(pl.read_parquet(files, missing_columns="insert"))
+            frame, repairs = prepared(pl.read_parquet(files, glob=False, missing_columns="insert"))
             self._counted.add(repairs)
             led.append(self.folder / f"led-{number:05d}.parquet")
             keep.write(led[-1], with_leaders(frame).write_parquet)
@@ -189,7 +189,7 @@ class Spool:
     ) -> Path:  # fmt: skip
         """Write the rows of every file to one file per bucket, and remove it."""
         for n, path in enumerate(files):
-            frame = pl.read_parquet(path)
+            frame = pl.read_parquet(path, glob=False)
             if index is not None:
                 frame = frame.join(index.select(*KEY, "number"), on=KEY, how="left", maintain_order="left")
             frame = frame.with_columns(bucket.cast(pl.Int64).alias("bucket"))

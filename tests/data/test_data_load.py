@@ -14,7 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from idm_env.data import DataError, Trajectories, episodes, load, schema
+from idm_env.data import DataError, Trajectories, episodes, folder, load, schema
+from idm_env.trajectories.files import filter_file
+from idm_env.trajectories.spool import Spool
 from tests.data.tables import kinds, platoon, with_value
 
 FOOT = 0.3048
@@ -44,6 +46,28 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
     (first, _) = episodes(loaded)
     assert first.labels == {"driver": "x", "lane": "1"}
     assert np.allclose(first.columns["slope"], 0.01)
+
+
+@pytest.mark.parametrize("name", ["[t].csv", "t*.parquet", "?.csv.gz", "{t,u}.parquet", "~.csv", "runs=[7]/t.parquet"])
+def test_a_path_is_a_path(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Never a pattern that names another file beside it: in load, in the pieces of filter, in a folder of fit."""
+    monkeypatch.chdir(tmp_path)
+    for other in ("t.csv", "t2.parquet", "u.parquet", "a.csv.gz", "runs=7/t.parquet"):
+        Path(other).parent.mkdir(exist_ok=True)
+        write(platoon(vehicles=2, speed=30.0), Path(other))
+    Path(name).parent.mkdir(exist_ok=True)
+    path = write(platoon(vehicles=5), Path(name))
+    assert load(path).table["vehicle_id"].n_unique() == 5
+    assert Spool(path, Path("[spool]*"), "auto", 2).shelf.table(2).frame["vehicle_id"].unique().to_list() == ["5"]
+    if path.parent != Path():
+        (share,) = folder.shares(path.parent, 100)
+        assert share.vehicles == 5 and share.trajectories().table["vehicle_id"].n_unique() == 5
+
+
+def test_a_folder_of_results_is_a_path(tmp_path: Path) -> None:
+    path = write(platoon(vehicles=2), tmp_path / "t.csv")
+    filter_file(path, tmp_path / "o[1]*", baselines=False)
+    assert pl.read_parquet(tmp_path / "o[1]*" / "trajectories.parquet", glob=False)["vehicle_id"].n_unique() == 2
 
 
 @quick
