@@ -248,6 +248,10 @@ class Task(abc.ABC):
         self.simulator.check(values)
         return values
 
+    def like(self, params: Params) -> Tensor:
+        """Return a tensor of the precision and on the device of parameters."""
+        return next(iter(params[self.simulator.base.name].values()))
+
     @cached_property
     def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
         """What is drawn for every episode, and the ends of its range."""
@@ -309,7 +313,7 @@ class Task(abc.ABC):
         if who is None and where is None:
             return params
         made = {effect: dict(values) for effect, values in params.items()}
-        dtype = next(iter(params[self.simulator.base.name].values())).dtype
+        dtype = self.like(params).dtype
         if who is not None:
             for (effect, name), values in self._behaviour.drivers.items():
                 table = self.constant(f"drivers' {effect}.{name}", np.array(values), who.device, dtype)

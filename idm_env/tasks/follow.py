@@ -132,15 +132,14 @@ class FollowTask(Task):
     def begin(self, draw: Draw, params: Params) -> World:
         """Return a queue in equilibrium behind a drawn stretch of a drawn leader."""
         base = self.simulator.base
-        own = dict(params[base.name])
-        like = next(iter(own.values()))
+        like = self.like(params)
         device = draw.key.device
         steps = self.constant("steps", self.leaders.steps, device, torch.int64)
         trace, start = starts(draw, steps, (self.horizon or self.usual_steps) + self.warmup)
         episode = {"trace": trace, "start": start + self.warmup}
         first = self._motion(episode, torch.full_like(start, -self.warmup), like.dtype)
         speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()
-        driver = base.driver(own)
+        driver = base.driver(dict(params[base.name]))
         gaps = equilibrium_gap(driver, speed).expand_as(speed)[:, 1:]
         state = self.simulator.state(
             queue(first[:, :1], gaps, self.vehicle_length),

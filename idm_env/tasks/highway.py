@@ -71,7 +71,7 @@ class HighwayTask(LanesTask):
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return vehicles spread evenly over the lanes, each up to a quarter of its room aside, at their pace."""
-        like = params["idm"]["max_accel"]
+        like = self.like(params)
         aside = draw.uniforms(_PLACE_STREAM, self.vehicles, like.dtype) - 0.5
         index = torch.arange(self.vehicles, device=like.device)
         rank = torch.div(index, self.lanes_count, rounding_mode="floor")

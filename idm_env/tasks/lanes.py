@@ -130,13 +130,17 @@ class LanesTask(Task):
         return {**inputs, "lane_command": inputs["lane_command"].scatter(-1, slots, side)}
 
     def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
-        """Return checked parameters as tensors, desired speeds spread over drivers."""
-        values = super().params(dtype, device)
+        """Return checked parameters as tensors, desired speeds spread over drivers where the law has them."""
+        values, base = super().params(dtype, device), self.simulator.base.name
+        own = values[base]
+        if not self.spread or "desired_speed" not in own:
+            return values
         # Multiples of the golden ratio: evenly spread, whatever their number, and neighbours differ.
         share = (0.618033988749895 * torch.arange(self.vehicles, dtype=torch.float64)) % 1.0
         factor = (1.0 + self.spread * (2.0 * share - 1.0)).to(dtype=dtype, device=device)
-        idm = values["idm"]
-        return {**values, "idm": {**idm, "desired_speed": idm["desired_speed"] * factor}}
+        values = {**values, base: {**own, "desired_speed": own["desired_speed"] * factor}}
+        self.simulator.check(values)
+        return values
 
     @property
     def own_features(self) -> tuple[tuple[str, float, float, float], ...]:

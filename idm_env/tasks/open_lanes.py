@@ -90,7 +90,7 @@ class OpenLanesTask(LanesTask):
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return free traffic up to ``filled``, and everybody else waiting."""
-        like = params["idm"]["max_accel"]
+        like = self.like(params)
         trips = self._trips(draw, like.dtype)
         inside = trips.departs < 0
         begins = self.road.at_lane(trips.lane, trips.departs, "begins")

@@ -85,8 +85,7 @@ class PlatoonTask(Task):
     def begin(self, draw: Draw, params: Params) -> World:
         """Return a platoon in equilibrium at v̄, with drawn waves ahead of it."""
         base = self.simulator.base
-        own = dict(params[base.name])
-        like = next(iter(own.values()))
+        like = self.like(params)
         low, high = span("period", self.period, 1.0, "s")
         u = draw.uniforms(_WAVE_STREAM, 3 * _WAVES, like.dtype).view(-1, 3, _WAVES)
         share = u[:, 2] + 0.2
@@ -101,7 +100,7 @@ class PlatoonTask(Task):
         step = torch.full((len(waves),), -self.warmup, device=waves.device)
         first = self._motion(waves, step)
         speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()
-        driver = base.driver(own)
+        driver = base.driver(dict(params[base.name]))
         gaps = equilibrium_gap(driver, speed).expand_as(speed)[:, 1:]
         positions = queue(first[:, :1], gaps, self.vehicle_length)
         state = self.simulator.state(positions, speed, params, length=self.vehicle_length, step=step)

@@ -220,7 +220,7 @@ class ReplayTask(Task):
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return the recorded road at a drawn time."""
-        like = next(iter(params[self.simulator.base.name].values()))
+        like = self.like(params)
         starts = self.constant("starts", self._starts, draw.key.device, torch.int64)
         start = starts[(draw.uniforms(_START_STREAM, 1, torch.float64).squeeze(-1) * len(starts)).long()]
         motion, present = self._recorded(start, like.dtype)

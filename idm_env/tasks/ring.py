@@ -146,7 +146,7 @@ class RingTask(Task):
 
     def begin(self, draw: Draw, params: Params) -> World:
         """Return rings of drawn lengths: standing at equal gaps, or in a wave."""
-        like = next(iter(params[self.simulator.base.name].values()))
+        like = self.like(params)
         low, high = span("length", self.length, 1.0, "m")
         length = low + (high - low) * draw.uniforms(_LENGTH_STREAM, 1, like.dtype)
         place = torch.arange(self.vehicles, dtype=like.dtype, device=length.device) / self.vehicles

@@ -1,31 +1,71 @@
-"""Tasks run with any car-following law, named beside the task's own effects in the place of IDM."""
+"""Every task runs with every car-following law, named beside the task's own effects or by a file of drivers."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
 import pytest
 import torch
 
-from idm_env.tasks import Draw, make_task
+import idm_env  # noqa: F401 (registers the environments)
+from idm_env import instead
+from idm_env.config import Model, save_model
+from idm_env.effects import BASES, Brakes, Mobil, base_named
+from idm_env.tasks import TASKS
+from idm_env.tasks.lanes import LanesTask
 
 
-@pytest.mark.parametrize(
-    ("name", "law"),
-    [
-        ("ring", "gipps"),
-        ("platoon", "constant_time_gap"),
-        ("follow", "fvdm"),
-        ("replay", "iidm"),
-        ("follow", "idm_plus"),
-    ],
-)
-def test_a_task_takes_another_law(name: str, law: str) -> None:
-    """It starts, drives on without an agent, and nobody crashes within ten seconds."""
-    task = make_task(name, effects=[law], noise=0.0)
-    assert task.simulator.base.name == law
-    params = task.params(torch.float64, "cpu")
-    world = task.reset(Draw.of(torch.arange(2), torch.zeros(2, dtype=torch.int64)), params)
-    with torch.no_grad():
-        for _ in range(100):
-            world = task.step(world, None, None, params)
-    assert torch.isfinite(world.state.position).all() and (world.state.gap[world.state.gap < 9e3] > 0).all()
-    assert world.state.speed.max() > 0.5
+@pytest.fixture(scope="module")
+def drivers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file of two drivers of each law, who change lanes by MOBIL where there are several."""
+    folder = tmp_path_factory.mktemp("drivers")
+    for law in BASES:
+        base = base_named(law)
+        single = {f"a/{i}": {law: {"desired_speed": v}} for i, v in enumerate((27.0, 30.0))}
+        for name, more in (("one", ()), ("lanes", (Mobil(),))):
+            save_model(folder / f"{law}-{name}.yaml", Model((base, *more, Brakes()), {}, drivers=single))
+    return folder
+
+
+@pytest.mark.parametrize("how", ["effects", "drivers"])
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_takes_every_law(name: str, how: str, drivers: Path) -> None:
+    """It starts, drives on for two decisions about lanes without an agent, and nobody crashes or stands still."""
+    many = "lanes" if issubclass(TASKS[name], LanesTask) else "one"
+    choices: dict[str, Any] = {"task": name, "dtype": "float64", **({"warmup": 0} if name == "ring" else {})}
+    for law in BASES:
+        given = [law] if how == "effects" else str(drivers / f"{law}-{many}.yaml")
+        with instead.off():
+            env = gymnasium.make("DiffIDM-v0", **choices, **{how: given})
+            env.reset(seed=3)
+            for _ in range(12):
+                _, reward, terminated, _, _ = env.step(None)
+                assert np.isfinite(reward) and not terminated, law
+        state, task = env.unwrapped.state, env.unwrapped.task  # type: ignore[attr-defined]
+        assert task.simulator.base.name == law
+        assert torch.isfinite(state.position).all() and (state.gap > 0).all() and state.speed.max() > 0.1, law
+
+
+@pytest.mark.parametrize("law", BASES)
+def test_lane_changes_are_judged_by_the_law_that_is_there(law: str) -> None:
+    """Where only one lane is free ahead, a driver of each law wants it for what this law gains there."""
+    from idm_env.changes import beside, wished
+    from idm_env.roads import Lanes
+    from idm_env.simulator import Simulator
+
+    simulator = Simulator(Lanes(2), (base_named(law), Mobil(), Brakes()))
+    params = simulator.defaults(dtype=torch.float64)
+    position, speed = torch.tensor([40.0, 0.0], dtype=torch.float64), torch.tensor([5.0, 20.0], dtype=torch.float64)
+    state = simulator.state(position, speed, params, lane=torch.tensor([0, 0]))
+    view = simulator.road.view(state)
+    order = view.order(None)  # type: ignore[attr-defined]
+    sides = view.side(order, 1, state), view.side(order, -1, state)  # type: ignore[attr-defined]
+    wish = wished(simulator, beside(simulator, view, sides, state, {}, params), params)  # type: ignore[arg-type]
+    alone = simulator.state(position[1:], speed[1:], params, lane=torch.tensor([0]))
+    free = simulator.wanted(simulator.scene(alone, {}), params)[0]
+    here = simulator.wanted(simulator.scene(state, {}), params)[0]
+    torch.testing.assert_close(wish.left[1], free[0] - here[1] - params["mobil"]["threshold"])
+    assert wish.left[1] > 0.1
