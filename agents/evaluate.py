@@ -1,6 +1,6 @@
 """How good a policy is: the same deterministic test for every agent, and pictures of it.
 
-``python -m agents.evaluate runs/ring-apg/last.pt [--video ring]``. On the ring: six lengths 220–270 m, 300 s of
+``python -m agents.evaluate runs/ring-apg/last.pt [--video ring.gif]``. On the ring: six lengths 220–270 m, 300 s of
 human driving, in which a wave grows, then 300 s with the policy; 120 s after it has taken over, the human opposite
 brakes with 4 m/s² for 2 s. Judged are the last 100 s. Without that shock any vehicle that leans gently on a failsafe
 passes.
@@ -9,7 +9,7 @@ passes.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -300,21 +300,47 @@ def score(row: Mapping[str, Any]) -> float:
     return float(min(row["speed_ratio"], 1.0) - row["speed_std"] - tailgating - row["collisions"])
 
 
-def film(path: Path, environment: Mapping[str, Any], policy: Policy, steps: int, seed: int = 0) -> None:
-    """Write a video of one episode; every second step is a picture, at twice real time."""
-    from gymnasium.utils.save_video import save_video
+def shown(
+    environment: Mapping[str, Any], policy: Policy, human: int, steps: int, seed: int = 0, **keywords: Any
+) -> Iterator[DiffIDMEnv]:
+    """Yield an environment after every step of one episode: ``human`` steps of human driving, then of the policy.
 
-    env = DiffIDMEnv(**{**environment, "warmup_pool": 0}, render_mode="rgb_array")
+    ``keywords`` are more of the environment's own.
+    """
+    chosen: dict[str, Any] = {**environment, "warmup_pool": 0, "max_episode_steps": -1, **keywords}
+    task = task_of(environment)
+    if isinstance(task, RingTask):
+        # The shock comes as long after the policy has taken over as in the test.
+        chosen |= {"length": 250.0, "shock_after": task.shock_after + human * task.simulator.dt}
+    env = DiffIDMEnv(**chosen)
     observation, _ = env.reset(seed=seed)
-    frames, past = [], None
-    for step in range(steps):
-        action, past = policy.predict(observation, past)
-        observation, _, terminated, truncated, _ = env.step(action)
-        if step % 2 == 0:
-            frames.append(env.render())
-        if terminated or truncated:
-            break
-    save_video(frames, str(path.parent), name_prefix=path.stem, fps=10, episode_trigger=lambda _: True)
+    past = None
+    for step in range(human + steps):
+        action, past = (None, None) if step < human else policy.predict(observation, past)
+        observation, _, terminated, *_ = env.step(action)
+        yield env
+        if terminated:
+            return
+
+
+def film(path: Path, environment: Mapping[str, Any], policy: Policy, human: int, steps: int, seed: int = 0) -> None:
+    """Write one episode as a GIF, from 20 s before the policy takes over: a picture a second, ten of them a second."""
+    from PIL import Image
+
+    from idm_env.render import COLOURS_DRAWN, colour
+
+    frames, every = [], round(1.0 / task_of(environment).simulator.dt)
+    first = max(human - 20 * every, 0)
+    # One palette for all pictures, of the colours that are drawn: a palette by frequency would drop the agent's mark.
+    colours = [*COLOURS_DRAWN, *(colour(x, 39.0) for x in range(40))]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([part for each in colours for part in each])
+    for step, env in enumerate(shown(environment, policy, human, steps, seed, render_mode="rgb_array")):
+        if step >= first and step % every == 0:
+            picture = Image.fromarray(env.render())
+            picture = picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.LANCZOS)
+            frames.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0, optimize=True)
 
 
 def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: int, steps: int, seed: int = 0) -> None:
@@ -324,20 +350,9 @@ def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: i
     """
     from idm_env.diagrams import lane_panels, rollout_panel, space_time
 
-    chosen: dict[str, Any] = {**environment, "warmup_pool": 0, "max_episode_steps": -1}
-    task = task_of(environment)
-    if isinstance(task, RingTask):
-        # The shock comes as long after the policy has taken over as in the test.
-        chosen |= {"length": 250.0, "shock_after": task.shock_after + human * task.simulator.dt}
-    env = DiffIDMEnv(**chosen)
-    observation, _ = env.reset(seed=seed)
-    states, past = [], None
-    for step in range(human + steps):
-        action, past = (None, None) if step < human else policy.predict(observation, past)
-        observation, _, terminated, *_ = env.step(action)
+    states = []
+    for env in shown(environment, policy, human, steps, seed):
         states.append(env.state)
-        if terminated:
-            break
     dt = env.task.simulator.dt
     motion = Motion(*(torch.cat([getattr(s, name) for s in states]) for name in Motion._fields))
     if states[0].links is None:
@@ -364,9 +379,9 @@ class Arguments:
 
     Args:
         checkpoint: Such as runs/ring-apg/last.pt.
-        video: Folder and first part of the name of a video, such as pictures/ring.
+        video: File of a moving picture, such as ring.gif.
         picture: File of a space-time diagram, such as ring.png.
-        human: Steps of human driving before the policy, in the diagram.
+        human: Steps of human driving before the policy, in video and diagram.
         steps: Steps with the policy, in video and diagram.
         seed: Of the episode that is shown.
     """
@@ -393,7 +408,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
         if arguments.video is not None:
-            film(arguments.video, environment, policy, arguments.steps, arguments.seed)
+            film(arguments.video, environment, policy, arguments.human, arguments.steps, arguments.seed)
         if arguments.picture is not None:
             picture(arguments.picture, environment, policy, arguments.human, arguments.steps, arguments.seed)
 

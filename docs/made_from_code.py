@@ -1,4 +1,4 @@
-"""Pages that are made from the code at every build: environments, effects, commands, reports, figures, limits, API."""
+"""Pages that are made from the code at every build: tasks, effects, commands, reports, API."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write(folder: Path) -> None:
     (out / "pictures").mkdir(parents=True, exist_ok=True)
     pages = {
         "environments.md": environments(), "effects.md": effects(out / "pictures"), "commands.md": commands(),
-        "figures.md": section("Figures"), "limits.md": section("What is not done"), "api.rst": api(),
+        "api.rst": api(),
     }  # fmt: skip
     for name, text in pages.items():
         path = out / name
@@ -53,7 +53,7 @@ def environments() -> str:
     from idm_env.tasks import TASKS
 
     lines = [
-        "# Environments", "",
+        "# Tasks", "",
         '`gymnasium.make("DiffIDM-v0", task=NAME, …)`; `make_vec` for a native batch; `idm_env.envs.pettingzoo` for '
         "one agent per controlled vehicle. Every keyword below is one of `make`, and may stand in YAML.", "",
     ]  # fmt: skip
@@ -272,7 +272,7 @@ def response(effect: Any, path: Path) -> bool:
     return True
 
 
-# -- commands, sections of the README, API, examples -----------------------------------------------------------------
+# -- commands, API, examples -----------------------------------------------------------------------------------------
 
 
 def commands() -> str:
@@ -302,17 +302,6 @@ def commands() -> str:
             lines.append(f"| {names} | {default} | {meaning} |")
         lines.append("")
     return "\n".join(lines) + "\n"
-
-
-def section(title: str) -> str:
-    """Return a section of the README as a page of its own."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
-    assert found, f"README has no section {title}"
-    body = re.sub(r"\]\(docs/", "](../", found[1])
-    body = re.sub(r"\]\(#what-agents-learn\)", "](figures.md#what-agents-learn)", body)
-    body = re.sub(r"^### ", "## ", body, flags=re.MULTILINE)
-    return f"# {title}\n{body}"
 
 
 def api() -> str:

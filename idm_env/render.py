@@ -27,6 +27,8 @@ _MOST_LANES = 8
 """Lanes beyond these are drawn over the first ones again."""
 _ASPHALT, _GROUND, _INK, _MARK = (70, 74, 82), (244, 243, 238), (30, 32, 36), (30, 90, 220)
 _CHANGE = (208, 60, 150)
+COLOURS_DRAWN = (_ASPHALT, _GROUND, _INK, _MARK, _CHANGE)
+"""Colours of a picture besides those of speeds (red, green, blue)."""
 _CHANGE_SHOWN = 1.0
 """How long an arrow shows that a vehicle has changed lanes (s)."""
 

@@ -220,6 +220,25 @@ def test_files_that_documents_name_are_there(path: Path) -> None:
     assert not missing, f"{path.name} names {missing}"
 
 
+def sentences(path: Path) -> list[str]:
+    """Return the sentences of a document's prose: no code, no tables, no headings, links as their text."""
+    text = re.sub(r"^(```|:::).*?^\1$", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^(#|\|).*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    parts = re.split(r"\n\s*\n|^- ", text, flags=re.MULTILINE)
+    return [s for part in parts for s in re.split(r"(?<=[.:])\s+(?=[A-Z`*0-9])", " ".join(part.split())) if s]
+
+
+def test_the_first_pages_are_short() -> None:
+    """A reader sees what the package is on one page, in sentences that are read once."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 120 and len(text.split()) <= 800
+    assert (ROOT / "docs" / "ring.gif").stat().st_size <= 800_000
+    for name in ("README.md", "docs/index.md"):
+        lengths = sorted((len(s.split()), s) for s in sentences(ROOT / name))
+        assert lengths[len(lengths) // 2][0] <= 15 and lengths[-1][0] <= 35, f"{name}: {lengths[-1]}"
+
+
 def test_every_document_has_its_place_on_the_site() -> None:
     """Sphinx takes one that has none for an error, and so does this, at once."""
     text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
