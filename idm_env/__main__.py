@@ -10,7 +10,7 @@ def main() -> None:
     try:
         from idm_env.cli import run
     except ImportError as error:
-        sys.exit(f"error: the command line needs {error.name or error}. Install it with: pip install 'idm-env[data]'")
+        sys.exit(f"error: {error}")
     run()
 
 

@@ -10,13 +10,15 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
-import typer
-from rich.console import Console
-from rich.table import Table
-
 import idm_env
 from idm_env import checks, keep
+from idm_env.extras import needed
 from idm_env.progress import OnProgress, shown
+
+with needed("the command line"):
+    import typer
+    from rich.console import Console
+    from rich.table import Table
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -35,6 +35,7 @@ from idm_env import effects as catalogue
 from idm_env import parameters
 from idm_env.checks import nearest, one_of, shown, whole
 from idm_env.effects import CarFollowing, Effect
+from idm_env.extras import needed
 from idm_env.keep import write_text
 from idm_env.roads import Lane, Road
 from idm_env.simulator import INTEGRATORS, Integration, Simulator
@@ -328,8 +329,6 @@ def _harmless(yaml: Any, text: str, loader: Any) -> None:
 
 
 def _yaml() -> Any:
-    try:
+    with needed("a YAML file"):
         import yaml
-    except ImportError:
-        raise ImportError("YAML files need PyYAML. Install it with: pip install 'idm-env[data]'") from None
     return yaml

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from idm_env.extras import needed
 from idm_env.fonts import legible
 
 COLOURS = np.array([(178, 24, 43), (239, 138, 98), (253, 219, 120), (120, 190, 110), (26, 120, 80)], float)
@@ -178,13 +179,11 @@ def space_time(
 
 def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = None, columns: int | None = None) -> Any:
     """Return a matplotlib figure of panels, in one column up to three of them, else in two; not yet ``legible``."""
-    try:
+    with needed("a diagram"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import LineCollection
         from matplotlib.colors import LinearSegmentedColormap
         from matplotlib.figure import Figure
-    except ImportError:
-        raise ImportError("diagrams need matplotlib. Install it with: pip install 'idm-env[data]'") from None
     columns = columns or (1 if len(drawn) <= 3 else 2)
     rows = max(1, -(-len(drawn) // columns))
     height = 4.8 if rows == 1 else 0.8 + 3.0 * rows

@@ -7,6 +7,7 @@ files that a part writes in one piece (``parts.Parts``); what comes back through
 
 from __future__ import annotations
 
+import logging
 import os
 import pickle
 import signal
@@ -17,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Protocol, TypeVar
 
+from idm_env.extras import needed
 from idm_env.progress import OnProgress, silent
 
 KINDS = ("serial", "processes", "ray")
@@ -324,17 +326,15 @@ def _begin() -> None:
 @contextmanager
 def _connected(address: str | None) -> Iterator[None]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
+    with needed("executor = 'ray'"):
         import ray
-    except ImportError:
-        raise ImportError("executor = 'ray' needs ray. Install it with: pip install 'idm-env[ray]'") from None
     ours = not ray.is_initialized()
     # Left to itself Ray joins whatever cluster somebody runs on this machine.
     address = address or os.environ.get("RAY_ADDRESS")
     if ours:
-        more = {"include_dashboard": False} if address is None else {}
+        more: dict[str, Any] = {"include_dashboard": False} if address is None else {}
         try:
-            ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR", **more)
+            ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **more)
         except (ConnectionError, RuntimeError, ValueError) as error:
             words = " ".join(str(error).split())[:200]
             raise ValueError(

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import polars as pl
-
 from idm_env import keep
+from idm_env.extras import needed
 from idm_env.report import plain
+
+with needed("a part of a folder"):
+    import polars as pl
 
 
 class Parts:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from idm_env.diagrams import COLOURS, space_time
+from idm_env.extras import needed
 from idm_env.roads import Lanes
 from idm_env.types import State
 
@@ -43,10 +44,8 @@ def colour(speed: float, fastest: float) -> tuple[int, int, int]:
 
 def _pygame() -> Any:
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    try:
+    with needed("rendering"):
         import pygame
-    except ImportError:
-        raise ImportError("rendering needs pygame-ce. Install it with: pip install 'idm-env[render]'") from None
     return pygame
 
 

@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from idm_env.extras import needed
 from idm_env.keep import write_text
 
 if TYPE_CHECKING:
@@ -165,10 +166,8 @@ def _encoded(figure: Figure) -> str:
 
 def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (9.0, 3.4)) -> tuple[Figure, Any]:
     """Return a figure and its axes ([rows, columns] array) without a display; ImportError names the extra."""
-    try:
+    with needed("a report"):
         import matplotlib
-    except ImportError:
-        raise ImportError("reports need matplotlib. Install it with: pip install 'idm-env[data]'") from None
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 

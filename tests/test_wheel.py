@@ -6,6 +6,7 @@ import ast
 import email
 import importlib.metadata
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,9 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from idm_env.extras import OF
+from idm_env.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
 NO_PART = ("__pycache__", "*.egg-info")
@@ -78,39 +82,155 @@ def test_it_declares_what_it_imports_and_no_extra_for_what_it_does_not_carry(whe
     assert not undeclared
     used = set().union(*imported(wheel))
     assert everything == used & everything
+    known = importlib.metadata.packages_distributions()
+    for module, extra in OF.items():
+        assert {canonicalize_name(name) for name in known[module]} & declared[extra]
 
 
-def test_it_works_where_there_is_no_checkout(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
-    """Installed into a fresh environment that sees the same libraries, but not an editable installation of this."""
-    place = tmp_path / "environment"
+def environment(wheel: zipfile.ZipFile, place: Path, *extras: str) -> Path:
+    """Return the python of an environment with the wheel, what it declares for these extras, and nothing else."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", place], check=True)
     site = next(place.glob("lib/python*/site-packages"))
-    # As plain paths: what is installed editable there is found by .pth files, which only a site's own folder reads.
-    paths = [p for p in sys.path if "site-packages" in p]
-    (site / "libraries.pth").write_text("\n".join(paths))
+    declared = requirements(wheel)
+    wanted = set[str]().union(*(declared[extra] for extra in ("", *extras)))
+    linked: set[str] = set()
+    while names := wanted - linked:
+        for name in names:
+            distribution = importlib.metadata.distribution(name)
+            for line in distribution.requires or []:
+                one = Requirement(line)
+                if one.marker is None or one.marker.evaluate({"extra": ""}):
+                    wanted.add(canonicalize_name(one.name))
+            for top in {file.parts[0] for file in distribution.files or []} - {"..", "__pycache__"}:
+                if not (site / top).exists() and not top.endswith(".pth"):
+                    (site / top).symlink_to(str(distribution.locate_file(top)))
+        linked |= names
     install = [sys.executable, "-m", "pip", "--python", place / "bin" / "python", "install", "--quiet", "--no-deps"]
     subprocess.run([*install, str(wheel.filename)], check=True)
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"IDM_ENV_CACHE": str(tmp_path / "c")}
+    return place / "bin" / "python"
 
-    def done(*command: object, **more: str) -> subprocess.CompletedProcess[str]:
-        words = [str(part) for part in command]
-        return subprocess.run(words, cwd=tmp_path, env=environment | more, text=True, capture_output=True)
 
-    def call(*command: object, **more: str) -> str:
-        told = done(*command, **more)
-        assert told.returncode == 0, told.stderr
-        return told.stdout
+def call(*command: object, at: Path, code: int = 0, **more: str) -> subprocess.CompletedProcess[str]:
+    """Run a command where neither the checkout nor its libraries are seen."""
+    clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"IDM_ENV_CACHE": str(at / "cache")}
+    done = subprocess.run([str(part) for part in command], cwd=at, env=clean | more, text=True, capture_output=True)
+    assert done.returncode == code, done.stderr
+    return done
 
-    python, command = place / "bin" / "python", place / "bin" / "idm-env"
-    assert str(site) in call(python, "-c", "import idm_env; print(idm_env.__file__)")
-    time = [0.1 * i for i in range(100)]
-    rows = [f"{v},{t:.1f},{20 * t - 30 * v:.2f},1" for v in range(3) for t in time]
+
+@pytest.fixture(scope="module")
+def core(wheel: zipfile.ZipFile, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the python of an environment without extras."""
+    return environment(wheel, tmp_path_factory.mktemp("core"))
+
+
+def test_without_extras_every_module_is_imported_or_names_its_extra(
+    wheel: zipfile.ZipFile, core: Path, tmp_path: Path
+) -> None:
+    """One line of ImportError; what is not of an extra's subject is imported."""
+    names = [name.removesuffix(".py").removesuffix("/__init__") for name in wheel.namelist() if name.endswith(".py")]
+    (tmp_path / "modules.txt").write_text("\n".join(name.replace("/", ".") for name in names))
+    (tmp_path / "run.py").write_text(IMPORTING)
+    told = dict(line.split("\t") for line in call(core, "run.py", at=tmp_path).stdout.splitlines())
+    assert told.keys() == {name.replace("/", ".") for name in names}
+    for name, why in told.items():
+        assert why == "imported" or re.search(r" needs [\w.]+\. Install it with: pip install 'idm-env\[\w+\]'$", why), (
+            name, why,
+        )  # fmt: skip
+    assert {name.split(".")[1] for name, why in told.items() if why != "imported"} == OF_EXTRAS
+    assert told["idm_env.envs.sb3"].endswith("[sb3]'") and told["idm_env.kernels.printed"].endswith("[kernels]'")
+
+
+IMPORTING = """
+import importlib
+for name in open("modules.txt").read().split():
+    try:
+        importlib.import_module(name)
+        print(name, "imported", sep="\\t")
+    except ImportError as error:
+        print(name, error, sep="\\t")
+"""
+OF_EXTRAS = {"cli", "data", "discovery", "drift", "envs", "fitting", "kernels", "parts", "prediction", "trajectories"}
+"""Parts of the package of which some module needs an extra (of ``envs``: Stable-Baselines3's face)."""
+
+STEPPING = """
+import gymnasium, idm_env, torch
+from idm_env.envs.pettingzoo import parallel_env
+from idm_env.extras import OF
+from idm_env.tasks import TASKS
+for task in TASKS:
+    env = gymnasium.make("DiffIDM-v0", task=task)
+    env.reset(seed=1)
+    assert torch.isfinite(torch.as_tensor(env.step(env.action_space.sample())[1])).all()
+    env = gymnasium.make_vec("DiffIDM-v0", num_envs=2, vectorization_mode="vector_entry_point", task=task)
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    env = parallel_env(task=task)
+    env.reset(seed=1)
+    env.step({name: env.action_space(name).sample() for name in env.agents})
+    print(task)
+"""
+
+
+def test_without_extras_every_task_steps_in_every_face(core: Path, tmp_path: Path) -> None:
+    """Gymnasium's single and vector environments and PettingZoo's, on the torch path: numba is not there."""
+    (tmp_path / "run.py").write_text(STEPPING)
+    assert call(core, "run.py", at=tmp_path).stdout.split() == list(TASKS)
+
+
+ASKED = {
+    "gymnasium.make('DiffIDM-v0', task='replay', data='a.csv').reset()": "data",
+    "gymnasium.make('DiffIDM-v0', task='replay_lanes', data='a.csv').reset()": "data",
+    "gymnasium.make('DiffIDM-v0', effects='model.yaml')": "data",
+    "env = gymnasium.make('DiffIDM-v0', render_mode='rgb_array'); env.reset(); env.render()": "render",
+}
+ASKING = f"""
+import gymnasium, idm_env
+for what in {list(ASKED)}:
+    try:
+        exec(what)
+        print("nothing")
+    except ImportError as error:
+        print(error)
+"""
+
+
+def test_what_wants_an_extra_says_which_in_one_line(core: Path, tmp_path: Path) -> None:
+    """Arguments of an environment, and the command line."""
+    for name in ("a.csv", "model.yaml"):
+        (tmp_path / name).touch()
+    told = call(core, "-c", ASKING, at=tmp_path).stdout + call(core.with_name("idm-env"), at=tmp_path, code=1).stderr
+    extras = [*ASKED.values(), "data"]
+    for line, extra in zip(told.splitlines(), extras, strict=True):
+        assert line.endswith(f" Install it with: pip install 'idm-env[{extra}]'"), line
+
+
+def of_core(example: Path) -> bool:
+    """Whether an example imports the core's own libraries only, and of the package nothing of an extra."""
+    core = {"gymnasium", "idm_env", "numpy", "pettingzoo", "torch", *sys.stdlib_module_names}
+    names = re.findall(r"^ *(?:from|import) ([\w.]+)", example.read_text(), re.MULTILINE)
+    parts = {name.split(".")[1] for name in names if name.startswith("idm_env.")}
+    return {name.split(".")[0] for name in names} <= core and not parts & OF_EXTRAS
+
+
+CORE_EXAMPLES = [path.stem for path in sorted((ROOT / "examples").glob("*.py")) if of_core(path)]
+
+
+@pytest.mark.parametrize("name", CORE_EXAMPLES)
+def test_examples_that_need_no_extra_run_without_them(core: Path, tmp_path: Path, name: str) -> None:
+    """From another folder, as a user does."""
+    assert call(core, ROOT / "examples" / f"{name}.py", at=tmp_path).stdout.strip()
+
+
+def test_with_its_extra_the_command_runs_where_there_is_no_checkout(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    """A page that is a file of the package, and the words that a shell completes."""
+    command = environment(wheel, tmp_path / "environment", "data").with_name("idm-env")
+    rows = [f"{v},{0.1 * i:.1f},{2.0 * i - 30 * v:.2f},1" for v in range(3) for i in range(100)]
     (tmp_path / "my.csv").write_text("\n".join(["vehicle_id,time_s,position_m,lane", *rows]) + "\n")
-    call(command, "plot", "my.csv", "--html", "--out", "drawn.png")  # its page is a file of the package
-    assert "<svg" in (tmp_path / "drawn.html").read_text() or "canvas" in (tmp_path / "drawn.html").read_text()
+    call(command, "plot", "my.csv", "--html", "--out", "drawn.png", at=tmp_path)
+    assert 'id="diagram"' in (tmp_path / "drawn.html").read_text()
     for typed, at, wanted in (("idm-env fi", "1", ["fit", "filter"]), ("idm-env fit --held", "2", ["--held-out"])):
-        found = call(command, _IDM_ENV_COMPLETE="complete_bash", COMP_WORDS=typed, COMP_CWORD=at)
-        assert found.split() == wanted
-    refused = done(command, "bench")
-    assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (1, "", 1)
-    assert "bench needs a checkout" in refused.stderr
+        asked = {"_IDM_ENV_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": at}
+        assert call(command, at=tmp_path, **asked).stdout.split() == wanted
+    refused = call(command, "bench", at=tmp_path, code=1)
+    assert not refused.stdout and refused.stderr.count("\n") == 1 and "bench needs a checkout" in refused.stderr

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from idm_env.data import synthetic
-from idm_env.data.episode import Episode, Episodes
-from idm_env.data.episodes import episodes
-from idm_env.data.errors import DataError, Repair
-from idm_env.data.load import load
-from idm_env.data.records import Record
-from idm_env.data.schema import LEADER_LOST_GAP_M
-from idm_env.data.smooth import Motion, noise_sigma, smooth
-from idm_env.data.trajectories import Trajectories
+from idm_env.extras import needed
+
+with needed("a trajectory file"):
+    from idm_env.data import synthetic
+    from idm_env.data.episode import Episode, Episodes
+    from idm_env.data.episodes import episodes
+    from idm_env.data.errors import DataError, Repair
+    from idm_env.data.load import load
+    from idm_env.data.records import Record
+    from idm_env.data.schema import LEADER_LOST_GAP_M
+    from idm_env.data.smooth import Motion, noise_sigma, smooth
+    from idm_env.data.trajectories import Trajectories
 
 __all__ = [
     "LEADER_LOST_GAP_M",

@@ -5,7 +5,10 @@ Needs the extras ``data`` and ``kernels``.
 
 from __future__ import annotations
 
-from idm_env.discovery.discover import Discovery, discover
-from idm_env.discovery.write import write_report
+from idm_env.extras import needed
+
+with needed("explaining"):
+    from idm_env.discovery.discover import Discovery, discover
+    from idm_env.discovery.write import write_report
 
 __all__ = ["Discovery", "discover", "write_report"]

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-try:
+from idm_env.extras import needed
+
+with needed("estimating drift"):
     import numba
-except ImportError:
-    raise ImportError("estimating drift needs numba. Install it with: pip install 'idm-env[kernels]'") from None
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 LOG_2PI = float(np.log(2.0 * np.pi))

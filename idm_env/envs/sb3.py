@@ -8,10 +8,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from stable_baselines3.common.vec_env import VecEnv
 
 from idm_env.checks import shown
 from idm_env.envs.info import row
+from idm_env.extras import needed
+
+with needed("SB3VecEnv"):
+    from stable_baselines3.common.vec_env import VecEnv
 
 
 class SB3VecEnv(VecEnv):

@@ -7,8 +7,12 @@ printed file is not there to be imported in a process that has printed another.
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from idm_env.extras import needed
+
+with needed("a compiled loop"):
+    import numba
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -5,11 +5,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
+
+from idm_env.extras import needed
+
+with needed("a compiled loop"):
+    import numba
+    from llvmlite import ir
+    from numba import types
+    from numba.extending import intrinsic
 
 _MAGIC = 6755399441055744.0
 """1.5 · 2^52: added to a double, it leaves the nearest whole number in the lowest bits."""

@@ -11,9 +11,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import extending
-from numba.core import cgutils, types
+
+from idm_env.extras import needed
+
+with needed("a compiled loop"):
+    from llvmlite import ir
+    from numba import extending
+    from numba.core import cgutils, types
 
 intrinsic: Any = extending.intrinsic
 

@@ -8,9 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
+from idm_env.extras import needed
+
+with needed("a compiled loop"):
+    from llvmlite import ir
+    from numba import types
+    from numba.extending import intrinsic
+
 
 _POINTER = ir.IntType(8).as_pointer()
 

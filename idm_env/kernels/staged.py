@@ -14,10 +14,14 @@ from contextvars import ContextVar
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils, types
-from numba.core.typing.templates import signature
-from numba.extending import intrinsic
+
+from idm_env.extras import needed
+
+with needed("a compiled loop"):
+    from llvmlite import ir
+    from numba.core import cgutils, types
+    from numba.core.typing.templates import signature
+    from numba.extending import intrinsic
 
 from idm_env.kernels.functions import exp_float64, sigmoid_float64
 

@@ -18,9 +18,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from idm_env.extras import needed
+
+with needed("a compiled loop"):
+    import numba
 
 from idm_env.kernels.memory import LINE, add, copy, copy_truth, fill, number
 from idm_env.scalar import library

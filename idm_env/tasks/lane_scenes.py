@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from idm_env.data.errors import DataError
 from idm_env.tasks.scenes import Track, recorded_tracks, smoothed
 
 if TYPE_CHECKING:
@@ -46,6 +45,8 @@ def recorded_lanes(path: str, dt: float, run: str | None, first_lane: str) -> La
         ValueError: If a run does not exist or its step does not fit ``dt``.
         DataError: If the file cannot be used, has several runs and none was named, or says no lanes.
     """
+    from idm_env.data import DataError
+
     tracks = recorded_tracks(path, dt, None if run is None else (run,))
     runs = sorted({track.key.rsplit("/", 1)[0] for track in tracks})
     if len(runs) > 1:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-try:
+from idm_env.extras import needed
+
+with needed("filtering or reconstruction"):
     import numba
-except ImportError:
-    raise ImportError(
-        "filtering, reconstruction and the paper's recipe are compiled loops and need numba. Install it with: "
-        "pip install 'idm-env[kernels]'"
-    ) from None
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})

@@ -1,0 +1,27 @@
+"""Which extra gives what the core does without: said in one line wherever it is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+OF = {
+    **dict.fromkeys(("google", "jinja2", "matplotlib", "pandera", "polars", "pyarrow", "rich", "scipy", "statsmodels",
+                     "typer", "yaml"), "data"),
+    **dict.fromkeys(("llvmlite", "numba"), "kernels"),
+    "pygame": "render", "ray": "ray", "stable_baselines3": "sb3",
+}  # fmt: skip
+"""Module → the extra that installs it."""
+
+
+@contextmanager
+def needed(what: str) -> Iterator[None]:
+    """Import in here what an extra installs: where it is missing the ImportError names ``what`` and the cure."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        name = (error.name or "").partition(".")[0]
+        if name not in OF:
+            raise
+        cure = f"Install it with: pip install 'idm-env[{OF[name]}]'"
+        raise ImportError(f"{what} needs {name}. {cure}", name=name) from None
