@@ -10,7 +10,7 @@ import sys
 
 import torch
 
-from idm_env.bench.measure import Case, measure
+from benchmarks.bench.measure import Case, measure
 from idm_env.effects import ALL, CANDIDATES, IDM, Brakes, Effect
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
