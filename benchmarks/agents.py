@@ -14,6 +14,11 @@ command may be interrupted, repeated, and started several times; ``--executor ra
 cluster with shared storage. A training ends with its updates, so that a busy machine does not shorten it, or after 150
 CPU seconds; ``--times 10`` gives it ten times as many of both, over which the learning rate falls. CPU seconds are
 those of training; evaluations every 3 s are not counted.
+
+Of the picture: for each task and agent the share of seeds that have not solved it yet, against the CPU seconds of
+training (Kaplan and Meier 1958); a seed that never solves counts as long as it was trained. Of an agent's trials that
+one is shown which solves most seeds, of equals the one with most of them, of these the one that solves soonest, or was
+trained longest.
 """
 
 from __future__ import annotations
@@ -23,10 +28,11 @@ import fcntl
 import json
 import os
 import shutil
+import statistics
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,19 +42,54 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import workers  # noqa: E402 (found by the path above)
+import matplotlib.pyplot as plt  # noqa: E402 (threads are set before numpy starts, and the path before our own)
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from matplotlib.axes import Axes  # noqa: E402
+from scipy.stats import CensoredData, ecdf  # noqa: E402
+
+from agents import apg, common  # noqa: E402
+from agents.classical import controllers  # noqa: E402
+from agents.environments import task_of  # noqa: E402
+from agents.evaluate import (  # noqa: E402
+    as_judged,
+    evaluate,
+    evaluate_follow,
+    evaluate_ring,
+    held_out,
+    mixed,
+    score,
+    solved_at,
+)  # fmt: skip
+from agents.imitation import default_data  # noqa: E402
+from agents.policy import Policy  # noqa: E402
+from agents.reference import (  # noqa: E402
+    HIDDEN,
+    RANDOM,
+    alone,
+    families,
+    networks,
+    passing,
+    random_policies,
+    singles,
+    tried,
+)  # fmt: skip
+from agents.rollout import FRESH, LENGTHS, Act  # noqa: E402
+from benchmarks import add_executor, executor_of  # noqa: E402
 from idm_env.config import read_yaml  # noqa: E402
 from idm_env.executor import Executor, Serial  # noqa: E402
+from idm_env.keep import write_text  # noqa: E402
 from idm_env.progress import OnProgress  # noqa: E402
 
 LIMIT = 150.0
 """CPU seconds after which a training ends that has updates left."""
 EVERY = 3.0
 TESTS = ("failsafe", "failsafe-shock", "brakes", "brakes-shock", "follow")
-"""Of the reference rows (``benchmarks.agents_reference.tests``)."""
+"""Of the reference rows (``tests``)."""
 SEARCH_SEEDS, SEEDS = (100, 101), tuple(range(10))
 
 Options = dict[str, Any]
+Row = dict[str, Any]
 EVERY_STEP: Options = {
     "hold": 1, "count": 64, "n_steps": 300, "batch_size": 4800, "gamma": 0.999, "gae_lambda": 0.95,
     "no_anneal": True, "updates": 88,
@@ -143,8 +184,6 @@ class Training:
 
 def once(folder: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any] | None:
     """Return the result of a folder, made now if it is not there; None where another process works on it."""
-    from idm_env.keep import write_text
-
     result = folder / "result.json"
     folder.mkdir(parents=True, exist_ok=True)
     # The lock goes with its process: whatever was interrupted is begun again.
@@ -179,15 +218,11 @@ def perform(job: Job, out: Path) -> dict[str, Any] | None:
 
 def outcome(training: Path, done: subprocess.CompletedProcess[str], unseen: bool) -> dict[str, Any]:
     """Return what a training came to: evaluations, last and best checkpoint, the last one on held-out traffic too."""
-    from agents.common import load
-    from agents.evaluate import as_judged, evaluate, held_out, solved_at
-    from agents.rollout import FRESH
-
     if not (training / "last.pt").exists() or not (training / "best.pt").exists():
         summary = {"solved": False, "ever": False, "spent": 0.0, "error": True}
         return {"error": done.stderr[-2000:], "history": [], "summary": summary}
-    policy, content = load(training / "last.pt")
-    best, at_best = load(training / "best.pt")
+    policy, content = common.load(training / "last.pt")
+    best, at_best = common.load(training / "best.pt")
     environment = as_judged(content["environment"], content["training"]["arguments"]["judged_in"])
     history = content["training"]["history"]
     # The first evaluation is of the policy before any update: it solves nothing, whatever it passes.
@@ -240,8 +275,6 @@ def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
 
     The best has most seeds solved, then the highest mean score of the last evaluation.
     """
-    from agents.evaluate import score
-
     jobs = trials(config)
     found = [perform(job, out) for job in jobs]
     done = [row for row in found if row is not None]
@@ -281,6 +314,401 @@ def run(
     deque(executor.map(train, [Training(job, out) for job in wanted]), 0)
 
 
+def results(out: Path, config: str) -> list[Row]:
+    """Return every result of a configuration, by trial, length of training and seed."""
+    found = [json.loads(path.read_text()) for path in (out / config).glob("trial*/seed*/result.json")]
+    return sorted(found, key=lambda r: (r["trial"], r.get("times", 1), r["seed"]))
+
+
+def groups(out: Path, config: str, seeds: Sequence[int]) -> dict[str, list[Row]]:
+    """Return the results of a configuration's seeds, by what was trained for how long."""
+    found: dict[str, list[Row]] = {}
+    for r in results(out, config):
+        if r["seed"] in seeds:
+            times = r.get("times", 1)
+            found.setdefault(f"{r['trial']}" + (f", {times} times" if times > 1 else ""), []).append(r)
+    return found
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a Markdown table."""
+    print("\n| " + " | ".join(head) + " |\n|" + " --- |" * len(head))
+    for row in rows:
+        print("| " + " | ".join(row) + " |")
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Return median and range."""
+    if not values:
+        return "–"
+    middle, low, high = (format(x, form) for x in (statistics.median(values), min(values), max(values)))
+    return f"{middle} ({low}–{high})"
+
+
+def ring(r: Row) -> list[str]:
+    """Return speed ratio, deviation, time gap and collisions of one evaluation."""
+    return [f"{r['speed_ratio']:.3f}", f"{r['speed_std']:.2f}", f"{r['time_gap']:.2f}", str(r["collisions"])]
+
+
+def search_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print what the trials of each search came to."""
+    rows = []
+    for config in configs:
+        found = [r for r in results(out, config) if r["seed"] in seeds]
+        for trial in sorted({r["trial"] for r in found}):
+            part = [r for r in found if r["trial"] == trial]
+            ends = ["/".join(ring(r["last"])[:2]) for r in part if r["history"]]
+            options = ", ".join(f"{k} {v}" for k, v in part[0]["options"].items())
+            rows.append([config, str(trial), options, f"{solved(part)} of {len(part)}", ", ".join(ends)])
+    table(("agent", "trial", "what it changes", "solved", "last ratio/std of each seed"), rows)
+
+
+def solved(rows: Sequence[Row]) -> int:
+    """Return how many are solved."""
+    return sum(r["summary"]["solved"] for r in rows)
+
+
+def summary_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print one row per agent: how many of its seeds solved the test, and how soon.
+
+    Vehicle-steps are steps of environments times the vehicles in one.
+    """
+    rows = []
+    for config, name, part in ((c, n, p) for c in configs for n, p in groups(out, c, seeds).items()):
+        done = [r["summary"] for r in part if r["summary"]["solved"]]
+        vehicles = task_of(environment_of(f"{config.split('-')[0]}-apg")).vehicles
+        rows.append([
+            config, name, f"{len(done)} of {len(part)}", str(sum(r["summary"]["ever"] for r in part)),
+            spread([r["summary"]["spent"] for r in part if r["history"]], ".0f"),
+            spread([d["cpu_seconds"] for d in done], ".1f"), spread([d["steps"] / 1000 for d in done], ".0f"),
+            spread([d["steps"] * vehicles / 1e6 for d in done], ".1f"),
+        ])  # fmt: skip
+    table(
+        ("agent", "trial", "solved", "ever passed", "CPU s trained", "CPU s to solved", "1000 steps to solved",
+         "million vehicle-steps to solved"), rows
+    )  # fmt: skip
+
+
+def median_ratio(theirs: Sequence[float], ours: Sequence[float], draws: int = 10_000) -> tuple[float, float, float]:
+    """Return the ratio of two medians and its 95 % interval: percentiles of a bootstrap over seeds.
+
+    Seeds that never solve are infinite: later than all others, whenever that would be.
+    """
+    generator = np.random.default_rng(0)
+    drawn = [np.median(generator.choice(x, (draws, len(x))), axis=1) for x in (theirs, ours)]
+    with np.errstate(invalid="ignore"):  # infinite over infinite says nothing
+        low, high = np.nanquantile(drawn[0] / drawn[1], (0.025, 0.975), method="nearest")
+        return float(np.median(theirs) / np.median(ours)), float(low), float(high)
+
+
+def ratio_line(out: Path, ours: str, theirs: str, seeds: Sequence[int]) -> None:
+    """Print how much more another agent needs: the ratio of medians over all seeds, with its interval.
+
+    There is none where half of the seeds do not solve; of those it is only known that they need more than they had.
+    """
+    one, others = groups(out, ours, seeds), groups(out, theirs, seeds)
+    base = [r["summary"] for part in one.values() for r in part]
+    for name, part in others.items():
+        other = [r["summary"] for r in part]
+        for key, what in (("cpu_seconds", "CPU seconds"), ("steps", "environment steps")):
+            a, b = ([float(s[key]) if s["solved"] else float("inf") for s in some] for some in (base, other))
+            told = f"\n{theirs} ({name}) / {ours}, {what} to solved: "
+            if a and np.isfinite([np.median(a), np.median(b)]).all():
+                told += "{:.2f} ({:.2f}–{:.2f})".format(*median_ratio(b, a))
+            else:
+                told += "no ratio"
+            print(
+                f"{told}; {int(np.isfinite(b).sum())} of {len(b)} and {int(np.isfinite(a).sum())} of {len(a)} solved",
+                end="",
+            )
+            spent = [s["spent"] for s in other if not s["solved"]]
+            if a and np.isfinite(np.median(a)) and spent and key == "cpu_seconds":
+                print(f"; those not solved had {min(spent) / np.median(a):.0f} times {ours}'s median", end="")
+            print(".")
+
+
+def seed_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print every seed: before any update, last and best checkpoint; the last one on held-out lengths and drivers."""
+    rows = []
+    for config, name, part in ((c, n, p) for c in configs for n, p in groups(out, c, seeds).items()):
+        for r in part:
+            if not r["history"]:
+                continue
+            s, unseen = r["summary"], r["held_out"]
+            when = [f"{s['cpu_seconds']:.1f}", f"{s['steps'] // 1000}"] if s["solved"] else ["–", "–"]
+            kinds = ("lengths", "drivers", "mixed")
+            far = [
+                "/".join(ring(unseen[k])[:2]) + (f" {unseen[k]['collisions']} coll." if unseen[k]["collisions"] else "")
+                for k in kinds
+            ]
+            ends = ["/".join(ring(r[k])) for k in ("fresh_last", "fresh_best")]
+            before = "/".join(ring(r["untrained"])[:2])
+            rows.append([config, name, str(r["seed"]), before, *when, *ends, *far])
+    figures = "ratio/std/time gap/collisions"
+    table(
+        ("agent", "trial", "seed", "before any update", "CPU s", "1000 steps", f"last: {figures}", f"best: {figures}",
+         "lengths 200–300 m", "drivers ±20 %, worst", "drivers mixed"), rows,
+    )  # fmt: skip
+
+
+def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print where the last checkpoints touch somebody, taking over in other traffic, without and with a failsafe.
+
+    A case is: rings with a collision of all rings, and the medians over seeds of worst speed ratio and deviation.
+    """
+    rows, environment, draws = [], environment_of("ring-apg"), (1,)
+    # A controller with memory drives one batch once, so it is made anew for every case.
+    by_hand = controllers(environment, LENGTHS, draws)
+    policies: dict[str, list[Any]] = {name: [by_hand[name]] for name in ("no command", "PI with saturation")}
+    for config in configs:
+        paths = [(out / config).glob(f"trial*/seed{seed}/training/last.pt") for seed in seeds]
+        policies[config] = [lambda path=path: common.load(path)[0] for found in paths for path in found]
+    for name, makers in policies.items():
+        for failsafe in (0.0, 3.0):
+            own = {**environment, "failsafe": failsafe}
+            figures = []
+            for case, warmup in ((own, 750), (own, 1750), (own, 3000), (mixed(own), 3000)):
+                found = [evaluate_ring(make(), case, warmup=warmup, draws=draws) for make in makers]
+                touched, rings = sum(r["collisions"] for r in found), sum(len(r["ratios"]) for r in found)
+                ratio, std = (statistics.median(r[k] for r in found) for k in ("speed_ratio", "speed_std"))
+                figures.append(f"{touched} of {rings} / {ratio:.3f} / {std:.2f}")
+            rows.append([name, str(len(makers)), f"{failsafe:g} m/s²" if failsafe else "none", *figures])
+    table(
+        ("agent", "seeds", "failsafe", "after 75 s (Flow's)", "after 175 s", "after 300 s (the test)",
+         "after 300 s, drivers mixed"), rows,
+    )  # fmt: skip
+
+
+def unshocked_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print what the last checkpoints do on the thirty fresh rings of their test without its shock."""
+    rows = []
+    for config in configs:
+        for path in (p for seed in seeds for p in sorted((out / config).glob(f"trial*/seed{seed}/training/last.pt"))):
+            policy, content = common.load(path)
+            test = as_judged(content["environment"], content["training"]["arguments"]["judged_in"])
+            found = evaluate(policy, {**test, "shock": 0.0}, draws=FRESH)
+            rows.append([config, *path.parts[-4:-2], *ring(found), "yes" if found["passed"] else "no"])
+    table(
+        ("agent", "trial", "seed", "worst ratio", "worst deviation", "smallest time gap", "collisions, of 30 rings",
+         "passes"), rows,
+    )  # fmt: skip
+
+
+def environment_of(config: str) -> Row:
+    """Return the environment of one of APG's configurations; the other agents of a task have the same."""
+    return common.load_agent(ROOT / "configs" / f"{config}.yaml", apg.Arguments, "apg").environment
+
+
+def follow_table(out: Path, configs: Sequence[str], leader: Path | None) -> None:
+    """Print fuel and energy behind the made-up leader and, where there are, measured ones."""
+    plain = environment_of("follow-apg")
+    roads: dict[str, Row] = {"made-up": plain}
+    if leader is not None and leader.exists():
+        roads["I-80"] = {**plain, "leader": str(leader)}
+    rows = []
+    for name, environment in roads.items():
+        human = evaluate_follow(None, environment)
+        rows.append(
+            [name, "the leader itself", "", "", f"{human['leader_litres']:.2f}", "", f"{human['leader_energy']:.3f}"]
+        )
+        rows.append([name, "IDM", "", *follow(human)])
+        for config in configs:
+            for path in sorted((out / config).glob("trial*/seed*/training/last.pt")):
+                seed = path.parents[1].name.removeprefix("seed")
+                rows.append([name, config, seed, *follow(evaluate_follow(common.load(path)[0], environment))])
+    table(
+        ("leader", "vehicle", "seed", "reward per step", "L/100 km", "L/100 km with those behind", "energy (J/kg/m)",
+         "smallest time gap (s)", "collisions"), [r + [""] * (9 - len(r)) for r in rows],
+    )  # fmt: skip
+
+
+def follow(r: Row) -> list[str]:
+    """Return the figures of one policy in task follow."""
+    return [
+        f"{r['reward']:.3f}", f"{r['litres']:.2f}", f"{r['litres_behind']:.2f}", f"{r['energy']:.3f}",
+        f"{r['time_gap']:.2f}", str(r["collisions"]),
+    ]  # fmt: skip
+
+
+def tables(
+    out: Path, search: dict[str, list[Row]], search_seeds: Sequence[int], seeds: Sequence[int], data: Path
+) -> None:
+    """Print everything that there are results for."""
+    compared = [c for c, trials in search.items() if len(trials) > 1]
+    rings, followers = ([c for c in search if c.startswith(task)] for task in ("ring", "follow"))
+    search_table(out, compared, search_seeds)
+    for task, configs in (("ring", rings), ("follow", followers)):
+        summary_table(out, configs, seeds)
+        for other in ("shac", "ppo", "sac"):
+            ratio_line(out, f"{task}-apg", f"{task}-{other}", seeds)
+    seed_table(out, rings, seeds)
+    follow_table(out, followers, data)
+
+
+UNTRAINED = range(8)
+"""Seeds of policies before any update, and after one."""
+MOST = 0.05
+"""Share of the random policies above which a task is no test."""
+
+
+def tests() -> dict[str, Row]:
+    """Return the environments by name: rings behind a failsafe or with real brakes, with a shock or without; follow."""
+    guarded = environment_of("ring-apg")
+    free = {**guarded, "failsafe": 0.0, "max_command": [-4.5, 2.6]}
+    shock = {"shock": 4.0}
+    return {
+        "failsafe": guarded,
+        "failsafe-shock": {**guarded, **shock},
+        "brakes": free,
+        "brakes-shock": {**free, **shock},
+        "follow": environment_of("follow-apg"),
+    }
+
+
+def begun(environment: Row, folder: Path, updates: int) -> list[Policy]:
+    """Return the policies of APG's configuration for this task before any update, or after one."""
+    made: list[Policy] = []
+    for seed in UNTRAINED:
+        arguments = common.load_agent(ROOT / "configs" / f"{environment['task']}-apg.yaml", apg.Arguments, "apg")
+        arguments.environment, arguments.seed, arguments.updates = environment, seed, 1
+        arguments.out = folder / f"seed{seed}"
+        torch.manual_seed(seed)
+        if updates:
+            if not (arguments.out / "last.pt").exists():
+                apg.train(arguments)
+            made.append(common.load(arguments.out / "last.pt")[0])
+        else:
+            made.append(common.begin(arguments, "apg")[0])
+    return made
+
+
+BEGUN = {"APG before any update": 0, "APG after one update": 1}
+UNTRAINED_NAMES = [f"seed {seed}" for seed in UNTRAINED]
+
+
+def on_ring(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
+    """Return what makes each row of a ring, by name."""
+    made: dict[str, Callable[[], Row]] = {
+        name: lambda make=make: alone(make, environment) for name, make in singles(environment).items()
+    }
+    for name, family in families(environment).items():
+        made[name] = lambda family=family: tried(family(), environment)
+    # Trained on the ring without a shock, as agents are.
+    training = {k: v for k, v in environment.items() if k != "shock"}
+    for name, updates in BEGUN.items():
+        made[name] = lambda updates=updates: tried(
+            networks(begun(training, folder, updates), UNTRAINED_NAMES), environment
+        )
+    return made
+
+
+def behind_leader(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
+    """Return what makes each row behind a recorded leader, by name. Policies begin as clones of IDM there."""
+
+    def judged(acts: Sequence[Act | None], names: Sequence[str] = ()) -> Row:
+        names = names or [str(i) for i in range(len(acts))]
+        return passing(names, lambda draws, some: [evaluate_follow(acts[i], environment, draws=draws) for i in some])
+
+    made: dict[str, Callable[[], Row]] = {"IDM (a human driver more)": lambda: judged([None], [""])}
+    for name, hidden in zip(RANDOM, HIDDEN, strict=True):
+        made[name] = lambda hidden=hidden: judged(random_policies(environment, 200, hidden))
+    for name, updates in BEGUN.items():
+        made[name] = lambda updates=updates: judged(begun(environment, folder, updates), UNTRAINED_NAMES)
+
+    def always(action: float) -> Act:
+        return lambda observation: observation.new_full((len(observation), 1), action)
+
+    actions = [round(0.1 * i - 1.0, 1) for i in range(21)]
+    made["constants"] = lambda: judged([always(x) for x in actions], [f"{x:g} of the range" for x in actions])
+    return made
+
+
+def reference(out: Path, names: Sequence[str]) -> None:
+    """Do what is missing, and print the table."""
+    columns: dict[str, dict[str, Row | None]] = {}
+    for name in names:
+        environment, folder = tests()[name], out / "reference" / name
+        columns[name] = {}
+        # With and without a shock policies are trained alike.
+        trained = out / "reference" / name.removesuffix("-shock")
+        makers = on_ring if environment["task"] == "ring" else behind_leader
+        for i, (row, make) in enumerate(makers(environment, trained / "one_update").items()):
+            print(f"{name}: {row}", flush=True)
+            columns[name][row] = once(folder / f"row{i}", lambda make=make, row=row: {"row": row, **make()})
+    every = dict.fromkeys(row for column in columns.values() for row in column)
+    rows = [[row, *(told(columns[n][row]) if row in columns[n] else "" for n in names)] for row in every]
+    table(
+        ("passed of tried; the best: ratio/std/time gap/collisions, of follow reward/time gap/collisions", *names), rows
+    )
+    for name in names:
+        found = [columns[name][row] for row in RANDOM]
+        done = [r for r in found if r is not None]
+        if len(done) == len(found):
+            passed, all_of = sum(len(r["passed"]) for r in done), sum(r["tried"] for r in done)
+            verdict = "a test" if passed <= MOST * all_of else "no test"
+            print(f"\n{name}: {passed} of {all_of} random policies pass, so it is {verdict}.")
+        for row, r in columns[name].items():
+            if r is not None and any(r["passed"]):
+                print(f"{name}, passed by {row}: {json.dumps(r['passed'][:12], ensure_ascii=False)}")
+
+
+def told(row: Row | None) -> str:
+    """Return a cell."""
+    if row is None:
+        return "another process works on it"
+    figures = row["figures"]
+    best = (
+        "/".join(ring(figures))
+        if "speed_ratio" in figures
+        else "{reward:.3f}/{time_gap:.2f}/{collisions}".format(**figures)
+    )
+    return f"{len(row['passed'])} of {row['tried']}; {best}"
+
+
+AGENTS = {"apg": "#1e5adc", "shac": "#1a7850", "ppo": "#b2182b", "sac": "#ef8a62"}
+TASKS = {"ring": "ring with a shock", "follow": "behind a recorded leader"}
+
+
+def shown(out: Path, config: str, seeds: Sequence[int]) -> list[Row]:
+    """Return the results, without failures, of the trial that is shown."""
+    parts = [[r for r in part if r["history"]] for part in groups(out, config, seeds).values()]
+
+    def rank(part: Sequence[Row]) -> tuple[int, int, float]:
+        summaries = [r["summary"] for r in part]
+        took = [s["cpu_seconds"] for s in summaries if s["solved"]]
+        spent = max((s["spent"] for s in summaries), default=0.0)
+        return len(took), len(part), -statistics.median(took) if took else spent
+
+    return max(parts, key=rank, default=[])
+
+
+def curve(axes: Axes, rows: Sequence[Row], name: str, colour: str) -> None:
+    """Draw the share of seeds that are not solved yet."""
+    summaries = [r["summary"] for r in rows]
+    solved = [s["cpu_seconds"] for s in summaries if s["solved"]]
+    spent = [s["spent"] for s in summaries if not s["solved"]]
+    left = ecdf(CensoredData(uncensored=solved, right=spent)).sf
+    x, y = [1.0, *left.quantiles], [1.0, *left.probabilities]
+    axes.step(x, y, where="post", color=colour, label=f"{name}: {len(solved)} of {len(rows)} seeds")
+    axes.plot(spent, left.evaluate(spent), "|", color=colour, markersize=10)
+
+
+def picture(out: Path, seeds: Sequence[int], path: Path) -> None:
+    """Write the picture, a panel per task."""
+    figure, panels = plt.subplots(1, len(TASKS), figsize=(10, 3.6), sharey=True, layout="constrained")
+    for axes, (task, title) in zip(panels, TASKS.items(), strict=True):
+        for agent, colour in AGENTS.items():
+            rows = shown(out, f"{task}-{agent}", seeds)
+            if rows:
+                curve(axes, rows, agent.upper(), colour)
+        axes.set(title=title, xscale="log", xlabel="CPU seconds of training", ylim=(-0.03, 1.03))
+        axes.legend(frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("share of seeds not solved yet")
+    figure.savefig(path, dpi=110)
+    print(path)
+
+
 def main() -> None:
     """Run, or show."""
     import argparse
@@ -293,31 +721,21 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train no more seeds than that")
     parser.add_argument("--times", type=int, default=1, help="train the seeds for so many times the updates")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
-    workers.add(parser)
+    add_executor(parser)
     options = parser.parse_args()
+    rings, seeds = [c for c in options.only if c.startswith("ring")], SEEDS[: options.seeds]
     if options.what == "table":
-        from agents.imitation import default_data
-        from benchmarks.agents_tables import show
-
-        show(options.out, SEARCH, SEARCH_SEEDS, SEEDS, default_data())
+        tables(options.out, SEARCH, SEARCH_SEEDS, SEEDS, default_data())
     elif options.what == "picture":
-        from benchmarks.agents_pictures import draw
-
-        draw(options.out, SEEDS, ROOT / "docs" / "agents_survival.png")
+        picture(options.out, SEEDS, ROOT / "docs" / "agents_survival.png")
     elif options.what == "takeover":
-        from benchmarks.agents_tables import takeover_table
-
-        takeover_table(options.out, [c for c in SEARCH if c.startswith("ring")], SEEDS[: options.seeds])
+        takeover_table(options.out, rings, seeds)
     elif options.what == "unshocked":
-        from benchmarks.agents_tables import unshocked_table
-
-        unshocked_table(options.out, [c for c in options.only if c.startswith("ring")], SEEDS[: options.seeds])
+        unshocked_table(options.out, rings, seeds)
     elif options.what == "reference":
-        from benchmarks import agents_reference
-
-        agents_reference.show(options.out.resolve(), options.tests, once)
+        reference(options.out.resolve(), options.tests)
     else:
-        with workers.of(options) as executor:
+        with executor_of(options) as executor:
             run(options.only, options.out.resolve(), options.seeds, options.trial, executor, options.times)
 
 

@@ -4,6 +4,7 @@ Every set is generated from a fresh seed by idm_env.data.synthetic, whose code s
 tool sees positions, speeds and lengths only. One line of JSON per set is kept, so that a run goes on where it stopped:
 
     python benchmarks/discovery.py --sets 2 --clean 100 --jobs 2 --out /tmp/discovery_benchmark.jsonl
+    python benchmarks/discovery.py --pictures docs    # those of docs/closing-the-loop.md, from data made here
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 
-from benchmarks import workers  # noqa: E402
+from benchmarks import add_executor, kept_rows, rows_of  # noqa: E402
 
 RESPONSE = {"delay", "lag"}
 TRUE = {
@@ -296,22 +297,41 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def pictures(folder: Path) -> None:
+    """Draw what one discovery tried, who looks like whom, and gaps before and after."""
+    from idm_env.data import synthetic
+    from idm_env.discovery import discover, pictures
+
+    found = discover(synthetic.generate(3, effect="brake_light", ou=0.05)[0])
+    drawn = {
+        "ranking": pictures.ranking(found.rounds[0]), "look_alikes": pictures.look_alikes(found),
+        "gaps": pictures.gaps(found),
+    }  # fmt: skip
+    for name, figure in drawn.items():
+        assert figure is not None
+        figure.savefig(folder / f"discovery_{name}.png", dpi=90, bbox_inches="tight")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", type=int, default=1, help="sets of every kind with an effect")
     parser.add_argument("--clean", type=int, default=6, help="sets without an effect, of every kind of noise")
     parser.add_argument("--few", type=int, default=0, help="sets without an effect, of 4 to 9 runs")
-    workers.add(parser, "processes")
+    add_executor(parser, "processes")
     parser.add_argument("--first-seed", type=int, default=70_000)
     parser.add_argument("--only", default="", help="part of the keys of the sets to run, such as 'one|delay'")
     parser.add_argument("--out", type=Path, default=Path("discovery_benchmark.jsonl"))
+    parser.add_argument("--pictures", type=Path, help="draw the pictures of the documents into this folder, no more")
     arguments = parser.parse_args()
-    done = workers.kept(arguments.out, "key")
+    if arguments.pictures is not None:
+        pictures(arguments.pictures)
+        return
+    done = kept_rows(arguments.out, "key")
     wanted = [
         j for j in jobs(arguments.sets, arguments.clean, arguments.first_seed, arguments.few) if arguments.only in j.key
     ]
     missing = [j for j in wanted if j.key not in done]
-    for number, row in enumerate(workers.rows(measure, missing, arguments.out, arguments), 1):
+    for number, row in enumerate(rows_of(measure, missing, arguments.out, arguments), 1):
         done[row["key"]] = row
         print(f"{number}/{len(missing)} {row['key']}: {row['verdict']} {row['found']}", file=sys.stderr)
     print(table([done[j.key] for j in wanted if j.key in done]))

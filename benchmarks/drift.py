@@ -26,7 +26,6 @@ import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import torch  # noqa: E402
 from scipy.stats import energy_distance  # noqa: E402
 
-from benchmarks import drift_gru  # noqa: E402
 from idm_env.data import Episode, episodes, load  # noqa: E402
 from idm_env.drift import forecast  # noqa: E402
 from idm_env.drift.estimate import Estimate, estimate, usual  # noqa: E402
@@ -329,13 +328,6 @@ def i80(folder: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[
     past, count = residuals(plain, mine), round(HORIZONS[-1] / dt)
     on = going_on(past, starts, autoregression(trained, theta), dt, count)
     rows.score(f"IDM + AR({ORDER})", *by_residual(plain, mine, starts, on))
-    lengths = np.array([len(e) for e in train])
-    nets = drift_gru.trained(
-        residuals(trained, theta), training.gap.numpy(), training.speed.numpy(), lengths, count
-    )  # fmt: skip
-    on = drift_gru.ahead(nets, past, batch.gap.numpy(), batch.speed.numpy(), starts)
-    rows.score("IDM + GRU", *by_residual(plain, mine, starts, on))
-    say("nets trained")
     for name, drifts in MODELS.items():
         for noise in NOISES if choose else (noises[name],):
             label = f"{name}, noise {noise[0]:g} m, {noise[1]:g} m/s"

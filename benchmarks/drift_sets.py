@@ -30,7 +30,7 @@ import polars as pl  # noqa: E402
 import torch  # noqa: E402
 from scipy.stats import t as student  # noqa: E402
 
-from benchmarks import workers  # noqa: E402
+from benchmarks import add_executor, kept_rows, rows_of  # noqa: E402
 from idm_env.data import Trajectories, episodes  # noqa: E402
 from idm_env.drift.estimate import estimate, usual  # noqa: E402
 from idm_env.drift.kinds import behind_a_record, tell  # noqa: E402
@@ -183,15 +183,15 @@ def main() -> None:
     only = parser.add_mutually_exclusive_group()
     only.add_argument("--alone", action="store_true", help="estimate only what is hidden, on sets with drift")
     only.add_argument("--steady", action="store_true", help="only sets without drift, a fifth of --sets")
-    workers.add(parser)
+    add_executor(parser)
     arguments = parser.parse_args()
-    done = workers.kept(arguments.out, "key")
+    done = kept_rows(arguments.out, "key")
     seeds: Sequence[int] = range(arguments.first_seed, arguments.first_seed + arguments.sets)
     if arguments.alone or arguments.steady:
         seeds = [s for s in seeds if bool(HIDDEN[s % len(HIDDEN)][1]) == arguments.alone]
     wanted = [(s, arguments.alone, arguments.drivers, arguments.seconds) for s in seeds]
     missing = [part for part in wanted if key(part) not in done]
-    for row in workers.rows(scored, missing, arguments.out, arguments):
+    for row in rows_of(scored, missing, arguments.out, arguments):
         done[row["key"]] = row
         print(f"{row['key']}: {row['hidden']}, told {row['one_of']}", file=sys.stderr, flush=True)
     print(table([done[key(part)] for part in wanted]))

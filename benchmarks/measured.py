@@ -22,7 +22,7 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import polars as pl  # noqa: E402
 
-from benchmarks import workers  # noqa: E402
+from benchmarks import add_executor, kept_rows, rows_of  # noqa: E402
 from idm_env.data import load  # noqa: E402
 from idm_env.discovery import Discovery, discover  # noqa: E402
 from idm_env.progress import OnProgress, silent  # noqa: E402
@@ -150,12 +150,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("IDM_ENV_DATA", "../shared/data")))
     parser.add_argument("--out", type=Path, default=Path("measured.jsonl"))
     parser.add_argument("--only", default="", help="part of the names of the cases to run")
-    workers.add(parser)
+    add_executor(parser)
     arguments = parser.parse_args()
-    done = workers.kept(arguments.out, "case")
+    done = kept_rows(arguments.out, "case")
     wanted = {n: c for n, c in cases(arguments.data).items() if arguments.only in n}
     missing = [(name, arguments.data, case) for name, case in wanted.items() if name not in done]
-    for found in workers.rows(timed, missing, arguments.out, arguments):
+    for found in rows_of(timed, missing, arguments.out, arguments):
         done[found["case"]] = found
         print(f"{found['case']}: {found['verdict']}", file=sys.stderr)
     print(table([done[n] for n in wanted if n in done]))

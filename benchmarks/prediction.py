@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 
-from benchmarks import workers
+from benchmarks import add_executor, executor_of
 from idm_env.data.scenario import Scenario
 from idm_env.data.womd import scenarios
 from idm_env.prediction.files import OURS, case_of
@@ -97,11 +97,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--shares", action="store_true", help="print the shares fitted to all scenes, and nothing else")
-    workers.add(parser)
+    add_executor(parser)
     options = parser.parse_args()
     begin = time.perf_counter()
     parts = [scenario for path in options.files for scenario in scenarios(path)]
-    with workers.of(options) as executor:
+    with executor_of(options) as executor:
         scenes = [scene for _, scene in sorted(executor.map(known_agents, parts), key=itemgetter(0))]
     if options.shares:
         for (kind, pace), values in fit_shares(one.seen for scene in scenes for one in scene).items():

@@ -1,6 +1,7 @@
 """Filtering and reconstruction side by side with every baseline, on vehicles that no tuning has seen; and their times.
 
     python -m benchmarks.trajectories --data FOLDER [--part filter|reconstruct|time] [--executor processes]
+    python -m benchmarks.trajectories --pictures docs    # those of docs/trajectories.md, from data made here
 
 FOLDER holds the measured files named in ``FILES``. Baselines are tuned on the truth of every other vehicle, for each
 figure by itself; ours sees no truth: its noise is fitted to the noisy positions of those same vehicles. The published
@@ -10,6 +11,7 @@ recipe is run as published; its speed is compared with a direct implementation o
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import time
 from collections.abc import Callable
@@ -19,14 +21,20 @@ import numpy as np
 import polars as pl
 import torch
 
-from benchmarks import workers
+from benchmarks import add_executor, executor_of
+from idm_env.data import synthetic
+from idm_env.data.scenario import Agent, Control, Lane, Scenario
+from idm_env.prediction.pictures import scene_picture
+from idm_env.prediction.predict import predict
+from idm_env.prediction.scene import Scene
 from idm_env.progress import OnProgress, silent
 from idm_env.trajectories import baselines, paper
 from idm_env.trajectories.noise import SPARSE_WHITE_M, fit_noise
 from idm_env.trajectories.recipe import clock_of, overlaps, recipe
+from idm_env.trajectories.report import before_and_after
 from idm_env.trajectories.scores import Motion, Tally
 from idm_env.trajectories.smoother import SPARSE
-from idm_env.trajectories.tracks import Pieces, Track, read_table
+from idm_env.trajectories.tracks import Pieces, Track, from_frame, read_table
 
 RAW, CLEAN = "ngsim_i80_rawlike.csv.gz", "ngsim_i80_lanes.parquet"
 FILES = {
@@ -222,19 +230,69 @@ def timing(count: int, seconds: float) -> None:
     print(f"  ratio                       : {layer / own:8.1f}")
 
 
+def noisy_tracks() -> list[Track]:
+    """Return generated drivers whose positions carry noise correlated over 0.3 s, white noise, and jumps."""
+    made, _ = synthetic.generate(3, runs=2, followers=4, seconds=60.0)
+    rng = np.random.default_rng(0)
+    tracks = []
+    for track in Pieces(from_frame(made.table.select("run_id", "vehicle_id", "leader_id", "time_s", "position_m"))):
+        fade, noise = np.exp(-0.1 / 0.3), np.empty(len(track))
+        noise[0] = 0.3 * rng.normal()
+        for k in range(1, len(noise)):
+            noise[k] = fade * noise[k - 1] + 0.3 * np.sqrt(1 - fade * fade) * rng.normal()
+        noise += 0.1 * rng.normal(size=len(noise))
+        noise[rng.integers(0, len(noise), 2)] += 3.0
+        tracks.append(dataclasses.replace(track, position_m=track.position_m + noise))
+    return tracks
+
+
+def crossing() -> Scenario:
+    """Return a crossing with a stop sign, and a vehicle that halts at it and goes on to the left."""
+    east = Lane(1, np.array([[-80.0, 0.0], [-4.0, 0.0]]), exits=(2, 3))
+    across = Lane(2, np.array([[-4.0, 0.0], [60.0, 0.0]]), exits=())
+    angle = np.linspace(0, np.pi / 2, 12)
+    bend = np.stack([-4.0 + 8.0 * np.sin(angle), 8.0 - 8.0 * np.cos(angle)], axis=1)
+    left = Lane(3, np.concatenate([bend, [[4.0, 60.0]]]), exits=())
+    path = np.concatenate([east.line, left.line])
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    speed = np.interp(np.arange(91), [0, 10, 50, 60, 91], [10.5, 10.0, 0.3, 0.3, 5.0])
+    along = 76.0 - 2.5 - 21.4 - 10.3 + np.concatenate([[0.0], np.cumsum(0.1 * speed[:-1])])
+    position = np.stack([np.interp(along, length, path[:, i]) for i in (0, 1)], axis=1)
+    step = np.gradient(position, axis=0)
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    agent = Agent(1, "vehicle", 4.6, 1.9, position, heading, velocity, np.ones(91, bool))
+    return Scenario(
+        "a crossing", (agent,), (east, across, left), (0,), controls=(Control("sign", np.array([-6.0, -4.0])),)
+    )
+
+
+def pictures(folder: Path) -> None:
+    """Draw a filtered track before and after, and the futures of a vehicle at a stop sign beside what it did."""
+    tracks = noisy_tracks()
+    filtered = recipe(tracks, 0.1, fit_noise([(t.time_s, t.position_m) for t in tracks], 0.1))
+    before_and_after(filtered[2].track, filtered[2].motion).savefig(folder / "filtering.png", dpi=90)
+    figure, _ = scene_picture(scene := crossing(), predict(Scene(scene), 0))
+    figure.savefig(folder / "prediction.png", dpi=90)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, help="folder of the measured files")
     parser.add_argument("--part", choices=("filter", "reconstruct", "time"))
     parser.add_argument("--tracks", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=60.0)
-    workers.add(parser)
+    add_executor(parser)
+    parser.add_argument("--pictures", type=Path, help="draw the pictures of the documents into this folder, no more")
     options = parser.parse_args()
+    if options.pictures is not None:
+        pictures(options.pictures)
+        return
     if options.part in (None, "time"):
         timing(options.tracks, options.seconds)
     if options.data is None:
         return
-    with workers.of(options) as executor:
+    with executor_of(options) as executor:
         if options.part in (None, "filter"):
             for _, text in executor.map(filtering, [(options.data, number) for number in (1, 2)]):
                 print(text, flush=True)

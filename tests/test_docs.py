@@ -213,7 +213,8 @@ def test_blocks_are_found_and_markers_give_a_reason() -> None:
 def test_files_that_documents_name_are_there(path: Path) -> None:
     """A file that was renamed or deleted is not sent to."""
     text = path.read_text(encoding="utf-8")
-    named = set(re.findall(r"\b((?:idm_env|tests|benchmarks|examples|configs|agents|docs)/[\w/.-]+\.\w+)", text))
+    folders = "idm_env|tests|benchmarks|studies|examples|configs|agents|docs"
+    named = set(re.findall(rf"\b((?:{folders})/[\w/.-]+\.\w+)", text))
     named |= {f"{path.parent.relative_to(ROOT)}/{link}" for link in re.findall(r"\]\((?!http|#)([^)#]+)", text)}
     made = re.compile(r"docs/(?:jobs/\.\./)?(?:generated|gallery)/")  # by `make docs`; see test_pages.py
     missing = sorted(n for n in named if not made.match(n) and not (ROOT / n).exists())

@@ -51,9 +51,7 @@ def outside(words: list[str]) -> str | None:
     file = ROOT / (words[2].replace(".", "/") + ".py" if words[1] == "-m" else words[1])
     if not file.exists():
         return f"no {file}"
-    text = "".join(
-        f.read_text() for f in (file, ROOT / "agents" / "common.py", ROOT / "benchmarks" / "agents_tables.py")
-    )
+    text = "".join(f.read_text() for f in (file, ROOT / "agents" / "common.py", ROOT / "benchmarks" / "__init__.py"))
     options = [w.partition("=")[0].removeprefix("--") for w in words if w.startswith("--")]
     return next(
         (f"no option --{o} of {file.name}" for o in options if o.replace("-", "_") not in text and o not in text), None

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from benchmarks.opencf_forecast import FIRST, forecasts, submission
-from benchmarks.public_benchmarks import BASELINES, Event, events, follow, lost, opencf, transfollower
-
-from benchmarks.public_benchmarks import Clip, RawIDM  # isort: skip
+from benchmarks.public_benchmarks import BASELINES, Clip, Event, RawIDM, events, follow, lost, opencf, transfollower
 
 
 def test_the_published_idm_trajectories_come_back(measured) -> None:  # type: ignore[no-untyped-def]
@@ -61,28 +56,3 @@ def test_a_collision_costs_what_it_loses() -> None:
     right[0][0][:] = one.follower[1:] - 6.0
     found = lost([one], right)
     assert found.collisions == 0 and found.spacing == pytest.approx(36.0 * 49 / 50)
-
-
-def test_a_submission_has_the_benchmarks_columns_and_times() -> None:
-    """Six samples from 3.0 s on; acceleration is the change of speed, the first one from the last known speed."""
-    one = replace(event(40), name="pair007")
-    made = [(np.arange(60.0).reshape(6, 10), np.full((6, 10), 5.2))]
-    table = submission([one], made)
-    assert table.columns == [
-        "CF_pair_id", "sample_id", "Time", "follower_dist", "follower_speed", "follower_acceleration"
-    ]  # fmt: skip
-    assert table["CF_pair_id"].unique().to_list() == ["test_7"] and table.height == 60
-    first = table.filter(table["sample_id"] == 3)
-    assert first["Time"].to_list() == [round(3.0 + 0.1 * k, 1) for k in range(10)]
-    assert first["follower_dist"].to_list() == list(range(30, 40))
-    assert first["follower_acceleration"].to_numpy() == pytest.approx([2.0] + 9 * [0.0])
-
-
-def test_a_forecast_of_a_pair_begins_where_the_history_ends() -> None:
-    """Behind a leader at a steady 5 m/s, 12 m ahead: six different samples, none of which jumps or collides."""
-    time = 0.1 * np.arange(60)
-    items = [Event(f"pair{k:03}", 12.0 + k + 5.0 * time, 0 * time + 5.0, 5.0 * time, 0 * time + 5.0) for k in range(3)]
-    for one, (position, speed) in zip(items, forecasts(items, FIRST, count=12), strict=True):
-        assert position.shape == speed.shape == (6, 30)
-        assert np.abs(position[:, 0] - one.follower[FIRST + 1]).max() < 0.1
-        assert (position < one.leader[FIRST + 1 :]).all() and len(np.unique(position[:, -1])) == 6

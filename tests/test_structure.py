@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 import pytest
@@ -181,6 +183,29 @@ def test_a_path_is_never_taken_for_a_pattern(path: Path) -> None:
         }:
             told = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
             assert told.get("glob") == "False", f"line {node.lineno} without glob=False"
+
+
+STUDIES = sorted(p for p in (ROOT / "studies").iterdir() if p.is_dir())
+
+
+@pytest.mark.parametrize("folder", STUDIES, ids=lambda p: p.name)
+def test_a_study_is_frozen_with_its_date_its_commit_and_its_outcome(folder: Path) -> None:
+    """And with its script, its table, and every file and page that it links to."""
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    day = date.fromisoformat(folder.name[:10])
+    assert f"\nDate: {day.day} {day:%B %Y}. " in text and re.search(r"\b[Cc]ommit:? [0-9a-f]{7}\b", text)
+    assert "\n**Outcome.** " in text and "\n| --- |" in text.replace("|---|", "| --- |")
+    assert list(folder.glob("*.py"))
+    missing = [to for to in re.findall(r"\]\((?!http)([^)#]+)", text) if not (folder / to).exists()]
+    assert not missing
+
+
+def test_nobody_imports_a_study() -> None:
+    """What is frozen is run at its commit."""
+    folders = ("idm_env", "agents", "benchmarks", "examples", "tests")
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    assert len(files) > 300
+    assert not [path for path in files if re.search(r"^\s*(?:from|import) studies\b", path.read_text(), re.MULTILINE)]
 
 
 def test_importing_the_package_imports_no_torch_and_registers_the_environment() -> None:

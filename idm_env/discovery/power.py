@@ -3,7 +3,7 @@
 In a report nothing is simulated anew: the effect is planted into the predictions of the fitted drivers through their
 responses to it, every driver's own parameters following, on top of their own errors, drift included, whose signs are
 drawn anew for every run. Each draw goes through what decides on an addition: strengths from other runs, gains, the
-level that the test over the whole list asks for, the least gain and the lockbox. ``python -m benchmarks.planted``
+level that the test over the whole list asks for, the least gain and the lockbox. ``studies/2026-11-22-planted-effects``
 plants into simulations, lets the whole tool look at them, and says how often it finds what is said here.
 """
 
@@ -31,7 +31,7 @@ FACTORS = (1e-3, 1e2)
 CLOSE = 1.05
 BEYOND_LINES = 1.5
 """What lines leave out: candidates that show the same effect raise the level of the test along with it, and errors on
-runs kept back have their say. Held against simulations by ``benchmarks.planted`` (docs/closing-the-loop.md)."""
+runs kept back have their say. Held against simulations in ``studies/2026-11-22-planted-effects``."""
 
 
 @dataclass(frozen=True)

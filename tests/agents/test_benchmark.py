@@ -109,12 +109,10 @@ def test_searches_of_the_compared_are_equal_and_options_exist(benchmark):
 
 
 def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, monkeypatch, capsys):
-    from agents import evaluate
     from agents.common import save
     from agents.policy import Policy
-    from benchmarks.agents_tables import environment_of, takeover_table
 
-    judged = []
+    environment_of, judged = benchmark.environment_of, []
 
     def judge(act, environment, warmup, draws):
         drawn = isinstance(environment["parameters"]["idm"]["time_gap"], list)
@@ -122,9 +120,9 @@ def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, 
         judged.append((name, environment["failsafe"], drawn, warmup))
         return {**LAST, "collisions": int(not environment["failsafe"]), "ratios": [1.0] * 6}
 
-    monkeypatch.setattr(evaluate, "evaluate_ring", judge)
+    monkeypatch.setattr(benchmark, "evaluate_ring", judge)
     save(tmp_path / "ring-apg/trial2/seed1/training/last.pt", Policy(3), "apg", environment_of("ring-apg"), {})
-    takeover_table(tmp_path, ["ring-apg"], (0, 1))
+    benchmark.takeover_table(tmp_path, ["ring-apg"], (0, 1))
     cases = [(False, 750), (False, 1750), (False, 3000), (True, 3000)]
     names = ("no_command", "PISaturation", "Policy")
     assert judged == [(name, b, *case) for name in names for b in (0.0, 3.0) for case in cases]
@@ -138,8 +136,6 @@ def test_the_seeds_of_a_given_trial_need_no_search(benchmark, tmp_path):
 
 
 def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tmp_path, monkeypatch, capsys):
-    from benchmarks import agents_reference
-
     made = []
 
     def makers(environment, folder):
@@ -148,23 +144,22 @@ def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tm
             return {"tried": 10, "six": len(passed), "passed": passed, "best": "b", "figures": LAST}
 
         easy = ["1", "2"] if not environment.get("shock") else []
-        return {name: lambda name=name: row(name, easy) for name in ("constants", *agents_reference.RANDOM)}
+        return {name: lambda name=name: row(name, easy) for name in ("constants", *benchmark.RANDOM)}
 
-    monkeypatch.setattr(agents_reference, "on_ring", makers)
+    monkeypatch.setattr(benchmark, "on_ring", makers)
     for _ in range(2):
-        agents_reference.show(tmp_path, ("failsafe", "failsafe-shock"), benchmark.once)
+        benchmark.reference(tmp_path, ("failsafe", "failsafe-shock"))
     assert len(made) == 6 and {shock for _, shock in made} == {0.0, 4.0}
     printed = capsys.readouterr().out
     assert "| constants | 2 of 10; 1.000/0.10/1.00/0 | 0 of 10; 1.000/0.10/1.00/0 |" in printed
     assert "failsafe: 4 of 20 random policies pass, so it is no test." in printed
     assert "failsafe-shock: 0 of 20 random policies pass, so it is a test." in printed
-    assert set(benchmark.TESTS) == set(agents_reference.tests())
+    assert set(benchmark.TESTS) == set(benchmark.tests())
 
 
 def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark, monkeypatch):
     from agents import evaluate
     from agents.policy import Policy
-    from benchmarks import agents_reference
 
     asked = []
 
@@ -173,18 +168,17 @@ def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark
         reward = 0.7 if act is None else 0.9
         return {"reward": reward, "time_gap": 1.0, "collisions": 0, "passed": reward >= evaluate.FOLLOW_REWARD}
 
-    monkeypatch.setattr(agents_reference, "evaluate_follow", judge)
-    monkeypatch.setattr(agents_reference, "random_policies", lambda environment, count, hidden: [Policy(3)] * 2)
-    rows = agents_reference.behind_leader(agents_reference.tests()["follow"], Path())
+    monkeypatch.setattr(benchmark, "evaluate_follow", judge)
+    monkeypatch.setattr(benchmark, "random_policies", lambda environment, count, hidden: [Policy(3)] * 2)
+    rows = benchmark.behind_leader(benchmark.tests()["follow"], Path())
     alone = rows["IDM (a human driver more)"]()
     assert (alone["tried"], alone["passed"]) == (1, [])
     assert rows["random networks"]()["passed"] == ["0", "1"] and asked == [(0,)] * 3 + [(1, 2, 3, 4, 5)] * 2
     assert rows["constants"]()["tried"] == 21
 
 
-def test_the_trial_that_solves_most_is_drawn_or_that_of_most_seeds_the_soonest_or_longest(tmp_path):
-    from benchmarks.agents_pictures import shown
-
+def test_the_trial_that_solves_most_is_drawn_or_that_of_most_seeds_the_soonest_or_longest(benchmark, tmp_path):
+    shown = benchmark.shown
     for trial, seed, spent in ((0, 0, 40.0), (1, 0, 90.0), (1, 1, 0.0), (2, 0, 10.0), (2, 1, 20.0)):
         folder = tmp_path / "ring-ppo" / f"trial{trial}" / f"seed{seed}"
         folder.mkdir(parents=True)
@@ -206,14 +200,12 @@ def test_the_trial_that_solves_most_is_drawn_or_that_of_most_seeds_the_soonest_o
         assert drawn() == [(trial, 0)]  # it solves it, and then sooner
 
 
-def test_the_share_not_solved_yet_counts_those_that_never_solve(tmp_path):
+def test_the_share_not_solved_yet_counts_those_that_never_solve(benchmark):
     import matplotlib.pyplot as plt
-
-    from benchmarks.agents_pictures import curve
 
     rows = [{"summary": {"solved": s < 9.0, "cpu_seconds": s, "spent": 20.0}} for s in (2.0, 4.0, 9.0, 9.0)]
     _, axes = plt.subplots()
-    curve(axes, rows, "X", "red")
+    benchmark.curve(axes, rows, "X", "red")
     line = axes.lines[0]
     assert list(zip(line.get_xdata(), line.get_ydata(), strict=True)) == [(1, 1), (2, 0.75), (4, 0.5), (20, 0.5)]
     assert line.get_label() == "X: 2 of 4 seeds"
@@ -239,10 +231,8 @@ def test_an_interrupted_training_is_resumed(benchmark, tmp_path):
     assert ["--resume" in command for command in benchmark.trained] == [True, False]
 
 
-def test_a_ratio_of_medians_has_an_interval_and_counts_those_that_never_solve():
-    from benchmarks.agents_tables import median_ratio
-
-    far = float("inf")
+def test_a_ratio_of_medians_has_an_interval_and_counts_those_that_never_solve(benchmark):
+    far, median_ratio = float("inf"), benchmark.median_ratio
     assert median_ratio([20.0], [10.0, 10.0]) == (2.0, 2.0, 2.0)
     # The median of two seeds is that of the pairs 1 1, 1 3, 3 1, 3 3: each a quarter.
     assert median_ratio([1.0, 3.0], [1.0]) == (2.0, 1.0, 3.0)
@@ -250,9 +240,7 @@ def test_a_ratio_of_medians_has_an_interval_and_counts_those_that_never_solve():
     assert median_ratio([far, far, 2.0], [1.0])[0] == far
 
 
-def test_what_never_solved_is_told_with_what_it_had(tmp_path, capsys):
-    from benchmarks.agents_tables import ratio_line
-
+def test_what_never_solved_is_told_with_what_it_had(benchmark, tmp_path, capsys):
     def result(config, seed, solved, times=1):
         summary = {"solved": solved, "spent": 40.0 * times, "cpu_seconds": 20.0 + seed, "steps": 1000}
         folder = tmp_path / config / f"trial0x{times}" / f"seed{seed}"
@@ -264,8 +252,8 @@ def test_what_never_solved_is_told_with_what_it_had(tmp_path, capsys):
         result("ring-apg", seed, True)
         result("ring-ppo", seed, False, times=5)
     result("ring-sac", 0, True)
-    ratio_line(tmp_path, "ring-apg", "ring-ppo", range(10))
-    ratio_line(tmp_path, "ring-apg", "ring-sac", range(10))
+    benchmark.ratio_line(tmp_path, "ring-apg", "ring-ppo", range(10))
+    benchmark.ratio_line(tmp_path, "ring-apg", "ring-sac", range(10))
     told = capsys.readouterr().out
     assert "ring-ppo (0, 5 times) / ring-apg, CPU seconds to solved: no ratio; 0 of 3 and 3 of 3 solved; " in told
     assert "those not solved had 10 times ring-apg's median." in told

@@ -11,7 +11,7 @@ from PIL import Image
 from agents import common, evaluate
 from agents.classical import FollowerStopper, PISaturation, Seen, controllers, no_command, seen
 from agents.environments import task_of
-from agents.evaluate import solved_at
+from agents.evaluate import kinds, solved_at
 from agents.policy import Policy
 from agents.rollout import Driven, drive, moments, ring_start, uniform_speed
 from idm_env.effects.idm import equilibrium_speed
@@ -276,3 +276,12 @@ def test_a_road_of_several_lanes_is_drawn_with_a_panel_for_each(tmp_path, monkey
 def test_a_wrong_file_is_told_in_one_line(tmp_path):
     with pytest.raises(SystemExit, match=r"error: .*none\.pt is not a file"):
         evaluate.main([str(tmp_path / "none.pt")])
+
+
+def test_a_kind_of_drivers_is_what_its_name_says():
+    made = kinds({"task": "ring", "parameters": {"idm": {"time_gap": 1.5}}})
+    assert len(made) == 10
+    for name, factor in (("time_gap −20 %", 0.8), ("time_gap +20 %", 1.2)):
+        start = ring_start(made[name], (230.0,), 5)
+        assert float(start.params["idm"]["time_gap"]) == pytest.approx(1.5 * factor)
+        assert float(start.params["idm"]["max_accel"]) == 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 
 import pytest
@@ -10,9 +9,7 @@ import torch
 
 from agents import apg, common, evaluate, ppo
 from agents.environments import human_driving, make_env, task_of
-from agents.policy import Policy
-from agents.rollout import episodes_start, ring_start, uniform_speed
-from benchmarks import agents_lanes, agents_shared
+from agents.rollout import episodes_start
 
 FREE = {"task": "bottleneck", "inflow": 720.0, "vehicles": 40, "controlled": [4], "failsafe": 3.0}
 
@@ -29,16 +26,6 @@ def test_in_free_traffic_what_comes_goes(short):
     assert all(abs(flow - 720.0) <= 2 * 60.0 for flow in found["outflows"])
     assert found["queued"] == 0 and found["passed"] and 20.0 < found["speed"] < 32.0
     assert found["outflow"] == pytest.approx(sum(found["outflows"]) / 2)
-
-
-def test_agents_of_one_name_are_rows_of_their_own_tasks(tmp_path):
-    """Folders are ``trained/merge/apg-seed0`` and ``trained/bottleneck/apg-seed0``."""
-    paths = []
-    for task, seconds in (("merge", 3.0), ("bottleneck", 4.0)):
-        paths.append(tmp_path / task / "apg-seed0" / "last.pt")
-        common.save(paths[-1], Policy(3, (4,)), "apg", {"task": task}, {"cpu_seconds": seconds})
-    rows = [list(agents_lanes.trained({"task": task}, paths)) for task in ("merge", "bottleneck")]
-    assert rows == [["trained: apg-seed0, 3 CPU s"], ["trained: apg-seed0, 4 CPU s"]]
 
 
 def test_policies_that_drive_together_drive_as_alone(monkeypatch):
@@ -71,93 +58,6 @@ def test_apg_learns_in_traffic_that_flows(quick, monkeypatch):
     before, _ = common.begin(apg.Arguments(**{**quick, "environment": environment}), "apg")
     assert all(bool(torch.isfinite(x).all()) for x in policy.parameters())
     assert not torch.equal(policy.body[-1].weight, before.body[-1].weight)
-
-
-def test_rows_of_lanes_are_driven_once(tmp_path, monkeypatch, capsys):
-    row = {
-        "speed": 9.0,
-        "outflow": 1700.0,
-        "queued": 40.0,
-        "reward": 0.2,
-        "collisions": 1,
-        "outflows": [1600.0, 1800.0],
-    }
-    driven = []
-
-    def drive(family, environment):
-        driven.append(environment["task"])
-        return {name: {**row, "reward": 0.1 * i} for i, name in enumerate(family or {"IDM": None})}
-
-    monkeypatch.setattr(agents_lanes, "driven", drive)
-    monkeypatch.setattr(
-        agents_lanes, "networks", lambda environment: {"random network 0": None, "random network 1": None}
-    )
-    monkeypatch.setattr("sys.argv", ["agents_lanes", "--out", str(tmp_path)])
-    agents_lanes.main()
-    before = len(driven)
-    agents_lanes.main()
-    assert before == len(driven) == 4 * len(agents_lanes.TASKS)
-    told = capsys.readouterr().out
-    assert "| bottleneck | best of 6: always 1 m/s² | 9.0 | 1700 (1600–1800) | 40 | 0.500 | 1 |" in told
-    assert "best of 2: random network 1" in told
-
-
-def test_shared_policies_are_judged_on_rings_as_long_as_their_vehicles_need(tmp_path, monkeypatch, capsys):
-    judged = []
-
-    def judge(act, environment, draws):
-        task = task_of(environment)  # refused where vehicles do not fit the ring
-        judged.append((task.vehicles, len(task.agents), act is None))
-        return {"speed_ratio": 1.0, "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}
-
-    monkeypatch.setattr(agents_shared, "evaluate_ring", judge)
-    monkeypatch.setattr(agents_shared, "oracle", lambda name, environment: name)
-    monkeypatch.setattr(agents_shared, "UNTAUGHT", {"always 0 m/s²": lambda environment: "still"})
-    monkeypatch.setattr(agents_shared.common, "load", lambda path, task: (path, {}))
-    path = tmp_path / "ring-apg/trial0/seed1/training/last.pt"
-    monkeypatch.setattr("sys.argv", ["agents_shared", "--out", str(tmp_path), "--checkpoints", str(path)])
-    for _ in range(2):
-        agents_shared.main()
-    assert judged.count((110, 2, True)) == 1 and (110, 5, True) not in judged
-    assert judged.count((110, 5, False)) == 2 + len(agents_shared.ORACLES)
-    assert "| 110 | 5 (4.5 %) | ring-apg/trial0/seed1 | 1.000 | 0.10 | 1.00 | 0 | yes |" in capsys.readouterr().out
-    assert json.loads((tmp_path / "22-1/IDM-for-all/result.json").read_text())["passed"]
-
-
-def test_what_has_learned_nothing_drives_every_agent(monkeypatch):
-    environment = {
-        "task": "ring",
-        "vehicles": 44,
-        "controlled": 3,
-        "length": [440.0, 540.0],
-        "failsafe": 3.0,
-        "warmup": 9,
-    }
-    monkeypatch.setattr(
-        agents_shared, "judged_rings", lambda *_, **__: ring_start(environment, (440.0, 500.0), warmup=9)
-    )
-    seen = ring_start(environment, (440.0, 500.0), warmup=9)
-    observed = seen.task.observe(seen.world).flatten(1)
-    for name, make in agents_shared.UNTAUGHT.items():
-        if name.startswith("random network") and name[-1] != "1":
-            continue
-        action = make(environment)(observed)
-        assert action.shape == (2, 3) and bool((action.abs() <= 1.0).all()), name
-    always = agents_shared.UNTAUGHT["always 0.3 m/s²"](environment)(observed)
-    assert torch.allclose(seen.task.command(always), torch.full((2, 3), 0.3))
-
-
-def test_an_oracle_is_slow_first_and_then_faster_behind_krauss():
-    environment = {"task": "ring", "vehicles": 8, "controlled": 2, "length": [80.0, 90.0], "failsafe": 3.0}
-    start = ring_start(environment, (80.0, 90.0), warmup=20)
-    task, uniform = start.task, uniform_speed(start).unsqueeze(-1)
-    act = agents_shared.Oracle(start, first=0.5, last=1.0, after=1.0, gain=0.1)
-    seen = torch.tensor([[0.4, 0.0, 9.0, 0.4, 0.0, 9.0]] * 2)  # 2 m/s, far behind a leader who is as fast
-    shares = [(task.command(act(seen)) / 0.1 + 2.0) / uniform for _ in range(700)]
-    for step, share in ((0, 0.5), (10, 0.5), (310, 0.75), (610, 1.0), (699, 1.0)):
-        assert torch.allclose(shares[step], torch.full((2, 2), share), atol=1e-4)
-    close = torch.tensor([[0.4, 0.0, 0.5, 0.4, 0.0, 9.0]] * 2)  # the first of both has touched its leader
-    assert task.command(act(close))[:, 0].tolist() == [-1.0, -1.0]
 
 
 def test_a_ring_of_twice_the_vehicles_is_twice_as_long(monkeypatch):

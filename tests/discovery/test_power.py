@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from idm_env.data import episodes, synthetic
+from idm_env.data import synthetic
 from idm_env.discovery import discover
 from idm_env.discovery.model import SPREAD
 from idm_env.discovery.power import CLOSE, Bar, Planted, reach, strength_of
 from idm_env.discovery.score import ALPHA, FAINT, level, westfall_young
-from idm_env.effects import ALL, IDM, make
-from idm_env.fitting.batch import Batch
+from idm_env.effects import ALL, make
 
 
 def planted(units: int, curvature: float, pull: float, bar: Bar, sizes: int = 1) -> Planted:
@@ -56,77 +55,6 @@ def test_the_level_is_where_a_further_candidate_becomes_significant() -> None:
             gain = statistic**2 * FAINT * 8 / (np.sqrt(shape).sum() ** 2 - statistic**2 * shape.sum())
             p = westfall_young(np.vstack((gain * shape, others)), 0, run).p_value[0] / share
             assert (p < ALPHA) == significant
-
-
-def test_drivers_with_their_own_drift_not_turned_do_again_what_they_did() -> None:
-    """What the benchmark plants into is the measured motion: simulated behind the leader it comes back."""
-    from benchmarks import planted as benchmark
-
-    trajectories, _ = synthetic.generate(5, runs=4, followers=2, seconds=60.0, ou=0.1)
-    found = discover(trajectories, effects=["lag", "drag"])
-    drag = make("drag")
-    made = {turned: benchmark.planted(found, (0.0, 0.0), drag, {"coefficient": 0.0}, 0, turned)
-            for turned in (False, True)}  # fmt: skip
-    errors = []
-    for again in made.values():
-        pairs = zip(found.records.episodes, episodes(again), strict=True)
-        errors.append(np.concatenate([b.speed_mps - a.speed_mps for a, b in pairs]).std())
-    assert errors[0] < 0.02 and 0.1 < errors[1] < 1.0
-    assert len(made[True].drivers or ()) == len(found.records.episodes)
-    slower = benchmark.planted(found, (0.0, 0.0), drag, {"coefficient": 5e-3}, 0, False)
-    assert sum(e.speed_mps.mean() for e in episodes(slower)) < sum(e.speed_mps.mean() for e in found.records.episodes)
-
-
-def test_planted_drivers_are_not_bent_by_their_drift() -> None:
-    """Free simulation takes drift for parameters; what is left of accelerations then answers to the scene."""
-    from benchmarks import planted as benchmark
-
-    trajectories, truth = synthetic.generate(6000, runs=5, followers=2, seconds=120.0, ou=0.1)
-    found = discover(trajectories, effects=["drag"])
-    true = {(d["run_id"], d["vehicle_id"]): d for d in truth.drivers.iter_rows(named=True)}
-    names = [p.name for p in IDM().declared]
-    off = {"predictions": benchmark.drivers(found)[found.records.group].log().numpy()}
-    saved = found.models["model.yaml"].drivers
-    off["free"] = np.log([[saved[found.records.groups[g]]["idm"][n] for n in names] for g in found.records.group])
-    own = np.log([[true[e.run_id, e.vehicle_id][n] for n in names] for e in found.records.episodes])
-    error = {name: np.abs(x - own).mean() for name, x in off.items()}
-    assert error["predictions"] < 0.8 * error["free"]
-    batch = Batch.of(found.records.episodes, substeps=1)
-    left = benchmark.beside_the_model(found, batch).numpy()
-    inner = [left[20 : len(e) - 20, i] for i, e in enumerate(batch.episodes)]
-    assert np.concatenate(inner).std() == pytest.approx(0.1, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("verdict", "tried", "told"),
-    [("unexplained", "drag", True), ("unexplained", "delay", False), ("none", "drag", False)],
-)
-def test_what_is_refused_by_name_is_told(monkeypatch: pytest.MonkeyPatch, verdict: str, tried: str, told: bool) -> None:
-    from types import SimpleNamespace
-
-    from benchmarks import planted as benchmark
-
-    said = [{"effect": "drag", "parameter": "coefficient", "would_be_found": 1e-3}]
-    measured = SimpleNamespace(report={"excluded": said, "error": {"before": {}}})
-    report = {
-        "verdict": verdict, "reason": "", "found": [], "candidates": [], "helps": {}, "error": {"before": {}},
-        "partial": {"terms": [{"effect": tried}]},
-    }  # fmt: skip
-    monkeypatch.setattr(benchmark, "fitted", lambda *data: (measured, (0.0, 0.0)))
-    monkeypatch.setattr(benchmark, "parameters", lambda found, name: {})
-    monkeypatch.setattr(benchmark, "planted", lambda *given: None)
-    monkeypatch.setattr(benchmark, "discover", lambda data: SimpleNamespace(report=report))
-    row = benchmark.measure(("drag", 1.0, 0, (1, 0.1, 10, None, ())))
-    assert (row["right"], row["told"]) == (False, told)
-
-
-def test_what_no_strength_would_show_is_not_planted() -> None:
-    from benchmarks import planted as benchmark
-
-    excluded = [{"effect": "lag", "would_be_found": None}, {"effect": "drag", "would_be_found": 1e-3},
-                {"effect": "grade", "would_be_found": None}]  # fmt: skip
-    assert benchmark.told(excluded, []) == (["drag"], ["lag"])
-    assert benchmark.told(excluded, ["drag"]) == (["drag"], [])
 
 
 def test_a_latency_below_one_step_is_nobody_s() -> None:

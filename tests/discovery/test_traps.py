@@ -8,6 +8,7 @@ import pytest
 from benchmarks import discovery as sets
 from idm_env.data import synthetic
 from idm_env.discovery import discover
+from tests.discovery import sumo
 
 
 @pytest.mark.parametrize("hidden", ["lag", "leader_acceleration"])
@@ -60,18 +61,14 @@ class TestSumo:
         pytest.importorskip("libsumo", reason="SUMO is not installed: pip install libsumo")
 
     def test_its_idm_lacks_nothing_but_half_a_step(self) -> None:
-        from benchmarks.sumo_sets import CASES, platoons
-
-        for name in ("IDM", "IDM on slopes"):
-            found = discover(platoons(5, CASES[name], runs=8, followers=2, seconds=120.0))
+        for slope in (0.0, 0.04):
+            found = discover(sumo.platoons(5, slope=slope))
             assert found.verdict == "none"
             (known,) = found.report["known"]
             assert known["effect"] in ("lag", "delay") and 0.02 < known["estimate"] < 0.1
 
     def test_drivers_that_decide_once_a_second_are_late(self) -> None:
-        from benchmarks.sumo_sets import CASES, platoons
-
-        report = discover(platoons(5, CASES["IDM, decides every 1 s"], runs=8, followers=2, seconds=120.0)).report
+        report = discover(sumo.platoons(5, decides_every=1.0)).report
         found = report["found"][0]
         assert report["verdict"] in ("named", "one_of") and found["effect"] in ("delay", "lag")
         assert found["parameters"]["delay"]["estimate"] == pytest.approx(0.5, abs=0.2)

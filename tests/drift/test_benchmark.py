@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import drift, drift_gru, drift_sets
+from benchmarks import drift, drift_sets
 from idm_env.data import episodes
 from idm_env.drift.estimate import estimate, usual
 from idm_env.drift.kinds import behind_a_record
@@ -15,31 +15,13 @@ from idm_env.fitting.problem import IDM_NAMES
 STEPS = 6
 
 
-def decaying(rows: int, samples: int) -> np.ndarray:
-    """Residuals [samples, rows] that start anew every ten samples and then lose a fifth at every step."""
-    random = np.random.default_rng(0)
-    starts = random.standard_normal((samples // 10 + 1, rows))
-    return starts[np.arange(samples) // 10] * 0.8 ** (np.arange(samples) % 10)[:, None]
-
-
-def test_targets_are_the_steps_that_follow_as_far_as_they_were_measured() -> None:
-    residual = np.arange(9.0)[:, None].repeat(2, 1)
-    values, known = drift_gru.targets(residual, np.array([10, 7]), 3)
-    assert values[2, 0].tolist() == [3.0, 4.0, 5.0] and known[2, 0].all()
-    # A record of 7 samples has 6 steps, 0 to 5.
-    assert known[:, 1].sum(1).tolist() == [3, 3, 3, 2, 1, 0, 0, 0, 0]
-
-
-def test_the_net_goes_on_as_the_residual_does_and_so_does_the_autoregression() -> None:
-    residual = decaying(24, 80)
-    gap, speed = (np.full((81, 24), x) for x in (20.0, 15.0))
-    nets = drift_gru.trained(residual, gap, speed, np.full(24, 81), STEPS)
-    fresh = decaying(5, 80)[:, ::-1] + 0.0
-    starts = [(r, t) for r in range(5) for t in (13, 23, 33, 43)]
-    true = np.stack([fresh[t : t + STEPS, r] for r, t in starts], 1)
-    found = drift_gru.ahead(nets, fresh, gap[:, :5], speed[:, :5], starts)
-    assert np.sqrt(np.mean((found - true) ** 2)) < 0.35 * np.sqrt(np.mean(true**2))
-    same = drift.going_on(fresh, starts, np.array([0.8, 0.0, 0.0]), drift.RESIDUAL_S, STEPS)
+def test_the_autoregression_goes_on_as_the_residual_does() -> None:
+    """Residuals that start anew every ten samples and then lose a fifth at every step, begun at the fourth."""
+    starts = np.random.default_rng(0).standard_normal((8, 5))
+    residual = starts[np.arange(80) // 10] * 0.8 ** (np.arange(80) % 10)[:, None]
+    begun = [(r, t) for r in range(5) for t in (13, 23, 33, 43)]
+    true = np.stack([residual[t : t + STEPS, r] for r, t in begun], 1)
+    same = drift.going_on(residual, begun, np.array([0.8, 0.0, 0.0]), drift.RESIDUAL_S, STEPS)
     assert same == pytest.approx(true)
 
 

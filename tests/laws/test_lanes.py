@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks import lanes_laws
+from benchmarks import lanes
 from idm_env import progress
 from idm_env.effects import IDM, Brakes, make
 from idm_env.kernels import dispatch
@@ -93,19 +93,19 @@ def test_links_are_inverse_and_lead_to_the_next_vehicle_of_the_lane(ring: float 
 def test_random_traffic_breaks_no_law() -> None:
     """A little of what ``python -m benchmarks.lanes laws`` does over 10⁹ vehicle-steps; and its counts can count."""
     with dispatch.off():
-        found = lanes_laws.check(3e4, progress.silent, rows=3, each=90, decisions=60)
+        found = lanes.check(3e4, progress.silent, rows=3, each=90, decisions=60)
         for kind, counts in found.items():
-            assert not any(counts[law] for law in lanes_laws.LAWS), (kind, counts)
+            assert not any(counts[law] for law in lanes.LAWS), (kind, counts)
             assert counts["changed"] > 0 and counts["blocked"] > 50
             assert (counts["entered"] > 20) == (kind != "ring")
         assert sum(counts["changed"] for counts in found.values()) > 100
-        simulator, state, params = lanes_laws.world("ring", 1, 1, 40, DTYPE)
+        simulator, state, params = lanes.world("ring", 1, 1, 40, DTYPE)
         after, kept = simulator.without("lane_command").rollout(state, {}, params, 10)
     assert after.links is not None
     swapped = after.links._replace(leader=after.links.leader.roll(1, -1))
     wrong = after._replace(links=swapped, gap=-after.gap)
-    counts = lanes_laws.broken(simulator, state, wrong, kept._replace(gap=-kept.gap), params)
-    assert all(counts[law] > 0 for law in lanes_laws.LAWS if law not in ("vehicles lost", "moved too far"))
+    counts = lanes.broken(simulator, state, wrong, kept._replace(gap=-kept.gap), params)
+    assert all(counts[law] > 0 for law in lanes.LAWS if law not in ("vehicles lost", "moved too far"))
 
 
 def test_forward_mode_sees_neighbours_by_links_too() -> None:

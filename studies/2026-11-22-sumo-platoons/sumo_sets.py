@@ -21,7 +21,7 @@ import numpy as np
 import polars as pl
 
 from benchmarks import workers
-from benchmarks.bench.peers import straight_lane
+from idm_env.bench.peers import straight_lane
 from idm_env.data import Trajectories, scripted
 from idm_env.progress import OnProgress, silent
 
