@@ -26,8 +26,8 @@ class Finding(NamedTuple):
 def findings(folder: Path = Path()) -> list[Finding]:
     """Return what was found; ``folder`` is where results would be written."""
     return [
-        *_versions(), *(_extra(name) for name in EXTRAS), _kernels(), _threads(), _gpu(), _cache(),
-        _writable("compiled loops", _numba_cache(), "Set NUMBA_CACHE_DIR to a folder that you may write to."),
+        *_versions(), *(_extra(name) for name in EXTRAS), _kernels(), _threads(), _gpu(),
+        _cache("cache of printed steps", "IDM_ENV_CACHE"), _cache("compiled loops", "NUMBA_CACHE_DIR"),
         _writable("results", folder, "Go to a folder that you may write to, or give --out one."),
     ]  # fmt: skip
 
@@ -125,21 +125,17 @@ def _gpu() -> Finding:
     return Finding("GPU", "missing", f"torch is built for CUDA {built}, and no device answers", "Look at nvidia-smi.")
 
 
-def _cache() -> Finding:
+def _cache(told: str, variable: str) -> Finding:
     from idm_env.scalar import library
 
-    told, asked, used = "cache of printed steps", os.environ.get("IDM_ENV_CACHE"), library.folder()
-    cure = "Set IDM_ENV_CACHE to a folder that you may write to."
-    if asked and Path(asked).resolve() != used.resolve():
-        return Finding(told, "broken", f"IDM_ENV_CACHE={asked} cannot be written; {used} is used", cure)
-    if used.name.startswith("idm_env_"):
-        return Finding(told, "missing", f"no cache can be written: {used} is lost at the end", cure)
-    return _writable(told, used, cure)
-
-
-def _numba_cache() -> Path:
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(named) if named else Path(__file__).parent / "trajectories" / "__pycache__"
+    asked, used = os.environ.get(variable), library.folder(variable)
+    cure = f"Set {variable} to a folder to which you may write, and nobody else."
+    if used is None:
+        return Finding(told, "missing", "no folder serves: all is compiled at every start", cure)
+    if asked and Path(asked).resolve() != used:
+        why = library.exposed(Path(asked).resolve()) if Path(asked).is_dir() else None
+        return Finding(told, "broken", f"{variable}={asked} {why or 'cannot be written'}; {used} is used", cure)
+    return Finding(told, "ok", str(used))
 
 
 def _writable(what: str, folder: Path, cure: str) -> Finding:

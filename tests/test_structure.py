@@ -21,6 +21,7 @@ ALLOWED = {
     "keep": set(),
     "extras": set(),
     "instead": set(),
+    "compat": set(),
     "modules": set(),
     "parameters": {"types", "checks"},
     "effects": {"types", "parameters", "checks", "modules"},
@@ -35,7 +36,7 @@ ALLOWED = {
     "simulator": {"types", "parameters", "step", "instead"},
     "scalar": {"types", "effects", "roads", "history", "step", "modules", "changes"},
     "kernels": {"extras", "types", "effects", "roads", "history", "step", "simulator", "instead", "scalar", "checks",
-        "changes", "decisions", "population",
+        "changes", "decisions", "population", "compat",
     },
     "fonts": set(),
     "report": {"extras", "fonts", "keep"},
@@ -50,8 +51,8 @@ ALLOWED = {
         "checks", "keep", "progress", "diagrams", "executor", "extras", "parts", "changes",
     },
     "drift": {
-        "types", "parameters", "effects", "roads", "simulator", "data", "config", "fitting", "keep", "report",
-        "progress", "extras",
+        "types", "parameters", "effects", "roads", "simulator", "kernels", "data", "config", "fitting", "keep",
+        "report", "progress", "extras",
     },
 }  # fmt: skip
 """What a part may import of the package; parts that are not named may import anything but what FORBIDDEN says."""

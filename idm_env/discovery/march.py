@@ -28,7 +28,6 @@ from idm_env.discovery.slots import SETS, TARGETS, Push
 from idm_env.discovery.slots import Slot as Changed
 from idm_env.effects import IDM, Brakes, CarFollowing, Effect
 from idm_env.effects.free import FEATURES
-from idm_env.kernels import curves, functions, staged
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane
 from idm_env.scalar import library
@@ -178,9 +177,7 @@ class Loop:
     @cached_property
     def march(self) -> Any:
         """The compiled function of ``march_loops``."""
-        return library.load(
-            "march", self.text, tuple(Path(m.__file__ or "") for m in (curves, functions, staged))
-        ).march
+        return library.load("march", self.text).march
 
 
 def why_not_recorded(effect: Effect, dt: float = 0.1) -> str | None:

@@ -7,9 +7,9 @@ This file is a template (``march``). What is printed is staged: Python runs it o
 # mypy: ignore-errors
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from idm_env.kernels.compiler import compiler
 from idm_env.kernels.curves import value_of_curve
 from idm_env.kernels.staged import (
     Merged,
@@ -31,7 +31,7 @@ from idm_env.kernels.staged import (
 )
 
 ROOM = 68
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+compiled = compiler()
 
 
 @staged()

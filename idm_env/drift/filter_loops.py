@@ -12,9 +12,9 @@ import numpy as np
 from idm_env.extras import needed
 
 with needed("estimating drift"):
-    import numba
+    from idm_env.kernels.compiler import compiler
 
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+compiled = compiler(fastmath={"contract"})
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from idm_env.extras import needed
 
 with needed("a compiled loop"):
-    import numba
+    from idm_env.kernels.compiler import compiler
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiler()
 def curve(p, number, tables, x):
     """Piecewise linear through evenly spaced knots (periodic where a period is given), or a trapezoid."""
     form, count = tables[number, 0], tables[number, 1]

@@ -14,7 +14,7 @@ from idm_env.decisions import decided
 from idm_env.kernels import decision_loops, lanes, order_loops
 from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import dense, operand
-from idm_env.kernels.printed import FUNCTIONS, HEADER, printed
+from idm_env.kernels.printed import HEADER, printed
 from idm_env.kernels.tiles import ROW, Array
 from idm_env.population import turnover
 from idm_env.roads import Lanes
@@ -47,7 +47,7 @@ class Decision:
     def compiled(self, kind: str) -> tuple[int, Array]:
         """Return the address of the phase in a precision, and its constants."""
         text = HEADER.format(title=self._title, row=ROW, kind=kind) + self._text
-        module = library.load("wishes", text, (FUNCTIONS,))
+        module = library.load("wishes", text)
         return int(module.wish.address), np.array([float(x) for x in self._constants], kind)
 
 

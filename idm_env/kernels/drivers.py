@@ -22,7 +22,7 @@ from idm_env.effects.base import Effect
 from idm_env.history import PAST
 from idm_env.kernels import driver_loops as loops
 from idm_env.kernels import threads as pool
-from idm_env.kernels.printed import FUNCTIONS, HEADER
+from idm_env.kernels.printed import HEADER
 from idm_env.kernels.tiles import Array
 from idm_env.kernels.workspace import take
 from idm_env.roads import Lane, Road
@@ -34,9 +34,7 @@ from idm_env.scalar.record import Form, Untraceable, record, slot_name
 from idm_env.step import Integration, Stepping
 from idm_env.types import Inputs, Params, Record, State
 
-BESIDE = """beside = cfunc(
-    types.void(REAL, REAL, types.int64, REAL), cache=True, error_model="numpy", fastmath={"contract"}
-)
+BESIDE = """beside = phase(types.void(REAL, REAL, types.int64, REAL), fastmath={"contract"})
 
 """
 """Compiler of the phases that carry one direction's rows."""
@@ -62,7 +60,7 @@ class _Printed:
         """Return the addresses of phases, 0 for what there is not, and the constants of a precision."""
         if (kind, names) not in self.known:
             head = HEADER.format(title=self.title, row=loops.ROW, kind=kind) + BESIDE
-            module, there = library.load("driver", head + self.text.text, (FUNCTIONS,)), self.text.phases
+            module, there = library.load("driver", head + self.text.text), self.text.phases
             # Rounded as torch rounds a Python number that meets a tensor.
             constants = np.array([float(x) for x in self.text.constants.values] or [0.0], kind)
             addresses = [getattr(module, n).address if n in there else 0 for n in names]

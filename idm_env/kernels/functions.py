@@ -10,10 +10,11 @@ import numpy as np
 from idm_env.extras import needed
 
 with needed("a compiled loop"):
-    import numba
     from llvmlite import ir
     from numba import types
     from numba.extending import intrinsic
+
+from idm_env.kernels.compiler import compiler
 
 _MAGIC = 6755399441055744.0
 """1.5 · 2^52: added to a double, it leaves the nearest whole number in the lowest bits."""
@@ -65,7 +66,7 @@ _two_to = _exponent(ir.DoubleType(), ir.IntType(64), 1023, 52, types.float64)
 _two_to_single = _exponent(ir.FloatType(), ir.IntType(32), 127, 23, types.float32)
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@compiler(forceinline=True)
 def exp_float64(x):
     """Return e^x of a double, within one unit in the last place; beyond ±708 as at ±708."""
     y = -708.0 if x < -708.0 else x
@@ -99,7 +100,7 @@ _C7, _C6, _C5 = np.float32(1 / 5040), np.float32(1 / 720), np.float32(1 / 120)
 _C4, _C3 = np.float32(1 / 24), np.float32(1 / 6)
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@compiler(forceinline=True)
 def exp_float32(x):
     """Return e^x of a float, within two units in the last place; beyond −87 and 88 as there."""
     y = _LOW if x < _LOW else x
@@ -118,7 +119,7 @@ def exp_float32(x):
     return p * _two_to_single(shifted)  # type: ignore[call-arg]
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@compiler(forceinline=True)
 def sigmoid_float64(x):
     """Return 1 / (1 + e^−x), not below 5e-131: numbers too small for full precision cost a hundred products each."""
     return 1.0 / (1.0 + exp_float64(-x if x > -300.0 else 300.0))
@@ -127,13 +128,13 @@ def sigmoid_float64(x):
 _FAR_32 = np.float32(-40.0)
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@compiler(forceinline=True)
 def sigmoid_float32(x):
     """Return 1 / (1 + e^−x), not below 4e-18, for the same reason."""
     return _ONE / (_ONE + exp_float32(-x if x > _FAR_32 else -_FAR_32))
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@compiler(forceinline=True)
 def log1p_float64(x):
     """Return log(1 + x) of a double, within two units in the last place; −∞ at −1 and nan below."""
     u = 1.0 + x
@@ -162,7 +163,7 @@ _ZERO, _INFINITE, _NAN = np.float32(0.0), np.float32(np.inf), np.float32(np.nan)
 _TWO, _C9_LOG, _C7_LOG, _C5_LOG, _C3_LOG = (np.float32(x) for x in (2.0, 1 / 9, 1 / 7, 1 / 5, 1 / 3))
 
 
-@numba.njit(cache=True, error_model="numpy", forceinline=True)
+@compiler(forceinline=True)
 def log1p_float32(x):
     """Return log(1 + x) of a float, within two units in the last place; −∞ at −1 and nan below."""
     u = _ONE + x

@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,25 +26,23 @@ from idm_env.step import Integration, Stepping
 
 Made = TypeVar("Made")
 
-FUNCTIONS = Path(__file__).with_name("functions.py")
-"""What printed phases call."""
-
 HEADER = '''"""{title}
 
 Printed by idm_env from one recorded step; see idm_env/scalar. Delete at will: it is printed again when needed.
 """
 
 import numpy as np
-from numba import carray, cfunc, types
+from numba import carray, types
 
+from idm_env.kernels.compiler import phase
 from idm_env.kernels.functions import exp_{kind} as exp, log1p_{kind} as log1p, sigmoid_{kind} as sigmoid
 
 ROW = {row}
 SIZE = (1 << 40,)
 REAL = types.CPointer(types.{kind})
 SIGNATURE = types.void(REAL, types.int64, REAL)
-exact = cfunc(SIGNATURE, cache=True, error_model="numpy")
-swift = cfunc(SIGNATURE, cache=True, error_model="numpy", fastmath={{"contract"}})
+exact = phase(SIGNATURE)
+swift = phase(SIGNATURE, fastmath={{"contract"}})
 
 '''
 
@@ -128,7 +125,7 @@ class TileKernel:
 @lru_cache(maxsize=512)
 def _compiled(title: str, kind: str, printed: tuple[str, tuple[str, ...]], names: tuple[str, ...]) -> Array:
     text, there = printed
-    module = library.load("phases", HEADER.format(title=title, row=ROW, kind=kind) + text, (FUNCTIONS,))
+    module = library.load("phases", HEADER.format(title=title, row=ROW, kind=kind) + text)
     return np.array([getattr(module, n).address if n in there else 0 for n in names], np.int64)
 
 

@@ -30,6 +30,8 @@ HEADER = '''"""Printed by idm_env from one call of a task's functions; see idm_e
 import numpy as np
 from numba import njit
 
+from idm_env.kernels.compiler import compiler
+
 F = np.{kind}
 inlined = njit(nogil=True, error_model="numpy", forceinline=True)
 
@@ -45,7 +47,7 @@ def smaller(x, y):
     return y if x > y else x
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiler()
 def run(rows, c, {arguments}):
 {flat}    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
     for r in range(rows):

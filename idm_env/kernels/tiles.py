@@ -12,10 +12,6 @@ compiler knows, so it need not test dozens of arrays for overlap, which it refus
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,43 +20,11 @@ from numpy.typing import NDArray
 from idm_env.extras import needed
 
 with needed("a compiled loop"):
-    import numba
+    from idm_env.kernels.compiler import compiler
 
 from idm_env.kernels.memory import LINE, add, copy, copy_truth, fill, number
-from idm_env.scalar import library
 
 Array = NDArray[Any]
-
-_settings: Any = numba.config
-
-
-@lru_cache(maxsize=1)
-def _cache_of_loops() -> str:
-    """Return the folder of compiled loops, named by the digest of all files here.
-
-    Numba notices a change of the file that holds a function, not of one that it calls, and then runs machine code of
-    another day. Its setting for the place of its cache is read when a function is decorated.
-    """
-    sources = sorted(Path(__file__).parent.glob("*.py"))
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
-    place = Path(_settings.CACHE_DIR or library.folder()) / f"loops_{digest}"
-    if not place.exists():
-        library.announce()
-    return str(place)
-
-
-def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a loop with these options of numba, in the cache of this version of it."""
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        place, _settings.CACHE_DIR = _settings.CACHE_DIR, _cache_of_loops()
-        try:
-            return numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-        finally:
-            _settings.CACHE_DIR = place
-
-    return compiled
-
 
 exact = compiler()
 """Compiler for whatever yields values: IEEE arithmetic as written, so values do not depend on the loop around them."""

@@ -5,6 +5,6 @@ from __future__ import annotations
 from idm_env.extras import needed
 
 with needed("filtering or reconstruction"):
-    import numba
+    from idm_env.kernels.compiler import compiler
 
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+compiled = compiler(fastmath={"contract"})

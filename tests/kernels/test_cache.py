@@ -10,6 +10,8 @@ import pytest
 
 pytest.importorskip("numba")
 
+from idm_env.data import synthetic
+
 PACKAGE = Path(__file__).parents[2] / "idm_env"
 PROBE = """
 from idm_env.kernels import caller
@@ -57,3 +59,33 @@ def test_a_change_in_a_function_that_a_loop_calls_is_noticed(tmp_path):
     assert compiled and sorted((tmp_path / "cache").rglob("*.nbc")) == compiled  # used again
     callee.write_text(CALLEE.format(added=100))
     assert run() == 206
+
+
+def test_a_command_runs_on_a_damaged_cache_and_heals_it(tmp_path):
+    """Each kind of file, damaged in each way: cut, empty, zeros."""
+    table = synthetic.generate(2, runs=2, followers=1, seconds=20.0)[0].table
+    table.drop("gap_m").write_csv(tmp_path / "data.csv")
+    cache = tmp_path / "cache"
+    environment = {**os.environ, "IDM_ENV_CACHE": str(cache)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+
+    def run():
+        command = [sys.executable, "-m", "idm_env", "simulate", tmp_path / "data.csv", "--base", "idm"]
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stderr, (tmp_path / "out" / "simulate" / "report.json").read_bytes()
+
+    _, report = run()
+    damaged = []
+    for kind in ("py", "nbc"):
+        files = sorted(cache.glob(f"*.{kind}"))
+        assert len(files) >= (1 if kind == "py" else 3)
+        for number, path in enumerate(files):
+            kept = path.read_bytes()
+            path.write_bytes((kept[: len(kept) // 2], b"", bytes(len(kept)))[number % 3])
+            damaged.append(path)
+    told, again = run()
+    assert again == report and "Traceback" not in told
+    assert all(path.stat().st_size and not path.read_bytes().startswith(bytes(99)) for path in damaged)
+    lines = [line for line in told.splitlines() if "is damaged (" in line]
+    assert lines and all(line.count(str(cache)) == 1 for line in lines)
