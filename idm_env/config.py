@@ -13,7 +13,7 @@ An effect that the package has never seen is written as the place of its class, 
 
 ``by`` says what the keys of ``drivers`` are, as in ``fit``: ``driver`` (run/vehicle), ``run_id``, ``vehicle_id`` or a
 column. ``substeps`` is there where a fit chose another number of simulated steps per sample than the default.
-``fitted_on`` holds the name of the file and a digest of every track that the model was fitted on, so that ``simulate``
+``fitted_on`` holds the name of the file and the places and times of all who were fitted, so that ``simulate``
 can tell a fitted from a held-out figure.
 
 Unknown keys are errors with a suggestion, in one line.
@@ -152,7 +152,7 @@ def _fitted_on(value: Any) -> dict[str, Any]:
     _known(_mapping("fitted_on", value), ("source", "tracks"), "key of fitted_on")
     tracks = value.get("tracks", [])
     if not isinstance(tracks, list):
-        raise ValueError("fitted_on.tracks must be a list of digests, as fit writes it. Remove fitted_on if in doubt.")
+        raise ValueError("fitted_on.tracks must be a list of marks, as fit writes it. Remove fitted_on if in doubt.")
     return {"source": str(value.get("source", "")), "tracks": [str(track) for track in tracks]} if value else {}
 
 

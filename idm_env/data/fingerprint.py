@@ -1,9 +1,9 @@
-"""What a model was fitted on: a digest of every driver's track, whatever the file is called or how it is cut."""
+"""What a model was fitted on: where every driver was at whole seconds, whatever the file is called or how it is cut."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -14,19 +14,69 @@ from idm_env.data.trajectories import Trajectories
 
 Track = tuple[str, str]
 
+MOST_PLACES = 64
+"""Places of a mark; those of a longer drive are 2, 4, … seconds apart."""
+NEAR_M, ALIKE = 1.0, 0.9
+"""A driver is known whose place is as near (m) at so large a share of the times that a mark and his track share.
 
-def fingerprints(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[Track, str]:
-    """Return, by (run_id, vehicle_id), the digest of a track: times since its first sample (ms) and positions (mm)."""
-    wanted = pl.DataFrame(sorted(set(drivers)), schema=dict.fromkeys(TRACK, pl.String), orient="row")
-    table = trajectories.table.select(*TRACK, "time_s", "position_m").join(wanted, on=TRACK, how="semi")
+Of 222 vehicles of NGSIM's I-80 all are known from the raw positions to the filtered ones and back; of another quarter
+of an hour on the same road 4 are taken for one of them."""
+_READABLE = re.compile(r"\d+( -?\d+){2,}")
+
+
+def marks(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[Track, str]:
+    """Return the mark of a track by (run_id, vehicle_id): ``every first x x …``.
+
+    The places x (m, rounded) are those at every multiple of ``every`` seconds of the file's clock, from ``first`` on.
+    """
     found = {}
-    for (run, vehicle), part in table.partition_by(TRACK, as_dict=True).items():
-        time, position = part["time_s"].to_numpy(), part["position_m"].to_numpy()
-        whole = np.round(np.stack((time - time[0], position)) * 1000.0).astype("<i8")
-        found[run, vehicle] = hashlib.sha256(whole.tobytes()).hexdigest()[:12]
+    for track, time, position in _tracks(trajectories, drivers):
+        every = 1
+        while time[-1] - time[0] >= every * MOST_PLACES:
+            every *= 2
+        at = np.arange(np.ceil(time[0] / every), np.floor(time[-1] / every) + 1) * every
+        if len(at):
+            places = np.round(np.interp(at, time, position)).astype(int)
+            found[track] = " ".join(map(str, (every, int(at[0]), *places)))
+    return found
+
+
+def seen(trajectories: Trajectories, drivers: Iterable[Track], known: Iterable[str]) -> set[Track] | None:
+    """Return the drivers whose tracks have these ``known`` marks, whatever run and vehicle are called here.
+
+    None where no mark can be read: there is none, or another version wrote them.
+    """
+    times, places, owner, count = [], [], [], 0
+    for mark in filter(_READABLE.fullmatch, known):
+        every, first, *told = (int(x) for x in mark.split())
+        times.append(first + every * np.arange(len(told)))
+        places.append(np.array(told, float))
+        owner.append(np.full(len(told), count))
+        count += 1
+    if not count:
+        return None
+    when, where, whose = (np.concatenate(parts) for parts in (times, places, owner))
+    order = np.argsort(when, kind="stable")
+    when, where, whose = when[order], where[order], whose[order]
+    found = set()
+    for track, time, position in _tracks(trajectories, drivers):
+        part = slice(*np.searchsorted(when, (time[0], time[-1] + 1e-6)))
+        near = np.abs(np.interp(when[part], time, position) - where[part]) <= NEAR_M
+        shared = np.bincount(whose[part], minlength=count)
+        alike = np.bincount(whose[part], near, minlength=count)
+        if ((shared > 1) & (alike >= ALIKE * shared)).any():
+            found.add(track)
     return found
 
 
 def fitted_on(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[str, Any]:
-    """Return what ``model.yaml`` says of the data of a fit: the file's name and the digests of its drivers' tracks."""
-    return {"source": trajectories.source, "tracks": sorted(set(fingerprints(trajectories, drivers).values()))}
+    """Return what ``model.yaml`` says of the data of a fit: the file's name and the marks of its drivers' tracks."""
+    return {"source": trajectories.source, "tracks": sorted(set(marks(trajectories, drivers).values()))}
+
+
+def _tracks(trajectories: Trajectories, drivers: Iterable[Track]) -> Iterator[tuple[Track, np.ndarray, np.ndarray]]:
+    """Yield each driver with his times (s) and places (m)."""
+    wanted = pl.DataFrame(sorted(set(drivers)), schema=dict.fromkeys(TRACK, pl.String), orient="row")
+    table = trajectories.table.select(*TRACK, "time_s", "position_m").join(wanted, on=TRACK, how="semi")
+    for (run, vehicle), part in table.partition_by(TRACK, as_dict=True).items():
+        yield (run, vehicle), part["time_s"].to_numpy(), part["position_m"].to_numpy()

@@ -15,7 +15,7 @@ from idm_env import report as page
 from idm_env.config import Model, load_model, nested, save_model
 from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories
 from idm_env.data.errors import by_kind
-from idm_env.data.fingerprint import fingerprints
+from idm_env.data.fingerprint import marks, seen
 from idm_env.data.folder import Share, shares, stamp
 from idm_env.effects import Brakes, base_named
 from idm_env.executor import Executor, Serial
@@ -119,7 +119,7 @@ def _fit_file(work: _Work) -> dict[str, Any]:
         left_out += lost
     data = {**trajectories.summary(), "left_out": [str(r) for r in chosen.left_out], "episodes": len(chosen)}
     data["account"] = page.account(by_kind(trajectories.repairs), by_kind(left_out))
-    result = _write(work, found, held_out, data, fingerprints(trajectories, _drivers(chosen)).values())
+    result = _write(work, found, held_out, data, marks(trajectories, _drivers(chosen)).values())
     pooled.parts.remove()
     return result
 
@@ -272,11 +272,10 @@ def _data_section(result: dict[str, Any]) -> list[page.Block]:
 
 def _seen(model: Model, trajectories: Trajectories, items: Episodes, error: Errors) -> dict[str, Any]:
     """Return how many episodes are of tracks that the model was fitted on, the error on the others, and it in words."""
-    tracks = fingerprints(trajectories, _drivers(items))
-    known = set(model.fitted_on.get("tracks", ()))
-    new = torch.tensor([tracks[driver] not in known for driver in _drivers(items)])
+    known = seen(trajectories, _drivers(items), model.fitted_on.get("tracks", ()))
+    new = torch.tensor([driver not in (known or ()) for driver in _drivers(items)])
     count, others = int((~new).sum()), float(error.gap_rmse[new].mean()) if new.any() else None
-    if not known:
+    if known is None:
         words = "of which the model does not say whether it was fitted on them."
     elif others is None:
         words = "fitted on these data: not a held-out figure."
@@ -288,8 +287,8 @@ def _seen(model: Model, trajectories: Trajectories, items: Episodes, error: Erro
     else:
         words = "on data that the model was not fitted on."
     return {
-        "source": model.fitted_on.get("source"), "episodes_fitted_on": count if known else None,
-        "gap_rmse_of_others_m": others if known else None, "words": words,
+        "source": model.fitted_on.get("source"), "episodes_fitted_on": None if known is None else count,
+        "gap_rmse_of_others_m": None if known is None else others, "words": words,
     }  # fmt: skip
 
 

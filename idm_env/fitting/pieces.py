@@ -17,7 +17,7 @@ import torch
 from idm_env import report as page
 from idm_env.data import DataError, Episode, Repair, Trajectories
 from idm_env.data.errors import Counted, by_kind
-from idm_env.data.fingerprint import fingerprints
+from idm_env.data.fingerprint import marks
 from idm_env.data.folder import Share
 from idm_env.executor import Executor
 from idm_env.fitting import drivers, pictures
@@ -85,7 +85,7 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
             parts.finish(number, {"lost": str(wrong), "share": str(piece.data)})
             return
         summary = _told(trajectories, items.left_out)
-        summary["tracks"] = sorted(set(fingerprints(trajectories, [(e.run_id, e.vehicle_id) for e in items]).values()))
+        summary["tracks"] = sorted(set(marks(trajectories, [(e.run_id, e.vehicle_id) for e in items]).values()))
         data: Sequence[Episode] = items
     else:
         data = piece.data
