@@ -121,7 +121,9 @@ def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Seque
     """Train as the command line says, on one thread; what is wrong is told in one line."""
     torch.set_num_threads(1)
     with one_line():
-        return train(parse(kind, agent, argv))
+        found = parse(kind, agent, argv)
+        with keep.alone(found.out):
+            return train(found)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
+import os
 import signal
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ with needed("the command line"):
     import typer
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -30,7 +32,9 @@ app = typer.Typer(
     "time_s and position_m (SI units, front bumper), or the official NGSIM or OpenACC layout; leader_id, lane, gap_m, "
     "speed_mps, length_m and run_id are used where present. Ctrl-C keeps what is done: add `--resume` to go on.",
 )
-console = Console(stderr=True)
+# A path, a column or a sentence may have brackets and colons in it: nothing is markup.
+PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
+console = Console(stderr=True, **PLAIN)
 EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
 """What ``explain`` writes."""
 PICTURES = (".png", ".svg", ".pdf")
@@ -136,7 +140,7 @@ def _show(title: str, rows: list[dict[str, Any]]) -> None:
         )
     for row in rows:
         table.add_row(*(number(v) if isinstance(v, float) else str(v) for v in row.values()))
-    Console().print(table)
+    Console(**PLAIN).print(table)
 
 
 @app.command()
@@ -244,7 +248,7 @@ def _fit_lane_changes(
     _show("MOBIL by the likelihood of lane changes", [{n: row[n] for n in columns} for row in result["parameters"]])
     names = ("model", "parameters", "fitted", "held_out", "mobil_gains", "standard_error")
     _show("Log-likelihood, of all drivers and of those held out", [{n: r[n] for n in names} for r in result["models"]])
-    console.print(result["sentence"], soft_wrap=True, highlight=False, markup=False)
+    console.print(result["sentence"], soft_wrap=True, highlight=False)
     _done(out, result["data"]["account"])
 
 
@@ -306,8 +310,8 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
     from idm_env.discovery.words import ERRORS, ceilings, laws, weight
     from idm_env.report import account
 
-    console.print(f"Verdict: [bold]{result['verdict'].replace('_', ' ')}[/bold]. ", end="")
-    console.print(result["sentence"], markup=False, highlight=False)
+    console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
+    console.print(result["sentence"], highlight=False)
     before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
     if before is not None:
         _show("Errors on runs that neither fitted nor chose anything", [
@@ -379,8 +383,8 @@ def demo(
             path = folder / "platoon.csv"
             made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
             columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
-            keep.write(path, made.table.select(columns).write_csv)
-            console.print(f"Ten runs of a leader and three followers: {path}")
+            keep.write_csv(path, made.table.select(columns))
+            console.print(f"Ten runs of a leader and three followers: {path}", soft_wrap=True)
         result, models = explain_one(path, out, Question(), on_progress=report)
     _explained(result, models, out)
 
@@ -440,8 +444,8 @@ def drift(
         result = drift_file(source, out, drivers=drivers, on_progress=report)
     _show("Log-likelihood that every sort of drift gains over drivers who do not drift", result["sorts"])
     console.print(result["sentence"], soft_wrap=True, highlight=False)
-    console.print(result["data"]["account"], soft_wrap=True, markup=False, highlight=False)
-    console.print(f"Model: [bold]{(out / 'model.yaml').resolve()}[/bold]", soft_wrap=True)
+    console.print(result["data"]["account"], soft_wrap=True, highlight=False)
+    _told("Model", out / "model.yaml")
 
 
 @app.command()
@@ -560,11 +564,11 @@ def plot(
         console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
     if numbers:
         told = ", ".join(f"{number}: {word}" for number, word in numbers.items())
-        console.print(f"No font here has these names: {told}.", soft_wrap=True, markup=False, highlight=False)
+        console.print(f"No font here has these names: {told}.", soft_wrap=True, highlight=False)
     if source.suffix not in (".yaml", ".yml"):
-        console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, markup=False, highlight=False)
+        console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, highlight=False)
     for path in written:
-        console.print(f"Picture: [bold]{path.resolve()}[/bold]", soft_wrap=True)
+        _told("Picture", path)
 
 
 def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress) -> list[Any]:
@@ -737,9 +741,13 @@ def _number(option: str, text: str, wrong: str) -> float:
         raise ValueError(f"{option} = {checks.shown(text)} is {wrong}.") from None
 
 
+def _told(word: str, path: Path) -> None:
+    console.print(Text.assemble(f"{word}: ", (os.path.realpath(path), "bold")), soft_wrap=True)
+
+
 def _done(out: Path, account: str) -> None:
-    console.print(account, soft_wrap=True, markup=False, highlight=False)
-    console.print(f"Report: [bold]{(out / 'report.html').resolve()}[/bold]", soft_wrap=True)
+    console.print(account, soft_wrap=True, highlight=False)
+    _told("Report", out / "report.html")
 
 
 def run() -> None:

@@ -132,8 +132,8 @@ def _cache(told: str, variable: str) -> Finding:
     cure = f"Set {variable} to a folder to which you may write, and nobody else."
     if used is None:
         return Finding(told, "missing", "no folder serves: all is compiled at every start", cure)
-    if asked and Path(asked).resolve() != used:
-        why = library.exposed(Path(asked).resolve()) if Path(asked).is_dir() else None
+    if asked and Path(os.path.realpath(asked)) != used:
+        why = library.exposed(Path(os.path.realpath(asked))) if Path(asked).is_dir() else None
         return Finding(told, "broken", f"{variable}={asked} {why or 'cannot be written'}; {used} is used", cure)
     return Finding(told, "ok", str(used))
 
@@ -145,4 +145,4 @@ def _writable(what: str, folder: Path, cure: str) -> Finding:
             pass
     except OSError as error:
         return Finding(what, "broken", f"{folder}: {error.strerror or error}", cure)
-    return Finding(what, "ok", str(folder.resolve()))
+    return Finding(what, "ok", os.path.realpath(folder))

@@ -2,8 +2,8 @@
 
 One mechanism for every command. ``write`` replaces a file only by a whole one. ``results`` guards a folder of results:
 no output is an input, and nothing is overwritten that ``run.json`` there does not name as ours. ``Store`` holds what an
-interrupted run goes on with, in a folder of our own that only its ``run.json`` makes removable. ``read`` turns whatever
-is wrong with a file into one line with a cure.
+interrupted run goes on with, in a folder of our own that only its ``run.json`` makes removable. ``alone`` lets one job
+at a time write to a folder. ``read`` turns whatever is wrong with a file into one line with a cure.
 """
 
 from __future__ import annotations
@@ -13,21 +13,35 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
+import socket
+import threading
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import quote
+
+if TYPE_CHECKING:
+    import polars as pl
 
 MARK = "run.json"
 """The file that says what in a folder is ours."""
 UNFINISHED = "idm-env-unfinished"
 """Folder in a folder of results in which interrupted runs leave what they go on with."""
 AFRESH = "Leave out --resume to start afresh."
+LOCK = ".idm-env-lock"
+"""The file in a folder that a job holds while it writes there, and in which it says who it is."""
+LOCK_SECONDS = 2.0
+"""How long a folder may be held by somebody who is about to end (s)."""
+FORMULA = r"^[=+\-@\t\r\n]"
+"""What a cell begins with that a spreadsheet takes for a formula."""
 
 _OWNER = "idm-env"
+_PART = ".idm-env-part"
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 R = TypeVar("R")
 
@@ -41,7 +55,7 @@ def write(path: Path, writer: Callable[[Path], Any], *, shared: bool = False) ->
     OSError, in one line, where the disk is full; nothing is left of the file then.
     """
     mine = f"-{uuid.uuid4().hex}" if shared else ""
-    beside = path.with_name(f".{path.stem}.idm-env-part{mine}{path.suffix}")
+    beside = path.with_name(f".{path.stem}{_PART}{mine}{path.suffix}")
     try:
         writer(beside)
         os.replace(beside, path)
@@ -64,6 +78,25 @@ def full(error: BaseException) -> str | None:
 def write_text(path: Path, content: str) -> None:
     """Write a text file in one piece."""
     write(path, lambda beside: beside.write_text(content, encoding="utf-8"))
+
+
+def write_csv(path: Path, table: pl.DataFrame | pl.LazyFrame) -> None:
+    """Write a table as csv in one piece: every csv of ours.
+
+    A text that a spreadsheet would take for a formula, in a cell or as a column's name, gets an apostrophe in front;
+    numbers stay numbers, also where they are texts.
+    """
+    import polars as pl
+
+    rows = table.lazy()
+    schema = rows.collect_schema()
+    words = [name for name, kind in schema.items() if kind in (pl.String, pl.Categorical, pl.Enum)]
+    for name in words:
+        text = pl.col(name).cast(pl.String)
+        formula = text.str.contains(FORMULA) & text.cast(pl.Float64, strict=False).is_null()
+        rows = rows.with_columns(pl.when(formula).then("'" + text).otherwise(text).alias(name))
+    rows = rows.rename({name: f"'{name}" for name in schema if re.match(FORMULA, name)})
+    write(path, rows.sink_csv)
 
 
 def read(path: Path, reader: Callable[[Path], R], cure: str) -> R:
@@ -113,35 +146,108 @@ def results(out: str | Path, names: Sequence[str], inputs: Iterable[Path | str |
     folder, inputs = Path(out), list(inputs)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file. Give --out a folder.")
-    left = (folder / UNFINISHED).resolve()
+    left = _real(folder / UNFINISHED)
     for given in inputs:
-        if given is not None and Path(given).resolve().is_relative_to(left):
+        if given is not None and _real(given).is_relative_to(left):
             raise ValueError(f"{given} belongs to an interrupted run, which removes it at its end. Copy it elsewhere.")
-        if given is not None and Path(given).is_dir() and folder.resolve().is_relative_to(Path(given).resolve()):
+        if given is not None and Path(given).is_dir() and _real(folder).is_relative_to(_real(given)):
             raise ValueError(f"{folder} lies in {given}, whose files are all read. Give --out a folder elsewhere.")
     for name in names:
         not_an_input(folder / name, inputs)
-    mark = _mark(folder)
-    if mark is None and os.path.lexists(folder / MARK):
-        raise ValueError(f"{folder / MARK} is not one of {_OWNER}'s. Move it, or give --out another folder.")
-    ours: dict[str, str | None] = dict((mark or {}).get("files", {}))
-    for name in names:
-        path = folder / name
-        if os.path.lexists(path) and not (name in ours and path.is_file() and ours[name] in (None, fingerprint(path))):
-            told = f"was changed since {_OWNER} wrote it" if name in ours else f"was not written by {_OWNER}"
-            raise ValueError(f"{path} {told}. Move it, or give --out another folder.")
-    folder.mkdir(parents=True, exist_ok=True)
-    # No digest: being written. Whoever is killed leaves files that the next run may replace.
-    _sign(folder, files={**ours, **dict.fromkeys(names)})
+    with alone(folder):
+        mark = _mark(folder)
+        if mark is None and os.path.lexists(folder / MARK):
+            raise ValueError(f"{folder / MARK} is not one of {_OWNER}'s. Move it, or give --out another folder.")
+        ours: dict[str, str | None] = dict((mark or {}).get("files", {}))
+        for name in names:
+            path = folder / name
+            if os.path.lexists(path) and not (
+                name in ours and path.is_file() and ours[name] in (None, fingerprint(path))
+            ):
+                told = f"was changed since {_OWNER} wrote it" if name in ours else f"was not written by {_OWNER}"
+                raise ValueError(f"{path} {told}. Move it, or give --out another folder.")
+        # No digest: being written. Whoever is killed leaves files that the next run may replace.
+        _sign(folder, files={**ours, **dict.fromkeys(names)})
+        try:
+            yield folder
+        finally:
+            now = {name: fingerprint(folder / name) for name in names if (folder / name).is_file()}
+            kept = {name: value for name, value in ours.items() if name not in names} | now
+            if kept:
+                _sign(folder, files=kept)
+            else:
+                (folder / MARK).unlink(missing_ok=True)
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Hold a folder, which is made if missing, while this lasts; whoever holds it may do so again.
+
+    The system lets go of the lock when its process ends, however that ends. Where there are no locks nothing is held.
+
+    Raises:
+        ValueError: If another job holds it, with its process, machine and beginning; and if it cannot be made.
+    """
     try:
-        yield folder
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if full(error):
+            raise
+        raise ValueError(f"{folder} cannot be made ({error.strerror}). Give --out another folder.") from None
+    place, me = _real(folder), (os.getpid(), threading.get_ident())
+    if _holders.get(place) == me:
+        yield
+        return
+    lock = _locked(folder)
+    _holders[place] = me
+    try:
+        yield
     finally:
-        now = {name: fingerprint(folder / name) for name in names if (folder / name).is_file()}
-        kept = {name: value for name, value in ours.items() if name not in names} | now
-        if kept:
-            _sign(folder, files=kept)
-        else:
-            (folder / MARK).unlink(missing_ok=True)
+        del _holders[place]
+        if lock is not None:
+            with suppress(OSError):
+                (folder / LOCK).unlink()
+            os.close(lock)
+
+
+_holders: dict[Path, tuple[int, int]] = {}
+
+
+def _locked(folder: Path) -> int | None:
+    """Return the open lock of a folder, or None where there are no locks."""
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    path, until = folder / LOCK, time.monotonic() + LOCK_SECONDS
+    while True:
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with suppress(FileNotFoundError):  # removed by who held it: the next file of that name is another
+                if os.path.samestat(os.fstat(lock), os.stat(path)):
+                    with suppress(OSError):  # a full disk
+                        os.ftruncate(lock, 0)
+                        told = f"process {os.getpid()} on {socket.gethostname()}, since {time.ctime()}"
+                        os.write(lock, told.encode())
+                    return lock
+            os.close(lock)
+        except BlockingIOError:
+            holder = os.pread(lock, 200, 0).decode(errors="replace") or "another process"
+            os.close(lock)
+            if time.monotonic() > until:
+                raise ValueError(
+                    f"{folder} is being written to by {holder}. Wait for its end, or give --out another folder."
+                ) from None
+            time.sleep(0.1)
+        except OSError:  # a file system without locks
+            os.close(lock)
+            return None
+
+
+def _real(path: Path | str) -> Path:
+    """Return a path without links; ``Path.resolve`` has no answer where one leads to itself."""
+    return Path(os.path.realpath(path))
 
 
 def _mark(folder: Path) -> dict[str, Any] | None:
@@ -176,7 +282,7 @@ class Store:
         self._memory: dict[str, bytes] = {}
         if folder is None:
             return
-        if folder.is_dir() and any(folder.iterdir()):
+        if folder.is_dir() and any(_PART not in path.name for path in folder.iterdir()):
             mark = _mark(folder)
             if mark is None:
                 raise ValueError(
@@ -187,7 +293,7 @@ class Store:
                 if mark.get("fingerprint") != run:
                     raise ValueError(f"{folder} was left by a run on other data or options. {AFRESH}")
                 return
-            shutil.rmtree(folder)
+            _remove(folder)
         folder.mkdir(parents=True, exist_ok=True)
         _sign(folder, fingerprint=run)
 
@@ -226,7 +332,7 @@ class Store:
     def remove(self) -> None:
         """Remove everything: the run has ended."""
         if self.folder is not None and _mark(self.folder) is not None:
-            shutil.rmtree(self.folder)
+            _remove(self.folder)
             if self.folder.parent.name == UNFINISHED:
                 with suppress(OSError):  # another command has left something there
                     self.folder.parent.rmdir()
@@ -245,6 +351,16 @@ class Store:
             return reader(self._memory[key]) if key in self._memory else None
         path = self.folder / f"{key}.kept"
         return read(path, lambda p: reader(_unsealed(p)), AFRESH) if path.exists() else None
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder of ours, what says so last: whoever is killed on the way leaves one that is still ours."""
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != MARK:
+            path.unlink()
+    shutil.rmtree(folder)
 
 
 def _unsealed(path: Path) -> bytes:

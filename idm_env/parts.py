@@ -60,7 +60,10 @@ class Parts:
     def join(self, name: str, target: Path) -> None:
         """Write the tables of all parts as one, csv or parquet by the target's name, holding one of them at a time."""
         whole = pl.scan_parquet(self.tables(name), glob=False, missing_columns="insert", extra_columns="ignore")
-        keep.write(target, whole.sink_csv if target.suffix == ".csv" else whole.sink_parquet)
+        if target.suffix == ".csv":
+            keep.write_csv(target, whole)
+        else:
+            keep.write(target, whole.sink_parquet)
 
     def remove(self) -> None:
         """Remove the folder: the run has ended."""

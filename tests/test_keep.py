@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import shutil
 import subprocess
@@ -149,6 +150,80 @@ def test_fit_and_simulate_refuse_to_overwrite_what_they_read(data: Path, tmp_pat
     assert content(out) == before
 
 
+HOLD = """
+import os, signal, sys
+from pathlib import Path
+from idm_env import keep
+
+with keep.results(sys.argv[1], ["report.json"]):
+    print("held", flush=True)
+    if sys.stdin.readline().strip() == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_one_job_at_a_time_writes_to_a_folder_and_a_dead_one_is_not_in_the_way(tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("fcntl")
+    monkeypatch.setattr(keep, "LOCK_SECONDS", 0.2)
+    for end in ("end", "die"):
+        other = subprocess.Popen(
+            [sys.executable, "-c", HOLD, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        with other:
+            assert other.stdin and other.stdout and other.stdout.readline() == "held\n"
+            with pytest.raises(ValueError, match=rf"is being written to by process {other.pid} on .*, since .* Wait"):
+                run(tmp_path)
+            other.stdin.write(f"{end}\n")
+        assert (keep.LOCK in content(tmp_path)) == (end == "die")
+        run(tmp_path)
+        assert set(content(tmp_path)) == {*NAMES, keep.MARK}
+        shutil.rmtree(tmp_path)
+        tmp_path.mkdir()
+
+
+def test_a_lock_is_held_once_per_job_and_not_by_another_thread(tmp_path: Path, monkeypatch) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    pytest.importorskip("fcntl")
+    monkeypatch.setattr(keep, "LOCK_SECONDS", 0.2)
+    with keep.results(tmp_path, NAMES):
+        run(tmp_path)  # explain writes its report so
+        with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match=f"written to by process {os.getpid()} on"):
+            pool.submit(run, tmp_path).result()
+        assert keep.LOCK in content(tmp_path)
+    assert keep.LOCK not in content(tmp_path)
+
+
+def test_a_lock_follows_no_link(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("years of work")
+    (tmp_path / keep.LOCK).symlink_to(tmp_path / "thesis.txt")
+    with pytest.raises(OSError, match="idm-env-lock"):
+        run(tmp_path)
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+@pytest.mark.parametrize("below", [".", "under"])
+def test_a_link_to_itself_is_one_line(tmp_path: Path, below: str) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(ValueError, match=r"loop(/under)? cannot be made \(.*\)\. Give --out another folder\."):
+        run(tmp_path / "loop" / below)
+
+
+def test_formulas_are_escaped_and_numbers_stay_numbers(tmp_path: Path) -> None:
+    """A spreadsheet runs what begins with one of = + - @, or with a blank that it leaves out."""
+    formulas = ["=1+1", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "=cmd|' /C calc'!A0"]
+    harmless = ["a", "", None, "-3", "+4.5", "1e-3", "a=b"]
+    table = pl.DataFrame({"x": [*formulas, *harmless], "=y": [-1.5] * 14}).with_columns(
+        k=pl.col("x").cast(pl.Categorical)
+    )
+    keep.write_csv(tmp_path / "a.csv", table.lazy())
+    with (tmp_path / "a.csv").open(newline="") as file:
+        found = list(csv.DictReader(file))
+    wanted = [f"'{text}" for text in formulas] + [text or "" for text in harmless]
+    assert [row["x"] for row in found] == [row["k"] for row in found] == wanted
+    assert {row["'=y"] for row in found} == {"-1.5"}
+
+
 # -- unfinished work -------------------------------------------------------------------------------------------------
 
 
@@ -179,6 +254,23 @@ def test_a_folder_that_is_not_ours_is_never_emptied(tmp_path: Path) -> None:
                 keep.Store(folder, "a", resume)
             assert "\n" not in str(told.value)
     assert (folder / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_store_that_is_killed_while_it_is_made_or_removed_is_still_ours(tmp_path: Path, monkeypatch) -> None:
+    folder = tmp_path / keep.UNFINISHED / "fit"
+    folder.mkdir(parents=True)
+    (folder / ".run.idm-env-part.json").write_text("{")
+    store = keep.Store(folder, "a", True)
+    store.put_json("x", 1)
+
+    def killed(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(keep.shutil, "rmtree", killed)
+    with pytest.raises(KeyboardInterrupt):
+        store.remove()
+    monkeypatch.undo()
+    assert keep.Store(folder, "b", False).kept() == []
 
 
 def damaged(path: Path) -> dict[str, bytes]:

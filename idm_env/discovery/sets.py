@@ -122,7 +122,7 @@ def explain_sets(
             done += 1
             progress("sets", done, len(paths), "")
         rows = parts.summaries()
-        keep.write(out / "sets.csv", pl.DataFrame(rows, infer_schema_length=None).select(COLUMNS).write_csv)
+        keep.write_csv(out / "sets.csv", pl.DataFrame(rows, infer_schema_length=None).select(COLUMNS))
         page.write_page(out / "report.html", f"{len(rows)} data sets", _page(rows))
         parts.remove()
     return rows
