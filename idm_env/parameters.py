@@ -7,6 +7,8 @@ tensors (``defaults``, ``sample``, ``null``), moves tensors in and out of their 
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -47,6 +49,14 @@ class Parameter:
     def __post_init__(self) -> None:
         if not self.low < self.high or not self.low <= self.default <= self.high:
             raise ValueError(f"parameter '{self.name}': default {self.default} is outside [{self.low}, {self.high}].")
+        if not re.fullmatch(r"[\w-]+", self.name):
+            raise ValueError(f"parameter {self.name!r}: a name has letters, digits, '_' and '-'.")
+        inside = self.null is None or self.low <= self.null <= self.high
+        if not inside and not (self.role == "threshold" and math.isfinite(self.null or 0.0)):
+            raise ValueError(
+                f"parameter '{self.name}': null {self.null} is outside [{self.low}, {self.high}], as only that of a "
+                "threshold may be, which is absent far beyond its bounds."
+            )
 
     def transform(self) -> Transform:
         """Bijection from the real line onto the open interval (low, high)."""

@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from idm_env import instead, parameters
 from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead, normals
-from idm_env.types import Inputs, Params, State
+from idm_env.types import Inputs, Params, State, mapped
 
 
 class Trajectory(NamedTuple):
@@ -103,8 +103,10 @@ class Simulator(Stepping):
             inputs = self.drawn(state.speed, inputs, steps, seed)
         if steps > 0 and keep in (_kept, None):
             self._covered(inputs, steps)
+            self.tried(state, inputs, params)
             fast = instead.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)
-            if fast is not None:
+            # NaN that an effect of one's own has made is told by the step itself.
+            if fast is not None and not (self.own and bool(fast[0].speed.isnan().any())):
                 last, kept_of_all = fast
                 return last, None if kept_of_all is None else Trajectory(*kept_of_all)
         slices = self.slices(inputs, steps)
@@ -132,6 +134,28 @@ class Simulator(Stepping):
         columns = (torch.stack(column) for column in zip(*kept, strict=True))
         first = kept[0]
         return state, type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
+
+    @property
+    def untried(self) -> bool:
+        """Whether effects of the user's own are still to be tried."""
+        return self.own and "_tried" not in self.__dict__
+
+    def tried(self, state: State, inputs: Inputs, params: Params) -> None:
+        """Do one step on copies where effects of one's own are at work, once: compiled steps do not watch them.
+
+        ``inputs`` as in ``rollout``. ValueError names an effect that does what it must not (``effects/watched.py``).
+        """
+        if not self.untried:
+            return
+        # A step at which lanes are decided about.
+        state = state._replace(step=state.step - state.step.remainder(self.decides_after))
+        with torch.inference_mode(False), torch.no_grad():
+            numbers = {e: {n: torch.as_tensor(x) for n, x in values.items()} for e, values in params.items()}
+            copied, given, values = (
+                mapped(lambda x: x.detach().clone(), each) for each in (state, self.slices(inputs, 1)[0], numbers)
+            )
+            Stepping.step(self, copied, given, values)  # type: ignore[arg-type]
+        self.__dict__["_tried"] = True
 
     def advance(self, state: State, inputs: Inputs, params: Params) -> State:
         """Return the state Δt later, as ``step`` does, by what may run in place of it: a rollout of one step."""
@@ -171,7 +195,8 @@ class Compiled(Simulator):
         if "failed" in self.__dict__:
             return super().step(state, inputs, params)
         try:
-            return self._compiled(state, inputs, params)
+            after = self._compiled(state, inputs, params)
+            return super().step(state, inputs, params) if self.own and bool(after.speed.isnan().any()) else after
         except torch._dynamo.exc.TorchDynamoException as error:
             self.__dict__["failed"] = True
             first = str(error).strip().splitlines()[0]

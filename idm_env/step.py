@@ -63,6 +63,9 @@ class Stepping:
             raise ValueError(
                 f"a simulator needs exactly one car-following effect, got {following or 'none'}. Add IDM() or drop one."
             )
+        sideways = next((e.name for e in self.effects if e.hook == "change"), None)
+        if sideways and not self.road.beside:
+            raise ValueError(f"effect '{sideways}' changes lanes, and this road has one. Take Lanes(2), or none.")
         if self.integration not in INTEGRATORS:
             hint = parameters.nearest(self.integration, INTEGRATORS)
             raise ValueError(f"integration = '{self.integration}' is unknown.{hint}")
@@ -109,6 +112,11 @@ class Stepping:
         hooks["perceive"] = tuple(sorted(hooks["perceive"], key=lambda e: e.rank))
         hooks["limit"] = tuple(sorted((*hooks["limit"], *unspoken(self.effects)), key=lambda e: e.rank))
         return hooks
+
+    @cached_property
+    def own(self) -> bool:
+        """Whether an effect of the user's own is at work."""
+        return any(e.own for e in self.effects)
 
     @cached_property
     def changes(self) -> tuple[Effect, ...]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from idm_env.effects.watched import RETURNS, watched
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Motion, Scene, Wish
 
@@ -20,6 +22,9 @@ Sought = Literal["anywhere", "profile", "interval", "step", "given"]
 because a column of the file gives the profile."""
 Neighbour = Literal["leader", "second leader", "vehicle behind", "vehicle in an adjacent lane"]
 """Whom a record must show for the effect to be seen in it."""
+
+NEEDED = frozenset({"second_leader", "behind", "merger"})
+"""Neighbours that a scene has where an effect ``needs`` them."""
 
 P = dict[str, Tensor]
 """The parameters of one effect: name → tensor."""
@@ -83,6 +88,8 @@ class Effect:
     adds: ClassVar[bool] = False
     draws: ClassVar[bool] = False
     hook: ClassVar[Hook]
+    own: ClassVar[bool] = False
+    """Whether the effect is the user's own, whose hooks are watched (``effects/watched.py``)."""
 
     sources: ClassVar[tuple[str, ...]] = ()
     title: ClassVar[str] = ""
@@ -106,6 +113,15 @@ class Effect:
                 f"effect {cls.__name__} overrides {mine or 'no hook'}; override exactly one of {', '.join(HOOKS)}."
             )
         cls.hook = mine[0]
+        if cls.kind and not re.fullmatch(r"[\w-]+", cls.kind):
+            raise TypeError(
+                f"effect {cls.__name__}: kind = {cls.kind!r} names files and columns. Take letters, digits, '_' and "
+                "'-'."
+            )
+        if unknown := cls.needs - NEEDED:
+            raise TypeError(
+                f"effect {cls.__name__}: needs = {sorted(unknown)} is unknown. A scene has {', '.join(sorted(NEEDED))}."
+            )
         for promise, known in (("sought", Sought), ("beyond", Neighbour)):
             if (value := getattr(cls, promise)) not in get_args(known):
                 raise TypeError(
@@ -113,6 +129,10 @@ class Effect:
                 )
         # Not inherited: a subclass has another equation, and what its parent promised of his is not known of it.
         cls.adds = vars(cls).get("adds", cls.hook in ("adapt", "accelerate", "limit"))
+        cls.own = not cls.__module__.startswith("idm_env.")
+        for name in RETURNS if cls.own else ():
+            if name in vars(cls):
+                setattr(cls, name, watched(name, vars(cls)[name]))
         cls.remembers = cls.remember is not Effect.remember
         if cls.remembers and "wind_up_s" not in vars(cls):
             cls.wind_up_s = math.inf
@@ -188,10 +208,26 @@ class Effect:
 class CarFollowing(Effect):
     """An effect that wants an acceleration *and* owns the driver's parameters; a simulator has exactly one."""
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if not vars(cls).get("kind"):  # a base of laws: what it lacks its heirs have
+            return
+        lacks = [
+            what
+            for what, there in (
+                ("equation: override accelerate", cls.accelerate is not CarFollowing.accelerate),
+                ("driver: override driver", cls.driver is not CarFollowing.driver),
+                ("parameters: declare some", cls.declared or cls.parameters is not Effect.parameters),
+            )
+            if not there
+        ]
+        if lacks:
+            raise TypeError(f"car-following law {cls.__name__} has no {'; no '.join(lacks)}.")
+
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the wanted acceleration (m/s²)."""
-        raise TypeError(f"{type(self).__name__} is a car-following effect without an equation: override accelerate.")
+        raise NotImplementedError
 
     def driver(self, p: P) -> Driver:
         """Return the driver before any adaptation."""
-        raise TypeError(f"{type(self).__name__} is a car-following effect without a driver: override driver.")
+        raise NotImplementedError

@@ -214,7 +214,7 @@ class Batch:
 
         ``live`` (bool, ``(n, agents)``) leaves only single agents' vehicles to their drivers, and drops their commands.
         """
-        if self._values is not None:
+        if self._values is not None and not self.task.simulator.untried:
             told = self._step_values(action, live)
             if told is not None:
                 return Outcome.of(told)
@@ -256,7 +256,8 @@ class Batch:
                 self._driven = self.task.driven(self.glance().episode, self.params)
             told = values.step(given, who, noise, max(self._used - 1, 0), self._driven)
         except Untraceable:
-            # Said once, as a warning, where an effect is why (``kernels.printed``).
+            # Said once, as a warning, where an effect is why (``kernels.printed``); NaN the step itself tells.
+            self._world = self.world
             self._values, self._used, self._block = None, used, block
             return None
         self._world, self._loaded, self._seen = None, True, told["observation"]

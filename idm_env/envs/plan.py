@@ -148,7 +148,7 @@ class Plan:
         bound = self._bound
         if bound is None or bound.params is not params or bound.changed():
             bound = self._bound = self._bind(params)
-        rows, made, asked = self._rows, self._recorded, self._asked[side]
+        rows, made, asked, task = self._rows, self._recorded, self._asked[side], self._task
         for place, is_action in self._given:
             asked[place] = action if is_action else live  # type: ignore[assignment]
         made.before.run(rows, asked, self._outs)
@@ -164,6 +164,8 @@ class Plan:
             bound.loaded = self._tiles == 1
         else:
             self._split(bound, side, call, threads)
+        if task.simulator.own and np.isnan(new["state_speed"]).any():
+            raise Untraceable("an effect returned nan: the step itself tells which")
         if self._slots:
             self._past.newest += 1
         np.add(old["state_step"], 1, out=new["state_step"])

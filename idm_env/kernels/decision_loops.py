@@ -211,19 +211,22 @@ def relink(order, begin, count, ring, base, lane, leader, follower, fresh):
 @exact
 def settle(w, results, at, m, own_lane, left, right, begin, ring, left_hand, base, order, winner, utility, to_left,
            looks, signals, refused, blocked, turn):  # fmt: skip
-    """Grant the best claim on each gap so far, and count the others; return whether there was any."""
-    some = False
+    """Grant the best claim on each gap so far, and count the others; return whether there was any, −1 for NaN."""
+    some = 0
     for j in range(m):
         r = at + j
         if looks:
             signals[r] = w[results + 4 * ROW + j]
         if len(turn) and not turn[order[r]]:
             continue
-        if w[results + 3 * ROW + j] > 0:
+        comes_to_nothing = w[results + 3 * ROW + j]
+        if comes_to_nothing != 0:
+            if comes_to_nothing != comes_to_nothing:
+                return -1
             blocked[base + order[r]] += 1
         if not w[results + 2 * ROW + j] > 0:
             continue
-        some = True
+        some = 1
         utility[r], to_left[r] = w[results + j], w[results + ROW + j] > 0
         to, behind = (own_lane + 1, left) if to_left[r] else (own_lane - 1, right)
         key = key_of(r, to, behind, begin, ring)
@@ -294,7 +297,8 @@ def decide(
     ``plan`` says what the ``slots`` rows of the printed ``phase`` are filled with, ``places`` whose. ``merger`` (rows ·
     n own slots, or empty if nobody looks) gets who signals beside everybody; those slots decide whose ``turn``
     it is (empty: all). ``orders`` (rows · n) and ``begins`` (rows · (count + 1)) get the order of every row afterwards,
-    as ``walk`` would put it. Returns False, with some rows decided, where links are not the order of positions.
+    as ``walk`` would put it. Returns False, with some rows decided, where links are not the order of positions, or a
+    wish is NaN.
     """
     lane, leader, follower, changed, refused, blocked, unjudged = links
     w, which = workspace((slots + RESULTS) * ROW, k), np.empty(len(places) * CHUNK, np.int64)
@@ -313,7 +317,7 @@ def decide(
         beside(place, begin, count, -1, right)
         fill_alike(w, slots, plan, row)
         winner[:] = -1
-        some = False
+        some = 0
         for own in range(count):
             for at in range(begin[own], begin[own + 1], CHUNK):
                 m = min(CHUNK, begin[own + 1] - at)
@@ -324,10 +328,13 @@ def decide(
                     ring, tables,
                 )  # fmt: skip
                 call(phase, w, padded(m), k)  # type: ignore[call-arg]
-                some |= settle(
+                found = settle(
                     w, slots * ROW, at, m, own, left, right, begin, ring, left_hand, base, order, winner, utility,
                     to_left, len(merger) > 0, signals, refused, blocked, turn,
                 )  # fmt: skip
+                if found < 0:
+                    return False
+                some |= found
         granted[:] = False
         for r in winner:
             if r >= 0:

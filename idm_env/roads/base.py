@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,6 +19,9 @@ class Road(abc.ABC):
     Written with shifted views instead of index gathers, because compilers fuse those. A road on which the order changes
     (``Lanes``) answers through ``view(state)``, which is bound to the links of that state.
     """
+
+    beside: ClassVar[bool] = False
+    """Whether there may be a lane beside another; of ``Lanes`` the property says it."""
 
     def view(self, state: State) -> Road:
         """Return this road as it is in a state: itself, where the order never changes."""

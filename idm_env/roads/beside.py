@@ -7,7 +7,7 @@ What stands here is arithmetic of one vehicle and its neighbours. ``roads.linked
 from __future__ import annotations
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -81,6 +81,8 @@ def signalled(left: Tensor, right: Tensor, wish: Wish, left_hand: bool) -> Tenso
 
 class Sideways(Ending):
     """A road on which one can look beside."""
+
+    beside: ClassVar[bool] = True
 
     @abc.abstractmethod
     def at(self, x: Any, slot: Any) -> Any:

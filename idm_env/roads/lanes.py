@@ -109,6 +109,11 @@ class Lanes(Road):
                     f"these must rise, and lie on the road of {last:g} m."
                 )
 
+    @property
+    def beside(self) -> bool:  # type: ignore[override]
+        """Whether there is more than one lane."""
+        return self.count > 1
+
     # -- tables over lanes ---------------------------------------------------------------------------------------
 
     def table(self, name: Where) -> tuple[float, ...]:

@@ -66,6 +66,8 @@ class Graph:
     """Makes nodes, each once, with what follows from the arithmetic of constants folded in."""
 
     note: str = ""
+    suspects: list[Node] = field(default_factory=list)
+    """What effects of the user's own have made, which may be NaN."""
     _known: dict[tuple[object, ...], Node] = field(default_factory=dict)
 
     def node(self, op: str, *args: Node, label: Slot | float | int | None = None, level: int | None = None) -> Node:

@@ -198,6 +198,8 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
     The memories of ``form`` at their beginning are graphs, too (``begin``).
     ``Untraceable`` names the effect and the function for which that cannot be done.
     """
+    # A search tries what it likes, and effects that are switched off there must leave nothing behind.
+    told = graph is None
     graph = Graph() if graph is None else graph
     recording = Recording(graph)
     recorder = _Recorder(
@@ -212,6 +214,7 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
     given = Parameters(recorder, graph)
     try:
         after = recorder.step(state, inputs_of_form(form, graph), given)  # type: ignore[arg-type]
+        suspects = tuple(dict.fromkeys(graph.suspects)) if told else ()
         scene, driver = recorder.scene(state, {}), recorder._following.driver(given[recorder._following.name])  # type: ignore[arg-type]
         for effect in simulator.effects:
             if effect.name in form.memories:
@@ -225,6 +228,9 @@ def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recor
         ) from error
     for name in ("position", "speed", "accel"):
         recording.respond[name] = value_of(graph, getattr(after, name))
+    for node in suspects:  # a limit or a maximum further on may lose NaN
+        speed = recording.respond["speed"]
+        recording.respond["speed"] = graph.select(graph.compare("ne", node, node), node, speed)
     for name in form.memories:
         recording.respond[f"memory of {name}"] = value_of(graph, after.memory[name])
     recording.close["gap"] = value_of(graph, after.gap)

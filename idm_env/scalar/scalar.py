@@ -44,6 +44,10 @@ class Scalar:
         """Return the empty size."""
         return self.shape
 
+    def suspected(self) -> None:
+        """Remember that an effect of the user's own has made this: its NaN is to be told."""
+        self.graph.suspects.append(value_of(self.graph, self))
+
     def __bool__(self) -> bool:
         raise _refused(self.graph, "a Python `if` (or `and`, `or`, `not`) on a tensor; use torch.where")
 

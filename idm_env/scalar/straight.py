@@ -118,7 +118,7 @@ class Straight:
             assert isinstance(node.label, float)
             if isinstance(node.label, TimeStep):
                 return f"k[{self.varying.index(node.label)}]"
-            return repr(float(node.label)) if node.label >= 0 else f"({float(node.label)!r})"
+            return constant_text(node.label)
         if node.op == "input":
             assert isinstance(node.label, Slot)
             return self._read(node.label)
@@ -132,6 +132,12 @@ class Straight:
         if node.op == "table":
             return f"looked_up(value_of_curve, p, {node.label}, tables, {arguments[0]})"
         return _STAGED[node.op].format(*arguments)
+
+
+def constant_text(value: float) -> str:
+    """Return a constant as Python text, in which infinity and NaN have no names."""
+    text = repr(float(value)).replace("inf", "1e999").replace("nan", "1e999 - 1e999")
+    return text if value >= 0 else f"({text})"
 
 
 def block_note(node: Node) -> str:

@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import torch
+
 from idm_env.changes import beside, wished
 from idm_env.roads.beside import Preference, Side, Sideways, preferred, within
 from idm_env.roads.chains import Chains
@@ -20,7 +22,7 @@ from idm_env.scalar.record import Form, Parameters, SeenRoad, inputs_of_form, st
 from idm_env.scalar.scalar import Scalar, Untraceable, value_of
 from idm_env.scalar.source import Constants, Write, body, function, row
 from idm_env.step import Stepping
-from idm_env.types import State
+from idm_env.types import State, Wish
 
 SIDES = ("left", "right")
 SEARCHED = ("lane", "ahead", "behind", "laps ahead", "laps behind", "opens", "closes", "stops")
@@ -72,6 +74,15 @@ class _Sides(SeenRoad, Sideways):
         )  # fmt: skip
 
 
+def _or_nan(sides: tuple[Side, Side], wish: Wish, blocked: Any) -> Any:
+    """Return who is blocked, NaN where a wish for a side that is there and free is."""
+    for side, *parts in zip(sides, wish[:2], wish[2:4], strict=True):
+        free = side.exists & (side.gap > 0) & (side.back_gap > 0)
+        for part in parts:
+            blocked = torch.where(free & (part != part), torch.nan, blocked)
+    return blocked
+
+
 class Wishes:
     """A recorded decision: slots that it reads, and its text; ``Untraceable`` where an effect cannot be recorded."""
 
@@ -86,7 +97,10 @@ class Wishes:
         try:
             left, right = (view.side(name, state) for name in SIDES)
             scene = beside(stepping, view, (left, right), state, inputs, given)  # type: ignore[arg-type]
-            found = preferred(left, right, wished(stepping, scene, given), road.handed == "left")  # type: ignore[arg-type]
+            wish = wished(stepping, scene, given)
+            found = preferred(left, right, wish, road.handed == "left")  # type: ignore[arg-type]
+            if graph.suspects:  # effects of the user's own: their NaN is told by who is blocked
+                found = found._replace(blocked=_or_nan((left, right), wish, found.blocked))
             # Who signals is asked for only where somebody looks.
             told = found if simulator.sees_mergers else found[:-1]
             self.outputs: tuple[Node, ...] = tuple(value_of(graph, x) for x in told)

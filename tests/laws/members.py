@@ -8,7 +8,7 @@ from torch import Tensor
 from idm_env.changes import MERGER_GAP, MERGER_SPEED
 from idm_env.effects import ALL, IDM, Brakes, CarFollowing, Curve, DriverCurve, Effect, Grade, PerceptionNoise, Wander
 from idm_env.effects.free import FEATURES
-from idm_env.roads import Lane, Ring
+from idm_env.roads import Lane, Ring, Road
 from idm_env.simulator import Simulator
 from idm_env.types import FAR, Adjacent, Command, Imagined, Params, Record, State
 
@@ -16,7 +16,7 @@ N = 5
 DTYPE = torch.float64
 
 MEMBERS: list[Effect] = [
-    *(cls() for cls in ALL.values()),
+    *(cls() for cls in ALL.values() if cls.hook != "change"),  # those are refused on one lane
     IDM(exponent=None),
     IDM(sharpness=1.0),
     Brakes(sharpness=1.0),
@@ -35,7 +35,7 @@ def label(effect: Effect) -> str:
     return repr(effect).replace(" ", "")
 
 
-def around(effect: Effect, road: Lane | Ring | None = None, **options: object) -> Simulator:
+def around(effect: Effect, road: Road | None = None, **options: object) -> Simulator:
     """Return a simulator of IDM and Brakes with ``effect`` in it, in the place of IDM if it is car-following."""
     following = () if isinstance(effect, CarFollowing) else (IDM(),)
     base = [e for e in (*following, Brakes()) if e.name != effect.name]
