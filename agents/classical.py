@@ -24,6 +24,7 @@ from agents.common import load_agent, one_line
 from agents.environments import task_of
 from agents.evaluate import as_judged, evaluate_ring
 from agents.rollout import FRESH, LENGTHS, Act, ring_start, uniform_speed
+from idm_env import trust
 from idm_env.tasks import Task
 
 
@@ -146,16 +147,21 @@ class Arguments:
 
     Args:
         config: An agent's file, of which the environment is taken.
+        trust: Run Python code that the file names, such as my_file.py:MyEffect.
     """
 
     config: str = "configs/ring-apg.yaml"
+    trust: bool = False
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per controller."""
     torch.set_num_threads(1)
     with one_line():
-        arguments = load_agent(tyro.cli(Arguments, args=argv).config, apg.Arguments, "apg")
+        asked = tyro.cli(Arguments, args=argv)
+        if asked.trust:
+            trust.always()
+        arguments = load_agent(asked.config, apg.Arguments, "apg")
         environment = as_judged(arguments.environment, arguments.judged_in)
     print("controller | worst speed ratio | worst std (m/s) | smallest time gap (s) | collisions")
     for name, make in controllers(environment, LENGTHS, FRESH).items():

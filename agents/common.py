@@ -20,9 +20,9 @@ from torch import Tensor, nn
 import idm_env
 from agents.environments import first_seed, human_driving, task_of
 from agents.policy import Policy
-from idm_env import keep
+from idm_env import keep, trust
 from idm_env.checks import finite, nearest, shown
-from idm_env.config import load_environment, number, read_yaml
+from idm_env.config import check_places, load_environment, number, read_yaml
 from idm_env.tasks import Task
 
 SCHEMA = 2
@@ -30,7 +30,7 @@ SCHEMA = 2
 
 MAY_BE_ZERO = {"recurrent", "seed", "clone", "critic_first", "learning_starts"}
 POSITIVE = {"learning_rate", "clip"}
-KEPT = ("last.pt", "best.pt", "model.zip", "returns.pkl", "replay.pkl")
+KEPT = ("last.pt", "best.pt", "learner.pt")
 """What trainings keep in ``out``, beside their logs."""
 LOGS = ("csv", "tensorboard", "stdout", "json")
 MAY_CHANGE = {
@@ -104,9 +104,13 @@ def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
     """Return the arguments of ``--config FILE`` and of the other options, which win."""
     before = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     before.add_argument("--config")
+    before.add_argument("--trust", action="store_true")
     known, rest = before.parse_known_args(argv)
+    if known.trust:
+        trust.always()
     default = kind() if known.config is None else load_agent(known.config, kind, agent)
-    text = f"{kind.__doc__}\n\n--config FILE reads a YAML file first, such as configs/ring-apg.yaml."
+    text = f"{kind.__doc__}\n\n--config FILE reads a YAML file first, such as configs/ring-apg.yaml. "
+    text += "--trust runs Python code that YAML files and checkpoints name, such as my_file.py:MyEffect."
     found = tyro.cli(kind, default=default, args=rest, description=text)
     for path in (found.out / name for name in KEPT):
         keep.not_an_input(path, (known.config, *(getattr(found, name, None) for name in ("data", "start", "teacher"))))
@@ -230,6 +234,7 @@ def load(path: str | Path, task: str | None = None, agent: str | None = None) ->
         raise ValueError(
             f"{path} is broken (parts of a checkpoint are missing). Delete it and train anew, without --resume."
         )
+    check_places(path, content)
     for name, wanted in (("task", task), ("agent", agent)):
         if wanted is not None and content[name] != wanted:
             raise ValueError(

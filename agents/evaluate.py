@@ -35,7 +35,7 @@ from agents.rollout import (
     ring_start,
     uniform_speed,
 )
-from idm_env import metrics, population
+from idm_env import metrics, population, trust
 from idm_env.envs.gym import DiffIDMEnv
 from idm_env.tasks.ring import RingTask
 
@@ -384,6 +384,7 @@ class Arguments:
         human: Steps of human driving before the policy, in video and diagram.
         steps: Steps with the policy, in video and diagram.
         seed: Of the episode that is shown.
+        trust: Run Python code that the checkpoint names, such as my_file.py:MyEffect.
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
@@ -392,6 +393,7 @@ class Arguments:
     human: int = 1500
     steps: int = 1500
     seed: int = 0
+    trust: bool = False
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -400,6 +402,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     with one_line():
         if min(arguments.steps, arguments.human + 1) < 1:
             raise ValueError(f"steps = {arguments.steps} must be at least 1, human = {arguments.human} at least 0.")
+        if arguments.trust:
+            trust.always()
         policy, content = load(arguments.checkpoint)
         environment = as_judged(content["environment"], content["training"].get("arguments", {}).get("judged_in"))
         for name, act in (("human", None), (content["agent"], policy)):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import idm_env
-from idm_env import checks, keep
+from idm_env import checks, keep, trust
 from idm_env.extras import needed
 from idm_env.progress import OnProgress, shown
 
@@ -100,6 +100,16 @@ Base = Annotated[
         help="Car-following law: idm (the default), idm_plus, iidm, fvdm, gipps, constant_time_gap, my_file.py:MyLaw."
     ),
 ]
+
+
+def _trust(given: bool) -> None:
+    if given:
+        trust.always()
+
+
+Trust = Annotated[
+    bool, typer.Option("--trust", callback=_trust, help="Run Python code that YAML files name, as my_file.py:MyEffect.")
+]
 Step = Annotated[
     float | None, _ranged("--dt", help="Use every n-th sample, to this step (s).", low=0.001, high=100.0, unit="s")
 ]
@@ -184,6 +194,7 @@ def fit(
         float, _ranged(help="--lane-changes: seconds from a decision to the new lane number.", low=0.0, high=10.0)
     ] = 0.0,
     first_lane: Annotated[str, typer.Option(help="--lane-changes: where the lowest lane is, left or right.")] = "left",
+    trusted: Trust = False,
 ) -> None:
     """Calibrate IDM, or another law, by gradients through the simulator, per driver, group or pooled.
 
@@ -192,7 +203,7 @@ def fit(
     """
     if lane_changes:
         source_of_changes = {"data", "out", "model", "base", "seed", "ring_length", "layout", "where", "lane_changes",
-                             "every", "ahead", "first_lane"}  # fmt: skip
+                             "every", "ahead", "first_lane", "trusted"}  # fmt: skip
         _only(context, "--lane-changes", source_of_changes)
         _fit_lane_changes(data, out, model, base, seed, ring_length, layout, where, every, ahead, first_lane)
         return
@@ -404,6 +415,7 @@ def simulate(
     window: Window = None,
     dt: Step = None,
     where: Where = None,
+    trusted: Trust = False,
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
     with shown(console) as report:
@@ -452,6 +464,7 @@ def drift(
 def effects(
     model: Annotated[Path | None, typer.Argument(help="A model.yaml: only the effects in it.")] = None,
     cite: Annotated[bool, typer.Option("--cite", help="Print the publications that they are taken from.")] = False,
+    trusted: Trust = False,
 ) -> None:
     """List the catalogue of effects, or the effects of a model, with their parameters or their publications."""
     from idm_env.effects import ALL
@@ -519,6 +532,7 @@ def plot(
         _ranged(help="Length of a rollout, all vehicles left to their drivers (s).", low=0.1, high=1e5, unit="s"),
     ] = 300.0,
     seed: Seed = 0,
+    trusted: Trust = False,
 ) -> None:
     """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
 
@@ -624,6 +638,7 @@ def filter_(
     executor: Workers = "serial",
     jobs: Jobs = None,
     ray_address: RayAddress = None,
+    trusted: Trust = False,
 ) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
     with shown(console) as report:
@@ -664,6 +679,7 @@ def reconstruct(
     executor: Workers = "serial",
     jobs: Jobs = None,
     ray_address: RayAddress = None,
+    trusted: Trust = False,
 ) -> None:
     """Reconstruct dense trajectories from sparse ones, a second or more between points."""
     with shown(console) as report:
@@ -754,9 +770,6 @@ def run() -> None:
     """Run the command line: bad input ends with one line and exit code 1, Ctrl-C with 130."""
     try:
         code = app(standalone_mode=False)  # an exit code where typer has dealt with the end itself
-        if code == 130:
-            _interrupted()
-        sys.exit(code if isinstance(code, int) else 0)
     except Exception as error:
         # A library may turn an interruption into an error of another kind; typer makes EOFError an Abort.
         cause = error.__cause__ if isinstance(error, typer.Abort) else error
@@ -770,6 +783,14 @@ def run() -> None:
         sys.exit(getattr(error, "exit_code", 2))
     except KeyboardInterrupt:
         _interrupted()
+    except BaseException as error:  # nothing of ours, unless a shell completes a command line
+        if "_IDM_ENV_COMPLETE" in os.environ or {"--show-completion", "--install-completion"} & set(sys.argv):
+            raise
+        told = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
+        _failed(ValueError(f"the command was ended from within ({told}), as by a file of effects. Mend that file."))
+    if code == 130:
+        _interrupted()
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 def _failed(error: Exception) -> NoReturn:

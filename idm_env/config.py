@@ -9,7 +9,9 @@
      by: driver, drivers: {run1/7: {idm: {time_gap: 1.1}}}, substeps: 4}
 
 An effect that the package has never seen is written as the place of its class, ``my_file.py:MyEffect`` or
-``my_package.my_module:MyEffect``; reading such a model runs that file.
+``my_package.my_module:MyEffect``. That is code of whoever wrote the YAML file. It is free where this process has
+imported it already. Otherwise it is run only if ``trusted``, inside ``idm_env.trust.trusting()``, or with
+IDM_ENV_TRUST=1.
 
 ``by`` says what the keys of ``drivers`` are, as in ``fit``: ``driver`` (run/vehicle), ``run_id``, ``vehicle_id`` or a
 column. ``substeps`` is there where a fit chose another number of simulated steps per sample than the default.
@@ -22,6 +24,7 @@ Unknown keys are errors with a suggestion, in one line.
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -32,7 +35,7 @@ import torch
 from torch import Tensor
 
 from idm_env import effects as catalogue
-from idm_env import parameters
+from idm_env import parameters, trust
 from idm_env.checks import nearest, one_of, shown, whole
 from idm_env.effects import CarFollowing, Effect
 from idm_env.extras import needed
@@ -114,13 +117,17 @@ class Model:
         return values
 
 
-def load_model(path: str | Path) -> Model:
-    """Return the model of a ``model.yaml``; ValueError, in one line, for everything that does not belong in it."""
-    content = read_yaml(path)
-    try:
-        return _model(content)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+def load_model(path: str | Path, *, trusted: bool = False) -> Model:
+    """Return the model of a ``model.yaml``; ValueError, in one line, for everything that does not belong in it.
+
+    ``trusted``: code that the file names is run; otherwise it is such an error.
+    """
+    with trust.trusting(trusted):
+        content = read_yaml(path)
+        try:
+            return _model(content)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
 
 def _model(content: dict[str, Any]) -> Model:
@@ -180,9 +187,13 @@ def save_model(path: str | Path, model: Model) -> None:
     write_text(Path(path), text)
 
 
-def load_environment(path: str | Path) -> dict[str, Any]:
-    """Return the keyword arguments of an environment's YAML file; it must say ``configures: environment``."""
-    content = read_yaml(path)
+def load_environment(path: str | Path, *, trusted: bool = False) -> dict[str, Any]:
+    """Return the keyword arguments of an environment's YAML file; it must say ``configures: environment``.
+
+    ValueError, in one line, for what is none, and for code that the file names, unless it is ``trusted``.
+    """
+    with trust.trusting(trusted):
+        content = read_yaml(path)
     if content.pop("configures", None) != "environment":
         raise ValueError(
             f"{path}: no environment is configured here. Write 'configures: environment' in its first line."
@@ -294,7 +305,39 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())[:200]}") from None
     if not isinstance(content, dict):
         raise ValueError(f"{path} must hold a mapping, one 'key: value' per line.")
+    check_places(path, content)
     return content
+
+
+def check_places(path: str | Path, content: Mapping[Any, Any]) -> None:
+    """Raise ValueError, in one line, where what a file says names code to run, unless it is trusted; else say so.
+
+    Whoever reads a file of others, of whatever layout, calls this first. Every list under a key ``effects`` counts.
+    """
+    waiting: list[Any] = [content]
+    while waiting:
+        part = waiting.pop()
+        waiting += part.values() if isinstance(part, Mapping) else part if isinstance(part, (list, tuple)) else ()
+        if not isinstance(part, Mapping):
+            continue
+        if not isinstance(part.get("trusted", {}), Mapping):
+            raise ValueError(f"{path}: trusted = {shown(part['trusted'])} is not for a file to say. Say it yourself.")
+        effects = part.get("effects")
+        listed = isinstance(effects, Iterable) and not isinstance(effects, (str, Mapping))
+        for one in effects if listed else ():  # type: ignore[union-attr]
+            where = one.get("effect") if isinstance(one, Mapping) else one
+            if not isinstance(where, str) or ":" not in where or catalogue.imported(place := where.rpartition(":")[0]):
+                continue
+            if not trust.given():
+                raise ValueError(
+                    f"{path}: effect {shown(where)} is code of {shown(place)}, which is not run unasked. Read it, then "
+                    f"give --trust, trusted=True in Python, or {trust.VARIABLE}=1."
+                )
+            logging.getLogger("idm_env").warning("runs %s, which %s names.", place, path)
+            try:
+                catalogue.named(where)
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
 
 
 def _harmless(yaml: Any, text: str, loader: Any) -> None:

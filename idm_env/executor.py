@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Protocol, TypeVar
 
+from idm_env import trust
 from idm_env.extras import needed
 from idm_env.progress import OnProgress, silent
 
@@ -168,7 +169,7 @@ def _flow(
         while waiting or flying:
             while waiting and len(flying) < (1 if deaths else workers.room()):
                 number = waiting.popleft()
-                flying[workers.submit(dumps((here, function, parts[number])))] = number
+                flying[workers.submit(dumps((here, trust.given(), function, parts[number])))] = number
             done = workers.wait(list(flying))
             number = flying.pop(done)
             try:
@@ -204,23 +205,26 @@ def _work(payload: bytes) -> tuple[str, Any]:
     for name in THREADS:  # before any library starts its threads
         os.environ[name] = "1"
     try:
-        here, function, part = pickle.loads(payload)
+        here, trusted, function, part = pickle.loads(payload)
         with suppress(OSError):  # relative paths mean the same as where the work was asked for
             os.chdir(here)
         if torch := sys.modules.get("torch"):  # whatever was set when it was imported
             torch.set_num_threads(1)
-        return "done", function(part, silent)
+        with trust.trusting(trusted):
+            return "done", function(part, silent)
     except OSError as error:
         return "storage", OSError(*error.args)
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # an effect of a user's may call sys.exit()
         try:
             pickle.loads(pickle.dumps(error))
         except Exception:
             return "failed", _told(error)
-        return "failed", error
+        return "failed", error if isinstance(error, Exception) else _told(error)
 
 
-def _told(error: Exception) -> str:
+def _told(error: BaseException) -> str:
     words = " ".join(str(error).split())
     return words if isinstance(error, ValueError) and words else f"{type(error).__name__}: {words}".rstrip(": ")
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -25,6 +26,7 @@ from agents.policy import Policy
 from idm_env import checks, cli
 from idm_env.config import load_environment, load_model
 from idm_env.data import synthetic
+from idm_env.effects import ALL
 from idm_env.envs.pettingzoo import parallel_env
 
 QUICK = settings(max_examples=60)
@@ -59,6 +61,86 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "data.csv"
     synthetic.generate(2, runs=2, followers=1, seconds=30.0)[0].table.drop("gap_m").write_csv(path)
     return path
+
+
+# -- files of effects ------------------------------------------------------------------------------------------------
+
+ENDINGS = {
+    "exits": "import sys; sys.exit(0)",
+    "exits without a word": "raise SystemExit",
+    "raises what is no Exception": "class Odd(BaseException): pass\nraise Odd('a' * 5000)",
+    "raises": "raise RuntimeError('two\\nlines')",
+    "ends a generator": "raise GeneratorExit",
+    "is no Python": "def (",
+    "divides": "1 / 0",
+    "exits when its class is made": """
+import sys
+from dataclasses import dataclass
+from typing import ClassVar
+from idm_env.effects import IDM
+@dataclass(frozen=True)
+class X(IDM):
+    kind: ClassVar[str] = "odd"
+    def __post_init__(self):
+        sys.exit(0)
+""",
+    "exits when it is asked": """
+import sys
+from dataclasses import dataclass
+from typing import ClassVar
+from idm_env.effects import IDM
+@dataclass(frozen=True)
+class X(IDM):
+    kind: ClassVar[str] = "odder"
+    def accelerate(self, scene, driver, p):
+        sys.exit(0)
+""",
+}
+USES: dict[str, tuple[object, ...]] = {
+    "explain --effects": ("explain", "DATA", "--effects", "FILE:X"),
+    "explain --base": ("explain", "DATA", "--base", "FILE:X"),
+    "fit --base": ("fit", "DATA", "--starts", "1", "--base", "FILE:X"),
+    "fit --lane-changes": ("fit", "DATA", "--lane-changes", "--base", "FILE:X"),
+    "simulate --base": ("simulate", "DATA", "--base", "FILE:X"),
+    "simulate --model": ("simulate", "DATA", "--trust", "--model", "MODEL"),
+    "effects --cite": ("effects", "MODEL", "--cite", "--trust"),
+    "plot": ("plot", "ENVIRONMENT", "--trust", "--out", "OUT.png"),
+    "several sets": ("explain", "DATA", "DATA", "--effects", "FILE:X"),
+}
+
+
+@pytest.fixture
+def same_catalogue(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a test enters, and whom it trusts, is gone after it."""
+    monkeypatch.setenv("IDM_ENV_TRUST", "0")
+    before = dict(ALL)
+    yield
+    ALL.clear()
+    ALL.update(before)
+
+
+@pytest.mark.usefixtures("same_catalogue")
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_file_of_effects_that_ends_the_process_is_one_line(data: Path, tmp_path: Path, ending: str, use: str) -> None:
+    file, model, environment = (tmp_path / name for name in ("mine.py", "model.yaml", "environment.yaml"))
+    file.write_text(ENDINGS[ending])
+    model.write_text(f"effects: ['{file}:X', brakes]\n")
+    environment.write_text(f"configures: environment\ntask: ring\nwarmup: 1\neffects: ['{file}:X']\n")
+    paths = {
+        "DATA": data,
+        "FILE:X": f"{file}:X",
+        "MODEL": model,
+        "ENVIRONMENT": environment,
+        "OUT.png": tmp_path / "a.png",
+    }
+    words = [paths.get(str(word), word) for word in USES[use]]
+    if ending == "exits when it is asked" and words[0] == "effects":
+        assert run(*words)[0] == 0  # it is not asked
+        return
+    line = refused(*words, *(() if {"--out", "--cite"} & set(words) else ("--out", tmp_path / "out")))
+    assert "mine.py" in line or "odd" in line or "ended from within (SystemExit: 0)" in line
+    assert not list(tmp_path.glob("out/report.*"))
 
 
 # -- numbers ---------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -37,6 +38,8 @@ def square(part: Part, on_progress: OnProgress) -> int:
     on_progress("square", part.number, 10)
     if part.wrong == "raise":
         raise ZeroDivisionError("no gap")
+    if part.wrong == "exit":
+        sys.exit(0)
     if part.wrong == "full":
         raise OSError(errno.ENOSPC, "No space left on device")
     if part.wrong == "always dies" or (part.wrong == "dies once" and marks == 0):
@@ -68,6 +71,12 @@ def test_every_part_is_done_once_and_the_one_that_raises_is_named(kind: str, tmp
             found[number] = result
     assert found == {i: i**2 for i in range(6) if i != 3}
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"{i}-0" for i in range(6)]
+
+
+def test_a_part_that_ends_its_worker_is_named(tmp_path: Path) -> None:
+    """An effect of a user's that calls sys.exit(0) ends neither the worker nor whoever asked."""
+    payload = pickle.dumps((os.getcwd(), False, square, Part(3, tmp_path, "exit")))
+    assert executor._work(payload) == ("failed", "SystemExit: 0")
 
 
 def test_dead_processes_are_replaced_and_a_part_that_kills_them_is_told_from_the_others(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from idm_env.effects.neighbours import BrakeLight, Courtesy, Follower, Lateral, 
 from idm_env.effects.noise import DRIFTS, AccelNoise, Noise, PerceptionNoise, Wander
 from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
-from idm_env.effects.registry import entered, is_candidate, lives, read
+from idm_env.effects.registry import entered, imported, is_candidate, lives, read
 from idm_env.effects.surroundings import Drag, Grade
 from idm_env.effects.time_gaps import Relaxation, SetPointAsymmetry, SpeedTimeGap
 
@@ -240,6 +240,7 @@ __all__ = [
     "base_named",
     "candidates",
     "describe",
+    "imported",
     "make",
     "named",
     "register",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -31,9 +31,11 @@ def entered(effect: type[Effect], known: dict[str, type[Effect]]) -> type[Effect
         raise ValueError(f"the name '{effect.kind}' of {effect.__name__} is that of {taken.__name__}. Give it another.")
     try:
         effect()
-    except TypeError as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise ValueError(
-            f"effect '{effect.kind}' cannot be made without arguments ({error}). Give its fields defaults."
+            f"effect '{effect.kind}' cannot be made without arguments ({_said(error)}). Give its fields defaults."
         ) from None
     known[effect.kind] = effect
     return effect
@@ -47,21 +49,41 @@ def is_candidate(effect: type[Effect]) -> bool:
 
 
 def read(where: str) -> type[Effect]:
-    """Return the class at ``my_file.py:MyEffect`` or ``my_package.my_module:MyEffect``; the file is run for that.
+    """Return the class at ``my_file.py:MyEffect`` or ``my_package.my_module:MyEffect``.
 
-    ValueError, in one line, where there is none.
+    The file is run for that, unless this process has imported it. ValueError, in one line, where there is no such
+    class, and for whatever the file raises, ``sys.exit()`` included.
     """
     place, _, name = where.rpartition(":")
     try:
-        module = _module_of(Path(place)) if place.endswith(".py") else importlib.import_module(place)
-    except Exception as error:
-        raise ValueError(f"effect {where}: {place} cannot be read ({type(error).__name__}: {error}).") from None
-    found = getattr(module, name, None)
+        module = imported(place) or (_module_of(Path(place)) if place.endswith(".py") else import_module(place))
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise ValueError(f"effect {where}: {place} cannot be read ({_said(error)}).") from None
+    found = vars(module).get(name)  # a module's own __getattr__ may import
     if not (isinstance(found, type) and issubclass(found, Effect)):
         mine = {k: v for k, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__}
         able = ", ".join(k for k, v in mine.items() if issubclass(v, Effect)) or "none"
         raise ValueError(f"effect {where}: {place} has no class {name} of effects. It has: {able}.")
     return found
+
+
+def imported(place: str) -> ModuleType | None:
+    """Return the module of a place if this process has run it; nothing is run for that."""
+    if not place.endswith(".py"):
+        return sys.modules.get(place)
+    try:
+        full = Path(place).resolve()
+        if (known := sys.modules.get(_name_of(full))) is not None:
+            return known
+        for module in list(sys.modules.values()):
+            file = getattr(module, "__dict__", {}).get("__file__") or ""
+            if file.endswith(full.name) and not module.__name__.startswith(_PREFIX) and Path(file).resolve() == full:
+                return module
+    except (OSError, ValueError):  # no file, or no name of one
+        pass
+    return None
 
 
 def lives(effect: type[Effect]) -> str:
@@ -85,5 +107,12 @@ def _file(effect: type[Effect]) -> str:
 def _module_of(path: Path) -> ModuleType:
     """Run a file once per process and text, and return it as a module."""
     full = path.resolve()
-    name = _PREFIX + hashlib.sha256(str(full).encode() + full.read_bytes()).hexdigest()[:16]
-    return modules.run(full, name)
+    return modules.run(full, _name_of(full))
+
+
+def _name_of(path: Path) -> str:
+    return _PREFIX + hashlib.sha256(str(path).encode() + path.read_bytes()).hexdigest()[:16]
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

@@ -30,6 +30,7 @@ KEYWORDS = (
     "max_episode_steps",
     "info",
     "num_envs",
+    "trusted",
 )
 TENSORS, SPACES, ROW_BYTES = 25, 8, 400
 """Memory of one environment: tensors per vehicle, arrays per observed feature, and bytes besides, as measured."""
@@ -66,13 +67,15 @@ def settings(
     render_mode: str | None = None,
     max_episode_steps: int | None = None,
     info: str | Sequence[str] | None = None,
+    trusted: bool = False,
     **choices: Any,
 ) -> Settings:
     """Return checked settings.
 
     ``config`` is a YAML file that says ``configures: environment`` and gives any of these keywords; a keyword that is
     given here as well wins. ``max_episode_steps`` None leaves the limit to the task, −1 is no limit. ``info`` is one or
-    several of ``INFO``, ``"all"`` (which None is) or ``"none"``.
+    several of ``INFO``, ``"all"`` (which None is) or ``"none"``. ``trusted``: code that YAML files name is run; without
+    it that is an error.
 
     Raises:
         KeywordError: A TypeError in one line, with a suggestion, for a keyword that does not exist.
@@ -89,7 +92,7 @@ def settings(
         "info": info,
     }
     if config is not None:
-        read = load_environment(config)
+        read = load_environment(config, trusted=trusted)
         said = {key: read.pop(key, None) for key in own}
         own = {key: said[key] if value is None else value for key, value in own.items()}
         choices = {**read, **choices}
@@ -101,7 +104,11 @@ def settings(
             f"unexpected keyword argument '{next(iter(choices))}' beside a task that is already made. "
             "Give it to the task."
         )
-    made = chosen if isinstance(chosen, Task) else make_task(cast(str, chosen), others=KEYWORDS, **choices)
+    made = (
+        chosen
+        if isinstance(chosen, Task)
+        else make_task(cast(str, chosen), others=KEYWORDS, trusted=trusted, **choices)
+    )
     return Settings(
         task=made,
         output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
+from idm_env import trust
 from idm_env.checks import nearest, shown
 from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import KeywordError
@@ -34,8 +35,10 @@ TASKS: dict[str, type[Task]] = {
 }
 
 
-def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any) -> Task:
+def make_task(task: str = "ring", *, others: Iterable[str] = (), trusted: bool = False, **choices: Any) -> Task:
     """Return a task by name with its static choices; ``others``, which the caller takes himself, are suggested too.
+
+    ``trusted``: code that a model file among the choices names is run.
 
     Raises:
         KeywordError: A TypeError, with a suggestion, for a keyword that does not exist.
@@ -48,7 +51,8 @@ def make_task(task: str = "ring", *, others: Iterable[str] = (), **choices: Any)
         if choice not in known:
             like = nearest(str(choice), [name for name in (*known, *others) if name != choice])
             raise KeywordError(f"task '{task}' got an unexpected keyword argument {shown(choice)}.{like}")
-    return TASKS[task](**choices)
+    with trust.trusting(trusted):
+        return TASKS[task](**choices)
 
 
 __all__ = [
