@@ -2,8 +2,8 @@
 
 They see the same observations in the same fixed normalisation, get the same reward, are stopped by the same clock and
 judged by the same test as the agents that differentiate. After every chunk of learning the actor is copied into a
-``Policy``, so that all agents leave the same files; ``model.zip`` and SAC's ``replay.pkl`` beside them are SB3's own,
-for ``resume``.
+``Policy``, so that all agents leave the same files; ``learner.pt`` beside them is for ``resume``. It holds tensors and
+numbers only: SB3's own files are pickles, which run whatever code somebody has put into them.
 
 ``python -m agents.ppo --config configs/ring-ppo.yaml --seed 1``
 """
@@ -237,6 +237,44 @@ def copy_actor(model: BaseAlgorithm, policy: Policy, update: int, kept: Path) ->
         mine.load_state_dict(other.state_dict())
 
 
+MEMORY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+"""Arrays of SAC's replay buffer."""
+
+
+def learned(model: BaseAlgorithm, env: VecNormalize) -> dict[str, Any]:
+    """Return what learning goes on with, as tensors and numbers."""
+    rewards = env.ret_rms
+    kept: dict[str, Any] = {
+        "schema": common.SCHEMA,
+        "parameters": model.get_parameters(),
+        "variables": {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]},
+        "steps": model.num_timesteps,
+        "updates": model._n_updates,
+        "returns": [float(x) for x in (rewards.mean, rewards.var, rewards.count)],
+    }
+    if isinstance(model, SAC):
+        memory: Any = model.replay_buffer
+        kept["memory"] = {name: torch.from_numpy(getattr(memory, name)[: memory.size()]) for name in MEMORY}
+        kept["place"] = memory.pos
+    return kept
+
+
+def goes_on(model: BaseAlgorithm, env: VecNormalize, kept: dict[str, Any]) -> None:
+    """Put what ``learned`` returned into a new model."""
+    model.set_parameters(kept["parameters"], device="cpu")
+    for name, value in kept["variables"].items():
+        getattr(model, name).data.copy_(value)
+    model.num_timesteps, model._n_updates = int(kept["steps"]), int(kept["updates"])
+    mean, variance, count = kept["returns"]
+    env.ret_rms.mean, env.ret_rms.var, env.ret_rms.count = np.asarray(mean), np.asarray(variance), count
+    if isinstance(model, SAC):
+        memory: Any = model.replay_buffer
+        for name in MEMORY:
+            rows = kept["memory"][name].numpy()
+            getattr(memory, name)[: len(rows)] = rows
+        memory.pos, memory.full = int(kept["place"]), len(rows) == memory.buffer_size
+
+
 def train(arguments: Arguments) -> list[dict[str, Any]]:
     """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
     began = time.process_time()
@@ -249,18 +287,12 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     vector = (Desynchronised if agents == 1 else Shared)(made, arguments.hold)
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
-    file, moments, memory = (arguments.out / f for f in ("model.zip", "returns.pkl", "replay.pkl"))
+    file, model = arguments.out / "learner.pt", make_model(arguments, env, policy)
     if saved:
-        kind = SAC if name == "sac" else PPO
-        env = keep.read(moments, lambda path: VecNormalize.load(str(path), vector), keep.AFRESH)
-        model: BaseAlgorithm = keep.read(file, lambda path: kind.load(path, env=env, device="cpu"), keep.AFRESH)
-        if isinstance(model, SAC):
-            keep.read(memory, model.load_replay_buffer, keep.AFRESH)
-    else:
-        model = make_model(arguments, env, policy)
-        if arguments.clone:
-            for mine, other in layers(model, policy):
-                other.load_state_dict(mine.state_dict())
+        keep.read(file, lambda path: goes_on(model, env, torch.load(path, weights_only=True)), keep.AFRESH)
+    elif arguments.clone:
+        for mine, other in layers(model, policy):
+            other.load_state_dict(mine.state_dict())
     chunk = arguments.n_steps * vector.num_envs
     steps = arguments.n_steps * arguments.count * arguments.hold
     done = model.num_timesteps // chunk
@@ -270,10 +302,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
 
     def store() -> None:
-        keep.write(file, model.save)
-        keep.write(moments, lambda path: env.save(str(path)))
-        if isinstance(model, SAC):
-            keep.write(memory, model.save_replay_buffer)
+        keep.write(file, lambda path: torch.save(learned(model, env), path))
 
     with Monitor(name, arguments, began, saved) as monitor:
         if not saved:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import io
+import os
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from stable_baselines3.common.save_util import load_from_pkl
 
 from agents import apg, common, environments, ppo, shac
 from agents.common import DivergedError
@@ -89,29 +91,85 @@ def test_training_may_begin_with_a_policy_of_another_road(quick, tmp_path):
         apg.train(dataclasses.replace(given, environment=raw, out=tmp_path / "raw"))
 
 
-@pytest.mark.parametrize("file", ["model.zip", "returns.pkl"])
-def test_a_broken_file_of_stable_baselines3_is_one_line(file, quick):
-    module, kind, small = AGENTS["ppo"]
+class Planted:
+    """Code that unpickling runs."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.mark}",)
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_a_broken_file_of_a_learner_is_one_line_and_code_in_it_is_not_run(name, quick, tmp_path):
+    module, kind, small = AGENTS[name]
     begun = kind(**quick, **{**small, "cpu_seconds": 1e-9})
     module.train(begun)
-    path = begun.out / file
-    for broken in (b"", b"garbage", path.read_bytes()[:-30]):
-        path.write_bytes(broken)
-        with pytest.raises(ValueError, match=rf"{file} is broken .*Leave out --resume") as told:
+    path, mark, planted = begun.out / "learner.pt", tmp_path / "it-ran", io.BytesIO()
+    whole = torch.load(path, weights_only=True)
+    torch.save(whole | {"returns": Planted(mark)}, planted)
+    other = io.BytesIO()
+    torch.save(whole | {"parameters": {}}, other)
+    files = (
+        b"",
+        b"garbage",
+        path.read_bytes()[:-30],
+        pickle.dumps(Planted(mark)),
+        planted.getvalue(),
+        other.getvalue(),
+    )
+    for broken in files:
+        for kept in ("learner.pt", "model.zip", "returns.pkl", "replay.pkl"):  # the last three were SB3's own
+            (begun.out / kept).write_bytes(broken)
+        with pytest.raises(ValueError, match=r"learner\.pt is broken .*Leave out --resume") as told:
             module.train(dataclasses.replace(begun, resume=True))
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(told.value) and not mark.exists()
+    last = begun.out / "last.pt"
+    for broken in files[3:5]:
+        last.write_bytes(broken)
+        with pytest.raises(ValueError, match=r"last\.pt is not a checkpoint of an agent, or is broken"):
+            module.train(dataclasses.replace(begun, resume=True))
+        assert not mark.exists()
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_what_a_learner_keeps_is_all_that_it_had(name, quick):
+    """Weights, optimisers' moments, entropy's weight, the deviation of returns, counts and memory, to the last bit."""
+    module, kind, small = AGENTS[name]
+    arguments = kind(**quick, **{**small, "cpu_seconds": 1e-9})
+    module.train(arguments)
+    kept = torch.load(arguments.out / "learner.pt", weights_only=True)
+    env = ppo.VecNormalize(
+        ppo.Desynchronised(environments.make_env(arguments.environment, arguments.count, output="numpy"), 2),
+        norm_obs=False,
+    )
+    model = ppo.make_model(dataclasses.replace(arguments, seed=5), env, common.load(arguments.out / "last.pt")[0])
+    ppo.goes_on(model, env, kept)
+    again = ppo.learned(model, env)
+    assert again["steps"] > 0 and again["updates"] > 0 and str(again) == str(kept)
+    for mine, other in zip(leaves(again), leaves(kept), strict=True):
+        assert torch.equal(mine, other)
+
+
+def leaves(part):
+    """Return all tensors of nested mappings and lists."""
+    if isinstance(part, torch.Tensor):
+        return [part]
+    inside = part.values() if isinstance(part, dict) else part if isinstance(part, (list, tuple)) else ()
+    return [leaf for each in inside for leaf in leaves(each)]
 
 
 def test_sac_resumes_with_its_memory(quick):
     module, kind, small = AGENTS["sac"]
     whole = kind(**quick, **small)
     first = module.train(dataclasses.replace(whole, cpu_seconds=1e-9))
-    buffer = load_from_pkl(whole.out / "replay.pkl")
+    before = torch.load(whole.out / "learner.pt", weights_only=True)["memory"]
     module.train(dataclasses.replace(whole, resume=True))
-    after = load_from_pkl(whole.out / "replay.pkl")
-    assert buffer.size() == first[-1]["steps"] // small["count"]
-    assert after.size() == 4 * buffer.size()
-    np.testing.assert_array_equal(after.observations[: buffer.size()], buffer.observations[: buffer.size()])
+    after = torch.load(whole.out / "learner.pt", weights_only=True)["memory"]
+    size = first[-1]["steps"] // small["count"]
+    for name, rows in before.items():
+        assert len(rows) == size and len(after[name]) == 4 * size and torch.equal(after[name][:size], rows)
     assert not list(whole.out.glob("*.part"))
 
 
