@@ -90,7 +90,7 @@ class Mobil(Effect):
             return torch.where(side.exists > 0, change, 0.0) - p["threshold"]
 
         return Wish(
-            gain(left) - p["keep_right"],
+            gain(left) - p["keep_right"] * left.exists,
             gain(right) + p["keep_right"] * right.exists,
             margin(left, here, p["safe_decel"]),
             margin(right, here, p["safe_decel"]),

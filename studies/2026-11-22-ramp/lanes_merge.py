@@ -1,8 +1,8 @@
 """Outflow of two lanes and a ramp over demand, with and without drivers who let others in.
 
 ``python -m benchmarks.lanes merge``: the road of task ``merge`` (a ramp from 400 to 600 m of 900 m), IDM with noise of
-0.2 m/s² per √s, vehicles that come at random, 4 seeds each. A fifth of the demand is on the ramp. Demand is held for
-20 minutes; outflow is counted in the last ten.
+0.2 m/s² at every step of 0.2 s (0.45 m/s² per √s), vehicles that come at random, 4 seeds each. A fifth of the demand is
+on the ramp. Demand is held for 20 minutes; outflow is counted in the last ten.
 """
 
 from __future__ import annotations

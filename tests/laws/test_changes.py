@@ -46,6 +46,19 @@ ROADS = {
 }
 
 
+@pytest.mark.parametrize("bias", [-1.0, 1.0])
+def test_a_side_that_does_not_exist_blocks_nobody(bias: float) -> None:
+    """Whoever would rather drive on the lane on which he is already wishes for nothing."""
+    simulator = Simulator(Lanes(2), (IDM(), Mobil(), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    params["mobil"]["keep_right"] = torch.tensor(bias, dtype=DTYPE)
+    position = torch.tensor([0.0], dtype=DTYPE)
+    start = simulator.state(position, position + 20.0, params, lane=0 if bias > 0 else 1)
+    end, _ = simulator.rollout(start, {}, params, 35)
+    assert end.links is not None
+    assert (int(end.links.blocked), int(end.links.changed)) == (0, 0)
+
+
 @settings(max_examples=8)
 @given(
     road=st.sampled_from(sorted(ROADS)),
