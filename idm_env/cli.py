@@ -224,6 +224,8 @@ def fit(
         )  # fmt: skip
         with opened(executor, jobs, ray_address) as workers:
             result = fit_file(source, options, out, resume=resume, executor=workers, on_progress=report)
+    if result["over_fitting"]:
+        console.print(result["over_fitting"], soft_wrap=True, highlight=False)
     rows = [{"": "fitted", **result["fit"]}]
     if result["held_out"] is not None:
         rows.append({"": "held out", **result["held_out"]})

@@ -58,6 +58,12 @@ class Parameter:
                 "threshold may be, which is absent far beyond its bounds."
             )
 
+    @property
+    def words(self) -> str:
+        """Its name and symbol as a sentence has them: "comfort deceleration b"."""
+        name = self.name.replace("_", " ").replace("accel", "acceleration").replace("decel", "deceleration")
+        return f"{name} {self.symbol}"
+
     def transform(self) -> Transform:
         """Bijection from the real line onto the open interval (low, high)."""
         return biject_to(constraints.interval(self.low, self.high))

@@ -58,10 +58,10 @@ class Parts:
         return sorted(self.folder.glob(f"[0-9]*.{name}.parquet"))
 
     def join(self, name: str, target: Path) -> None:
-        """Write the tables of all parts as one, csv or parquet by the target's name, holding one of them at a time."""
+        """Write the tables of all parts as one, holding one of them at a time: parquet, or csv with four digits."""
         whole = pl.scan_parquet(self.tables(name), glob=False, missing_columns="insert", extra_columns="ignore")
         if target.suffix == ".csv":
-            keep.write_csv(target, whole)
+            keep.write_csv(target, whole.with_columns(pl.selectors.float().round_sig_figs(4)))
         else:
             keep.write(target, whole.sink_parquet)
 

@@ -160,4 +160,4 @@ def test_whoever_asked_may_be_killed_and_goes_on_with_another_executor(
 
     assert fitted(folder, out, resume=True, on_progress=watch) == fitted(folder, tmp_path / "serial")
     assert len(seen) == 6 - len(before)
-    assert pl.read_csv(out / "drivers.csv")["group"].n_unique() == 12
+    assert pl.read_csv(out / "drivers.csv").n_unique(["run_id", "vehicle_id"]) == 12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -77,24 +78,28 @@ class Estimates:
         )  # fmt: skip
 
 
-def table(found: Fit, error: Errors) -> list[dict[str, Any]]:
+def table(found: Fit, error: Errors, by: str) -> list[dict[str, Any]]:
     """Return one row per group: episodes, gap RMSE (m), each parameter with its standard error, and what is doubtful.
 
+    A driver is told by ``run_id`` and ``vehicle_id``, another ``group`` by its name. What is not identified is NaN.
     ``bounds`` and ``not_identified`` list parameters by name, separated by blanks.
     """
     problem = found.problem
     count = torch.zeros(len(problem.groups)).index_add(0, problem.group, torch.ones(len(problem.batch)))
     square = torch.zeros(len(problem.groups), dtype=error.gap_rmse.dtype)
     rmse = (square.index_add(0, problem.group, error.gap_rmse.square()) / count).sqrt()
-    values, spread, bound = found.values(), found.uncertainty.standard_error, found.uncertainty.at_bound
+    told = found.uncertainty
+    values, spread, bound, known = found.values(), told.standard_error, told.at_bound, told.identified
     rows = []
     for g, group in enumerate(problem.groups):
-        row: dict[str, Any] = {"group": group, "episodes": int(count[g]), "gap_rmse_m": float(rmse[g])}
+        run, _, vehicle = group.rpartition("/")
+        row: dict[str, Any] = {"run_id": run, "vehicle_id": vehicle} if by == "driver" else {"group": group}
+        row |= {"episodes": int(count[g]), "gap_rmse_m": float(rmse[g])}
         for i, name in enumerate(found.names):
-            row |= {name: float(values[g, i]), f"{name}_error": float(spread[g, i])}
-        chosen = {"bounds": bound[g], "not_identified": ~found.uncertainty.identified[g] & ~bound[g]}
-        for what, told in chosen.items():
-            row[what] = " ".join(name for name, yes in zip(found.names, told.tolist(), strict=True) if yes)
+            row[name] = float(values[g, i]) if known[g, i] or bound[g, i] else math.nan
+            row[f"{name}_error"] = float(spread[g, i]) if known[g, i] and not bound[g, i] else math.nan
+        for what, which in {"bounds": bound[g], "not_identified": ~known[g] & ~bound[g]}.items():
+            row[what] = " ".join(name for name, yes in zip(found.names, which.tolist(), strict=True) if yes)
         rows.append(row | {"converged": bool(found.converged[g])})
     return rows
 
@@ -108,22 +113,42 @@ def bounds(found: Estimates) -> list[dict[str, Any]]:
         lower = on & (values[:, i] < 0.5 * (p.low + p.high))
         low, middle, high = np.quantile(values[:, i].numpy(), [0.1, 0.5, 0.9]).tolist()
         rows.append({
-            "parameter": name, "symbol": p.symbol, "unit": p.unit, "median": middle, "p10": low, "p90": high,
-            "low": p.low, "high": p.high, "groups": len(values), "on_low": int(lower.sum()),
-            "on_high": int((on & ~lower).sum()), "not_identified": int((~found.identified[:, i] & ~on).sum()),
+            "parameter": name, "words": p.words, "symbol": p.symbol, "unit": p.unit,
+            "median": middle, "p10": low, "p90": high, "low": p.low, "high": p.high,
+            "groups": len(values), "on_low": int(lower.sum()), "on_high": int((on & ~lower).sum()),
+            "not_identified": int((~found.identified[:, i] & ~on).sum()),
         })  # fmt: skip
     return rows
 
 
 def sentence(rows: list[dict[str, Any]]) -> str:
-    """Return which parameters sit on a bound for how many groups, most first: "b on its bound for 69 of 171"."""
-    count = {row["symbol"]: row["on_low"] + row["on_high"] for row in rows}
-    told = [
-        f"{symbol} on its bound for {n} of {rows[0]['groups']}"
-        for symbol, n in sorted(count.items(), key=lambda item: -item[1])
-        if n
-    ]
-    return f"Bounds: {', '.join(told)}." if told else "Bounds: no parameter is on one."
+    """Return which parameters sit on a bound for how many groups, most first."""
+    told = [f"{words} for {n} of {rows[0]['groups']}" for words, n in _on_bounds(rows) if n]
+    return f"On its bound: {', '.join(told)}." if told else "No parameter is on a bound."
+
+
+def _on_bounds(rows: list[dict[str, Any]]) -> list[tuple[str, int]]:
+    """Return every parameter in words and how many groups have it on a bound, most first."""
+    return sorted(((row["words"], row["on_low"] + row["on_high"]) for row in rows), key=lambda item: -item[1])
+
+
+def over_fitting(rows: list[dict[str, Any]], fitted: float, held_out: float | None, by: str) -> str:
+    """Return what over-fitting shows, and what to do; nothing where it does not show.
+
+    It shows in a gap RMSE (m) on held-out runs above 1.5 times that on the fitted ones, and in a parameter that is on
+    its bound for more than a third of several groups.
+    """
+    words, on = _on_bounds(rows)[0]
+    groups = rows[0]["groups"]
+    signs = []
+    if held_out is not None and held_out > 1.5 * fitted:
+        signs.append(f"the gap RMSE is {held_out:.2f} m on held-out runs and {fitted:.2f} m on the fitted ones")
+    if groups > 1 and 3 * on > groups:
+        signs.append(f"{words} is on its bound for {on} of {groups}")
+    if not signs:
+        return ""
+    cure = "Fit more runs" if by == "all" else "Fit one set of parameters to all (--by all)"
+    return f"Over-fitting: {', and '.join(signs)}. {cure}, or with a prior (idm_env.fitting.fit.fit(prior=...))."
 
 
 def blocks(found: Estimates, rows: Sequence[dict[str, Any]], shares: list[dict[str, Any]]) -> list[page.Block]:
@@ -167,8 +192,9 @@ def blocks(found: Estimates, rows: Sequence[dict[str, Any]], shares: list[dict[s
 
 
 def _row(found: Estimates, row: dict[str, Any]) -> dict[str, Any]:
+    name = row["group"] if "group" in row else f"{row['run_id']}/{row['vehicle_id']}"
     shown: dict[str, Any] = {
-        "driver": row["group"], "episodes": row["episodes"], "gap RMSE (m)": page.Cell(
+        "driver": name, "episodes": row["episodes"], "gap RMSE (m)": page.Cell(
             f"{row['gap_rmse_m']:.2f}", row["gap_rmse_m"]
         ),
     }  # fmt: skip
@@ -176,7 +202,6 @@ def _row(found: Estimates, row: dict[str, Any]) -> dict[str, Any]:
     for name, p in zip(found.names, found.parameters, strict=True):
         value, spread = row[name], row[f"{name}_error"]
         unit = "" if p.unit == "1" else f" ({p.unit})"
-        # A spread that says nothing is not a number worth reading; drivers.csv has it.
-        after = "⊣" if name in on else "?" if name in doubtful else f"± {spread:.1g}"
-        shown[f"{p.symbol}{unit}"] = page.Cell(f"{value:.3g} {after}", value, name in on)
+        after = "⊣" if name in on else "" if spread is None else f"± {spread:.1g}"
+        shown[f"{p.symbol}{unit}"] = page.Cell("?" if name in doubtful else f"{value:.3g} {after}", value, name in on)
     return shown | {"converged": row["converged"]}

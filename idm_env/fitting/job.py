@@ -142,6 +142,7 @@ def _write(
 ) -> dict[str, Any]:
     """Join the parts to the files that were promised, and return the report."""
     out, options, estimates = work.out, work.options, found.estimates
+    error = found.errors.summary()
     bounds, many = drivers.bounds(estimates), len(estimates.groups) > drivers.MOST_ROWS
     result: dict[str, Any] = {
         "schema": 1,
@@ -149,13 +150,16 @@ def _write(
         "data": data,
         "options": {**vars(options), "free": estimates.names},
         "fit": {
-            **found.errors.summary(),
+            **error,
             "groups": len(estimates.groups),
             "converged": found.converged,
             "iterations": found.iterations,
         },
         "held_out": held_out,
         "at_bounds": drivers.sentence(bounds),
+        "over_fitting": drivers.over_fitting(
+            bounds, error["gap_rmse_m"], None if held_out is None else held_out["gap_rmse_m"], options.by
+        ),
         "bounds": bounds,
         "parameters": [],
         "versions": page.versions(),
@@ -240,7 +244,8 @@ def _fit_page(result: dict[str, Any], joined: Joined, table: list[dict[str, Any]
     titles = ("Measured and simulated", "Residuals", "In space and time")
     return [
         page.lead(lead),
-        page.lead(result["at_bounds"]),
+        *([page.lead(result["over_fitting"])] if result["over_fitting"] else []),
+        page.text(result["at_bounds"]),
         _errors_table(rows),
         page.note(
             f"{result['fit']['converged']} of {result['fit']['groups']} groups converged. A value on its bound is not "

@@ -98,7 +98,7 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
     on_progress("errors", 0, 0, "in free simulation")
     error, simulated = errors(found.problem, found.own, found.shared)
     parts.write(number, PARAMETERS, pl.DataFrame(found.table()))
-    parts.write(number, DRIVERS, pl.DataFrame(drivers.table(found, error)))
+    parts.write(number, DRIVERS, pl.DataFrame(drivers.table(found, error, piece.by)).fill_nan(None))
     parts.write(number, ERRORS, pl.DataFrame({name: getattr(error, name).numpy() for name in Errors._fields}))
     drawn = []
     if number == 0:

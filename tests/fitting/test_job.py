@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
 
 from idm_env.config import load_model
 from idm_env.data import synthetic
+from idm_env.fitting.drivers import over_fitting
 from idm_env.fitting.job import FITTED, fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
 
@@ -48,21 +50,56 @@ def test_every_driver_has_a_row_and_bounds_are_counted(file: Path, tmp_path: Pat
     result = fit_file(
         Source(file, smooth=True), Options(starts=1), tmp_path, on_progress=lambda phase, *_: seen.append(phase)
     )
-    drivers = pl.read_csv(tmp_path / "drivers.csv", schema_overrides={"bounds": pl.String})
+    drivers = pl.read_csv(tmp_path / "drivers.csv", infer_schema=False)
     long = pl.read_parquet(tmp_path / "parameters.parquet")
-    assert drivers["group"].to_list() == long["group"].unique(maintain_order=True).to_list() and drivers.height == 8
+    names = drivers.select(pl.format("{}/{}", "run_id", "vehicle_id")).to_series()
+    assert names.to_list() == long["group"].unique(maintain_order=True).to_list() and drivers.height == 8
     for row in result["bounds"]:
         mine = long.filter(pl.col("parameter") == row["parameter"])
-        assert drivers[row["parameter"]].to_list() == pytest.approx(mine["estimate"].to_list())
+        wanted = [
+            f"{value:.4g}" if known or bound else None
+            for value, known, bound in mine.select("estimate", "identified", "at_bound").rows()
+        ]
+        assert [x and f"{float(x):.4g}" for x in drivers[row["parameter"]]] == wanted
+        assert max(len(x.strip("0.").replace(".", "")) for x in drivers[row["parameter"]].drop_nulls()) <= 4
         assert row["on_low"] + row["on_high"] == mine["at_bound"].sum()
         on = drivers["bounds"].fill_null("").str.split(" ").list.contains(row["parameter"])
         assert on.to_list() == mine["at_bound"].to_list()
         if mine["at_bound"].sum():
-            assert f"{row['symbol']} on its bound for {mine['at_bound'].sum()} of 8" in result["at_bounds"]
+            assert f" {row['symbol']} for {mine['at_bound'].sum()} of 8" in result["at_bounds"]
     assert result["at_bounds"] in (tmp_path / "report.html").read_text()
+    drivers = drivers.cast({"gap_rmse_m": pl.Float64, "episodes": pl.Float64})
     rms = (drivers["gap_rmse_m"] * drivers["episodes"]).sum() / drivers["episodes"].sum()
     assert rms == pytest.approx(result["fit"]["gap_rmse_m"], rel=0.3)
     assert seen[0] == "reading" and seen[-1] == "writing"
+
+
+def row(words: str, on: int, groups: int) -> dict[str, Any]:
+    return {"words": words, "on_low": on, "on_high": 0, "groups": groups}
+
+
+@pytest.mark.parametrize(
+    ("on", "groups", "fitted", "held", "by", "words"),
+    [
+        (37, 64, 2.06, 10.21, "driver",
+         "Over-fitting: the gap RMSE is 10.21 m on held-out runs and 2.06 m on the fitted ones, and comfort "
+         "deceleration b is on its bound for 37 of 64. Fit one set of parameters to all (--by all), or with a prior "
+         "(idm_env.fitting.fit.fit(prior=...))."),
+        (3, 64, 2.06, 10.21, "driver", "Over-fitting: the gap RMSE is 10.21 m on held-out runs and 2.06 m"),
+        (37, 64, 2.06, None, "driver", "Over-fitting: comfort deceleration b is on its bound for 37 of 64. Fit one"),
+        (0, 1, 2.0, 4.0, "all",
+         "Over-fitting: the gap RMSE is 4.00 m on held-out runs and 2.00 m on the fitted ones. Fit more runs"),
+        (1, 1, 2.0, 2.5, "all", ""),
+        (20, 64, 2.0, 2.9, "driver", ""),
+    ],
+)  # fmt: skip
+def test_fit_says_what_over_fitting_shows_and_what_to_do(
+    on: int, groups: int, fitted: float, held: float | None, by: str, words: str
+) -> None:
+    """A held-out error far above the fitted one, or a parameter on its bound for many drivers."""
+    rows = [row("time gap T", 0, groups), row("comfort deceleration b", on, groups)]
+    found = over_fitting(rows, fitted, held, by)
+    assert found.startswith(words) and bool(found) == bool(words)
 
 
 def test_simulate_repeats_what_fit_reported(file: Path, tmp_path: Path) -> None:
