@@ -17,7 +17,7 @@ _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
 def shown(value: Any) -> str:
     """Return a value as an error text may show it: never longer than a line, whatever it is."""
     try:
-        return _SHORT.repr(value)
+        return " ".join(_SHORT.repr(value).split("\n"))
     except (ValueError, RecursionError):  # Python writes no whole number of more than 4300 digits
         return f"a very large {type(value).__name__}"
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from idm_env.envs.beginnings import Beginnings
+from idm_env.envs.given import checked
 from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
 from idm_env.scalar.record import Untraceable
@@ -132,16 +133,19 @@ class Batch:
     def reset(self, rows: np.ndarray | None = None, state: State | None = None) -> Tensor | np.ndarray:
         """Begin a new episode in all or in some rows (indices); return the observations of all of them.
 
-        ``state`` replaces what would be drawn, with its graph. Everything else begins from constants.
+        ``state`` replaces what would be drawn, with its graph. Everything else begins from constants. ValueError, with
+        nothing begun, for a state that does not fit (``idm_env.envs.given``).
         """
         every = rows is None or len(rows) == self.count
         index = np.arange(self.count) if rows is None else rows
-        self.episodes[index] += 1
         device = self.settings.device
-        draw = self._draws(index, self.episodes[index])
+        draw = self._draws(index, self.episodes[index] + 1)
+        if state is not None:
+            state = self._given(state, draw)
+        self.episodes[index] += 1
         fresh, self._driven = self._beginnings.take(index, self.episodes), None
         if state is not None:
-            fresh = fresh._replace(state=self._given(state, len(index)))
+            fresh = fresh._replace(state=state)
         if every or not self.begun or self._draw is None:
             self.world, self._draw = fresh, draw
         elif self._values is not None and self._loaded and self._seen is not None:
@@ -149,16 +153,15 @@ class Batch:
             self._draw = Draw(self._draw.key.index_put((torch.as_tensor(index),), draw.key))
             self._world = self._block = None
             # Only these rows look anew.
-            self._seen = self._seen.copy()
             self._seen[index] = self.task.observe(fresh).detach().numpy()
-            return self._seen
+            return self._seen.copy()
         else:
             where = torch.as_tensor(index, device=device)
             self.world = mapped(lambda old, new: old.index_put((where,), new), self.world, fresh)
             self._draw = Draw(self._draw.key.index_put((where,), draw.key))
         self._block = None
         assert self.world is not None
-        return self.task.observe(self.world)
+        return self.task.observe(self.world).clone()
 
     def _draws(self, rows: np.ndarray, episodes: np.ndarray) -> Draw:
         device = self.settings.device
@@ -176,14 +179,13 @@ class Batch:
         picked = (draw.uniforms(_POOL_STREAM, 1, torch.float64).squeeze(-1) * self.task.warmup_pool).long()
         return mapped(lambda pooled: pooled[picked], self._pool)
 
-    def _given(self, state: State, rows: int) -> State:
-        if state.position.shape != (rows, self.task.vehicles):
-            raise ValueError(
-                f"options['state'] has positions of shape {tuple(state.position.shape)}; "
-                f"{(rows, self.task.vehicles)} is "
-                "needed: environments, vehicles."
-            )
-        return state._replace(step=state.step.expand(rows))
+    @torch.no_grad()
+    def _like(self, draw: Draw) -> State:
+        """Return the state with which the task would begin, before any warm-up."""
+        return self.task.begin(draw, self.task.driven(self.task.who(draw), self.params)).state
+
+    def _given(self, state: Any, draw: Draw) -> State:
+        return checked(state, self._like(draw), self.task.road)
 
     def set_params(self, params: Params) -> None:
         """Replace the parameters (tensors, which may require grad); they hold from the next step on."""
@@ -238,6 +240,8 @@ class Batch:
             command = state.speed.new_zeros(self.count, len(task.agents))
         self.world = after
         told = self._told(before, command, given, after, action is not None)
+        # What a task tells may be a part of its state: whoever is told gets numbers of his own.
+        told = {name: x.clone() for name, x in told.items()}
         return {n: x.cpu().numpy() for n, x in told.items()} if self.settings.output == "numpy" else told
 
     def _step_values(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> dict[str, Any] | None:
@@ -260,7 +264,8 @@ class Batch:
             self._world = self.world
             self._values, self._used, self._block = None, used, block
             return None
-        self._world, self._loaded, self._seen = None, True, told["observation"]
+        # What is told is written to by whom it pleases.
+        self._world, self._loaded, self._seen = None, True, told["observation"].copy()
         return told
 
     def _commanded(
@@ -310,8 +315,7 @@ class Batch:
         """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
         task, asked, found = self.task, self.settings.info, dict[str, Tensor]()
         if "accel" in asked:
-            # A copy: what is told of a step is not the state itself.
-            found["accel"] = task.pick(after.state.accel).clone()
+            found["accel"] = task.pick(after.state.accel)
         if "command" in asked:
             shape = (len(after.state.speed), len(task.agents))
             found["command"] = after.state.accel.new_full(shape, torch.nan) if command is None else command

@@ -16,7 +16,7 @@ from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.tasks import Task
-from idm_env.types import Params, State
+from idm_env.types import Params, State, mapped
 
 LIMIT = "max_episode_steps"
 
@@ -54,11 +54,11 @@ class Face:
 
     @property
     def state(self) -> State:
-        """The state of the traffic, one row per environment."""
+        """A copy of the state of the traffic, with its graph, one row per environment."""
         world = self.batch.world
         if world is None:
             raise RuntimeError("there is no state before reset. Call reset() first.")
-        return world.state
+        return mapped(lambda x: x.clone(), world.state)
 
     @property
     def params(self) -> Params:

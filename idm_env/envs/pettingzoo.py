@@ -78,14 +78,15 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """Begin an episode: the first one of ``seed`` if that is given, the next one otherwise.
 
-        There are no options; PettingZoo's own tests give some, so they are left aside without a word.
+        ``options["state"]`` is a ``State`` to start from. PettingZoo's own tests give others, so these are left aside.
         """
         if seed is not None or not self.batch.begun:
             self.batch.seed([0], [seeding.np_random(seed)[1]])
         # PettingZoo's own tests set it between episodes.
         self.batch.limit = self.max_cycles
+        state = options.get("state") if isinstance(options, dict) else None
+        seen = np.asarray(self.batch.reset(state=state)[0])
         self.agents = list(self.possible_agents)
-        seen = np.asarray(self.batch.reset()[0])
         if self.render_mode == "human":
             self.render()
         return self._by_agent(seen), {agent: self._begun(agent) for agent in self.agents}

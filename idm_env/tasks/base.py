@@ -284,7 +284,7 @@ class Task(abc.ABC):
 
     def reset(self, draw: Draw, params: Params) -> World:
         """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control."""
-        who = self._who(draw)
+        who = self.who(draw)
         params = self.driven(who, params)
         world = self.begin(draw, params)
         world = self._unsteady(world._replace(episode={**world.episode, **who}), draw)
@@ -296,7 +296,7 @@ class Task(abc.ABC):
             world = world._replace(state=self.simulator.rollout(world.state, inputs, params, steps, keep=None)[0])
         return world
 
-    def _who(self, draw: Draw) -> dict[str, Tensor]:
+    def who(self, draw: Draw) -> dict[str, Tensor]:
         """Return which of the drivers every vehicle is in these episodes, and where in their ranges parameters are."""
         found = {}
         if self._behaviour.drivers:
