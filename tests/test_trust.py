@@ -309,7 +309,7 @@ READERS = {
     "spec_from_file_location": {"modules.py"},
     "exec": {"kernels/staged.py"},
 }
-"""What may run or build whatever a file says, and where it stands. Executors pickle for their own workers; tests/kernels hold the caches."""
+"""What may run or build whatever a file says, and where: executors pickle for their own workers, caches are sealed."""
 NEVER = re.compile(
     r"\b(pickle\.load|load_from_pkl|load_replay_buffer|VecNormalize\.load|joblib|cloudpickle\.loads?|dill|marshal|shelve|runpy"
     r"|allow_pickle|weights_only=False|yaml\.(full|unsafe)_load|UnsafeLoader|FullLoader|eval)\b"
