@@ -9,6 +9,9 @@ import reprlib
 from collections.abc import Iterable
 from typing import Any
 
+MOST_LISTED = 12
+"""Words that an error lists; of more it names those that are nearest."""
+
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 2
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
@@ -23,13 +26,18 @@ def shown(value: Any) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return ' Did you mean …?' for the nearest known word, or the list of all when none is near."""
-    known, word = list(known), word[:200]
+    """Return ' Did you mean …?' for the nearest known word; when none is near, all words, or the best of many."""
+    known, word = list(dict.fromkeys(known)), word[:200]
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     if not close and "." in word:
         close = difflib.get_close_matches(word.split(".")[-1], [k.split(".")[-1] for k in known], n=1, cutoff=0.4)
         close = [k for k in known if close and k.split(".")[-1] == close[0]][:1]
-    return f" Did you mean '{close[0]}'?" if close else f" Known: {', '.join(sorted(known)) or 'none'}."
+    if close:
+        return f" Did you mean '{close[0]}'?"
+    if len(known) > MOST_LISTED:
+        like = difflib.get_close_matches(word, known, n=MOST_LISTED // 2, cutoff=0.0)
+        return f" Of {len(known)} known ones the nearest are {', '.join(like)}."
+    return f" Known: {', '.join(sorted(known)) or 'none'}."
 
 
 def one_of(name: str, value: Any, known: Iterable[str]) -> str:

@@ -317,10 +317,11 @@ def check_places(path: str | Path, content: Mapping[Any, Any]) -> None:
     waiting: list[Any] = [content]
     while waiting:
         part = waiting.pop()
-        waiting += part.values() if isinstance(part, Mapping) else part if isinstance(part, (list, tuple)) else ()
         if not isinstance(part, Mapping):
+            waiting += part if isinstance(part, (list, tuple)) else ()
             continue
-        if not isinstance(part.get("trusted", {}), Mapping):
+        waiting += (value for key, value in part.items() if key != "drivers")  # whose keys are names of drivers
+        if "trusted" in part:
             raise ValueError(f"{path}: trusted = {shown(part['trusted'])} is not for a file to say. Say it yourself.")
         effects = part.get("effects")
         listed = isinstance(effects, Iterable) and not isinstance(effects, (str, Mapping))

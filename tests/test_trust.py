@@ -167,6 +167,9 @@ WAYS: dict[str, Callable[[Planted], object]] = {
     "gym config that trusts itself": lambda p: gym.make(
         "DiffIDM-v0", config=str(p.yaml("b", **NESTED, trusted=True, effects=[p.place]))
     ),
+    "gym config that says it in a mapping and trusts itself": lambda p: gym.make(
+        "DiffIDM-v0", config=str(p.yaml("b", **NESTED, trusted={"a": 1}, effects=str(p.model)))
+    ),
     "vector": lambda p: gym.make_vec("DiffIDM-v0", num_envs=2, config=str(p.environment)),
     "parallel": lambda p: parallel_env(config=str(p.environment)),
     "fitting": lambda p: gym.make("DiffIDM-Fit-v0", trajectories=str(p.data()), effects=str(p.model)),
@@ -212,7 +215,7 @@ def test_no_way_of_reading_a_file_runs_the_code_that_it_names(way: str, planted:
     words = str(told.value)
     assert "\n" not in words
     if way.endswith("trusts itself"):
-        assert "trusted = True is not for a file to say" in words
+        assert "is not for a file to say. Say it yourself." in words
     else:
         assert planted.name in words and (".yaml: " in words or ".pt: " in words)
         assert "is not run unasked. Read it, then give --trust, trusted=True in Python, or IDM_ENV_TRUST=1." in words
@@ -267,6 +270,12 @@ def test_what_the_user_gives_or_this_process_has_imported_is_free(planted: Plant
     found = [load_model(planted.model).effects[1], gym.make("DiffIDM-v0", config=str(planted.environment)).unwrapped]
     assert type(found[0]) is type(env.unwrapped.task.simulator.effects[2]) and not planted.mark.exists()
     assert [e.name for e in load_model(planted.yaml("plain", effects=["idm", planted.name])).effects][1] == planted.name
+
+
+def test_a_driver_may_have_any_name(tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text("effects: [idm, brakes]\ndrivers: {trusted: {idm: {time_gap: 1.2}}}\n")
+    assert list(load_model(path).drivers) == ["trusted"]
 
 
 def test_a_module_that_this_process_has_imported_is_not_run_again(planted: Planted) -> None:

@@ -69,6 +69,15 @@ def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair
     for name in [*NUMBERS, "lane"]:
         if name in frame.columns and not frame[name].dtype.is_numeric():
             frame = _parse(frame, name, source)
+    if "lane" in frame.columns:
+        value = frame["lane"].cast(pl.Float64)
+        between = (value.is_finite() & ((value - value.round()).abs() > 1e-6)).fill_null(False)
+        if between.any():
+            row = int(between.arg_true()[0])
+            raise DataError(
+                f"{source}: lane = {value[row]:g} in row {row + 1} is between two lanes. Give a whole number, or an "
+                "empty cell."
+            )
     lane = [pl.col("lane").cast(pl.Float64).round().cast(pl.Int64, strict=False)] if "lane" in frame.columns else []
     present = [name for name in NUMBERS if name in frame.columns]
     frame = frame.with_columns(lane).with_columns(pl.col(present).cast(pl.Float64))

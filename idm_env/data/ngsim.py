@@ -60,7 +60,7 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
     if "leader_id" in frame.columns:
         columns.append(pl.col("leader_id"))
     if "lane_id" in frame.columns:
-        columns.append(pl.col("lane_id").cast(pl.Int64, strict=False).alias("lane"))
+        columns.append(pl.col("lane_id").alias("lane"))
     columns += [pl.col(old).alias(new) for old, new in _OTHERS.items() if old in frame.columns]
     return frame.select(columns), repairs
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.checks import whole
 from idm_env.envs.beginnings import Beginnings
 from idm_env.envs.given import checked
 from idm_env.envs.settings import INFO, Settings
@@ -126,7 +127,7 @@ class Batch:
     def seed(self, rows: Sequence[int] | np.ndarray, seeds: Sequence[int]) -> None:
         """Give rows new seeds; their next episode is the first of that seed."""
         # Seeds beyond 63 bits are folded: Gymnasium allows any whole number.
-        self.seeds[rows] = [int(s) & ((1 << 63) - 1) for s in seeds]
+        self.seeds[rows] = [whole("seed", s, 0) & ((1 << 63) - 1) for s in seeds]
         self.episodes[rows] = -1
         self._beginnings.forget()
 

@@ -11,9 +11,10 @@ from typing import Any, Literal, cast
 import torch
 from gymnasium.vector import AutoresetMode
 
+from idm_env import trust
 from idm_env.checks import nearest, one_of, shown
 from idm_env.config import load_environment
-from idm_env.tasks import KeywordError, Task, make_task
+from idm_env.tasks import KeywordError, Task, task_with
 
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -104,11 +105,8 @@ def settings(
             f"unexpected keyword argument '{next(iter(choices))}' beside a task that is already made. "
             "Give it to the task."
         )
-    made = (
-        chosen
-        if isinstance(chosen, Task)
-        else make_task(cast(str, chosen), others=KEYWORDS, trusted=trusted, **choices)
-    )
+    with trust.trusting(trusted):
+        made = chosen if isinstance(chosen, Task) else task_with(cast(str, chosen), choices, KEYWORDS)
     return Settings(
         task=made,
         output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium
@@ -111,8 +111,8 @@ class DiffIDMVectorEnv(Face, VectorEnv):
             if not self.batch.begun:
                 self.batch.seed(np.arange(self.num_envs), self._entropy())
             return
-        if isinstance(seed, (int, np.integer)):
-            super().reset(seed=int(seed))
+        if not isinstance(seed, Iterable):
+            super().reset(seed=whole("seed", seed, 0))
             seeds: Sequence[int | None] = [int(seed) + i for i in range(self.num_envs)]
         else:
             seeds = list(seed)
@@ -123,7 +123,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
             if not self.batch.begun and None in seeds:
                 self.batch.seed(np.arange(self.num_envs), self._entropy())
         given = [row for row in rows if seeds[row] is not None]
-        self.batch.seed(given, [int(seeds[row] or 0) for row in given])
+        self.batch.seed(given, [seed for row in given if (seed := seeds[row]) is not None])
 
     def _entropy(self) -> list[int]:
         """Return the seeds that follow the one that Gymnasium draws from the operating system."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from idm_env import trust
@@ -35,15 +35,19 @@ TASKS: dict[str, type[Task]] = {
 }
 
 
-def make_task(task: str = "ring", *, others: Iterable[str] = (), trusted: bool = False, **choices: Any) -> Task:
-    """Return a task by name with its static choices; ``others``, which the caller takes himself, are suggested too.
-
-    ``trusted``: code that a model file among the choices names is run.
+def make_task(task: str = "ring", *, trusted: bool = False, **choices: Any) -> Task:
+    """Return a task by name with its static choices; ``trusted``: code that a model file among them names is run.
 
     Raises:
         KeywordError: A TypeError, with a suggestion, for a keyword that does not exist.
         ValueError: For an unknown task, or a value that cannot be.
     """
+    with trust.trusting(trusted):
+        return task_with(task, choices)
+
+
+def task_with(task: str, choices: Mapping[str, Any], others: Iterable[str] = ()) -> Task:
+    """Return what ``make_task`` does; ``others``, keywords that the caller takes himself, are suggested too."""
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), TASKS)}")
     known = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]
@@ -51,8 +55,7 @@ def make_task(task: str = "ring", *, others: Iterable[str] = (), trusted: bool =
         if choice not in known:
             like = nearest(str(choice), [name for name in (*known, *others) if name != choice])
             raise KeywordError(f"task '{task}' got an unexpected keyword argument {shown(choice)}.{like}")
-    with trust.trusting(trusted):
-        return TASKS[task](**choices)
+    return TASKS[task](**choices)
 
 
 __all__ = [
@@ -76,4 +79,5 @@ __all__ = [
     "Task",
     "World",
     "make_task",
+    "task_with",
 ]

@@ -38,12 +38,11 @@ class LanesScene(NamedTuple):
 def recorded_lanes(path: str, dt: float, run: str | None, first_lane: str) -> LanesScene:
     """Return the road of one run of a trajectory file (None: its only one), smoothed, on a clock of ``dt``.
 
-    ``first_lane`` says whether the lane with the lowest number is on the left, as in NGSIM, or on the right. A vehicle
-    is not there where the file does not say its lane.
+    ``first_lane`` says whether the lane with the lowest number is on the left, as in NGSIM, or on the right.
 
     Raises:
         ValueError: If a run does not exist or its step does not fit ``dt``.
-        DataError: If the file cannot be used, has several runs and none was named, or says no lanes.
+        DataError: If the file cannot be used, has several runs and none was named, or leaves a lane empty.
     """
     from idm_env.data import DataError
 
@@ -51,12 +50,16 @@ def recorded_lanes(path: str, dt: float, run: str | None, first_lane: str) -> La
     runs = sorted({track.key.rsplit("/", 1)[0] for track in tracks})
     if len(runs) > 1:
         raise DataError(f"{path} has {len(runs)} runs, and they are different roads. Name one: runs=['{runs[0]}'].")
-    for track in tracks:
-        nowhere = ~np.isfinite(track.lanes)
-        track.position[nowhere] = track.speed[nowhere] = np.nan
     known = np.unique(np.concatenate([track.lanes[np.isfinite(track.lanes)] for track in tracks]))
     if not len(known):
         raise DataError(f"{path}: no vehicle has a lane. Give a column 'lane', or take task 'replay'.")
+    for track in tracks:
+        nowhere = np.isfinite(track.position) & ~np.isfinite(track.lanes)
+        if nowhere.any():
+            raise DataError(
+                f"{path}: vehicle {track.key} has no lane in {int(nowhere.sum())} rows, first "
+                f"{nowhere.argmax() * dt:g} s after the run begins. Fill in its lanes, or leave these rows out."
+            )
     lane = np.zeros((len(tracks[0].position), len(tracks)), int)
     for i, track in enumerate(tracks):
         lane[:, i] = _filled(np.searchsorted(known, track.lanes), np.isfinite(track.lanes))

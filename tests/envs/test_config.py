@@ -12,8 +12,9 @@ import idm_env  # noqa: F401
 from idm_env.config import Model, load_environment, load_model, save_model
 from idm_env.effects import IDM, Brakes, Curve, Delay
 from idm_env.envs.pettingzoo import parallel_env
+from idm_env.envs.settings import settings
 from idm_env.envs.vector import DiffIDMVectorEnv
-from idm_env.tasks import make_task
+from idm_env.tasks import TASKS, make_task
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 GOOD = {"configures": "model", "effects": ["idm", "brakes"], "parameters": {"idm": {"time_gap": 1.1}}}
@@ -170,3 +171,24 @@ def test_an_environment_file_must_say_so(tmp_path):
         gym.make("DiffIDM-v0", config=write(tmp_path / "x.yaml", {"task": "ring"}))
     with pytest.raises(ValueError, match="Did you mean 'vehicles'"):
         gym.make("DiffIDM-v0", config=write(tmp_path / "y.yaml", {"configures": "environment", "vehicels": 9}))
+
+
+@pytest.mark.parametrize("word", ["foobarbaz", "others", "x" * 3000, "lenght_of_ring", "trustd"])
+@pytest.mark.parametrize("task", TASKS)
+def test_an_unknown_keyword_is_a_short_line(task, word):
+    with pytest.raises(TypeError, match="got an unexpected keyword argument") as told:
+        settings(task=task, **{word: 1})
+    assert len(str(told.value)) < 240 and "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [["a", "b"], "ab", 1.5, [1.5, 2], -1, [-1, 2], True, [True, 2], [[1], 2], float("nan"), [1], {}, [None, "b"]],
+)
+@pytest.mark.parametrize("face", FACES)
+def test_a_seed_that_is_none_is_told_as_such(face, seed):
+    env = FACES[face](task="ring", warmup=1)
+    with pytest.raises(Exception, match=r"(?i)\bseed\b") as told:
+        env.reset(seed=seed)
+    assert "\n" not in str(told.value) and isinstance(told.value, (ValueError, gym.error.Error))
+    env.close()

@@ -237,9 +237,19 @@ def test_bad_choices_are_one_line(road, tmp_path):
     pair = table.filter(pl.col("vehicle_id").is_in(["a", "c"])).drop("lane")
     pair.with_columns(leader_id=pl.when(pl.col("vehicle_id") == "c").then(pl.lit("a"))).write_csv(none)
     assert make_task("replay_lanes", data=str(two), runs=["q"]).scene.ids[0] == "q/a"
+    partly, half = tmp_path / "partly.csv", tmp_path / "half.csv"
+    here = (pl.col("vehicle_id") == "c") & pl.col("time_s").is_between(1.0, 2.0)
+    table.with_columns(lane=pl.when(~here).then("lane")).write_csv(partly)
+    table.with_columns(lane=pl.when(here).then(1.5).otherwise("lane")).write_csv(half)
     for error, choices, words in (
         (DataError, {"data": str(two)}, r"2 runs.*Name one: runs=\['q'\]"),
         (DataError, {"data": str(none)}, "no vehicle has a lane"),
+        (
+            DataError,
+            {"data": str(partly)},
+            r"partly\.csv: vehicle r/c has no lane in 1\d rows, first 1 s after",
+        ),
+        (DataError, {"data": str(half)}, r"half\.csv: lane = 1\.5 in row \d+ is between two lanes"),
         (ValueError, {"data": road, "lane_changes": "driver"}, "Did you mean 'drivers'"),
         (ValueError, {"data": road, "first_lane": "middle"}, "first_lane"),
         (ValueError, {"data": str(two), "runs": ["q", "r"]}, "must name one run"),
