@@ -8,6 +8,7 @@ truncated back-propagation.
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,8 +19,10 @@ from torch import Tensor
 from idm_env.checks import whole
 from idm_env.envs.beginnings import Beginnings
 from idm_env.envs.given import checked
+from idm_env.envs.moves import Moves
 from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
+from idm_env.roads import Lanes
 from idm_env.scalar.record import Untraceable
 from idm_env.tasks import Draw, World
 from idm_env.types import Params, State, mapped
@@ -78,9 +81,10 @@ class Batch:
         self.seeds = np.zeros(count, dtype=np.int64)
         self.episodes = np.full(count, -1, dtype=np.int64)
         self._world: World | None = None
+        self._moves = Moves(made)
         self._values = self._compiled()
         self._loaded = False
-        self._seen: np.ndarray | None = None
+        self._seen: Any = None
         self._draw: Draw | None = None
         self._driven: Params | None = None
         self._pool: World | None = None
@@ -91,13 +95,13 @@ class Batch:
         self._ahead = max(1, _NORMALS_AT_ONCE // (count * self.task.vehicles))
 
     def _compiled(self) -> Values | None:
-        """Return what steps without a graph, where that can be."""
+        """Return what steps in compiled loops, where that can be."""
         made = self.settings
-        if made.output != "numpy" or made.device.type != "cpu" or dispatch.surroundings() is not None:
+        if made.device.type != "cpu" or dispatch.surroundings() is not None:
             return None
         from idm_env.envs.values import Values
 
-        return Values(self.task, self._commanded, self._told)
+        return Values(self._moves, graph=made.output == "torch")
 
     @property
     def begun(self) -> bool:
@@ -154,8 +158,12 @@ class Batch:
             self._draw = Draw(self._draw.key.index_put((torch.as_tensor(index),), draw.key))
             self._world = self._block = None
             # Only these rows look anew.
-            self._seen[index] = self.task.observe(fresh).detach().numpy()
-            return self._seen.copy()
+            seen = self.task.observe(fresh)
+            if isinstance(self._seen, Tensor):
+                self._seen = self._seen.index_copy(0, torch.as_tensor(index), seen)
+                return self._seen.clone()
+            self._seen[index] = seen.detach().numpy()
+            return self._seen.copy()  # type: ignore[no-any-return]
         else:
             where = torch.as_tensor(index, device=device)
             self.world = mapped(lambda old, new: old.index_put((where,), new), self.world, fresh)
@@ -227,20 +235,12 @@ class Batch:
     def _step_torch(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> dict[str, Any]:
         if isinstance(action, np.ndarray):
             action = torch.as_tensor(action, device=self.settings.device)
-        before, task = self.world, self.task
+        before = self.world
         assert before is not None
         block = self._normals(lambda: before.state.step)
         normals = None if block is None else {name: x[self._used - 1] for name, x in block.items()}
-        command, given, inputs = self._commanded(before, action, normals, live)
-        # With torch output always the step itself, so that values are the same bits with and without a graph.
-        simulator = task.simulator
-        advance = simulator.step if self.settings.output == "torch" else simulator.advance
-        state = advance(before.state, inputs, task.driven(before.episode, self.params))
-        after = before._replace(state=state)
-        if command is None:
-            command = state.speed.new_zeros(self.count, len(task.agents))
-        self.world = after
-        told = self._told(before, command, given, after, action is not None)
+        driven = self.task.driven(before.episode, self.params)
+        self.world, told = self._moves.step(before, action, live, normals, driven)
         # What a task tells may be a part of its state: whoever is told gets numbers of his own.
         told = {name: x.clone() for name, x in told.items()}
         return {n: x.cpu().numpy() for n, x in told.items()} if self.settings.output == "numpy" else told
@@ -249,87 +249,48 @@ class Batch:
         """Return what is told of a step by compiled loops; None, with nothing changed, where there are none."""
         values, world = self._values, self._world
         assert values is not None
-        if world is not None and not self._loaded:
-            values.load(world)
-        given = None if action is None else np.asarray(action).reshape(-1)
+        if self.settings.output == "torch" and dispatch.surroundings() is not None:
+            self._world, self._loaded = self.world, False
+            return None
         used, block = self._used, self._block
         try:
+            if world is not None and not self._loaded:
+                values.load(world)
             normals = self._normals(values.clock)
             noise = None if normals is None else self._drawn
             who = None if live is None else live.numpy().reshape(-1)
             if self._driven is None:
                 self._driven = self.task.driven(self.glance().episode, self.params)
-            told = values.step(given, who, noise, max(self._used - 1, 0), self._driven)
-        except Untraceable:
-            # Said once, as a warning, where an effect is why (``kernels.printed``); NaN the step itself tells.
-            self._world = self.world
+            told = values.step(action, who, noise, max(self._used - 1, 0), self._driven)
+        except Untraceable as why:
+            # Where an effect is why it was said before (``kernels.printed``); NaN the step itself tells.
+            if self.settings.output == "torch" and not isinstance(self.task.road, Lanes):
+                warnings.warn(f"no compiled step, the torch path runs instead: {why}.", stacklevel=4)
+            self._world, self._loaded = self.world, False
             self._values, self._used, self._block = None, used, block
             return None
         # What is told is written to by whom it pleases.
-        self._world, self._loaded, self._seen = None, True, told["observation"].copy()
+        seen = told["observation"]
+        self._world, self._loaded, self._seen = None, True, seen.clone() if isinstance(seen, Tensor) else seen.copy()
         return told
-
-    def _commanded(
-        self,
-        world: World,
-        action: Tensor | None,
-        normals: Mapping[str, Tensor] | None = None,
-        live: Tensor | None = None,
-    ) -> tuple[Tensor | None, Tensor | None, Mapping[str, Any]]:
-        """Return commands, commands as the failsafe lets them pass, and the inputs of a step."""
-        task = self.task
-        command = None if action is None else task.command(action)
-        given = None if command is None else task.limit(world, command)
-        inputs = task.wishes(task.inputs(world, given, normals, live), action, live)
-        if command is not None and live is not None:
-            command = torch.where(live, command, 0.0)
-        return command, given, inputs
-
-    def _told(
-        self, before: World, command: Tensor, given: Tensor | None, after: World, commanded: bool
-    ) -> dict[str, Tensor]:
-        """Return everything that faces tell of a step, by name."""
-        task = self.task
-        terminated, truncated = task.ended(after)
-        details = self._details(after, command if commanded else None, given, terminated)
-        if self.limit is not None:
-            truncated = truncated | (after.state.step >= self.limit).unsqueeze(-1)
-        reward = task.reward(before, command, after, terminated)
-        if len(task.agents) == 1:
-            ends, cut = terminated[..., 0], truncated[..., 0]
-        else:
-            ends, cut = terminated.any(-1), (truncated | terminated).all(-1) & truncated.any(-1)
-        return {
-            "observation": task.observe(after),
-            "reward": reward,
-            "terminated": terminated,
-            "truncated": truncated,
-            "whole_reward": reward.mean(-1),
-            "whole_terminated": ends,
-            "whole_truncated": cut,
-            **{f"info_{name}": x for name, x in details.items()},
-        }
-
-    def _details(
-        self, after: World, command: Tensor | None, given: Tensor | None, crashed: Tensor
-    ) -> dict[str, Tensor]:
-        """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
-        task, asked, found = self.task, self.settings.info, dict[str, Tensor]()
-        if "accel" in asked:
-            found["accel"] = task.pick(after.state.accel)
-        if "command" in asked:
-            shape = (len(after.state.speed), len(task.agents))
-            found["command"] = after.state.accel.new_full(shape, torch.nan) if command is None else command
-        if "failsafe" in asked:
-            if command is None or given is None or not task.failsafe:
-                found["failsafe"] = torch.zeros_like(crashed)
-            else:
-                found["failsafe"] = given < command
-        if "crash" in asked:
-            found["crash"] = crashed
-        return found | {name: x for name, x in task.told(after).items() if name in asked} if asked else found
 
     def detach(self) -> None:
         """Cut the graph behind the present state, for truncated back-propagation."""
+        if isinstance(self._seen, Tensor):
+            self._seen = self._seen.detach()
+        if self._world is None and self._loaded and self._values is not None:
+            self._values.detach()
+            return
         if self.world is not None:
             self.world = mapped(lambda x: x.detach(), self.world)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the graph: a copy, or what is pickled, goes on from the present worlds."""
+        world = self.world
+        cut = None if world is None else mapped(lambda x: x.detach(), world)
+        return {**self.__dict__, "_world": cut, "_loaded": False, "_values": None, "_seen": None, "_driven": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over everything, with loops of its own."""
+        self.__dict__.update(state)
+        self._values = self._compiled()

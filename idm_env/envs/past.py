@@ -19,17 +19,26 @@ _ROOM = 64
 class Past:
     """The past of worlds of one shape: ``rows`` (steps · signals, vehicles), oldest first; ``newest`` is the last step.
 
-    ``slots`` of these steps count. Without a past in the state it is empty, with no slots.
+    ``slots`` of these steps count. Without a past in the state it is empty, with no slots. ``kept`` says that what was
+    written stays as it is, for those who have the array.
     """
 
-    def __init__(self, state: State) -> None:
+    def __init__(self, state: State, kept: bool = False) -> None:
+        self.kept = kept
         self._shape = tuple(state.speed.shape)
-        kept = state.memory.get(PAST)
-        self.slots, self._signals = (0, 1) if kept is None else tuple(kept.shape[-2:])
+        past = state.memory.get(PAST)
+        self.slots, self._signals = (0, 1) if past is None else tuple(past.shape[-2:])
         self.newest = self.slots - 1
         kind = state.speed.detach().numpy().dtype
         count = math.prod(self._shape) if self.slots else 1
         self.rows = np.zeros(((self.slots + (_ROOM if self.slots else 1)) * self._signals, count), kind)
+
+    def copy(self) -> Past:
+        """Return another one of the same steps, with memory of its own."""
+        made = Past.__new__(Past)
+        made.__dict__.update(self.__dict__)
+        made.rows = self.rows.copy()
+        return made
 
     def load(self, state: State) -> None:
         """Take over the past of all worlds."""
@@ -48,6 +57,8 @@ class Past:
         """See that one more step fits in."""
         if (self.newest + 2) * self._signals > len(self.rows):
             last = self._last().copy()
+            if self.kept:
+                self.rows = np.zeros_like(self.rows)
             self.newest = self.slots - 1
             self._last()[:] = last
 

@@ -1,48 +1,46 @@
-"""A step of a batch without a graph: what a task says before and after it as compiled loops, its kernel between.
+"""A step of a batch as compiled loops, and its adjoint: what a task says before and after it, its kernel between.
 
-The task's own functions are recorded (``kernels.rows``), so nothing of theirs is written twice. Everything that holds
-for many steps is laid out once: two sets of arrays take turns as the state before and after a step.
+The task's own functions are recorded (``kernels.rows``), and so is what torch's autograd makes of them: nothing of
+theirs is written twice. Everything that holds for many steps is laid out once; a call hands over addresses.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.envs.past import Past
+from idm_env.envs.moves import Moves
 from idm_env.history import PAST
 from idm_env.kernels import threads as pool
 from idm_env.kernels import tiles
 from idm_env.kernels.lanes import part_of, static_of
+from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import Strides, operand, table
 from idm_env.kernels.printed import TileKernel, tile_kernel
-from idm_env.kernels.rows import RowFunction
-from idm_env.kernels.world_loop import advance, workspaces
+from idm_env.kernels.rows import RowFunction, adjoint
+from idm_env.kernels.world_loop import retreat_worlds, step_worlds, workspaces
 from idm_env.scalar.record import Form, Untraceable, slot_name
-from idm_env.tasks import Task, World
+from idm_env.tasks import World
 from idm_env.types import Params, State
 
 Array = np.ndarray
-Arrays = tuple[dict[str, Array], dict[str, Array]]
-Before = Callable[
-    [World, Tensor | None, Mapping[str, Tensor] | None, Tensor | None],
-    tuple[Tensor | None, Tensor | None, Mapping[str, Any]],
-]
-"""World, actions, normals, whose actions count → commands, what is let pass of them, and the inputs of the step."""
-After = Callable[[World, Tensor, Tensor | None, World, bool], dict[str, Tensor]]
-"""World, commands, commands let pass, world Δt later, whether anybody commanded → everything that faces tell."""
 _ROWS = (1009, 1013, 1019, 1021, 1031)
+_GIVEN = ("command", "given")
 
 
-class Recorded(NamedTuple):
+@dataclass
+class Recorded:
     """A task's step as it was recorded: functions before and after it, the kernel, and the inputs between.
 
-    ``normals`` are the kernel's slots for what effects draw, and ``many`` the number of rows in the recording.
+    ``normals`` are the kernel's slots for what effects draw, ``many`` the number of rows in the recording, and
+    ``flowing`` what is told and has derivatives.
     """
 
     before: RowFunction
@@ -51,170 +49,366 @@ class Recorded(NamedTuple):
     inputs: Mapping[str, Any]
     normals: Mapping[str, str]
     many: int
+    flowing: list[str]
+    back: Callable[[], tuple[RowFunction, RowFunction]]
+
+    @cached_property
+    def backward(self) -> tuple[RowFunction, RowFunction]:
+        """The adjoints of what comes before and after. Untraceable where torch's derivative cannot be recorded."""
+        return self.back()
+
+
+class Layout(NamedTuple):
+    """Where a world lies: numbers of every vehicle that steps change are ``blocks`` of one array, one after another.
+
+    ``still`` are the arrays of all else, and ``version`` counts how often one was replaced by another.
+    """
+
+    blocks: tuple[str, ...]
+    still: dict[str, Array]
+    version: int
+
+
+@dataclass(slots=True)
+class Moment:
+    """One step of a batch: all that its loops were given, so that its adjoint can be computed.
+
+    ``now`` and ``later`` are addresses of the world's blocks, whose memory the caller keeps.
+    """
+
+    now: int
+    later: int
+    clock: Array
+    action: Array | None
+    live: Array | None
+    normals: Mapping[str, Array] | None
+    at: int
+    past: Array
+    newest: int
+    bound: Bound | None = None
+    asked: dict[str, Array] = field(default_factory=dict)
+
+
+class _Table:
+    """The addresses that loops over rows are called with: what stays, what lies in the world, and what is given."""
+
+    def __init__(self, loops: RowFunction, layout: Layout, pitch: int) -> None:
+        still = {**layout.still, **{f"later_{n}": x for n, x in layout.still.items()}}
+        self._stays = loops.table(still)
+        self.given = {n: loops.place(n) for n in (*loops.needs, *loops.outs) if n not in still}
+        """Places of what is given with every call, by name."""
+        self._now, self._now_at = self._within(layout, pitch, "")
+        self._later, self._later_at = self._within(layout, pitch, "later_")
+
+    def _within(self, layout: Layout, pitch: int, prefix: str) -> tuple[Array, Array]:
+        found = {i: self.given.pop(prefix + n) for i, n in enumerate(layout.blocks) if prefix + n in self.given}
+        return np.array(list(found.values()), np.int64), np.array(list(found), np.int64) * pitch
+
+    def filled(self, now: int, later: int, given: Mapping[str, int]) -> Array:
+        """Return the addresses for one call."""
+        made = self._stays.copy()
+        made[self._now] = self._now_at + now
+        made[self._later] = self._later_at + later
+        for name, place in self.given.items():
+            made[place] = given[name]
+        return made
+
+
+class _Room:
+    """Arrays of fixed shapes that are taken together: one piece of memory for each of their types."""
+
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]], types: Mapping[str, Any]) -> None:
+        self._sizes: dict[Any, int] = {}
+        self._at: list[tuple[str, Any, int, int, tuple[int, ...]]] = []
+        for name, shape in shapes.items():
+            kind = np.dtype(types[name])
+            begin, count = self._sizes.get(kind, 0), math.prod(shape)
+            self._at.append((name, kind, begin, count, shape))
+            self._sizes[kind] = begin + count
+
+    def take(self, steps: int = 0) -> tuple[dict[str, Array], dict[str, int]]:
+        """Return fresh arrays by name, with ``steps`` as their first dimension where there are any; and addresses."""
+        base = {kind: np.empty(size * max(steps, 1), kind) for kind, size in self._sizes.items()}
+        first = {kind: x.__array_interface__["data"][0] for kind, x in base.items()}
+        made, there = {}, {}
+        for name, kind, begin, count, shape in self._at:
+            own = max(steps, 1)
+            flat = base[kind][begin * own : (begin + count) * own]
+            made[name] = flat.reshape((steps, *shape) if steps else shape)
+            there[name] = first[kind] + begin * own * kind.itemsize
+        return made, there
+
+
+class Laid:
+    """Tables and operands of a plan for the arrays of one layout."""
+
+    def __init__(self, plan: Plan, layout: Layout) -> None:
+        made, self.layout, self._plan = plan.recorded, layout, plan
+        self.ask = _Table(made.before, layout, plan.pitch)
+        self.tell = _Table(made.after, layout, plan.pitch)
+        self.inputs: list[tuple[Array, Strides]] = []
+        self.given: dict[int, str] = {}
+        """Places of the kernel's inputs that are given with every call, by name."""
+        first = 2 * len(plan.kernel.program.states) + plan.fixed
+        for i, slot in enumerate((*plan.kernel.numbers, *plan.kernel.flags)):
+            found, name = self._input(slot)
+            self.inputs.append(found)
+            if name is not None:
+                self.given[first + i] = name
+
+    def _input(self, slot: str) -> tuple[tuple[Array, Strides], str | None]:
+        """Return where the kernel finds an input, and its name where that is given with every call."""
+        made, rows, size = self._plan.recorded, self._plan.rows, self._plan.size
+        empty = np.empty(0, self._plan.real)
+        if slot in made.normals:
+            return (empty, (rows * size, size, 1)), made.normals[slot]
+        name = _plain(slot)
+        other, width = made.before.same.get(name, (name, made.before.shapes.get(name)))
+        if width is not None:
+            wide = math.prod(width)
+            return (empty, (0, wide, 0 if wide < size else 1)), other
+        x = part_of(made.inputs, slot)
+        if x.dim() == 2 and x.shape[0] == made.many:
+            x = x[:1]
+        return operand(x[None], (rows,), size, 1), None
+
+    @cached_property
+    def back(self) -> tuple[_Table, _Table]:
+        """The tables of the adjoints of what comes before and after."""
+        before, after = self._plan.recorded.backward
+        return _Table(before, self.layout, self._plan.pitch), _Table(after, self.layout, self._plan.pitch)
+
+    def bind(self, params: Params) -> Bound:
+        """Lay out what parameters give."""
+        plan = self._plan
+        kernel, task, state = plan.kernel, plan.task, plan.world.state
+        still = {n: self.layout.still.get(f"state_{n}") for n in ("length", "present")}
+        views = {n: torch.from_numpy(x).view(plan.rows, plan.size) for n, x in still.items() if x is not None}
+        state = state._replace(**views)  # type: ignore[arg-type]
+        program = kernel.program
+        values = [static_of(task.simulator, state, params, n) for n in (*program.statics, *program.parameters)]
+        made = [operand(x.to(state.speed.dtype), (plan.rows,), plan.size) for x in values] + self.inputs
+        places = np.concatenate((np.zeros(2 * len(program.states), np.int64), addresses([a for a, _ in made])))
+        strides = table([*(s for _, s in made), (0, plan.size, 1)])
+        return Bound(self, params, program.parameters, [a for a, _ in made], places, strides)
 
 
 class Plan:
-    """Steps of ``arrays`` with or without actions (``kind``: nobody acts, all actions count), as laid out.
+    """Steps of worlds with or without actions (``kind``: nobody acts, all actions count), as laid out.
 
     Raises:
         Untraceable: For a task or a simulator that cannot be recorded.
     """
 
     def __init__(
-        self,
-        task: Task,
-        before: Before,
-        after: After,
-        world: World,
-        arrays: Arrays,
-        past: Past,
-        kind: tuple[bool, bool],
-        draws: tuple[str, ...],
+        self, moves: Moves, world: World, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
     ) -> None:
-        made = self._recorded = _record(task, before, after, world, kind, draws)
-        self._task, self._world, self._arrays, self._past = task, world, arrays, past
-        self._rows, self._size = rows, size = world.state.speed.shape
-        kernel, self._real = (
-            made.kernel,
-            np.dtype(np.float32 if world.state.speed.dtype == torch.float32 else np.float64),
-        )
-        shapes = made.before.shapes
-        self._made = {name: np.empty(rows * math.prod(s), made.before.types[name]) for name, s in shapes.items()}
-        self._outs = list(self._made.values())
-        self._made |= {name: self._made[other] for name, (other, _) in made.before.same.items()}
-        self._answers = [(n, (rows, *s), made.after.types[n]) for n, s in made.after.shapes.items()]
+        self.moves, task = moves, moves.task
+        made = self.recorded = _record(moves, world, kind, draws)
+        self.kernel = kernel = made.kernel
+        self.task, self.world = task, world
+        self.rows, self.size = rows, size = world.state.speed.shape
+        self.real = real = np.dtype(np.float32 if world.state.speed.dtype == torch.float32 else np.float64)
+        self.count = rows * size
+        self.pitch = self.count * real.itemsize
+        self._between = _Room({n: (rows, *s) for n, s in made.before.shapes.items()}, made.before.types)
+        self._reused = self._between.take()
+        self._told = _Room({n: (rows, *s) for n, s in made.after.shapes.items()}, made.after.types)
         self._same = [(n, other, (rows, *s)) for n, (other, s) in made.after.same.items()]
         self._constant = {n: np.repeat(x[None], rows, 0) for n, x in made.after.constants.items()}
-        self._inputs = [self._input(n) for n in (*kernel.numbers, *kernel.flags)]
-        self._slots = slots = past.slots if kernel.signals else 0
-        wide = tiles.width(size, slots)
+        past = world.state.memory.get(PAST)
+        self.slots = past.shape[-2] if past is not None and kernel.signals else 0
+        wide = tiles.width(size, self.slots)
         around = tiles.halo(1, kernel.program.reach)
+        self._groups = tiles.tiles(rows, size, wide, around) if size <= wide else rows
+        self._one = tiles.tiles(rows, size, wide, around) == 1
+        self.extent = np.array((self.slots, rows, size, wide, around))
         self._small = rows * size < 2 * pool.GRAIN
-        self._tiles = tiles.tiles(rows, size, wide, around)
-        self._extent = np.array((slots, rows, size, wide, around))
-        self._work = workspaces(kernel, slots, self._real)
-        self._kernel = (
-            kernel.measures, kernel.forward(self._real.name), kernel.looks, kernel.recalls,
-            kernel.read, kernel.constants[self._real.name], self._extent,
+        self._work = workspaces(kernel, self.slots, real)
+        self._loops = (
+            kernel.measures, kernel.forward(real.name), kernel.looks, kernel.recalls,
+            kernel.read, kernel.constants[real.name], self.extent,
         )  # fmt: skip
-        self._asked = [self._needed(made.before.needs, side) for side in (0, 1)]
-        self._told = [self._needed(made.after.needs, side) for side in (0, 1)]
-        self._given = [
-            (made.before.needs.index(n), n == "action") for n in ("action", "live") if n in made.before.needs
-        ]
+        states = [layout.blocks.index(_block(n)) for n in kernel.program.states]
+        self._states = np.array(states, np.int64) * self.pitch
+        self._carried = [i for i, n in enumerate(layout.blocks) if i not in states]
         program = kernel.program
-        behind = 2 * len(program.states) + len(program.statics) + len(program.parameters)
-        self._normals = {behind + i: made.normals[n] for i, n in enumerate(kernel.numbers) if n in made.normals}
-        self._bound: _Bound | None = None
+        self.fixed = len(program.statics) + len(program.parameters)
+        self._laid = Laid(self, layout)
+        self._bound: Bound | None = None
+        self._loaded: Bound | None = None
 
-    def _input(self, slot: str) -> tuple[Array, Strides]:
-        """Return where the kernel finds an input: an array that ``before`` fills, a constant, or later normals."""
-        made, rows, size = self._recorded, self._rows, self._size
-        if slot in made.normals:
-            return np.empty(0, self._real), (rows * size, size, 1)
-        name = slot.replace(" ", "_")
-        if name in self._made:
-            found = self._made[name]
-            flat = found.view(np.uint8) if found.dtype == np.bool_ else found
-            return flat, (0, found.size // rows, 0 if found.size < rows * size else 1)
-        x = part_of(made.inputs, slot)
-        if x.dim() == 2 and x.shape[0] == made.many:
-            x = x[:1]
-        return operand(x[None], (rows,), size, 1)
+    # -- forwards ------------------------------------------------------------------------------------------------
 
-    def _needed(self, names: list[str], side: int) -> list[Array]:
-        """Return the arrays of names in the recording, with the state before the step on this side."""
-        found = []
-        for name in names:
-            if name in ("action", "live"):
-                found.append(np.empty(0, self._real))
-            elif name in ("command", "given"):
-                found.append(self._made[name])
-            else:
-                there = 1 - side if name.startswith("later_") else side
-                found.append(self._arrays[there][name.removeprefix("later_")])
-        return found
-
-    def run(
-        self,
-        side: int,
-        action: Array | None,
-        live: Array | None,
-        normals: dict[str, Array] | None,
-        at: int,
-        params: Params,
-    ) -> dict[str, Array]:
-        """Do one step of the arrays of a side; those of the other one are then the state Δt later."""
+    def of(self, layout: Layout, params: Params) -> Bound:
+        """Return what parameters give, laid out once for many steps."""
         bound = self._bound
+        if layout.version != self._laid.layout.version:
+            self._laid, bound = Laid(self, layout), None
         if bound is None or bound.params is not params or bound.changed():
-            bound = self._bound = self._bind(params)
-        rows, made, asked, task = self._rows, self._recorded, self._asked[side], self._task
-        for place, is_action in self._given:
-            asked[place] = action if is_action else live  # type: ignore[assignment]
-        made.before.run(rows, asked, self._outs)
-        if normals is not bound.normals:
-            bound.hear(normals, self._normals)
-        old, new = self._arrays[side], self._arrays[1 - side]
-        if self._slots:
-            self._past.make_room()
-        call = (self._past.rows, self._past.newest, *self._kernel, at)
-        threads = 1 if self._small else pool.count(rows * self._size)
+            bound = self._bound = self._laid.bind(params)
+        return bound
+
+    def run(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> dict[str, Array]:
+        """Do one step from blocks to blocks; return what is told. With ``tape`` what is between is kept for ``back``.
+
+        Untraceable where an effect of the user's own returned NaN.
+        """
+        bound = moment.bound
+        moment.now, moment.later = now.data_ptr(), later.data_ptr()
+        assert bound is not None
+        between, there = self._between.take() if tape else self._reused
+        moment.asked = between
+        given = dict(there)
+        if moment.action is not None:
+            given["action"] = _address(moment.action)
+        if moment.live is not None:
+            given["live"] = _address(moment.live)
+        given["state_step"] = _address(moment.clock)
+        told, where = self._told.take()
+        where |= {n: there[n] for n in _GIVEN if n in there}
+        where |= {n: there[o] for n, (o, _) in self.recorded.before.same.items() if n in _GIVEN}
+        clock = np.empty_like(moment.clock)
+        where["state_step"], where["later_state_step"] = given["state_step"], _address(clock)
+        asks, tells = (
+            bound.laid.ask.filled(moment.now, moment.later, given),
+            bound.laid.tell.filled(moment.now, moment.later, where),
+        )
+        places = self._places(moment, there)
+        call = (moment.past, moment.newest, *self._loops, moment.at)
+        made = self.recorded
+        head = (made.before.call, asks, made.after.call, tells, moment.clock, clock, places, bound.strides)
+        threads = 1 if self._small else pool.count(self.count)
         if threads == 1:
-            advance(bound.places[side], bound.strides, *self._work, *call, bound.loaded, 0, self._tiles)
-            bound.loaded = self._tiles == 1
+            step_worlds(*head, *self._work, *call, self._one and self._loaded is bound, 0, self._groups)
+            self._loaded = bound
         else:
-            self._split(bound, side, call, threads)
-        if task.simulator.own and np.isnan(new["state_speed"]).any():
+
+            def part(begin: int, end: int) -> None:
+                step_worlds(*head, *workspaces(self.kernel, self.slots, self.real), *call, False, begin, end)
+
+            pool.split(part, self._groups, 1, threads)
+        for i in self._carried:
+            later[i].copy_(now[i])
+        if self.task.simulator.own and bool(later[bound.laid.layout.blocks.index("state_speed")].isnan().any()):
             raise Untraceable("an effect returned nan: the step itself tells which")
-        if self._slots:
-            self._past.newest += 1
-        np.add(old["state_step"], 1, out=new["state_step"])
-        told = {name: np.empty(shape, kind) for name, shape, kind in self._answers}
-        made.after.run(rows, self._told[side], told.values())
+        told["clock"] = clock
         for name, other, shape in self._same:
             told[name] = told[other].reshape(shape)
         for name, value in self._constant.items():
             told[name] = value.copy()
         return told
 
-    def _split(self, bound: _Bound, side: int, call: tuple[Any, ...], threads: int) -> None:
-        """Share the tiles among threads, each with a workspace of its own."""
+    def _places(self, moment: Moment, between: Mapping[str, int]) -> Array:
+        """Return the addresses of states now and later and of the kernel's operands."""
+        assert moment.bound is not None
+        states = len(self._states)
+        places = moment.bound.places.copy()
+        places[:states] = self._states + moment.now
+        places[states : 2 * states] = self._states + moment.later
+        for place, name in moment.bound.laid.given.items():
+            places[place] = between[name] if name in between else _address((moment.normals or {})[name])
+        return places
 
-        def part(begin: int, end: int) -> None:
-            work = workspaces(self._recorded.kernel, self._slots, self._real)
-            advance(bound.places[side], bound.strides, *work, *call, False, begin, end)
+    # -- backwards -----------------------------------------------------------------------------------------------
 
-        pool.split(part, self._tiles, 1, threads)
+    @cached_property
+    def _scratch(self) -> Scratch:
+        return Scratch(self)
 
-    def _bind(self, params: Params) -> _Bound:
-        """Lay out what parameters give."""
-        kernel, task, state = self._recorded.kernel, self._task, self._world.state
-        still = {n: self._arrays[0].get(f"state_{n}") for n in ("length", "present")}
-        views = {n: torch.from_numpy(x).view(self._rows, self._size) for n, x in still.items() if x is not None}
-        state = state._replace(**views)  # type: ignore[arg-type]
-        names = (*kernel.program.statics, *kernel.program.parameters)
-        values = [static_of(task.simulator, state, params, n).to(state.speed.dtype) for n in names]
-        made = [operand(x, (self._rows,), self._size) for x in values] + self._inputs
-        one, other = ([held[_place_of(n)] for n in kernel.program.states] for held in self._arrays)
-        rest = [a for a, _ in made]
-        places = tuple(np.array([x.ctypes.data for x in (*a, *b, *rest)]) for a, b in ((one, other), (other, one)))
-        strides = table([*(s for _, s in made), (0, self._size, 1)])
-        return _Bound(params, kernel.program.parameters, [*one, *other, *rest], places, strides)
+    def back(
+        self, moment: Moment, on_told: Mapping[str, Array | None], on_later: Array | None, on_past: Array | None
+    ) -> tuple[Array, Array | None, Array, Array]:
+        """Return what falls on the world's blocks, on actions, on parameters (parameters, vehicles) and on the past.
+
+        ``on_told`` is what falls on ``flowing``, ``on_later`` on the blocks of the world Δt later and ``on_past`` on
+        the past (slots · signals, vehicles; newest first); None is nothing.
+        """
+        bound, room = moment.bound, self._scratch
+        assert bound is not None
+        layout, (asks, tells) = bound.laid.layout, bound.laid.back
+        on_now = np.zeros((len(layout.blocks), self.count), self.real)
+        on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
+        on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
+        seeded, begun = room.zeros if on_later is None else _address(on_later), _address(on_now)
+        given = {**room.there, **{f"on_{n}": room.zeros if x is None else _address(x) for n, x in on_told.items()}}
+        for i, name in enumerate(layout.blocks):
+            step = i * self.pitch
+            given[f"seed_{name}"] = room.zeros if on_later is None else seeded + step
+            given[f"begin_{name}"] = begun + step
+        if on_later is not None:
+            for i in self._carried:
+                on_now[i] = on_later.reshape(on_now.shape)[i]
+        given["state_step"] = _address(moment.clock)
+        clock = moment.clock + 1
+        given["later_state_step"] = _address(clock)
+        if moment.action is not None:
+            given["action"], given["on_action"] = _address(moment.action), _address(on_action)
+        if moment.live is not None:
+            given["live"] = _address(moment.live)
+        between = {n: _address(x) for n, x in moment.asked.items()}
+        given |= {n: between[n] for n in _GIVEN if n in between}
+        given |= {n: between[o] for n, (o, _) in self.recorded.before.same.items() if n in _GIVEN}
+        before, after = self.recorded.backward
+        signals = self.slots * self.kernel.signals
+        on_past = np.zeros((signals, self.count), self.real) if on_past is None else on_past
+        past = np.empty((signals, self.count), self.real)
+        retreat_worlds(
+            after.call, tells.filled(moment.now, moment.later, given),
+            before.call, asks.filled(moment.now, moment.later, given), self._places(moment, between),
+            bound.strides, *room.work, moment.past, moment.newest, room.ends, room.begins, on_past.ctypes.data,
+            past.ctypes.data, on_parameters.ctypes.data, room.on_inputs.ctypes.data, *room.loops, moment.at, 0,
+            self._groups,
+        )  # fmt: skip
+        return on_now, on_action, on_parameters, past
 
 
-class _Bound:
+class Scratch:
+    """Memory and tables of the adjoint of a plan's steps: what lies between, used again at every step."""
+
+    def __init__(self, plan: Plan) -> None:
+        kernel, real = plan.kernel, plan.real
+        moving = [_block(n) for n in kernel.program.moving]
+        named = [f"{kind}_{n}" for kind in ("end", "carried", "direct") for n in moving]
+        shapes = {**dict.fromkeys(named, (plan.count,)), "on_command": (plan.count,), "on_given": (plan.count,)}
+        self._made, self.there = _Room(shapes, dict.fromkeys(shapes, real)).take()
+        self.on_inputs = np.zeros((len(kernel.numbers), plan.count), real)
+        self.there |= {f"on_{_plain(n)}": _address(x) for n, x in zip(kernel.numbers, self.on_inputs, strict=True)}
+        self.ends, self.begins = (np.array([self.there[f"{k}_{n}"] for n in moving]) for k in ("end", "carried"))
+        told = plan.recorded.after
+        most = max([plan.count, *(plan.rows * math.prod(s) for s in told.shapes.values())])
+        self._zeros = np.zeros(most, real)
+        self.zeros = _address(self._zeros)
+        work, past = workspaces(kernel, plan.slots, real)
+        self.work = work, past, past.copy()
+        self.loops = (
+            kernel.measures, kernel.forward(real.name), kernel.looks, kernel.recalls, kernel.backward(real.name),
+            kernel.sends, kernel.again, kernel.constants[real.name], plan.extent,
+        )  # fmt: skip
+
+
+class Bound:
     """What parameters give: the addresses of all operands, and which parameters these are."""
 
     def __init__(
-        self, params: Params, names: Sequence[str], arrays: list[Array], places: tuple[Array, ...], strides: Array
+        self, laid: Laid, params: Params, names: tuple[str, ...], arrays: list[Array], places: Array, strides: Array
     ) -> None:
+        self.laid = laid
         self.params, self.places, self.strides = params, places, strides
-        self.normals: dict[str, Array] | None = None
-        self.loaded = False
-        """Whether the workspace holds the operands."""
         self._arrays = arrays  # so that their addresses stay theirs
         pairs = [name.split(".", 1) for name in names]
         self._watched = [(params[e], p, params[e][p], params[e][p]._version) for e, p in pairs]
+        self.wanted = [(i, x) for i, (_, _, x, _) in enumerate(self._watched) if x.requires_grad]
+        """Parameters that require a gradient, with their numbers."""
+        self._names = [names[i] for i, _ in self.wanted]
+
+    def with_values(self, values: Sequence[Tensor]) -> dict[str, dict[str, Tensor]]:
+        """Return the parameters with others in place of those that are ``wanted``."""
+        made = {effect: dict(own) for effect, own in self.params.items()}
+        for name, x in zip(self._names, values, strict=True):
+            effect, parameter = name.split(".", 1)
+            made[effect][parameter] = x
+        return made
 
     def changed(self) -> bool:
         """Return whether a parameter is another tensor now, or was written to."""
@@ -224,27 +418,20 @@ class _Bound:
                 return True
         return False
 
-    def hear(self, normals: dict[str, Array] | None, wanted: Mapping[int, str]) -> None:
-        """Take normals from other blocks from now on; ``wanted`` says at which place whose address is."""
-        self.normals = normals
-        for place, effect in wanted.items():
-            for places in self.places:
-                places[place] = (normals or {})[effect].ctypes.data
 
-
-def _record(
-    task: Task, before: Before, after: After, world: World, kind: tuple[bool, bool], draws: tuple[str, ...]
-) -> Recorded:
+def _record(moves: Moves, world: World, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Recorded:
     """Record a step with or without actions, and with or without saying whose count (``kind`` as in ``Plan``)."""
     if world.state.links is not None:
         raise Untraceable("vehicles change lanes: the torch path steps several lanes")
     idle, every = kind
+    task = moves.task
     size, count = world.state.speed.shape[-1], len(task.agents)
     # A number of rows that is no other dimension tells rows apart from everything else.
     many = next(p for p in _ROWS if p not in (size, count))
     dtype = world.state.speed.dtype
-    sample = {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in named(world).items()}
-    given = {} if idle else {"action": torch.zeros(many, count, dtype=dtype)}
+    leaves = {n: x.detach() for n, x in named(world).items()}
+    sample = {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in leaves.items()}
+    given = {} if idle else {"action": torch.zeros(many, count * len(task.commands), dtype=dtype)}
     if not (idle or every):
         given["live"] = torch.ones(many, count, dtype=torch.bool)
     normals = {name: torch.zeros(many, size, dtype=dtype) for name in draws}
@@ -252,7 +439,8 @@ def _record(
     slots: dict[str, str] = {}
 
     def early(**leaves: Tensor) -> dict[str, Tensor]:
-        asked, passed, inputs = before(_world(leaves, world), leaves.get("action"), normals or None, leaves.get("live"))
+        world_now = _world(leaves, world)
+        asked, passed, inputs = moves.commanded(world_now, leaves.get("action"), normals or None, leaves.get("live"))
         seen.update(inputs)
         out = {} if asked is None or passed is None else {"command": asked, "given": passed}
         for effect, value in inputs.items():
@@ -260,7 +448,7 @@ def _record(
                 if x is not None and x is normals.get(effect):
                     slots[slot_name(effect, part)] = effect
                 elif x is not None:
-                    out[slot_name(effect, part).replace(" ", "_")] = x
+                    out[_plain(slot_name(effect, part))] = x
         return out
 
     first = RowFunction(early, {**sample, **given}, many)
@@ -272,12 +460,65 @@ def _record(
         then = _world({n: x for n, x in leaves.items() if not n.startswith("later_")}, world)
         now, asked = _world(leaves, world, "later_"), leaves.get("command")
         said = now.state.speed.new_zeros(len(now.state.speed), count) if asked is None else asked
-        return after(then, said, leaves.get("given"), now, asked is not None)
+        return moves.told(then, said, leaves.get("given"), now, asked is not None)
 
     examples = {**sample, **{f"later_{n}": x.clone() for n, x in sample.items()}}
     if not idle:
-        examples |= {n: given["action"].clone() for n in ("command", "given")}
-    return Recorded(first, kernel, RowFunction(late, examples, many), seen, slots, many)
+        examples |= {n: torch.zeros(many, count, dtype=dtype) for n in _GIVEN}
+    last = RowFunction(late, examples, many)
+    moving = [_block(n) for n in kernel.program.moving]
+    numbers = [_plain(n) for n in kernel.numbers if n not in slots]
+    by = [*moving, *(f"later_{n}" for n in moving), *(_GIVEN if not idle else ())]
+    flowing = _flowing(late, examples, by)
+
+    def back() -> tuple[RowFunction, RowFunction]:
+        late_back = adjoint(late, flowing, by)
+
+        def later_first(**leaves: Tensor) -> dict[str, Tensor]:
+            found = late_back(**{n: x for n, x in leaves.items() if not n.startswith("seed_")})
+            made = {f"end_{n}": _sum(leaves[f"seed_{n}"], found.get(f"later_{n}")) for n in moving}
+            made |= {f"direct_{n}": found[n] for n in moving if n in found}
+            return made | {f"on_{n}": found[n] for n in _GIVEN if n in found}
+
+        told = {n: x for n, x in late(**examples).items() if n in flowing}
+        seeds = {f"on_{n}": torch.zeros_like(x).contiguous() for n, x in told.items()}
+        seeds |= {f"seed_{n}": sample[n].clone() for n in moving}
+        after_back = RowFunction(later_first, {**examples, **seeds}, many, apart=True)
+        there = after_back.outs
+        asked = [n for n in _GIVEN if f"on_{n}" in there]
+
+        def wide(**leaves: Tensor) -> dict[str, Tensor]:
+            out = early(**leaves)
+            return {n: x if n in _GIVEN else x.expand(many, size) for n, x in out.items()}
+
+        early_back = adjoint(wide, [*numbers, *asked], [*moving, *(() if idle else ("action",))])
+
+        def earlier(**leaves: Tensor) -> dict[str, Tensor]:
+            found = early_back(**{n: x for n, x in leaves.items() if n.split("_")[0] not in ("carried", "direct")})
+            made = {
+                f"begin_{n}": _sum(_sum(leaves[f"carried_{n}"], leaves.get(f"direct_{n}")), found.get(n))
+                for n in moving
+            }
+            return made | ({"on_action": found["action"]} if "action" in found else {})
+
+        seeds = {f"on_{n}": torch.zeros(many, size, dtype=dtype) for n in numbers}
+        seeds |= {f"on_{n}": torch.zeros(many, count, dtype=dtype) for n in asked}
+        seeds |= {f"carried_{n}": sample[n].clone() for n in moving}
+        seeds |= {f"direct_{n}": sample[n].clone() for n in moving if f"direct_{n}" in there}
+        return RowFunction(earlier, {**sample, **given, **seeds}, many, apart=True), after_back
+
+    return Recorded(first, kernel, last, seen, slots, many, flowing, back)
+
+
+def _sum(x: Tensor, more: Tensor | None) -> Tensor:
+    return x.clone() if more is None else x + more
+
+
+def _flowing(function: Callable[..., Mapping[str, Tensor]], leaves: Mapping[str, Tensor], by: list[str]) -> list[str]:
+    """Return the outputs of a function through which a gradient flows to some of its leaves."""
+    with torch.enable_grad():
+        out = function(**{n: x.clone().requires_grad_(n in by) for n, x in leaves.items()})
+    return [n for n, x in out.items() if x.requires_grad]
 
 
 def named(world: World) -> dict[str, Tensor]:
@@ -296,7 +537,18 @@ def _world(leaves: Mapping[str, Tensor], like: World, prefix: str = "") -> World
     return World(like.state._replace(**fields), episode)  # type: ignore[arg-type]
 
 
-def _place_of(state: str) -> str:
+def _plain(slot: str) -> str:
+    """Return the name of a slot as it stands in a program."""
+    return slot.replace(" ", "_")
+
+
+def _address(x: Array | None) -> int:
+    assert x is not None
+    return x.__array_interface__["data"][0]  # type: ignore[no-any-return]
+
+
+def _block(state: str) -> str:
+    """Return the name of a kernel's state among the blocks of a world."""
     if state == "step":
         return "clock"
     return f"memory_{state.removeprefix('memory of ')}" if state.startswith("memory of ") else f"state_{state}"

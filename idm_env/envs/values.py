@@ -1,110 +1,343 @@
-"""The worlds of a batch as arrays that compiled loops step (``plan.py``), without a graph."""
+"""The worlds of a batch as arrays that compiled loops step (``plan.py``), with a graph where one is asked for.
+
+A step is one node of autograd: its forward pass and its vector-Jacobian product are the plan's. Between steps the graph
+goes through the blocks of the world, one tensor, and a token that stands for the past.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.envs.moves import Moves
 from idm_env.envs.past import Past
-from idm_env.envs.plan import After, Array, Before, Plan, named
+from idm_env.envs.plan import Array, Bound, Layout, Moment, Plan, named
 from idm_env.history import PAST
-from idm_env.tasks import Task, World
-from idm_env.types import Params, State
+from idm_env.kernels.lanes import past_tensor
+from idm_env.scalar.record import Untraceable
+from idm_env.tasks import World
+from idm_env.types import Params, mapped
 
 
 class Values:
     """The worlds of a batch as arrays, and their steps.
 
+    ``graph`` says that steps may have a graph; then nothing that a step has read is written to later.
+
     Raises:
-        Untraceable: From ``step``, before anything has changed, where the task or its simulator cannot be recorded.
+        Untraceable: From ``load`` and ``step``, before anything has changed, where the task, its simulator or what
+            carries a graph cannot be recorded.
     """
 
-    def __init__(self, task: Task, before: Before, after: After) -> None:
-        self.task = task
-        self._before, self._after = before, after
+    def __init__(self, moves: Moves, *, graph: bool) -> None:
+        self._moves, self._graph = moves, graph
         self._plans: dict[tuple[bool, bool], Plan] = {}
         self._key: Any = None
-        self.arrays: tuple[dict[str, Array], dict[str, Array]] = ({}, {})
-        self.past: Past
-        self.side = 0
-        self.world: World | None = None
+        self._layout = Layout((), {}, 0)
+        self._blocks: Tensor
+        self._spare: Tensor | None = None
+        self._token: Tensor | None = None
+        self._clock: Array
+        self._past: Past
+        self._world: World
+
+    # -- worlds --------------------------------------------------------------------------------------------------
 
     def load(self, world: World) -> None:
-        """Take over worlds; they are copied."""
+        """Take over worlds; they are copied, with the graph of what steps change."""
+        leaves = named(world)
         key = (world.state.speed.shape, world.state.speed.dtype, tuple(world.state.memory), tuple(world.episode))
+        blocks = tuple(n for n in leaves if n in _DYNAMIC or n.startswith("memory_"))
+        fixed = next((n for n, x in leaves.items() if x.requires_grad and n not in blocks), None)
+        if fixed is not None:
+            raise Untraceable(f"{fixed.replace('_', '.', 1)} carries a graph")
         if key != self._key:
-            self._key, self._plans, self.arrays, self.past = key, {}, ({}, {}), Past(world.state)
-        self.world = world
-        state = world.state
-        for name, x in named(world).items():
-            self._put(name, x)
-        self._put("clock", _clock(state))
-        self.past.load(state)
+            self._plans, self._spare = {}, None
+        self._key, self._world = key, mapped(lambda x: x.detach(), world)
+        still = {n: np.array(x.numpy(), order="C").reshape(-1) for n, x in leaves.items() if n not in blocks}
+        self._clock = still.pop("state_step")
+        old = self._layout.still
+        if still.keys() != old.keys() or not all(np.array_equal(x, old[n]) for n, x in still.items()):
+            self._layout = Layout((*blocks, "clock"), still, self._layout.version + 1)
+        self._blocks = _block(world, self._layout.blocks)
+        self._past = Past(world.state, kept=self._graph)
+        self._past.load(world.state)
+        kept = world.state.memory.get(PAST)
+        self._token = None
+        if kept is not None and kept.requires_grad:
+            self._token = _Enter.apply(kept, tuple(world.state.speed.shape))
 
     def replace(self, rows: Array, fresh: World) -> None:
-        """Replace some rows (indices) by the worlds of ``fresh``."""
-        held, other = self.arrays[self.side], self.arrays[1 - self.side]
-        count = len(held["state_step"])
-        for name, x in (*named(fresh).items(), ("clock", _clock(fresh.state))):
-            values = x.detach().numpy()
-            held[name].reshape(count, *values.shape[1:])[rows] = values
-            if other[name] is not held[name] and name not in _DYNAMIC:
-                other[name].reshape(count, *values.shape[1:])[rows] = values
-        self.past.replace(rows, fresh.state)
-
-    def _put(self, name: str, x: Tensor) -> None:
-        held, other = self.arrays[self.side], self.arrays[1 - self.side]
-        if name in held:
-            np.copyto(held[name].reshape(x.shape), x.detach().numpy())
-            if other[name] is not held[name] and name not in _DYNAMIC:
-                # What no step changes must be the same on both sides.
-                np.copyto(other[name], held[name])
-            return
-        held[name] = np.array(x.detach().numpy(), order="C").reshape(-1)
-        other[name] = held[name] if name.startswith("episode_") or name == "state_length" else held[name].copy()
+        """Replace some rows (indices) by the worlds of ``fresh``, with their graph; that of the rows before is cut."""
+        index, blocks = torch.from_numpy(np.asarray(rows)), _block(fresh, self._layout.blocks)
+        leaves = {n: x.detach().numpy() for n, x in named(fresh).items()}
+        if self._graph:
+            self._blocks = self._blocks.index_copy(1, index, blocks)
+            self._clock, self._past = self._clock.copy(), self._past.copy()
+            if self._token is not None:
+                self._token = _Forget.apply(self._token, index, tuple(fresh.state.speed.shape))
+        else:
+            self._blocks[:, index] = blocks
+        self._clock[rows] = leaves["state_step"]
+        self._past.replace(rows, fresh.state)
+        for name, held in self._layout.still.items():
+            values = leaves[name]
+            old = held.reshape(len(self._clock), *values.shape[1:])
+            if np.array_equal(old[rows], values):
+                continue
+            if self._graph:
+                # What earlier steps have read stays as it was.
+                old = old.copy()
+                still = {**self._layout.still, name: old.reshape(-1)}
+                self._layout = self._layout._replace(still=still, version=self._layout.version + 1)
+            old[rows] = values
 
     def current(self, own: bool = True) -> World:
-        """Return the worlds as tensors of their own, or without the past as views that hold until the next step."""
-        assert self.world is not None
-        state, held = self.world.state, self.arrays[self.side]
+        """Return the worlds as tensors of their own, or as views until the next step, without graph and past."""
+        held, clock, layout = self._blocks if own else self._blocks.detach(), self._clock, self._layout
         if own:
-            held = {name: x.copy() for name, x in held.items()}
-        leaves = {n: torch.from_numpy(held[n]).view(x.shape) for n, x in named(self.world).items()}
-        memory = {name: leaves.get(f"memory_{name}", x) for name, x in state.memory.items()}
-        if PAST in memory and own:
-            memory[PAST] = self.past.tensor()
-        fields: Any = {n.removeprefix("state_"): x for n, x in leaves.items() if n.startswith("state_")}
-        episode = {n.removeprefix("episode_"): x for n, x in leaves.items() if n.startswith("episode_")}
-        return World(state._replace(**fields, memory=memory), episode)
+            clock, layout = clock.copy(), layout._replace(still={n: x.copy() for n, x in layout.still.items()})
+            held = held if self._graph else held.clone()
+        past = self._past.tensor() if own and self._past.slots else None
+        if past is not None and self._token is not None:
+            past = _Leave.apply(self._token, past)
+        return _world(self._world, layout, held, clock, past)
+
+    def detach(self) -> None:
+        """Cut the graph behind the worlds."""
+        self._blocks, self._token = self._blocks.detach(), None
 
     def clock(self) -> Tensor:
         """Return the steps of all rows, as they are now."""
-        return torch.from_numpy(self.arrays[self.side]["state_step"])
+        return torch.from_numpy(self._clock)
+
+    # -- steps ---------------------------------------------------------------------------------------------------
 
     def step(
-        self, action: Array | None, live: Array | None, normals: dict[str, Array] | None, at: int, params: Params
-    ) -> dict[str, Array]:
-        """Advance all rows; ``normals`` are blocks (steps, rows, vehicles) by effect, ``at`` the step in them.
+        self, action: Array | Tensor | None, live: Array | None, normals: Mapping[str, Array] | None, at: int,
+        params: Params,
+    ) -> dict[str, Any]:  # fmt: skip
+        """Advance all rows; ``normals`` are blocks (steps, rows · vehicles) by effect, ``at`` the step in them.
 
-        ``live`` says whose actions count (all, where it is None).
+        ``live`` says whose actions count (all, where it is None). Arrays are told; tensors where there may be a graph.
         """
-        kind = (action is None, live is None)
+        plan = self._plan((action is None, live is None), tuple(normals or ()))
+        bound = plan.of(self._layout, params)
+        given = action.detach().numpy() if isinstance(action, Tensor) else action
+        if self._past.slots:
+            self._past.make_room()
+        moment = Moment(
+            0, 0, self._clock, given, live, normals, at, self._past.rows, self._past.newest, bound
+        )  # fmt: skip
+        told: dict[str, Any]
+        if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
+            told = self._noted(plan, moment, action, bound)
+        else:
+            later = self._spare if self._spare is not None else torch.empty_like(self._blocks)
+            told = plan.run(moment, self._blocks, later, tape=False)
+            self._spare = None if self._graph else self._blocks
+            self._blocks, self._token = later, None
+            if self._graph:
+                clock = told.pop("clock")
+                told = {n: torch.from_numpy(x) for n, x in told.items()} | {"clock": clock}
+        self._clock = told.pop("clock")
+        if self._past.slots:
+            self._past.newest += 1
+        return told
+
+    def _plan(self, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Plan:
         plan = self._plans.get(kind)
         if plan is None:
-            assert self.world is not None
-            draws = tuple(normals or ())
-            plan = Plan(self.task, self._before, self._after, self.world, self.arrays, self.past, kind, draws)
+            world = self.current(own=False)
+            plan = Plan(self._moves, world, self._layout, kind, draws)
+            if self._graph:
+                _ = plan.recorded.backward
             self._plans[kind] = plan
-        told = plan.run(self.side, action, live, normals, at, params)
-        self.side = 1 - self.side
+        return plan
+
+    def _differentiated(self, action: Any, bound: Bound) -> bool:
+        return bool(
+            self._blocks.requires_grad
+            or self._token is not None
+            or bound.wanted
+            or (isinstance(action, Tensor) and action.requires_grad)
+        )
+
+    def _noted(self, plan: Plan, moment: Moment, action: Any, bound: Bound) -> dict[str, Any]:
+        """Do a step as a node of autograd."""
+        told: dict[str, Any] = {}
+        wanted = [x for _, x in bound.wanted]
+        token = self._token
+        if token is None and self._past.slots:
+            token = self._blocks.new_zeros(1).expand(plan.slots * plan.kernel.signals, plan.count)
+        out = _Step.apply(plan, moment, told, self._blocks, action, token, *wanted)
+        self._blocks = out[0]
+        self._token = out[1] if self._past.slots else None
+        told.update(zip(plan.recorded.flowing, out[2:], strict=True))
         return told
 
 
-_DYNAMIC = {f"state_{name}" for name in ("position", "speed", "accel", "gap", "step")}
+class _Step(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, plan: Plan, moment: Moment, told: dict[str, Any], blocks: Tensor, action: Tensor | None,
+        token: Tensor | None, *wanted: Tensor,
+    ) -> tuple[Tensor | None, ...]:  # fmt: skip
+        later = torch.empty_like(blocks)
+        arrays = plan.run(moment, blocks, later, tape=True)
+        told["clock"] = arrays.pop("clock")
+        told.update({n: torch.from_numpy(x) for n, x in arrays.items()})
+        ctx.plan, ctx.moment = plan, moment
+        ctx.save_for_backward(blocks, later, action, token, *wanted)
+        ctx.set_materialize_grads(False)
+        past = None if token is None else _like(token)
+        return (later, past, *(told[n] for n in plan.recorded.flowing))
+
+    @staticmethod
+    def backward(ctx: Any, on_later: Tensor | None, on_past: Tensor | None, *on_told: Tensor | None) -> Any:  # type: ignore[override]
+        plan, moment = ctx.plan, ctx.moment
+        blocks, _, action, token, *wanted = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            return (None,) * 3 + _twice(ctx, blocks, action, token, wanted, (on_later, on_past, *on_told))
+        names = plan.recorded.flowing
+        seeds = {n: None if x is None else x.contiguous().numpy() for n, x in zip(names, on_told, strict=True)}
+        later = None if on_later is None else on_later.contiguous().numpy()
+        past = None if on_past is None else on_past.contiguous().numpy()
+        on_now, on_action, on_parameters, before = plan.back(moment, seeds, later, past)
+        shape = blocks.shape
+        found = [torch.from_numpy(on_now).view(shape), None if on_action is None else torch.from_numpy(on_action)]
+        found.append(None if token is None else torch.from_numpy(before))
+        for i, x in moment.bound.wanted:
+            found.append(torch.from_numpy(on_parameters[i]).view(shape[1:]).sum_to_size(x.shape).to(x.dtype))
+        return (None,) * 3 + tuple(found)
 
 
-def _clock(state: State) -> Tensor:
-    return state.step.to(state.speed.dtype).unsqueeze(-1).expand(state.speed.shape)
+def _twice(
+    ctx: Any, blocks: Tensor, action: Tensor | None, token: Tensor | None, wanted: Sequence[Tensor],
+    seeds: Sequence[Tensor | None],
+) -> tuple[Tensor | None, ...]:  # fmt: skip
+    """Return gradients with a graph of their own, for second derivatives, from the torch path."""
+    plan, moment = ctx.plan, ctx.moment
+    later, past, told = _again(plan, moment, blocks, action, token, moment.bound.with_values(wanted))
+    outputs = [later, past, *(told[n] for n in plan.recorded.flowing)]
+    pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if o is not None and s is not None and o.requires_grad]
+    sources = [x for x in (blocks, action, token, *wanted) if x is not None and x.requires_grad]
+    found = iter(
+        torch.autograd.grad(
+            [o for o, _ in pairs], sources, [s for _, s in pairs], create_graph=True, allow_unused=True
+        )
+    )  # fmt: skip
+    return tuple(
+        next(found) if x is not None and x.requires_grad else None for x in (blocks, action, token, *wanted)
+    )  # fmt: skip
+
+
+def _again(
+    plan: Plan, moment: Moment, blocks: Tensor, action: Tensor | None, token: Tensor | None, params: Params
+) -> tuple[Tensor, Tensor | None, dict[str, Tensor]]:
+    """Do a step by torch: blocks and past Δt later and what is told, with a graph that can be differentiated."""
+    assert moment.bound is not None
+    layout, shape = moment.bound.laid.layout, tuple(blocks.shape[1:])
+    past = _recent(moment, plan, shape)
+    if past is not None and token is not None:
+        past = _Leave.apply(token, past)
+    world = _world(plan.world, layout, blocks, moment.clock, past)
+    live = None if moment.live is None else torch.from_numpy(moment.live).view(shape[0], -1)
+    drawn = moment.normals
+    normals = None if drawn is None else {n: torch.from_numpy(x).view(-1, *shape)[moment.at] for n, x in drawn.items()}
+    after, told = plan.moves.step(world, action, live, normals, params)
+    last = after.state.memory.get(PAST)
+    return _block(after, layout.blocks), None if last is None else _as_rows(last, shape), told
+
+
+def _world(like: World, layout: Layout, blocks: Tensor, clock: Array, past: Tensor | None) -> World:
+    """Return worlds as tensors that share the memory given."""
+    state = like.state
+    leaves = dict(zip(layout.blocks, blocks, strict=True))
+    for name, x in named(like).items():
+        if name not in leaves:
+            array = clock if name == "state_step" else layout.still[name]
+            leaves[name] = torch.from_numpy(array).view(x.shape)
+    memory = {name: leaves.get(f"memory_{name}", x) for name, x in state.memory.items()}
+    if past is not None:
+        memory[PAST] = past
+    fields: Any = {n.removeprefix("state_"): x for n, x in leaves.items() if n.startswith("state_")}
+    episode = {n.removeprefix("episode_"): x for n, x in leaves.items() if n.startswith("episode_")}
+    return World(state._replace(**fields, memory=memory), episode)
+
+
+def _block(world: World, names: Sequence[str]) -> Tensor:
+    """Return what steps change of worlds as one tensor, with its graph."""
+    state = world.state
+    clock = state.step.to(state.speed.dtype).unsqueeze(-1)
+    leaves = named(world) | {"clock": clock}
+    return torch.stack([leaves[n].to(state.speed.dtype).expand(state.speed.shape) for n in names])
+
+
+def _recent(moment: Moment, plan: Plan, shape: tuple[int, ...]) -> Tensor | None:
+    """Return the past that a step began with, as the state holds it."""
+    if not plan.slots:
+        return None
+    signals = plan.kernel.signals
+    end = (moment.newest + 1) * signals
+    last = moment.past[end - plan.slots * signals : end].reshape(plan.slots, signals, -1)[::-1]
+    return past_tensor(np.ascontiguousarray(last).reshape(-1, last.shape[-1]), plan.slots, shape)
+
+
+def _as_rows(past: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return a past, or what falls on it, as (slots · signals, vehicles), newest first."""
+    full = past.expand(*shape, *past.shape[-2:]).movedim((-2, -1), (0, 1))
+    return full.reshape(full.shape[0] * full.shape[1], -1)
+
+
+def _like(token: Tensor) -> Tensor:
+    """Return a token of the same shape: nobody reads it, so it has one number."""
+    return token.new_zeros(1).expand(token.shape)
+
+
+class _Enter(torch.autograd.Function):
+    """From a past to the token that stands for it: its gradient is that of the past."""
+
+    @staticmethod
+    def forward(ctx: Any, past: Tensor, shape: tuple[int, ...]) -> Tensor:
+        ctx.shape, ctx.full = past.shape, (*past.shape[-2:], *shape)
+        slots, signals, *_ = ctx.full
+        return past.new_zeros(1).expand(slots * signals, math.prod(shape))
+
+    @staticmethod
+    def backward(ctx: Any, on_token: Tensor) -> Any:  # type: ignore[override]
+        return on_token.reshape(ctx.full).movedim((0, 1), (-2, -1)).sum_to_size(ctx.shape), None
+
+
+class _Leave(torch.autograd.Function):
+    """From a token to the past that it stands for."""
+
+    @staticmethod
+    def forward(ctx: Any, token: Tensor, past: Tensor) -> Tensor:
+        return past.clone()
+
+    @staticmethod
+    def backward(ctx: Any, on_past: Tensor) -> Any:  # type: ignore[override]
+        return _as_rows(on_past, tuple(on_past.shape[:-2])), None
+
+
+class _Forget(torch.autograd.Function):
+    """A token after some rows began anew: nothing flows back into what they were."""
+
+    @staticmethod
+    def forward(ctx: Any, token: Tensor, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
+        ctx.rows, ctx.vehicles = rows, shape[-1]
+        return _like(token)
+
+    @staticmethod
+    def backward(ctx: Any, on_token: Tensor) -> Any:  # type: ignore[override]
+        apart = on_token.view(len(on_token), -1, ctx.vehicles)
+        return apart.index_fill(1, ctx.rows, 0.0).view_as(on_token), None, None
+
+
+_DYNAMIC = {f"state_{name}" for name in ("position", "speed", "accel", "gap", "present")}

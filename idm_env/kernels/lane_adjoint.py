@@ -90,19 +90,22 @@ def give_back(w, ah, n, signals, recalls, now):
 
 
 @exact
-def step_back(w, h, ah, n, size, measures, phases, back, looks, recalls, sends, k, now):
-    """Carry the adjoint of a tile back by one step, in place; the states are those before that step."""
+def step_back(w, h, pitch, ah, n, size, measures, phases, back, looks, recalls, sends, k, now, then):
+    """Carry the adjoint of a tile back by one step, in place; the states are those before that step.
+
+    ``now`` is the place of the step in the past at address ``h`` (see ``step``), ``then`` in its adjoint ``ah``.
+    """
     m, signals = padded(n), measures[SIGNALS]
-    perceive(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, now)
+    perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now)
     if measures[NUMBERS] + measures[FLAGS]:
         look(w, n, size, measures, looks, CLOSE)  # whose neighbour comes or goes is an input of this step
     for phase in (CLOSE, RESPOND):
         call(back[phase], w, m, k)  # type: ignore[call-arg]
         send(w, n, size, measures, sends, phase)
     if phases[SENSE]:
-        give_back(w, ah, n, signals, recalls, now)
+        give_back(w, ah, n, signals, recalls, then)
         for i in range(signals):
-            copy(w, measures[ON_SIGNAL_ROWS] + i * ROW, ah, (now * signals + i) * ROW, n)
+            copy(w, measures[ON_SIGNAL_ROWS] + i * ROW, ah, (then * signals + i) * ROW, n)
         call(back[SENSE], w, m, k)  # type: ignore[call-arg]
         send(w, n, size, measures, sends, SENSE)
 
@@ -187,7 +190,8 @@ def backward(
                 copy(w, measures[STATE_ROWS] + taped[i] * ROW, tape, (t * len(taped) + i) * ROW, n)
             if has_inputs:
                 load_inputs(w, operands, strides, now, row, first, n, size, measures)
-            step_back(w, h, ah, n, size, measures, phases, back, looks, recalls, sends, k, slots + t)
+            then = slots + t
+            step_back(w, h.ctypes.data, ROW, ah, n, size, measures, phases, back, looks, recalls, sends, k, then, then)
             if over:
                 for i in range(measures[NUMBERS]):
                     copy(on_inputs, (i * over + now) * count + at, w, measures[ON_INPUT_ROWS] + i * ROW + skip, own)

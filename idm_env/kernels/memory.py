@@ -53,6 +53,17 @@ def _bytes(context: Any, number: Any) -> Any:
 
 
 @intrinsic
+def located(typing_context: Any, address: Any, like: Any) -> Any:
+    """Return a pointer to what begins at an address, to numbers of the type ``like``."""
+    kind = types.CPointer(like.dtype)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(kind))
+
+    return kind(address, like), generate
+
+
+@intrinsic
 def number(typing_context: Any, place: Any, index: Any, like: Any) -> Any:
     """Return one number, of the type of those in the array ``like``."""
     kind = _number(place, like)
@@ -180,4 +191,4 @@ def prefetch(typing_context: Any, source: Any, at: Any, n: Any, like: Any) -> An
     return types.void(types.int64, types.int64, types.int64, like), generate
 
 
-__all__ = ["LINE", "add", "addresses", "copy", "copy_truth", "fill", "gather", "number", "prefetch"]
+__all__ = ["LINE", "add", "addresses", "copy", "copy_truth", "fill", "gather", "located", "number", "prefetch"]

@@ -49,3 +49,17 @@ def call_beside(typing_context: Any, address: Any, w: Any, block: Any, m: Any, k
         return context.get_dummy_value()
 
     return types.void(types.int64, w, block, types.int64, k), generate
+
+
+@intrinsic
+def call_rows(typing_context: Any, address: Any, begin: Any, end: Any, table: Any) -> Any:
+    """Call the loops at ``address`` (``rows.py``) over some rows, with a table of the addresses of their arrays."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64), ir.IntType(64), ir.IntType(64).as_pointer()])
+        function = builder.inttoptr(arguments[0], kind.as_pointer())
+        data = context.make_array(table)(context, builder, arguments[3]).data
+        builder.call(function, [arguments[1], arguments[2], data])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64, table), generate

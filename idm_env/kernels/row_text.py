@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 
 UNARY = {
@@ -17,6 +18,8 @@ UNARY = {
     "tanh": "np.tanh({0})",
     "logical_not": "(not {0})",
     "bitwise_not": "(not {0})",
+    "sign": "F(np.sign({0}))",
+    "sgn": "F(np.sign({0}))",
 }
 BINARY = {
     "add": "({0} + {1})",
@@ -27,6 +30,8 @@ BINARY = {
     "minimum": "smaller({0}, {1})",
     "maximum": "larger({0}, {1})",
     "pow": "({0} ** {1})",
+    "tanh_backward": "({0} * (F(1.0) - {1} * {1}))",
+    "threshold_backward": "({0} if {1} > F(0) else F(0))",
     "bitwise_and": "({0} and {1})",
     "bitwise_or": "({0} or {1})",
     "logical_and": "({0} and {1})",
@@ -63,6 +68,65 @@ def loops(shape: Sequence[int], line: Callable[[list[str]], str | list[str]]) ->
             head.append("    " * depth + f"for {name} in range({n}):")
             depth += 1
     return head + ["    " * depth + text for text in lines]
+
+
+_ELEMENT = re.compile(r"\b(?:[fib]|out_\w+)\[(\d+|r)[^\[\]]*\]")
+"""An element of the workspace or of an output: its text, and where its storage begins."""
+
+
+class _Group:
+    """Loops over one shape that run as one: none reads what another one writes at another element."""
+
+    def __init__(self, head: list[str]) -> None:
+        self.head, self.lines = head, list[str]()
+        self._written: dict[str, str] = {}
+        self._read: dict[str, set[str]] = {}
+
+    def takes(self, line: str) -> bool:
+        """Add a line, if that changes nothing."""
+        to, value = line.split(" = ", 1)
+        read, (target, store) = _elements(value), _elements(to)[0]
+        if any(self._written.get(at, text) != text for text, at in read):
+            return False
+        if self._written.get(store, target) != target or self._read.get(store, {target}) != {target}:
+            return False
+        self._written[store] = target
+        for text, at in read:
+            self._read.setdefault(at, set()).add(text)
+        self.lines.append(line)
+        return True
+
+
+def _elements(text: str) -> list[tuple[str, str]]:
+    """Return elements with the storage that each lies in."""
+    return [(m.group(), m.group().split("[")[0] + m.group(1)) for m in _ELEMENT.finditer(text)]
+
+
+def fused(parts: Sequence[list[str]]) -> list[str]:
+    """Return loops behind one another; neighbours over one shape as one, where that changes nothing."""
+    made: list[str] = []
+    group: _Group | None = None
+
+    def close() -> None:
+        nonlocal group
+        if group is not None:
+            made.extend(group.head)
+            made.extend("    " * len(group.head) + line for line in group.lines)
+            group = None
+
+    for lines in parts:
+        *head, last = lines
+        line = last.strip()
+        alone = head and all(x.strip().startswith("for ") for x in head) and _elements(line.split(" = ")[0])
+        if not alone:
+            close()
+            made.extend(lines)
+        elif group is None or group.head != head or not group.takes(line):
+            close()
+            group = _Group(head)
+            group.takes(line)
+    close()
+    return made
 
 
 def body(lines: Sequence[str]) -> str:

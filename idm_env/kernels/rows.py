@@ -9,7 +9,7 @@ of views. Whatever does not depend on the inputs is a constant.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,22 +17,28 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from idm_env.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, body, loops
+from idm_env.kernels.memory import addresses
+from idm_env.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, body, fused, loops
 from idm_env.scalar import library
 from idm_env.scalar.record import Untraceable
 
+_TEXT = {"f": "F", "i": "np.int64", "b": "np.bool_"}
 KINDS = {torch.float32: "f", torch.float64: "f", torch.int64: "i", torch.bool: "b"}
 TYPES = {"i": np.dtype(np.int64), "b": np.dtype(np.bool_)}
-_BLANK = {"new_zeros", "new_full", "new_ones", "zeros_like", "ones_like", "full_like"}
+_BLANK = {"new_zeros": 0.0, "zeros_like": 0.0, "zeros": 0.0, "new_ones": 1.0, "ones_like": 1.0}
+_FULL = {"new_full": 2, "full_like": 1, "full": 1}
+"""Constants of one value, which backward passes write to: the value, or the place of the argument that it is."""
 
 HEADER = '''"""Printed by idm_env from one call of a task's functions; see idm_env/kernels/rows.py. Delete at will."""
 
 import numpy as np
-from numba import njit
+from numba import carray, njit, types
 
-from idm_env.kernels.compiler import compiler
+from idm_env.kernels.compiler import phase
+from idm_env.kernels.memory import located
 
 F = np.{kind}
+SIZE = (1 << 40,)
 inlined = njit(nogil=True, error_model="numpy", forceinline=True)
 
 
@@ -47,10 +53,10 @@ def smaller(x, y):
     return y if x > y else x
 
 
-@compiler()
-def run(rows, c, {arguments}):
-{flat}    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
-    for r in range(rows):
+@phase(types.void(types.int64, types.int64, types.CPointer(types.int64)))
+def run(begin, end, at):
+{arguments}    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
+    for r in range(begin, end):
 '''
 
 
@@ -73,8 +79,6 @@ class _Recorder(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = func(*args, **(kwargs or {}))
-        if func._schema.is_mutable:
-            raise Untraceable(f"{func} writes in place")
         self.calls.append((func._schema.name.removeprefix("aten::"), args, kwargs or {}, out))
         return out
 
@@ -82,34 +86,40 @@ class _Recorder(TorchDispatchMode):
 class RowFunction:
     """``function(**inputs)`` as compiled loops; it returns a dict of tensors, each with the rows first.
 
-    ``inputs`` are examples with ``rows`` rows each. ``needs`` are the names of those that are read, in the order in
-    which ``run`` takes their arrays; ``shapes`` and ``types`` are those of the outputs, without rows. ``constants`` are
-    the outputs that depend on no input, without rows, and ``same`` those that are another one, in a shape of their own.
+    ``inputs`` are examples with ``rows`` rows each. ``needs`` are the names of those that are read, and ``outs`` of
+    those that are filled: in this order, behind what is ``fixed``, ``call`` takes their addresses. ``shapes`` and
+    ``types`` are those of the outputs, without rows. ``constants`` are the outputs that depend on no input, without
+    rows, and ``same`` those that are another one, in a shape of their own; ``apart`` fills these, too.
 
     Raises:
         Untraceable: For an operation that is not known here, or mixes rows.
     """
 
-    def __init__(self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int) -> None:
+    def __init__(
+        self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int, *,
+        apart: bool = False,
+    ) -> None:  # fmt: skip
         self._rows = rows
         self._places: dict[int, Place] = {}
-        self._stores: dict[int, tuple[str, str, int, int]] = {}
+        self._stores: dict[int, tuple[str, str, int]] = {}
         self._room = {"f": 0, "i": 0, "b": 0}
         self._constants: dict[float, int] = {}
         self._tables: list[np.ndarray] = []
         self._table_of: dict[int, str] = {}
-        self._lines: list[str] = []
+        self._parts: list[list[str]] = []
         with torch.no_grad(), _Recorder() as recorder:
             found = dict(function(**inputs))
         self._floats = next(x.dtype for x in (*inputs.values(), *found.values()) if x.is_floating_point())
         for name, x in inputs.items():
             kind, width = self._kind(x), x.numel() // rows
             self._keep(x, f"in_{name}", f"r * {width}", width, kind)
-        for call in recorder.calls:
+        self._blanks = {id(call[3]): call for call in recorder.calls if call[0] in _BLANK or call[0] in _FULL}
+        calls = _needed(recorder.calls, list(found.values()))
+        for call in calls:
             self._print(*call)
-        self.constants = {name: self._plain(x) for name, x in found.items() if id(x) not in self._places}
-        moving = {name: x for name, x in found.items() if id(x) in self._places}
-        self.same = self._twice(moving)
+        self.constants = {name: self._plain(x) for name, x in found.items() if not (apart or self._known(x))}
+        moving = {name: x for name, x in found.items() if name not in self.constants}
+        self.same = {} if apart else self._twice(moving)
         moving = {name: x for name, x in moving.items() if name not in self.same}
         self.shapes = {name: tuple(x.shape[1:]) for name, x in moving.items()}
         kinds = {name: self._kind(x) for name, x in moving.items()}
@@ -122,20 +132,34 @@ class RowFunction:
             def line(at: Any, to: Place = to, x: Tensor = x) -> str:
                 return f"{index(to, at)} = {self._at(x, at)}"
 
-            self._lines += loops(x.shape[1:], line)
-        text = "\n".join(self._lines)
+            self._parts.append(loops(x.shape[1:], line))
+        lines = fused(self._parts)
+        text = "\n".join(lines)
         self.needs = [name for name in inputs if f"in_{name}[" in text]
-        arguments = [f"in_{n}" for n in self.needs] + [f"t{k}" for k in range(len(self._tables))]
-        arguments += [f"to_{n}" for n in moving]
-        flat = "".join(f"    out_{n} = to_{n}.reshape(-1)\n" for n in moving)
+        self.outs = list(moving)
+        typed: list[tuple[str, str]] = [("c", "f")]
+        typed += [(f"t{k}", x.dtype.kind) for k, x in enumerate(self._tables)]
+        typed += [(f"in_{n}", self._kind(inputs[n])) for n in self.needs]
+        typed += [(f"out_{n}", kinds[n]) for n in moving]
+        arguments = "".join(
+            f"    {n} = carray(located(at[{k}], {_TEXT[kind]}), SIZE)\n" for k, (n, kind) in enumerate(typed)
+        )
         room = {kind: max(1, size) for kind, size in self._room.items()}
-        header = HEADER.format(kind=real.name, arguments=", ".join(arguments), flat=flat, **room)
-        self._c = np.array(list(self._constants) or [0.0], real)
-        self._run = library.load("rows", header + body(self._lines)).run
+        header = HEADER.format(kind=real.name, arguments=arguments, **room)
+        self._held = [np.array(list(self._constants) or [0.0], real), *self._tables]
+        self.fixed = addresses(self._held)
+        """Addresses that every call begins with."""
+        self.call: int = library.load("rows", header + body(lines)).run.address
+        """Address of the loops: (first row, row behind the last, addresses of arrays that hold row after row)."""
 
-    def run(self, rows: int, needed: Iterable[np.ndarray], outs: Iterable[np.ndarray]) -> None:
-        """Fill ``outs``, dense in any shape; what is ``needed`` is flat. All arrays hold row after row."""
-        self._run(rows, self._c, *needed, *self._tables, *outs)
+    def table(self, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the addresses for a call, from arrays by name; those that are missing are 0."""
+        names = (*self.needs, *self.outs)
+        return np.concatenate((self.fixed, addresses([arrays.get(n) for n in names])))
+
+    def place(self, name: str) -> int:
+        """Return where in the table the address of an input or an output stands."""
+        return len(self.fixed) + (*self.needs, *self.outs).index(name)
 
     def _twice(self, found: Mapping[str, Tensor]) -> dict[str, tuple[str, tuple[int, ...]]]:
         """Return outputs that are the numbers of another one, with its name and their own shape without rows."""
@@ -143,7 +167,7 @@ class RowFunction:
         twice = {}
         for name, x in found.items():
             strides = tuple(s for s, n in zip(x.stride()[1:], x.shape[1:], strict=True) if n > 1)
-            other = first.setdefault((self._places[id(x)][:3], strides, x.numel()), name)
+            other = first.setdefault((self._place(x)[:3], strides, x.numel()), name)
             if other != name:
                 twice[name] = (other, tuple(x.shape[1:]))
         return twice
@@ -156,12 +180,22 @@ class RowFunction:
         return KINDS[x.dtype]
 
     def _keep(self, x: Tensor, array: str, start: str, width: int, kind: str) -> None:
-        self._stores[x.untyped_storage().data_ptr()] = (array, start, width, 0)
+        self._stores[_storage(x)] = (array, start, width)
         self._view(x, kind)
+
+    def _known(self, x: Tensor) -> bool:
+        """Return whether a tensor depends on the inputs."""
+        return _storage(x) in self._stores
+
+    def _place(self, x: Tensor) -> Place:
+        """Return where a known tensor lies; autograd keeps other tensors of the same memory."""
+        if id(x) not in self._places:
+            self._view(x, self._kind(x))
+        return self._places[id(x)]
 
     def _view(self, x: Tensor, kind: str) -> None:
         """Enter a tensor that looks into a known storage."""
-        array, start, width, _ = self._stores[x.untyped_storage().data_ptr()]
+        array, start, width = self._stores[_storage(x)]
         if x.dim() == 0 or x.shape[0] != self._rows or x.stride(0) != width or x.storage_offset() >= max(width, 1):
             raise Untraceable("an operation mixes rows")
         self._places[id(x)] = Place(array, start, int(x.storage_offset()), tuple(x.stride()[1:]), kind)
@@ -198,7 +232,7 @@ class RowFunction:
             return self._number(x, kind or ("f" if isinstance(x, float) else "i"))
         own = self._kind(x)
         kind = kind or own
-        place = self._places.get(id(x))
+        place = self._place(x) if self._known(x) else None
         if place is None:
             values = self._plain(x)
             if values.size == 1:
@@ -224,26 +258,48 @@ class RowFunction:
     # -- operations ------------------------------------------------------------------------------------------------
 
     def _print(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> None:
-        given = [x for a in args for x in (a if isinstance(a, (list, tuple)) else (a,)) if isinstance(x, Tensor)]
-        if name in _BLANK or not any(id(x) in self._places for x in given):
+        if name in _BLANK or name in _FULL or not any(self._known(x) for x in _tensors(args)):
             return
+        inplace = name.endswith("_") and not name.endswith("__")
         for x in out if isinstance(out, (list, tuple)) else (out,):
-            if x.untyped_storage().data_ptr() in self._stores:
-                self._view(x, self._kind(x))
+            if inplace:
+                name = name.removesuffix("_")
+                if not self._known(x):
+                    self._began(x)
+                to = self._place(x)
+            elif self._known(x):
+                self._place(x)
                 continue
-            if x.dim() == 0 or x.shape[0] != self._rows:
-                raise Untraceable(f"{name} mixes rows")
-            self._lines += self._compute(name, args, kwargs, x, self._fresh(x))
+            else:
+                if x.dim() == 0 or x.shape[0] != self._rows:
+                    raise Untraceable(f"{name} mixes rows")
+                to = self._fresh(x)
+            self._parts.append(self._compute(name, args, kwargs, x, to))
+
+    def _began(self, x: Tensor) -> None:
+        """Give a constant of one value, that is written to now, a place."""
+        made = self._blanks.get(id(x))
+        if made is None or x.dim() == 0 or x.shape[0] != self._rows:
+            raise Untraceable("a constant is written to")
+        value = made[1][_FULL[made[0]]] if made[0] in _FULL else _BLANK[made[0]]
+        to = self._fresh(x)
+        self._parts.append(loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._number(value, to.kind)}"))
 
     def _compute(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], x: Tensor, to: Place) -> list[str]:
         shape = tuple(x.shape[1:])
+        if name in ("slice_backward", "select_backward"):
+            return self._spread(name, args, shape, to)
+        if name == "index_add":
+            return self._added(args, to)
+        if name == "masked_fill":
+            name, args = "where", (args[1], args[2], args[0])
         if name in UNARY or name in ("_to_copy", "clone"):
             form = UNARY.get(name, "{0}")
             return loops(shape, lambda at: f"{index(to, at)} = " + form.format(self._at(args[0], at, to.kind)))
         if name in BINARY or name in COMPARE:
             kind = to.kind if name in BINARY else self._common(args)
             form = BINARY.get(name) or COMPARE[name]
-            if kwargs.get("alpha", 1) != 1:
+            if kwargs.get("alpha", 1) != 1 or (name == "div" and kwargs.get("rounding_mode")):
                 raise Untraceable(f"{name} with alpha")
             if name == "pow" and args[1] in (2, 3):
                 form = "({0} * {0})" if args[1] == 2 else "({0} * {0} * {0})"
@@ -358,12 +414,44 @@ class RowFunction:
 
         return loops(x.shape[1:-1], line)
 
+    def _spread(self, name: str, args: Sequence[Any], shape: tuple[int, ...], to: Place) -> list[str]:
+        """Print zeros with a part of them filled: what falls on the whole from a slice, or from one index."""
+        source, sizes, dim, *rest = args
+        k = dim % len(sizes) - 1
+        if k < 0:
+            raise Untraceable(f"{name} mixes rows")
+        begin, end, step = (rest[0], rest[0] + 1, 1) if name == "select_backward" else rest
+        begin, end = (min(x + shape[k] if x < 0 else x, shape[k]) for x in (begin, end))
+        lines = loops(shape, lambda at: f"{index(to, at)} = {self._number(0, to.kind)}")
+        part = [len(range(begin, end, step)) if j == k else n for j, n in enumerate(shape)]
+
+        def line(at: list[str]) -> str:
+            there = [f"({begin} + {i} * {step})" if j == k else i for j, i in enumerate(at)]
+            own = [i for j, i in enumerate(at) if j != k] if name == "select_backward" else at
+            return f"{index(to, there)} = {self._at(source, own, to.kind)}"
+
+        return [*lines, *loops(part, line)]
+
+    def _added(self, args: Sequence[Any], to: Place) -> list[str]:
+        """Print ``x.index_add(dim, index, source)``."""
+        x, dim, which, source = args
+        k = dim % x.dim() - 1
+        if k < 0 or self._known(which):
+            raise Untraceable("index_add of rows")
+
+        def line(at: list[str]) -> str:
+            there = index(to, [self._at(which, [i]) if j == k else i for j, i in enumerate(at)])
+            return f"{there} = {there} + {self._at(source, at, to.kind)}"
+
+        first = loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at, to.kind)}")
+        return [*first, *loops(source.shape[1:], line)]
+
     def _picked(self, name: str, args: Sequence[Any], x: Tensor, to: Place) -> list[str]:
         """Print ``source[index, …]``: rows of a table by recorded indices, or columns by constant ones."""
         source = args[0]
         if name == "index_select":
             dim = args[1] % source.dim() - 1
-            if dim < 0 or id(args[2]) in self._places:
+            if dim < 0 or self._known(args[2]):
                 raise Untraceable("index_select of rows")
             return loops(
                 x.shape[1:],
@@ -373,13 +461,58 @@ class RowFunction:
                 ),
             )
         parts = args[1]
-        if id(source) in self._places or any(p is None or p.dim() != 1 for p in parts):
+        if self._known(source) or any(p is None or p.dim() != 1 for p in parts):
             raise Untraceable("an index into what changes")
         values = source.detach().cpu().numpy()
         table = self._table(source, values)
         return loops(
             x.shape[1:], lambda at: f"{index(to, at)} = {index(table, [*(self._at(p, []) for p in parts), *at])}"
         )
+
+
+def _storage(x: Tensor) -> int:
+    return x.untyped_storage().data_ptr()
+
+
+def _tensors(args: Sequence[Any]) -> list[Tensor]:
+    return [x for a in args for x in (a if isinstance(a, (list, tuple)) else (a,)) if isinstance(x, Tensor)]
+
+
+def _needed(calls: Sequence[Any], found: Sequence[Tensor]) -> list[Any]:
+    """Return the calls on which some results depend."""
+    wanted, kept = {_storage(x) for x in found}, []
+    for call in reversed(calls):
+        made = call[3] if isinstance(call[3], (list, tuple)) else (call[3],)
+        if any(_storage(x) in wanted for x in made if isinstance(x, Tensor)):
+            wanted |= {_storage(x) for x in _tensors(call[1])}
+            kept.append(call)
+    return kept[::-1]
+
+
+def adjoint(
+    function: Callable[..., Mapping[str, Tensor]], outputs: Sequence[str], by: Sequence[str]
+) -> Callable[..., dict[str, Tensor]]:
+    """Return the vector-Jacobian product of a function, by torch: to be recorded in its place.
+
+    It takes what the function takes and, as ``on_NAME``, what falls on each of the ``outputs``; it returns what falls
+    on the inputs ``by``, of those on which anything does.
+    """
+
+    def back(**leaves: Tensor) -> dict[str, Tensor]:
+        with torch.enable_grad():
+            own = {n: x.detach().requires_grad_() if n in by else x for n, x in leaves.items() if n[:3] != "on_"}
+            out = function(**own)
+            names = [n for n in outputs if n in out and out[n].requires_grad]
+            if not names:
+                return {}
+            # With a graph of its own autograd writes nothing in place that is still read.
+            found = torch.autograd.grad(
+                [out[n] for n in names], [own[n] for n in by], [leaves[f"on_{n}"] for n in names],
+                create_graph=True, allow_unused=True,
+            )  # fmt: skip
+        return {n: g.detach() for n, g in zip(by, found, strict=True) if g is not None}
+
+    return back
 
 
 def index(place: Place, at: Sequence[str]) -> str:

@@ -1,7 +1,8 @@
-"""One step of worlds whose arrays are known by their addresses: what environments call again and again.
+"""One step of worlds whose arrays are known by their addresses, and its adjoint: what environments call.
 
 A rollout packs its arrays anew at every call and takes fresh memory for its tiles. Here both stay: a call hands over a
-dozen arguments, so a single ring costs what its equations cost. The step is that of ``lane_loops``.
+dozen arguments, so a single ring costs what its equations cost. The step is that of ``lane_loops``; what a task says
+before and after it are loops over rows (``rows.py``).
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -11,11 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from idm_env.kernels.lane_adjoint import step_back
 from idm_env.kernels.lane_loops import (
     FLAGS,
+    GRADIENT_ROWS,
+    HOIST,
+    HOISTS,
     IS_RING,
+    MOVING,
     N_ROWS,
     NUMBERS,
+    ON_INPUT_ROWS,
+    ON_ROWS,
     PARAMETERS,
     SIGNALS,
     STATE_ROWS,
@@ -24,12 +32,24 @@ from idm_env.kernels.lane_loops import (
     fetch_next,
     fetch_states,
     load_inputs,
+    load_past,
     load_static,
     step,
+    store_past,
 )
-from idm_env.kernels.memory import copy
+from idm_env.kernels.memory import add, copy, fill
+from idm_env.kernels.phases import call, call_rows
 from idm_env.kernels.printed import TileKernel
-from idm_env.kernels.tiles import ROW, Array, exact, load, place, workspace
+from idm_env.kernels.tiles import ROW, Array, exact, load, padded, place, workspace
+
+
+@exact
+def piece_of_past(h, past, newest, slots, signals, strides, row, first, n, size, count):
+    """Fill the past of a piece of a long row, oldest step first."""
+    for s in range(slots):
+        for i in range(signals):
+            source = past + ((newest + 1 - slots + s) * signals + i) * count * h.itemsize
+            load(h, (s * signals + i) * ROW, source, strides, len(strides) - 1, 0, row, first, n, size, False)
 
 
 @exact
@@ -67,15 +87,102 @@ def advance(
             # Whole rows find their past where it lies: it is a hundred times as long as a state.
             step(w, all_past + at * k.itemsize, count, n, size, measures, phases, looks, recalls, k, newest + 1)
         else:
-            for s in range(slots):
-                for i in range(signals):
-                    source = all_past + ((newest + 1 - slots + s) * signals + i) * count * k.itemsize
-                    load(h, (s * signals + i) * ROW, source, strides, dense, 0, row, first, n, size, False)
+            piece_of_past(h, all_past, newest, slots, signals, strides, row, first, n, size, count)
             step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots)
             for i in range(signals):
                 copy(all_past, ((newest + 1) * signals + i) * count + at, h, (slots * signals + i) * ROW + skip, own)
         for i in range(states):
             copy(places[states + i], at, w, measures[STATE_ROWS] + i * ROW + skip, own)
+
+
+@exact
+def cut(extent, begin, end):
+    """Return rows and tiles of a range of groups: the rows of a tile, or one row that several tiles share."""
+    rows, size, wide, around = extent[1], extent[2], extent[3], extent[4]
+    if size <= wide:
+        several = wide // size
+        return begin * several, min(end * several, rows), begin, end
+    pieces = -(-size // (wide - 2 * around))
+    return begin, end, begin * pieces, end * pieces
+
+
+@exact
+def step_worlds(
+    before, asked, after, told, clock, later, places, strides, w, h, past, newest, measures, phases, looks, recalls,
+    read, k, extent, t, kept, begin, end,
+):  # fmt: skip
+    """Do one whole step of groups of worlds: loops over rows with their tables, ``advance`` between them, clocks."""
+    low, high, first, last = cut(extent, begin, end)
+    call_rows(before, low, high, asked)  # type: ignore[call-arg]
+    advance(
+        places, strides, w, h, past, newest, measures, phases, looks, recalls, read, k, extent, t, kept, first, last
+    )  # fmt: skip
+    for i in range(low, high):
+        later[i] = clock[i] + 1
+    call_rows(after, low, high, told)  # type: ignore[call-arg]
+
+
+@exact
+def retreat(
+    places, strides, w, h, ah, past, newest, on_end, on_begin, on_past_end, on_past, on_parameters, on_inputs,
+    measures, phases, looks, recalls, back, sends, again, k, extent, t, begin, end,
+):  # fmt: skip
+    """Carry adjoints at the end of a step to its begin, tile by tile; what falls on parameters is added.
+
+    Arguments as of ``advance`` and of ``lane_adjoint.backward``: ``on_end`` and ``on_begin`` are addresses of dense
+    adjoints of the moving states, ``on_past_end`` and ``on_past`` (slots · signals, vehicles), newest step first,
+    ``on_parameters`` (parameters, vehicles), ``on_inputs`` (inputs, vehicles). ``ah`` is room for an adjoint past.
+    """
+    slots, rows, size, wide, around = extent
+    states, signals, is_ring = measures[STATES], measures[SIGNALS], measures[IS_RING] != 0
+    dense, count = len(strides) - 1, rows * size
+    operands, filled = places[2 * states :], 0
+    has_inputs, all_past = measures[NUMBERS] + measures[FLAGS] > 0, past.ctypes.data
+    for tile in range(begin, end):
+        row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
+        at = row * size + first + skip
+        for i in again:
+            load(w, measures[STATE_ROWS] + i * ROW, places[i], strides, dense, 0, row, first, n, size, False)
+        load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
+        filled = max(filled, n)
+        if has_inputs:
+            load_inputs(w, operands, strides, t, row, first, n, size, measures)
+        for i in range(measures[MOVING]):
+            load(w, measures[ON_ROWS] + i * ROW, on_end[i], strides, dense, 0, row, first, n, size, False)
+        fill(w, measures[GRADIENT_ROWS], 0, (measures[PARAMETERS] + measures[HOISTS]) * ROW)
+        if signals:
+            fill(ah, 0, 0, len(ah))
+            load_past(ah, on_past_end, False, 1, slots, signals, strides, row, first, n, size, count)
+        if size <= wide:
+            source, pitch, now = np.int64(all_past + at * k.itemsize), count, newest + 1
+        else:
+            piece_of_past(h, all_past, newest, slots, signals, strides, row, first, n, size, count)
+            source, pitch, now = np.int64(h.ctypes.data), ROW, slots
+        step_back(w, source, pitch, ah, n, size, measures, phases, back, looks, recalls, sends, k, now, slots)
+        for i in range(measures[NUMBERS]):
+            copy(on_inputs, i * count + at, w, measures[ON_INPUT_ROWS] + i * ROW + skip, own)
+        if back[HOIST]:
+            call(back[HOIST], w, padded(n), k)  # type: ignore[call-arg]
+        for i in range(measures[MOVING]):
+            copy(on_begin[i], at, w, measures[ON_ROWS] + i * ROW + skip, own)
+        store_past(ah, on_past, slots - 1, slots, signals, at, skip, own, count)
+        for i in range(measures[PARAMETERS]):
+            add(on_parameters, i * count + at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)
+
+
+@exact
+def retreat_worlds(
+    after, told, before, asked, places, strides, w, h, ah, past, newest, on_end, on_begin, on_past_end, on_past,
+    on_parameters, on_inputs, measures, phases, looks, recalls, back, sends, again, k, extent, t, begin, end,
+):  # fmt: skip
+    """Do the adjoint of ``step_worlds``: ``after`` and ``before`` are now the adjoints of these loops."""
+    low, high, first, last = cut(extent, begin, end)
+    call_rows(after, low, high, told)  # type: ignore[call-arg]
+    retreat(
+        places, strides, w, h, ah, past, newest, on_end, on_begin, on_past_end, on_past, on_parameters, on_inputs,
+        measures, phases, looks, recalls, back, sends, again, k, extent, t, first, last,
+    )  # fmt: skip
+    call_rows(before, low, high, asked)  # type: ignore[call-arg]
 
 
 def workspaces(kernel: TileKernel, slots: int, real: np.dtype[Any]) -> tuple[Array, Array]:

@@ -1,0 +1,98 @@
+"""What a step of an environment is: pure functions of torch, which compiled loops are recorded from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from idm_env.envs.settings import Settings
+from idm_env.tasks import World
+from idm_env.types import Params
+
+
+class Moves:
+    """The functions of a step, of what environments are made of."""
+
+    def __init__(self, made: Settings) -> None:
+        self.task, self._limit, self._info = made.task, made.limit, made.info
+        # With torch output always the step itself, so that values are the same bits with and without a graph.
+        self._advance = self.task.simulator.step if made.output == "torch" else self.task.simulator.advance
+
+    def step(
+        self,
+        world: World,
+        action: Tensor | None,
+        live: Tensor | None,
+        normals: Mapping[str, Tensor] | None,
+        driven: Params,
+    ) -> tuple[World, dict[str, Tensor]]:
+        """Return the worlds Δt later and everything that faces tell of the step; ``driven`` are ``task.driven``."""
+        command, given, inputs = self.commanded(world, action, normals, live)
+        after = world._replace(state=self._advance(world.state, inputs, driven))
+        if command is None:
+            none = after.state.speed.new_zeros(len(after.state.speed), len(self.task.agents))
+            return after, self.told(world, none, given, after, False)
+        return after, self.told(world, command, given, after, True)
+
+    def commanded(
+        self,
+        world: World,
+        action: Tensor | None,
+        normals: Mapping[str, Tensor] | None = None,
+        live: Tensor | None = None,
+    ) -> tuple[Tensor | None, Tensor | None, Mapping[str, Any]]:
+        """Return commands, commands as the failsafe lets them pass, and the inputs of a step."""
+        task = self.task
+        command = None if action is None else task.command(action)
+        given = None if command is None else task.limit(world, command)
+        inputs = task.wishes(task.inputs(world, given, normals, live), action, live)
+        if command is not None and live is not None:
+            command = torch.where(live, command, 0.0)
+        return command, given, inputs
+
+    def told(
+        self, before: World, command: Tensor, given: Tensor | None, after: World, commanded: bool
+    ) -> dict[str, Tensor]:
+        """Return everything that faces tell of a step, by name."""
+        task = self.task
+        terminated, truncated = task.ended(after)
+        details = self._details(after, command if commanded else None, given, terminated)
+        if self._limit is not None:
+            truncated = truncated | (after.state.step >= self._limit).unsqueeze(-1)
+        reward = task.reward(before, command, after, terminated)
+        if len(task.agents) == 1:
+            ends, cut = terminated[..., 0], truncated[..., 0]
+        else:
+            ends, cut = terminated.any(-1), (truncated | terminated).all(-1) & truncated.any(-1)
+        return {
+            "observation": task.observe(after),
+            "reward": reward,
+            "terminated": terminated,
+            "truncated": truncated,
+            "whole_reward": reward.mean(-1),
+            "whole_terminated": ends,
+            "whole_truncated": cut,
+            **{f"info_{name}": x for name, x in details.items()},
+        }
+
+    def _details(
+        self, after: World, command: Tensor | None, given: Tensor | None, crashed: Tensor
+    ) -> dict[str, Tensor]:
+        """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
+        task, asked, found = self.task, self._info, dict[str, Tensor]()
+        if "accel" in asked:
+            found["accel"] = task.pick(after.state.accel)
+        if "command" in asked:
+            shape = (len(after.state.speed), len(task.agents))
+            found["command"] = after.state.accel.new_full(shape, torch.nan) if command is None else command
+        if "failsafe" in asked:
+            if command is None or given is None or not task.failsafe:
+                found["failsafe"] = torch.zeros_like(crashed)
+            else:
+                found["failsafe"] = given < command
+        if "crash" in asked:
+            found["crash"] = crashed
+        return found | {name: x for name, x in task.told(after).items() if name in asked} if asked else found

@@ -1,0 +1,186 @@
+"""The compiled step with a graph: the eager path's gradients and those of central differences, over all tasks."""
+
+import copy
+import gc
+import pickle
+import warnings
+import weakref
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import idm_env  # noqa: F401
+from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.simulator import Simulator
+
+pytest.importorskip("numba")
+
+CASES = {
+    "ring": ("ring", {"start": "wave", "warmup": 20, "failsafe": 3.0}),
+    "agents": (
+        "ring",
+        {
+            "warmup": 5,
+            "fuel": 0.1,
+            "tailgating": 1.0,
+            "controlled": 3,
+            "failsafe": 3.0,
+            "integration": "euler",
+            "max_episode_steps": 20,
+        },
+    ),
+    "shock": (
+        "ring",
+        {"warmup": 5, "controlled": 2, "shock": 4.0, "shock_after": 0.5, "max_command": [-4.5, 2.6]},
+    ),
+    "past": (
+        "ring",
+        {"warmup": 5, "effects": ["delay", "memory"], "parameters": {"idm.time_gap": 1.3}, "max_episode_steps": 30},
+    ),
+    "follow": ("follow", {"max_episode_steps": 25, "fuel_model": "circles"}),
+    "platoon": ("platoon", {"controlled": 2, "noise": 0.1}),
+    "replay": ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
+    "single": ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
+}
+PARAMETERS = ("time_gap", "max_accel")
+
+
+def made(case, eager, **more):
+    """Return an environment of a case, by torch where ``eager``, and its parameters that require a gradient."""
+    task, keywords = CASES[case]
+    env = DiffIDMVectorEnv(3, task=task, dtype="float64", output="torch", **{**keywords, **more})
+    if eager:
+        env.batch._values = None
+    return env
+
+
+def run(env, push, speed, shared, own, steps=50):
+    """Return a sum of what steps tell, over actions, first speeds and parameters (shared and per vehicle); and ends."""
+    env.params = env.task.params(torch.float64, "cpu")
+    env.reset(seed=4)
+    state = env.state
+    env.reset(options={"state": state._replace(speed=state.speed.detach() + speed)})
+    params = {name: dict(values) for name, values in env.params.items()}
+    base = env.task.simulator.base.name
+    params[base][PARAMETERS[0]] = params[base][PARAMETERS[0]].detach() * shared
+    params[base][PARAMETERS[1]] = params[base][PARAMETERS[1]].detach() * own
+    env.params = params
+    draw = np.random.default_rng(0)
+    total, ends = torch.zeros((), dtype=torch.float64), 0
+    for t in range(steps):
+        action = torch.as_tensor(draw.uniform(-0.9, 0.9, env.action_space.shape)) + push
+        observation, reward, terminated, truncated, info = env.step(None if t % 7 == 3 else action)
+        total = total + observation.sum() + 0.1 * reward.clamp(-20.0, 20.0).sum()
+        total = total + 0.1 * info.get("accel", torch.zeros(())).sum()
+        ends += int((terminated | truncated).sum())
+    return total + env.state.gap.clamp(-10.0, 100.0).sum(), ends
+
+
+def leaves(env):
+    """Return what is differentiated by: actions, speeds, a shared parameter and one per vehicle."""
+    width = env.task.vehicles
+    shapes = (env.single_action_space.shape, (3, width), (), (width,))
+    ones = (0.0, 0.0, 1.0, 1.0)
+    return [torch.full(s, x, dtype=torch.float64, requires_grad=True) for s, x in zip(shapes, ones, strict=True)]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_gradients_are_those_of_the_torch_path_and_of_differences(case):
+    results = []
+    for eager in (False, True):
+        env = made(case, eager)
+        own = leaves(env)
+        total, ends = run(env, *own)
+        found = torch.autograd.grad(total, own, allow_unused=True)
+        found = [torch.zeros_like(x) if g is None else g for g, x in zip(found, own, strict=True)]
+        results.append((total.detach(), found))
+        assert (env.batch._values is None) == eager, "the other path ran"
+    assert ends or "max_episode_steps" not in CASES[case][1]
+    (value, found), (wanted, torchs) = results
+    torch.testing.assert_close(value, wanted, rtol=1e-10, atol=1e-9)
+    for ours, theirs in zip(found, torchs, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9 * float(theirs.abs().max() + 1.0))
+    env = made(case, False)
+    # New episodes begin from the parameters in force, through which no gradient flows.
+    steps = CASES[case][1].get("max_episode_steps", 51) - 1
+    total, ended = run(env, *own, steps)
+    found = torch.autograd.grad(total, own, allow_unused=True)
+    found = [torch.zeros_like(x) if g is None else g for g, x in zip(found, own, strict=True)]
+    with torch.no_grad():
+        for i, (x, g) in enumerate(zip(own, found, strict=True)):
+            if ended and i > 1:
+                continue
+            towards = torch.rand(x.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(i))
+            ends = [
+                run(env, *[y.detach() + sign * 1e-6 * towards if y is x else y.detach() for y in own], steps)[0]
+                for sign in (1.0, -1.0)
+            ]
+            slope = float((ends[0] - ends[1]) / 2e-6)
+            assert slope == pytest.approx(float((g * towards).sum()), rel=1e-5, abs=1e-5)
+
+
+def test_nothing_is_stepped_by_torch_and_values_are_the_same_bits_without_a_graph(monkeypatch):
+    def stepped(self, *arguments):
+        raise AssertionError("the torch path ran")
+
+    def run(requires_grad, output):
+        env = DiffIDMVectorEnv(3, warmup=20, output=output, failsafe=3.0, max_episode_steps=12)
+        env.reset(seed=3)
+        kept = []
+        with monkeypatch.context() as patch:
+            patch.setattr(Simulator, "step", stepped)
+            for i in range(30):
+                action = torch.full((3, 1), 0.1 * (i % 5), requires_grad=requires_grad)
+                observation, reward, *_ = env.step(action)
+                kept.append(
+                    np.append(*(np.asarray(torch.as_tensor(x).detach(), np.float32) for x in (observation, reward)))
+                )
+        return np.stack(kept), env
+
+    (graph, env), (plain, _), (arrays, _) = run(True, "torch"), run(False, "torch"), run(False, "numpy")
+    np.testing.assert_array_equal(graph, plain)
+    np.testing.assert_array_equal(graph, arrays)
+    # In mid-window: copies go on alike, without the graph; cutting the graph frees it.
+    tape = weakref.ref(env.batch._values._blocks.grad_fn)
+    others = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    action = torch.zeros(3, 1)
+    mine = env.step(action)
+    for other in others:
+        theirs = other.step(action)
+        assert torch.equal(mine[0].detach(), theirs[0]) and not theirs[0].requires_grad
+    env.detach()
+    del mine
+    gc.collect()
+    assert tape() is None
+
+
+def test_second_derivatives():
+    env = DiffIDMVectorEnv(2, vehicles=4, length=60.0, warmup=5, dtype="float64", output="torch", effects=["delay"])
+
+    def total(push):
+        env.reset(seed=1)
+        env.step(push.expand(2, 1) ** 2)
+        return env.step(push.expand(2, 1))[1].sum() + env.step(push.expand(2, 1) * 0.5)[0].sum()
+
+    push = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradgradcheck(total, (push,))
+
+
+def test_what_cannot_be_recorded_steps_by_torch_and_is_named():
+    class Asks(type(gym.make("DiffIDM-v0").unwrapped.task)):
+        def observe(self, world):
+            return (
+                super().observe(world) * float(world.state.speed.max() > -1.0)
+                + torch.sort(world.state.gap).values[:, :1, None] * 0.0
+            )
+
+    env = DiffIDMVectorEnv(2, task=Asks(warmup=0), output="torch")
+    env.reset(seed=0)
+    action = torch.zeros(2, 1, requires_grad=True)
+    with pytest.warns(UserWarning, match="sort"):
+        env.step(action)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert env.step(action)[1].requires_grad
