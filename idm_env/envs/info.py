@@ -9,7 +9,8 @@
 ``crash``, ``crash_reason``
     Whether the episode ended in a crash (bool), and, only then, who touched whom (a text).
 ``vehicle_id``
-    Recorded ids of the agents' vehicles (a tuple of texts), in ``reset`` too; only in tasks that replay a recording.
+    Recorded ids of the agents' vehicles (``Ids``, a tuple of texts), in ``reset`` too; only in tasks that replay a
+    recording.
 ``lane_changes``, ``lane_refusals``
     How often in this episode each agent's vehicle has changed lanes, and how often it wished or was commanded to and
     could not: there was no lane or no safe room, or another claim won. Only in tasks on several lanes.
@@ -31,12 +32,24 @@ from torch import Tensor
 from idm_env.envs.batch import Batch, Outcome
 
 
-def ids(batch: Batch) -> tuple[str, ...] | None:
+class Ids(tuple[str, ...]):
+    """A tuple of texts that an array of numbers can hold: their UTF-8 codes, ``(texts, longest)``, zeros behind.
+
+    TorchRL keeps infos as tensors, and takes a plain tuple apart.
+    """
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Return the codes."""
+        codes = np.array([text.encode() for text in self])
+        return codes.view(np.uint8).reshape(len(self), -1).astype(dtype or np.uint8)
+
+
+def ids(batch: Batch) -> Ids | None:
     """Return the recorded ids of the agents' vehicles where the infos tell them."""
     known = batch.task.vehicle_ids
     if known is None or "vehicle_id" not in batch.settings.info:
         return None
-    return tuple(known[i] for i in batch.task.agents)
+    return Ids(known[i] for i in batch.task.agents)
 
 
 def begun(batch: Batch) -> dict[str, Any]:
@@ -74,7 +87,8 @@ class Rows:
         self._ids = None
         if known is not None:
             self._ids = np.empty(batch.count, dtype=object)
-            self._ids.fill(known)
+            for row in range(batch.count):  # numpy would fill in the codes
+                self._ids[row] = known
 
     def begun(self, rows: np.ndarray) -> dict[str, Any]:
         """Return the info of resets of some rows (bool)."""

@@ -9,6 +9,8 @@ from torchrl.envs import GymEnv, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 import idm_env  # noqa: F401
+from idm_env import instead
+from idm_env.tasks import TASKS
 
 LIMIT, COUNT = 4, 3
 QUICK = {"warmup": 5, "max_episode_steps": LIMIT}
@@ -74,6 +76,21 @@ def test_a_vector_is_collected_over_ends_as_gymnasiums_is(mode, output):
         torch.testing.assert_close(mine[key].double(), other[key].double(), rtol=0.0, atol=1e-5)
     for key in ("terminated", "truncated", "done"):
         assert torch.equal(mine["next", key], other["next", key])
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+@pytest.mark.parametrize("name", TASKS)
+def test_a_vector_of_every_task_is_collected_over_ends_with_all_that_infos_tell(name, output):
+    quick = {"warmup": 2} if name == "ring" else {}
+    with instead.off():
+        ours = gym.make_vec("DiffIDM-v0", num_envs=2, task=name, output=output, max_episode_steps=3, **quick)
+        told, ids = set(ours.reset(seed=0)[1]) | set(ours.step(None)[-1]), ours.unwrapped.task.vehicle_ids
+        seen = GymWrapper(ours).rollout(8, break_when_any_done=False)
+    assert seen["next", "done"].sum() == 4
+    assert {key for key in told if not key.startswith("_")} <= set(seen["next"].keys())
+    if ids is not None:
+        (agent,) = ours.unwrapped.task.agents
+        assert bytes(seen["next", "vehicle_id"][1, 5, 0].tolist()).rstrip(b"\0").decode() == ids[agent]
 
 
 def test_the_vector_says_its_mode_as_gymnasiums_vectors_do():
