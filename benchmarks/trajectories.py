@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import polars as pl
@@ -34,7 +35,8 @@ from idm_env.trajectories.recipe import clock_of, overlaps, recipe
 from idm_env.trajectories.report import before_and_after
 from idm_env.trajectories.scores import Motion, Tally
 from idm_env.trajectories.smoother import SPARSE
-from idm_env.trajectories.tracks import Pieces, Track, from_frame, read_table
+from idm_env.trajectories.spool import read_table
+from idm_env.trajectories.tracks import Pieces, Track
 
 RAW, CLEAN = "ngsim_i80_rawlike.csv.gz", "ngsim_i80_lanes.parquet"
 FILES = {
@@ -235,7 +237,11 @@ def noisy_tracks() -> list[Track]:
     made, _ = synthetic.generate(3, runs=2, followers=4, seconds=60.0)
     rng = np.random.default_rng(0)
     tracks = []
-    for track in Pieces(from_frame(made.table.select("run_id", "vehicle_id", "leader_id", "time_s", "position_m"))):
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "made.parquet"
+        made.table.select("run_id", "vehicle_id", "leader_id", "time_s", "position_m").write_parquet(path)
+        table = read_table(path)
+    for track in Pieces(table):
         fade, noise = np.exp(-0.1 / 0.3), np.empty(len(track))
         noise[0] = 0.3 * rng.normal()
         for k in range(1, len(noise)):

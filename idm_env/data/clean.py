@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import polars as pl
 
 from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
@@ -13,16 +15,14 @@ NO_LEADER = ("", "0", "-1", "nan", "none", "null", "na")
 MISSING_WORDS = ("", "na", "n/a", "nan", "null", "none", "-", "inf", "-inf", "+inf", "infinity", "-infinity")
 
 
-def check_columns(frame: pl.DataFrame, source: str) -> None:
-    """Raise DataError if the table is empty, lacks a required column, or seems to misspell an optional one."""
+def check_columns(columns: list[str], source: str) -> None:
+    """Raise DataError if the table lacks a required column, or seems to misspell an optional one."""
     for name in REQUIRED:
-        if name not in frame.columns:
-            raise missing_column(name, frame.columns, source, known=TIDY)
-    if frame.height == 0:
-        raise DataError(f"{source}: the table has a header and no rows; give at least one leader and one follower.")
-    others = [name for name in frame.columns if name not in TIDY]
+        if name not in columns:
+            raise missing_column(name, columns, source, known=TIDY)
+    others = [name for name in columns if name not in TIDY]
     for name in TIDY:
-        guess = None if name in frame.columns or name == "accel_mps2" else nearest(name, others, cutoff=0.85)
+        guess = None if name in columns or name == "accel_mps2" else nearest(name, others, cutoff=0.85)
         if guess:
             # Taking a misspelt column as an extra one would silently estimate what was measured.
             raise DataError(f"{source}: column {name!r} is missing and {guess!r} looks like it; rename or remove it.")
@@ -30,10 +30,10 @@ def check_columns(frame: pl.DataFrame, source: str) -> None:
 
 def exact(column: pl.Series, source: str) -> None:
     """Raise DataError if identifiers are floats so large that neighbouring integers are one float."""
-    largest = column.fill_nan(None).abs().max()
-    if isinstance(largest, float) and largest >= LARGEST_ID:
+    large = column.filter(column.fill_nan(None).abs() >= LARGEST_ID)
+    if len(large):
         raise DataError(
-            f"{source}: {column.name} = {largest:.17g} is a float beyond 2^53, where several identifiers become one; "
+            f"{source}: {column.name} = {large[0]:.17g} is a float beyond 2^53, where several identifiers become one; "
             "write identifiers as integers or text."
         )
 
@@ -42,7 +42,7 @@ def identifiers(frame: pl.DataFrame, source: str = "table") -> pl.DataFrame:
     """Return the frame with run_id, vehicle_id and leader_id as strings; run_id "0" where the column is absent.
 
     Raises:
-        DataError: If identifiers are floats so large that neighbouring integers are one float.
+        DataError: If identifiers are lists, or floats so large that neighbouring integers are one float.
     """
     if "run_id" not in frame.columns:
         frame = frame.with_columns(pl.lit("0").alias("run_id"))
@@ -50,14 +50,22 @@ def identifiers(frame: pl.DataFrame, source: str = "table") -> pl.DataFrame:
     for name in ("run_id", "vehicle_id", "leader_id"):
         if name not in frame.columns:
             continue
+        _single(frame[name], source)
         column = pl.col(name)
         if frame[name].dtype.is_float():
             exact(frame[name], source)
             # A csv column of integers with empty cells arrives as floats: 12.0 is vehicle 12.
             column = pl.when(column.round() == column).then(column.cast(pl.Int64, strict=False).cast(pl.String))
             column = column.otherwise(pl.col(name).fill_nan(None).cast(pl.String))
-        changes.append(column.cast(pl.String).str.strip_chars().alias(name))
+        changes.append(column.cast(pl.String).str.strip_chars().replace("", None).alias(name))
     return frame.with_columns(changes)
+
+
+def _single(column: pl.Series, source: str) -> None:
+    """Raise DataError if the cells of a column hold several values."""
+    if column.dtype.is_nested() or column.dtype == pl.Object:
+        kind = type(column.dtype).__name__.lower()
+        raise DataError(f"{source}: {column.name} holds a {kind} in every row; write one value per row.")
 
 
 def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
@@ -68,6 +76,7 @@ def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair
     repairs: list[Repair] = []
     for name in [*NUMBERS, "lane"]:
         if name in frame.columns and not frame[name].dtype.is_numeric():
+            _single(frame[name], source)
             frame = _parse(frame, name, source)
     if "lane" in frame.columns:
         value = frame["lane"].cast(pl.Float64)
@@ -108,20 +117,60 @@ def _parse(frame: pl.DataFrame, name: str, source: str) -> pl.DataFrame:
 
 
 def without_empty(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
-    """Leave out rows that have no vehicle, run or time."""
-    kept = frame.filter(pl.all_horizontal(pl.col("vehicle_id", "run_id", "time_s").is_not_null()))
+    """Leave out rows that have no vehicle or time.
+
+    Raises:
+        DataError: If one of the others has no run.
+    """
+    kept = frame.filter(pl.all_horizontal(pl.col("vehicle_id", "time_s").is_not_null()))
+    check_runs(kept.filter(pl.col("run_id").is_null()), source)
     count = frame.height - kept.height
-    if kept.height == 0:
-        raise DataError(f"{source}: no row has both a vehicle_id and a finite time_s; fill those columns.")
     text = f"{count} rows without a vehicle or a time were left out."
     return kept, [Repair("no time", count, text)] if count else []
 
 
-def ordered(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+def check_runs(nowhere: pl.DataFrame, source: str) -> None:
+    """Raise DataError if there are rows of vehicles without a run."""
+    if nowhere.height:
+        vehicle = nowhere["vehicle_id"][0]
+        raise DataError(
+            f"{source}: run_id is empty for vehicle {vehicle}; name the run of every row, or remove the column."
+        )
+
+
+@dataclass
+class Filled:
+    """How many rows a file has, over all its pieces, and in how many each column that every row needs is filled."""
+
+    rows: int = 0
+    whole: int = 0
+    filled: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REQUIRED, 0))
+
+    def add(self, frame: pl.DataFrame) -> None:
+        """Count the rows of one more piece."""
+        there = frame.select(pl.col(REQUIRED).is_not_null())
+        self.rows += frame.height
+        self.whole += int(there.select(pl.all_horizontal(REQUIRED).sum()).item())
+        for name in REQUIRED:
+            self.filled[name] += int(there[name].sum())
+
+    def check(self, source: str) -> None:
+        """Raise DataError if no row can be used."""
+        if not self.rows:
+            raise DataError(f"{source}: the table has a header and no rows; give at least one leader and one follower.")
+        empty = [name for name, count in self.filled.items() if not count]
+        if empty or not self.whole:
+            told = f"{listed(empty)} is empty in every row" if empty else f"no row has all of {listed(REQUIRED)}"
+            raise DataError(
+                f"{source}: {told}; fill it: the vehicle, the time in seconds, and the position of the front bumper "
+                "in metres."
+            )
+
+
+def ordered(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair], pl.DataFrame]:
     """Sort by run, vehicle and time, and keep the first of rows that repeat a time.
 
-    Raises:
-        DataError: If so many times are repeated with other positions that two recordings must share a run_id.
+    Also return who is at two places at one time: run_id, vehicle_id, the first such time and their number (``moved``).
     """
     repairs = []
     backward = pl.col("time_s").diff().over(TRACK) < 0
@@ -129,23 +178,31 @@ def ordered(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair
     if unsorted:
         text = f"Time runs backward at {unsorted} rows; the rows were sorted by time."
         repairs.append(Repair("time not increasing", unsorted, text))
-    frame = frame.sort(*(natural(name) for name in TRACK), "run_id", "vehicle_id", "time_s", maintain_order=True)
-    repeated = (pl.col("time_s").diff() == 0) & _same_track()
-    moved = repeated & ((pl.col("position_m") - pl.col("position_m").shift(1)).abs() > 1e-6)
-    counts = frame.select(repeated.sum().alias("repeated"), moved.sum().alias("moved")).row(0, named=True)
-    if counts["moved"] > max(0.02 * frame.height, 5):
-        run, vehicle, time = frame.filter(moved).select("run_id", "vehicle_id", "time_s").row(0)
+    frame = frame.sort(*NAMES, "time_s", pl.col("position_m").is_null(), maintain_order=True)
+    same = (pl.col("run_id") == pl.col("run_id").shift(1)) & (pl.col("vehicle_id") == pl.col("vehicle_id").shift(1))
+    repeated = (pl.col("time_s").diff() == 0) & same
+    moved = frame.filter(repeated & ((pl.col("position_m") - pl.col("position_m").shift(1)).abs() > 1e-6))
+    kept = frame.filter(~repeated.fill_null(False))
+    count = frame.height - kept.height
+    if count:
+        text = f"{count} rows repeat a time of their vehicle and were left out; the first of each was kept."
+        repairs.append(Repair("duplicated time", count, text))
+    twice = moved.group_by(TRACK, maintain_order=True).agg(pl.col("time_s").first(), pl.len().alias("moved"))
+    return kept, repairs, twice
+
+
+def check_recordings(twice: pl.DataFrame, rows: int, source: str) -> None:
+    """Raise DataError if vehicles are at two places at one time so often that two recordings must share a run_id.
+
+    ``twice`` is what ``ordered`` tells of all rows of the file.
+    """
+    moved = int(twice["moved"].sum())
+    if moved > max(0.02 * rows, 5):
+        run, vehicle, time = twice.sort(*NAMES).select(*TRACK, "time_s").row(0)
         raise DataError(
-            f"{source}: vehicle {vehicle} of run {run} is at two positions at t = {time:g} s, as are {counts['moved']} "
-            "rows; two recordings share a run_id: give each its own."
+            f"{source}: vehicle {vehicle} of run {run} is at two positions at t = {time:g} s, as are {moved} rows; two "
+            "recordings share a run_id: give each its own."
         )
-    if counts["repeated"]:
-        text = (
-            f"{counts['repeated']} rows repeat a time of their vehicle and were left out; the first of each was kept."
-        )
-        repairs.append(Repair("duplicated time", counts["repeated"], text))
-        frame = frame.filter(~repeated.fill_null(False))
-    return frame, repairs
 
 
 def natural(name: str) -> pl.Expr:
@@ -153,8 +210,8 @@ def natural(name: str) -> pl.Expr:
     return pl.col(name).cast(pl.Int64, strict=False).fill_null(2**62).alias(f"{name}_number")
 
 
-def _same_track() -> pl.Expr:
-    return (pl.col("run_id") == pl.col("run_id").shift(1)) & (pl.col("vehicle_id") == pl.col("vehicle_id").shift(1))
+NAMES = (natural("run_id"), "run_id", natural("vehicle_id"), "vehicle_id")
+"""The order of tracks."""
 
 
 def single_holes(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
@@ -177,17 +234,13 @@ def single_holes(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     return frame, repairs
 
 
-def without_position(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+def without_position(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     """Leave out rows whose position is still missing; tracks are split there."""
     kept = frame.filter(pl.col("position_m").is_not_null())
     count = frame.height - kept.height
-    if kept.height == 0:
-        raise DataError(
-            f"{source}: position_m is empty in every row; it must hold the front bumper's position in metres."
-        )
     if not count:
         return kept, []
-    tracks = frame.filter(pl.col("position_m").is_null()).select(TRACK).unique().rows()
+    tracks = frame.filter(pl.col("position_m").is_null()).select(TRACK).unique(maintain_order=True).rows()
     names = listed(vehicle for _, vehicle in tracks)
     text = f"{count} rows without a position were left out; tracks are split there (vehicles {names})."
     return kept, [Repair("no position", count, text)]

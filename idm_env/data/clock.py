@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import polars as pl
 
+from idm_env.data.clean import natural
 from idm_env.data.errors import DataError, Repair
 from idm_env.data.schema import TRACK
 
 LONGEST_BRIDGE = 2.5
 """Two samples at most this many steps apart are joined: jitter and one missing row, never more."""
+HOLE = 1.5
+"""A difference of time above this many usual ones is a hole."""
 CLOCK_ROUNDING_S = 1e-3
 """Times this close to the clock are on it: files round to milliseconds."""
 SHORTEST_STEP_S = 1e-3
@@ -17,20 +22,27 @@ SHORTEST_STEP_S = 1e-3
 LINEAR = ("position_m", "speed_mps", "gap_m", "length_m")
 
 
-def steps_of(frame: pl.DataFrame, source: str) -> dict[str, float]:
+def paces(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return, per vehicle of a sorted frame, the median difference of time, and sum and number of those not holes."""
+    change = frame.select(*TRACK, pl.col("time_s").diff().over(TRACK).alias("change")).drop_nulls()
+    change = change.with_columns(pl.col("change").median().over(TRACK).alias("middle"))
+    near = change.filter(pl.col("change") < HOLE * pl.col("middle"))
+    return near.group_by(TRACK).agg(pl.col("middle").first(), pl.col("change").sum().alias("total"), pl.len())
+
+
+def steps_of(paces: pl.DataFrame, runs: Iterable[str], source: str) -> dict[str, float]:
     """Return each run's time step in s: the mean of the differences of time that are not holes.
 
     Raises:
         DataError: If no vehicle has two times, or a step is too short to be one.
     """
-    change = frame.select("run_id", pl.col("time_s").diff().over(TRACK).alias("change")).drop_nulls()
-    change = change.with_columns(pl.col("change").median().over("run_id").alias("middle"))
-    near = change.filter(pl.col("change") < 1.5 * pl.col("middle")).group_by("run_id").agg(pl.col("change").mean())
+    usual = pl.col("middle") < HOLE * pl.col("middle").median().over("run_id")
+    near = paces.filter(usual).group_by("run_id").agg(step=pl.col("total").sum() / pl.col("len").sum())
     if near.height == 0:
         raise DataError(f"{source}: no vehicle has two different times; a track needs at least 5 s of rows.")
-    overall = float(near["change"].median())  # type: ignore[arg-type]
-    steps = dict.fromkeys(frame["run_id"].unique(), overall)
-    for run, step in near.rows():
+    overall = float(near["step"].median())  # type: ignore[arg-type]
+    steps = dict.fromkeys(runs, overall)
+    for run, step in near.sort(natural("run_id"), "run_id").select("run_id", "step").rows():
         if step < SHORTEST_STEP_S:
             raise DataError(f"{source}: time_s rises by {step:g} s from row to row in run {run}; is it in seconds?")
         # 0.1000004 is a clock of 0.1 s; 0.0333 is not one of 0.033 s.
@@ -38,20 +50,27 @@ def steps_of(frame: pl.DataFrame, source: str) -> dict[str, float]:
     return steps
 
 
-def regularise(frame: pl.DataFrame, steps: dict[str, float]) -> tuple[pl.DataFrame, list[Repair]]:
+def regularise(
+    frame: pl.DataFrame, steps: dict[str, float], starts: dict[str, float] | None = None, bridge: float = 0.0
+) -> tuple[pl.DataFrame, list[Repair]]:
     """Return the frame (sorted, times unique) on its runs' clocks, with the integer column ``step``.
+
+    A clock begins at ``starts`` of its run (s), or at its first row. Holes up to ``bridge`` (s) are filled, too.
 
     Position, speed, gap and length are interpolated linearly in time; all other columns are taken from the sample
     nearest in time, as a place on a lap must not be averaged over its wrap.
     """
     step = frame["run_id"].replace_strict(steps, return_dtype=pl.Float64).to_numpy()
-    start = frame.select(pl.col("time_s").min().over("run_id"))["time_s"].to_numpy()
+    if starts is None:
+        start = frame.select(pl.col("time_s").min().over("run_id"))["time_s"].to_numpy()
+    else:
+        start = frame["run_id"].replace_strict(starts, return_dtype=pl.Float64).to_numpy()
     exact = (frame["time_s"].to_numpy() - start) / step
     whole = np.round(exact)
     on_clock = np.abs(exact - whole) * step <= np.minimum(CLOCK_ROUNDING_S, 0.05 * step)
     exact = np.where(on_clock, whole, exact)
     track = frame.select(pl.struct(TRACK).rle_id())[TRACK[0]].to_numpy()
-    left, weight, ticks = _grid(exact, track)
+    left, weight, ticks = _grid(exact, track, np.maximum(LONGEST_BRIDGE, bridge / step))
     times = start[left] + ticks * step[left]
     changed = weight > 0
     if changed.any() or len(left) != frame.height:
@@ -68,11 +87,11 @@ def regularise(frame: pl.DataFrame, steps: dict[str, float]) -> tuple[pl.DataFra
     return result, _repairs(frame, on_clock, track[left[changed]])
 
 
-def _grid(exact: np.ndarray, track: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _grid(exact: np.ndarray, track: np.ndarray, bridge: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return, per tick of the clock, the sample to its left, the weight of the one to its right, and the tick."""
     first = np.ceil(exact)
     joined = np.zeros(len(exact), bool)
-    joined[:-1] = (track[1:] == track[:-1]) & (np.diff(exact) <= LONGEST_BRIDGE)
+    joined[:-1] = (track[1:] == track[:-1]) & (np.diff(exact) <= bridge[1:] + 1e-9)
     following = np.append(first[1:], 0.0)
     count = np.where(joined, following - first, first == exact).astype(int)
     left = np.repeat(np.arange(len(exact)), count)

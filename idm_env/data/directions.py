@@ -1,13 +1,15 @@
 """Two driving directions in one file: who drives towards falling positions is mirrored, into a run of its own.
 
-Everything behind this (leaders, gaps, the simulator) has positions that rise along the road.
+Everything behind this (leaders, gaps, the simulator) has positions that rise along the road. A file in which all fall
+is refused.
 """
 
 from __future__ import annotations
 
 import polars as pl
 
-from idm_env.data.errors import Repair
+from idm_env.data.clean import NAMES
+from idm_env.data.errors import DataError, Repair
 from idm_env.data.schema import TRACK
 
 DECIDED_M = 20.0
@@ -21,13 +23,17 @@ END = (
     pl.col("time_s").max().alias("end"),
     pl.col("position_m").sort_by("time_s").first().alias("from"),
     pl.col("position_m").sort_by("time_s").last().alias("to"),
+    pl.col("position_m").sort_by("time_s").diff().sign().sum().alias("rises"),
 )
-"""Times (s) and positions (m) of the ends of a track, per group of rows."""
+"""Per group of rows: times (s) and positions (m) of the ends of a track, and by how many its rises outnumber its falls.
+
+Where the two disagree the position begins anew, as on a lap: there it says nothing of the direction.
+"""
 
 
 def lane_of(frame: pl.DataFrame) -> pl.Expr:
     """Return, per group of rows, the first lane; null where there is none."""
-    return pl.col("lane").first() if "lane" in frame.columns else pl.lit(None, pl.Int64).alias("lane")
+    return pl.col("lane").drop_nulls().first() if "lane" in frame.columns else pl.lit(None, pl.Int64).alias("lane")
 
 
 def ends(frame: pl.DataFrame) -> pl.DataFrame:
@@ -38,18 +44,24 @@ def ends(frame: pl.DataFrame) -> pl.DataFrame:
     return known.group_by(TRACK, maintain_order=True).agg(*END, lane_of(frame))
 
 
-def against(vehicles: pl.DataFrame) -> pl.DataFrame:
+def against(vehicles: pl.DataFrame, source: str) -> pl.DataFrame:
     """Return run_id and vehicle_id of those (of ``ends``) that drive towards falling positions.
 
-    None where no vehicle drives the other way: there the sign of all positions is wrong, which is not ours to guess.
+    Raises:
+        DataError: If they all do: then the sign of all positions is wrong, which is not ours to guess.
     """
     net = (pl.col("to") - pl.col("from")).alias("net")
-    decided = vehicles.with_columns(net).with_columns(
-        pl.when(pl.col("net").abs() >= DECIDED_M).then(pl.col("net").sign()).alias("sign")
-    )
+    clear = (pl.col("net").abs() >= DECIDED_M) & (pl.col("net").sign() * pl.col("rises") >= 0)
+    decided = vehicles.with_columns(net).with_columns(pl.when(clear).then(pl.col("net").sign()).alias("sign"))
     of_lane = pl.when(pl.col("lane").is_not_null()).then(pl.col("sign").sum().over("run_id", "lane"))
     falling = decided.with_columns(pl.coalesce("sign", of_lane).alias("sign")).filter(pl.col("sign") < 0)
-    return falling.select(TRACK) if (decided["sign"] > 0).any() else falling.select(TRACK).clear()
+    if falling.height and not (decided["sign"] > 0).any():
+        run, vehicle, low, high = falling.sort(*NAMES).select(*TRACK, "to", "from").row(0)
+        raise DataError(
+            f"{source}: position_m falls while vehicles drive (vehicle {vehicle} of run {run}: from {high:g} to "
+            f"{low:g}); it must rise along the road: change its sign."
+        )
+    return falling.select(TRACK)
 
 
 def mirrored(frame: pl.DataFrame, vehicles: pl.DataFrame) -> pl.DataFrame:
@@ -91,7 +103,7 @@ def repairs(vehicles: pl.DataFrame) -> list[Repair]:
     return [Repair("direction mirrored", vehicles.height, text)]
 
 
-def one_way(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
-    """Return the frame with every vehicle driving towards rising positions."""
-    vehicles = against(ends(frame))
+def one_way(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the frame with every vehicle driving towards rising positions; DataError as in ``against``."""
+    vehicles = against(ends(frame), source)
     return mirrored(frame, vehicles), repairs(vehicles)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import polars as pl
 
-from idm_env.data import tidy
+from idm_env.data import clean, tidy
 from idm_env.data.clean import natural
-from idm_env.data.errors import DataError, missing_column
+from idm_env.data.errors import DataError
 from idm_env.data.trajectories import Trajectories
 
 _FILE = "idm_env_file"
@@ -17,7 +17,7 @@ _FILE = "idm_env_file"
 
 @dataclass(frozen=True)
 class Share:
-    """Some whole runs of a folder, the files that hold their rows, and how many vehicles they have."""
+    """Some whole runs of a folder (all: none named), the files that hold their rows, and how many vehicles."""
 
     folder: Path
     files: tuple[str, ...]
@@ -25,17 +25,18 @@ class Share:
     vehicles: int
 
     def __str__(self) -> str:
+        if not self.runs:
+            return "all runs"
         first, last = self.runs[0], self.runs[-1]
         return f"run {first}" if first == last else f"runs {first} to {last}"
 
     def trajectories(self, *, ring_length: float | None = None, place: str | None = None) -> Trajectories:
         """Read and check these runs. DataError for what cannot be used."""
         try:
-            frame = _scan(self.folder, list(self.files)).filter(_run().is_in(self.runs)).drop(_FILE).collect()
-            table, repairs = tidy.read(frame)
-            return Trajectories.from_frame(
-                table, source=f"{self.folder.name}, {self}", ring_length=ring_length, place=place, repairs=repairs
-            )
+            rows = _scan(self.folder, list(self.files)).drop(_FILE)
+            table, repairs = tidy.read((rows.filter(_run().is_in(self.runs)) if self.runs else rows).collect())
+            source = f"{self.folder.name}, {self}" if self.runs else self.folder.name
+            return Trajectories.from_frame(table, source=source, ring_length=ring_length, place=place, repairs=repairs)
         except (pl.exceptions.PolarsError, OSError) as error:
             raise _unreadable(self.folder, error) from error
 
@@ -47,21 +48,22 @@ def shares(folder: Path, vehicles: int) -> list[Share]:
     neighbour.
 
     Raises:
-        DataError: If there is no parquet file, none of them can be read, or a column is missing.
+        DataError: If there is no parquet file, none of them can be read, a column is missing, or a row has no run.
     """
     files = files_of(folder)
     try:
         scan = _scan(folder, files)
-        names = scan.collect_schema().names()
-        for name in ("run_id", "vehicle_id", "time_s", "position_m"):
-            if name not in names:
-                raise missing_column(name, [n for n in names if n != _FILE], folder.name)
+        names = [name for name in scan.collect_schema().names() if name != _FILE]
+        tidy.check(names, folder.name)
+        clean.check_columns(tidy.converted(names), folder.name)
+        if "run_id" not in names:
+            return [Share(folder, tuple(files), (), 0)]
+        scan = scan.filter(pl.col("vehicle_id").is_not_null())
         keys = scan.select(_run().alias("run_id"), "vehicle_id", _FILE).group_by("run_id", _FILE)
         found = keys.agg(pl.col("vehicle_id").unique()).collect(engine="streaming")
+        clean.check_runs(scan.filter(_run().is_null()).select("vehicle_id").head(1).collect(), folder.name)
     except (pl.exceptions.PolarsError, OSError) as error:
         raise _unreadable(folder, error) from error
-    if found["run_id"].null_count():
-        raise DataError(f"{folder.name}: run_id is empty in some rows; name the run of every row.")
     runs = found.group_by("run_id").agg(
         pl.col("vehicle_id").explode().n_unique().alias("vehicles"), pl.col(_FILE).sort()
     )
@@ -73,9 +75,7 @@ def shares(folder: Path, vehicles: int) -> list[Share]:
             cut.append(Share(folder, both, (*last.runs, run), last.vehicles + count))
         else:
             cut.append(Share(folder, tuple(where), (run,), count))
-    if not cut:
-        raise DataError(f"{folder} holds no rows; give a folder of parquet files with trajectories.")
-    return cut
+    return [replace(cut[0], runs=())] if len(cut) == 1 else cut or [Share(folder, tuple(files), (), 0)]
 
 
 def files_of(folder: Path) -> list[str]:
@@ -106,7 +106,7 @@ def _scan(folder: Path, files: list[str]) -> pl.LazyFrame:
 
 
 def _run() -> pl.Expr:
-    return pl.col("run_id").cast(pl.String)
+    return pl.col("run_id").cast(pl.String).str.strip_chars().replace("", None)
 
 
 def _unreadable(folder: Path, error: Exception) -> DataError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 
 from idm_env.data import units
-from idm_env.data.clean import NO_LEADER
+from idm_env.data.clean import NAMES, NO_LEADER, natural
 from idm_env.data.errors import DataError, Repair, listed
 from idm_env.data.schema import TRACK
 
@@ -13,63 +13,104 @@ SHARE_BEHIND = 0.5
 """If more than this share of followers' rows have their leader behind, positions or leaders are wrong."""
 
 
-def derive(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
+def derive(frame: pl.DataFrame) -> pl.DataFrame:
     """Return the frame with leader_id: the next vehicle ahead in the same run, lane and step.
 
-    With ``ring_length_m`` the foremost vehicle of a lane follows the hindmost one. Vehicles at the same position are
-    ordered by their identifier, so that the result does not depend on the order of rows.
+    Who has no lane, in a run that has lanes, has no leader. With ``ring_length_m`` the foremost vehicle of a lane
+    follows the hindmost one. Vehicles at the same position are ordered by their identifier, so that the result does not
+    depend on the order of rows.
     """
-    place = ["run_id", "lane", "step"]
+    place = ["run_id", "in_lane", "step"]
     on_ring = "ring_length_m" in frame.columns
     along = pl.col("position_m") % pl.col("ring_length_m") if on_ring else pl.col("position_m")
-    order = frame.with_row_index("row").with_columns(along.alias("along")).sort(*place, "along", "vehicle_id")
+    along = pl.coalesce(along, "position_m").alias("along")
+    order = frame.with_row_index("row").with_columns(along).sort(*place, "along", "vehicle_id")
     ahead = pl.col("vehicle_id").shift(-1).over(place)
     if on_ring:
         around = pl.when(pl.len().over(place) > 1).then(pl.col("vehicle_id").first().over(place))
         ahead = pl.coalesce(ahead, pl.when(pl.col("ring_length_m").is_not_null()).then(around))
-    derived = order.with_columns(ahead.alias("leader_id")).sort("row")
-    followers = derived.filter(pl.col("leader_id").is_not_null()).select(TRACK).n_unique()
-    lanes = (
-        "lane and position" if frame["lane"].null_count() < frame.height else "position, all vehicles being in one lane"
-    )
-    text = f"leader_id is absent: the leaders of {followers} vehicles were derived from {lanes}."
-    return derived.drop("row", "along"), [Repair("leaders derived", followers, text)]
+    ahead = pl.when(pl.col("in_lane").is_not_null()).then(ahead).alias("leader_id")
+    return order.with_columns(ahead).sort("row").drop("row", "along")
 
 
-def known(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
-    """Return the frame with leader_id null where it says "none" (empty, 0, -1) or names no vehicle of the run.
+def derived(followers: int, lanes: bool) -> Repair:
+    """Return what is to be said of so many vehicles whose leaders were derived."""
+    told = "lane and position" if lanes else "position, all vehicles being in one lane"
+    text = f"leader_id is absent: the leaders of {followers} vehicles were derived from {told}."
+    return Repair("leaders derived", followers, text)
+
+
+def in_lane(laned: pl.Expr) -> pl.Expr:
+    """Return where leaders are looked for: the lane, or one and the same in runs that are not ``laned``."""
+    return pl.when(laned).then(pl.col("lane")).otherwise(0).alias("in_lane")
+
+
+def known(frame: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return the frame with leader_id null where it says "none" (empty, 0, -1) or names no other vehicle of the run.
+
+    Also return how many rows name whom: columns ``leader_id``, ``state`` and ``len``, for ``named``. ``vehicles`` has
+    the run_id and vehicle_id of everybody.
+    """
+    there = vehicles.select("run_id", pl.col("vehicle_id").alias("leader_id"), exists=True).unique()
+    joined = frame.join(there, on=["run_id", "leader_id"], how="left", maintain_order="left")
+    # 0 and -1 mean "none" only where no vehicle has that name
+    none = pl.col("leader_id").is_null() | pl.col("leader_id").str.to_lowercase().is_in(NO_LEADER)
+    own = pl.when(pl.col("leader_id") == pl.col("vehicle_id")).then(pl.lit("own"))
+    state = own.when(pl.col("exists")).then(pl.lit("there")).when(none).then(pl.lit("none")).otherwise(pl.lit("lost"))
+    joined = joined.with_columns(state.alias("state"))
+    counts = joined.group_by("leader_id", "state").len()
+    leader = pl.when(pl.col("state") == "there").then(pl.col("leader_id")).alias("leader_id")
+    return joined.with_columns(leader).drop("exists", "state"), counts
+
+
+def named(counts: pl.DataFrame, source: str) -> list[Repair]:
+    """Return what is to be said of the leaders that a file names.
 
     Raises:
-        DataError: If every row is without leader, or no named leader exists.
+        DataError: If leaders are named, and none is another vehicle of its run.
     """
-    vehicles = frame.select("run_id", pl.col("vehicle_id").alias("leader_id"), exists=True).unique()
-    joined = frame.join(vehicles, on=["run_id", "leader_id"], how="left", maintain_order="left")
-    exists = joined["exists"].fill_null(False)
-    # 0 and -1 mean "none" only where no vehicle has that name
-    none = (joined["leader_id"].str.to_lowercase().is_in(NO_LEADER) & ~exists) | joined["leader_id"].is_null()
-    if none.all():
-        raise DataError(
-            f"{source}: leader_id is empty in every row, so that nobody follows anybody; fill it, or remove the column "
-            "to have leaders derived from lane and position."
-        )
-    own = (joined["leader_id"] == joined["vehicle_id"]).fill_null(False)
-    lost = ~none & ~exists
-    if not (exists & ~own & ~none).any():
-        name = joined.filter(~none)["leader_id"][0]
+    total = dict(counts.group_by("state").agg(pl.col("len").sum()).rows())
+    wrong = counts.filter(pl.col("state").is_in(["lost", "own"])).sort(natural("leader_id"), "leader_id")
+    if wrong.height and "there" not in total:
+        name = wrong["leader_id"][0]
         raise DataError(
             f"{source}: leader_id = {name!r} is no other vehicle of its run, as is every leader; check the identifiers."
         )
     repairs = []
-    if lost.any():
-        names = joined.filter(lost)["leader_id"].unique(maintain_order=True)
-        count, some = int(lost.sum()), listed(names, 5)
-        text = f"{count} rows name a leader that the run does not hold ({some}) and are taken as without leader."
-        repairs.append(Repair("leader does not exist", count, text))
-    if own.any():
-        text = f"{own.sum()} rows name the vehicle itself as leader and are taken as without leader."
-        repairs.append(Repair("own leader", int(own.sum()), text))
-    keep = exists & ~own & ~none
-    return joined.with_columns(pl.when(keep).then(pl.col("leader_id")).alias("leader_id")).drop("exists"), repairs
+    if lost := total.get("lost", 0):
+        names = wrong.filter(pl.col("state") == "lost")["leader_id"].unique(maintain_order=True)
+        text = f"{lost} rows name a leader that the run does not hold ({listed(names, 5)}); they are without leader."
+        repairs.append(Repair("leader does not exist", lost, text))
+    if own := total.get("own", 0):
+        text = f"{own} rows name the vehicle itself as leader and are taken as without leader."
+        repairs.append(Repair("own leader", own, text))
+    return repairs
+
+
+def steady(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the frame, sorted by track and ``step``, without leaders of a single sample between those of another.
+
+    Nobody counts as another. Of four samples around, three must have the other leader: a lane number is off once, or
+    the order of two vehicles side by side flickers. The gap there is the mean of those around.
+    """
+    leader = pl.col("leader_id")
+
+    def at(shift: int, name: str = "leader_id") -> pl.Expr:
+        return pl.col(name).shift(shift).over(TRACK)
+
+    beside = at(1).eq_missing(at(-1))
+    around = pl.sum_horizontal(at(shift).eq_missing(at(1)).cast(pl.Int8) for shift in (-2, -1, 1, 2))
+    whole = at(-1, "step") - at(1, "step") == 2
+    flicker = (beside & whole & (around >= 3) & leader.ne_missing(at(1))).fill_null(False)
+    count = int(frame.select(flicker.sum()).item())
+    if not count:
+        return frame, []
+    changes = [pl.when(flicker).then(at(1)).otherwise(leader).alias("leader_id")]
+    if "gap_m" in frame.columns:
+        mean = (at(1, "gap_m") + at(-1, "gap_m")) / 2
+        changes.append(pl.when(flicker).then(mean).otherwise("gap_m").alias("gap_m"))
+    text = f"{count} single samples of another leader were taken as of the one before and after."
+    return frame.with_columns(changes), [Repair("leader flickers", count, text)]
 
 
 def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
@@ -81,6 +122,17 @@ def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     Raises:
         DataError: If most leaders are behind their followers, or gaps and positions are in different units.
     """
+    joined = headways(frame, source)
+    gap = pl.when(pl.col("gap_measured")).then(pl.col("gap_m")).otherwise(pl.col("headway") - pl.col("lead_length"))
+    gap = pl.when(pl.col("leader_id").is_not_null()).then(gap)
+    joined = joined.with_columns(gap.alias("gap_m")).drop("lead_position", "lead_length", "headway")
+    count = joined.filter(~pl.col("gap_measured") & pl.col("gap_m").is_not_null()).height
+    text = f"{count} gaps were taken from the positions and lengths of the two vehicles, as gap_m is absent."
+    return joined, [Repair("gap from positions", count, text)] if count else []
+
+
+def headways(frame: pl.DataFrame, source: str) -> pl.DataFrame:
+    """Return the frame with gap_measured, lead_position, lead_length, headway (front to front); errors of ``gaps``."""
     if "gap_m" not in frame.columns:
         frame = frame.with_columns(pl.lit(None, pl.Float64).alias("gap_m"))
     measured = pl.col("gap_m").is_not_null().any().over("run_id")
@@ -94,19 +146,14 @@ def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     joined = joined.with_columns(headway.alias("headway"))
     _check_ahead(joined, source)
     units.check_gaps(joined, source)
-    gap = pl.when(pl.col("gap_measured")).then(pl.col("gap_m")).otherwise(pl.col("headway") - pl.col("lead_length"))
-    gap = pl.when(pl.col("leader_id").is_not_null()).then(gap)
-    joined = joined.with_columns(gap.alias("gap_m")).drop("lead_position", "lead_length", "headway")
-    count = joined.filter(~pl.col("gap_measured") & pl.col("gap_m").is_not_null()).height
-    text = f"{count} gaps were taken from the positions and lengths of the two vehicles, as gap_m is absent."
-    return joined, [Repair("gap from positions", count, text)] if count else []
+    return joined
 
 
 def _check_ahead(joined: pl.DataFrame, source: str) -> None:
     rows = joined.filter(~pl.col("gap_measured") & pl.col("headway").is_not_null())
-    behind = rows.filter(pl.col("headway") <= 0)
+    behind = rows.filter(pl.col("headway") < 0)
     if rows.height and behind.height > SHARE_BEHIND * rows.height:
-        run, vehicle, leader, time = behind.select("run_id", "vehicle_id", "leader_id", "time_s").row(0)
+        run, vehicle, leader, time = behind.sort(*NAMES, "step").select(*TRACK, "leader_id", "time_s").row(0)
         raise DataError(
             f"{source}: leader {leader} is behind vehicle {vehicle} of run {run} at t = {time:g} s, as in "
             f"{behind.height} of {rows.height} rows; positions must rise along the road, or give ring_length."

@@ -11,7 +11,7 @@ from pathlib import Path
 import polars as pl
 
 from idm_env.data import drones, folder, ngsim, openacc, tidy
-from idm_env.data.errors import DataError, Repair, listed
+from idm_env.data.errors import DataError, Repair
 from idm_env.data.trajectories import Trajectories
 
 LAYOUTS = ("auto", "tidy", "ngsim", "openacc", *drones.CSV, *drones.FILES)
@@ -152,18 +152,8 @@ def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.Dat
     found = layout if layout in drones.CSV else drones.layout_of(table.columns) if layout == "auto" else None
     if found:
         return drones.CSV[found](table, source)
-    if layout == "auto" and not tidy.matches(table.columns):
-        plain = {re.sub(r"\W+", "_", name.lower()).strip("_"): name for name in table.columns}
-        near = [
-            f"'{plain[name]}' to {name}"
-            for name in ("vehicle_id", "time_s", "position_m")
-            if plain.get(name, name) != name
-        ]
-        cure = f" Rename {' and '.join(near)}." if near else ""
-        raise DataError(
-            f"{source}: no known layout has the columns {listed(table.columns, 8)}; a tidy table, separated by commas, "
-            f"needs vehicle_id, time_s and position_m.{cure}"
-        )
+    if layout == "auto":
+        tidy.check(table.columns, source)
     return tidy.read(table)
 
 
@@ -217,5 +207,9 @@ def _table(path: Path, extension: str, skip: int = 0) -> pl.DataFrame:
 
 
 def _unreadable(path: Path, error: BaseException) -> DataError:
+    """Return the error in one line; of what is packed, two libraries would say the same fault in two ways."""
+    packed = next((kind for kind in ("parquet", "gz") if path.name.lower().endswith(f".{kind}")), None)
     reason = str(error).strip().splitlines()[0][:150] if str(error).strip() else type(error).__name__
+    if packed and not getattr(error, "errno", None):
+        reason = f"as {packed}"
     return DataError(f"{path.name} cannot be read ({reason}); is it complete and what its extension says?")

@@ -8,6 +8,29 @@ from idm_env.data import clean, clock, directions, leaders, schema, speeds, unit
 from idm_env.data.errors import DataError, Repair
 
 
+def rows(
+    frame: pl.DataFrame, source: str, ring_length: float | None, filled: clean.Filled
+) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the rows of a table, or of a piece of one, that can be used, by the rules that look at single rows.
+
+    ``filled`` counts them. DataError for what cannot be used.
+    """
+    clean.check_columns(frame.columns, source)
+    frame, repairs = clean.numbers(clean.identifiers(frame, source), source)
+    filled.add(frame)
+    frame, lost = clean.without_empty(_with_ring(frame, ring_length, source), source)
+    return frame, [*repairs, *lost]
+
+
+def measured(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return whole vehicles, sorted, by the rules for what was measured of each: lengths, laps, single speeds."""
+    done: list[Repair] = []
+    for rule in (units.implausible, speeds.unwrapped, speeds.lengths):
+        frame, repairs = rule(frame)
+        done += repairs
+    return frame, done
+
+
 def prepare(
     frame: pl.DataFrame, source: str, ring_length: float | None
 ) -> tuple[pl.DataFrame, dict[str, float], list[Repair]]:
@@ -22,28 +45,40 @@ def prepare(
         done.extend(result[1])
         return result[0]
 
-    clean.check_columns(frame, source)
-    frame = then(clean.numbers(clean.identifiers(frame, source), source))
-    frame = then(clean.without_empty(_with_ring(frame, ring_length, source), source))
-    frame = then(directions.one_way(frame))
-    frame = then(clean.ordered(frame, source))
+    filled = clean.Filled()
+    frame = then(rows(frame, source, ring_length, filled))
+    filled.check(source)
+    frame = then(directions.one_way(frame, source))
+    count = frame.height
+    frame, sorted_, twice = clean.ordered(frame)
+    done += sorted_
+    clean.check_recordings(twice, count, source)
     units.check(frame, source)
-    frame = then(units.implausible(frame))
-    frame = then(speeds.unwrapped(frame))
+    frame = then(measured(frame))
     frame = then(clean.single_holes(frame))
-    frame = then(clean.without_position(frame, source))
-    frame = then(speeds.lengths(frame))
-    steps = clock.steps_of(frame, source)
+    frame = then(clean.without_position(frame))
+    steps = clock.steps_of(clock.paces(frame), frame["run_id"].unique(), source)
     frame = then(clock.regularise(frame, steps))
     frame = then(speeds.complete(frame, steps))
-    if "leader_id" in frame.columns:
-        frame = then(leaders.known(_with_lane(frame), source))
-    else:
-        frame = then(leaders.derive(_with_lane(frame)))
+    frame = then(leaders.steady(then(_led(_with_lane(frame), source))))
     frame = then(leaders.gaps(frame, source))
     if frame["leader_id"].null_count() == frame.height:
         raise DataError(f"{source}: nobody follows anybody; two vehicles must share a run and a lane at one time.")
     return schema.check(_arranged(frame), source), steps, done
+
+
+def _led(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+    if "leader_id" in frame.columns:
+        frame, counts = leaders.known(frame, frame)
+        if (counts["state"] == "none").all():
+            raise DataError(
+                f"{source}: leader_id is empty in every row, so that nobody follows anybody; fill it, or remove the "
+                "column to have leaders derived from lane and position."
+            )
+        return frame, leaders.named(counts, source)
+    frame = leaders.derive(frame.with_columns(leaders.in_lane(pl.col("lane").is_not_null().any().over("run_id"))))
+    followers = frame.filter(pl.col("leader_id").is_not_null()).select(schema.TRACK).n_unique()
+    return frame.drop("in_lane"), [leaders.derived(followers, frame["lane"].null_count() < frame.height)]
 
 
 def _with_ring(frame: pl.DataFrame, ring_length: float | None, source: str) -> pl.DataFrame:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 import polars as pl
 
-from idm_env.data.errors import Repair
+from idm_env.data.errors import DataError, Repair, listed
+from idm_env.data.schema import REQUIRED
 
 FOOT_M, MILE_M = 0.3048, 1609.344
 NAMED: dict[str, tuple[tuple[str, float], ...]] = {
@@ -25,6 +28,25 @@ _OTHER_UNITS = {other for others in NAMED.values() for other, _ in others}
 def matches(columns: list[str]) -> bool:
     """Say whether the header is that of a tidy table; also true for one with a column missing, to name it."""
     return bool(({"time_s", "position_m", "speed_mps", "run_id"} | _OTHER_UNITS) & set(columns))
+
+
+def check(columns: list[str], source: str) -> None:
+    """Raise DataError if the header is that of no tidy table."""
+    if matches(columns):
+        return
+    plain = {re.sub(r"\W+", "_", name.lower()).strip("_"): name for name in columns}
+    near = [f"'{plain[name]}' to {name}" for name in REQUIRED if plain.get(name, name) != name]
+    cure = f" Rename {' and '.join(near)}." if near else ""
+    raise DataError(
+        f"{source}: no known layout has the columns {listed(columns, 8)}; a tidy table, separated by commas, "
+        f"needs vehicle_id, time_s and position_m.{cure}"
+    )
+
+
+def converted(columns: list[str]) -> list[str]:
+    """Return the names that a table has after ``read``."""
+    names = {other: name for name, others in NAMED.items() for other, _ in others if name not in columns}
+    return [names.get(name, name) for name in columns]
 
 
 def read(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:

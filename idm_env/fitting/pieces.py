@@ -151,7 +151,7 @@ def join(parts: Parts, options: Options) -> Joined:
     told = parts.summaries()
     good = [summary for summary in told if "lost" not in summary]
     if not good:
-        raise DataError(f"no part can be fitted: {told[0]['lost']}")
+        raise DataError(f"no part can be fitted: {told[0]['lost']}" if told[1:] else told[0]["lost"])
     odd = next((s["dt"] for s in good if abs(s["dt"] - good[0]["dt"]) > 1e-9), None)
     if odd is not None:
         raise DataError(f"some runs have steps of {good[0]['dt']:g} s, others of {odd:g} s. Give one --dt.")

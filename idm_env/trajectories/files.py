@@ -18,7 +18,7 @@ import numpy as np
 import polars as pl
 
 from idm_env import keep
-from idm_env.data import DataError, Repair
+from idm_env.data import DataError
 from idm_env.data.folder import stamp
 from idm_env.executor import Executor, Serial
 from idm_env.parts import Parts
@@ -131,8 +131,6 @@ def _run(
         raise
     _chunks(spool, parts, settings, plan, bridge, executor, progress)
     told = parts.summaries()
-    for part in told:
-        spool.count([Repair(*repair) for repair in part["repairs"]])
     scored = []
     if settings.task == "reconstruct":
         progress("scoring", 0, 0, "points left out of the file")
@@ -197,9 +195,9 @@ def _strand(strand: _Strand, progress: OnProgress) -> None:
             recent += chunks.restored(parts, number, tracks)
         else:
             told = {
-                "left_out": pieces.left_out, "notes": pieces.notes,
-                "repairs": [[r.kind, r.count, r.text] for r in table.repairs],
-            }  # fmt: skip
+                "left_out": pieces.left_out,
+                "notes": pieces.notes,
+            }
             recent += chunks.done(
                 parts, number, tracks, settings, strand.plan, recent, told,
                 lambda share, words, b=begin, e=end: progress(  # type: ignore[misc]

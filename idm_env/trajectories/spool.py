@@ -1,100 +1,101 @@
-"""A file of tracks on disk, sorted into buckets of vehicles, so that memory holds one chunk and never the file.
+"""A file of tracks on disk, sorted into chunks of vehicles, so that memory holds one chunk and never the file.
 
-The file is read in pieces. Where leaders must be derived from lanes, its rows are first brought together by time; then
-they are brought together by vehicle, in the order in which vehicles appear.
+The file is read in pieces, by the rules of ``data.load``. Its rows are brought together by vehicle, in the order in
+which vehicles appear; then by time, on the clock of each run, to find who is ahead.
 """
 
 from __future__ import annotations
 
 import shutil
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import polars as pl
 
 from idm_env import keep
-from idm_env.data import DataError, Repair, directions
-from idm_env.data.clean import check_columns, identifiers, natural, numbers
+from idm_env.data import Repair, clean, clock, directions, leaders, prepare, units
 from idm_env.data.errors import Counted
 from idm_env.data.load import batches
-from idm_env.data.speeds import length_assumed
-from idm_env.trajectories.tracks import Table, check_units, has_length, prepared, with_leaders
+from idm_env.trajectories.tracks import Table
 
-KEPT = ("run_id", "vehicle_id", "time_s", "position_m", "leader_id", "lane", "length_m", "ring_length_m")
+KEPT = ("run_id", "vehicle_id", "time_s", "position_m", "leader_id", "lane", "length_m", "ring_length_m", "gap_m")
 MOST_BUCKETS = 64
 BUCKET_ROWS = 400_000
 """Rows of a bucket of times."""
 KEY = ["run_id", "vehicle_id"]
+BRIDGED_S = 2.0
+"""Holes up to this are filled before leaders are looked for (s)."""
+LONGEST_STEP_S = 60.0
+"""Sparse tracks have a sample at least so often (s); above, times are in another unit."""
 
 
 @dataclass(frozen=True)
 class Shelf:
-    """Chunks of vehicles on disk, to be read by whoever works on them: their borders, and who is of the chunk's run.
+    """Chunks of vehicles on disk, to be read by whoever works on them.
 
     Attributes:
         source: Name of the file.
-        folder: Where the buckets are.
+        folder: Where they are.
         borders: First vehicle of every chunk, and the number of vehicles.
-        per_bucket: Chunks in a bucket.
     """
 
     source: str
     folder: Path
     borders: tuple[int, ...]
-    per_bucket: int
+
+    def path(self, number: int) -> Path:
+        """Return the file of one chunk."""
+        return self.folder / f"chunk-{number:05d}.parquet"
 
     def table(self, number: int) -> Table:
-        """Return the table of one chunk, with what was repaired."""
-        return self.part(number, range(self.borders[number], self.borders[number + 1]))
+        """Return the table of one chunk."""
+        return Table(pl.read_parquet(self.path(number), glob=False).drop("number"), self.source)
 
-    def part(self, number: int, vehicles: range) -> Table:
-        """Return the table of some vehicles of a chunk."""
-        files = sorted(self.folder.glob(f"vehicles-{number // self.per_bucket:03d}-*.parquet"))
-        inside = pl.col("number").is_between(vehicles.start, vehicles.stop - 1)
-        frame = pl.scan_parquet(files, glob=False, missing_columns="insert").filter(inside).collect()
-        frame, repairs = prepared(frame.sort("number", maintain_order=True).drop("number"))
-        return Table(frame, tuple(repairs), self.source)
+    def vehicle(self, index: int) -> Table:
+        """Return the table of one vehicle."""
+        path = self.path(bisect_right(self.borders, index) - 1)
+        one = pl.scan_parquet(path, glob=False).filter(pl.col("number") == index)
+        return Table(one.drop("number").collect(), self.source)
 
 
 class Spool:
-    """The vehicles of a file in the order of their appearance, and their rows in buckets under ``folder``.
+    """The vehicles of a file in the order of their appearance, and their rows in chunks under ``folder``.
 
-    Chunks are ``chunk`` vehicles at most and end where a run does, unless it has more than that.
+    Chunks are ``chunk`` vehicles at most and end where a run does, unless it has more than that. DataError for what
+    ``data.load`` refuses; but nobody need follow anybody, and samples may be sparse.
 
     Attributes:
         source: Name of the file.
         vehicles: (run, vehicle) of every vehicle.
         shelf: The chunks.
+        repairs: What was repaired.
     """
 
-    def __init__(self, path: str | Path, folder: Path, layout: str, chunk: int) -> None:
+    def __init__(
+        self, path: str | Path, folder: Path, layout: str, chunk: int, ring_length: float | None = None
+    ) -> None:  # fmt: skip
         self.source = Path(path).name
         self.folder = folder
         self._counted = Counted()
         if folder.exists():
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
-        raw, index = self._read(path, layout)
+        files, index = self._read(path, layout, ring_length)
         self.vehicles: list[tuple[str, str]] = index.select(KEY).rows()
-        borders = _borders([run for run, _ in self.vehicles], chunk)
-        self.shelf = Shelf(self.source, folder, borders, max(1, -(-(len(borders) - 1) // MOST_BUCKETS)))
-        self._distribute(self._led(raw, index), index)
+        self.shelf = Shelf(self.source, folder, _borders([run for run, _ in self.vehicles], chunk))
+        chunks = pl.Series(self.shelf.borders[1:-1], dtype=pl.UInt32)
+        index = index.with_columns(pl.lit(chunks).search_sorted(pl.col("number"), "right").alias("chunk"))
+        steps = self._shelve(files, index)
+        self._lead(steps, index)
+        self.repairs: tuple[Repair, ...] = self._counted.repairs()
 
     @property
     def chunks(self) -> int:
         """Number of chunks of vehicles."""
         return len(self.shelf.borders) - 1
-
-    @property
-    def repairs(self) -> tuple[Repair, ...]:
-        """What was repaired when the file was spooled, and what was counted since."""
-        return self._counted.repairs()
-
-    def count(self, repairs: Sequence[Repair]) -> None:
-        """Count what was repaired in a chunk."""
-        self._counted.add(repairs)
 
     def strands(self) -> list[tuple[int, ...]]:
         """Return the chunks that have to be done one after the other, because a run goes on from one to the next."""
@@ -106,97 +107,151 @@ class Spool:
 
     def picked(self, indices: Sequence[int]) -> Iterator[Table]:
         """Yield the tables of single vehicles."""
-        for index in indices:
-            number = bisect_right(self.shelf.borders, index) - 1
-            yield self.shelf.part(number, range(index, index + 1))
+        yield from map(self.shelf.vehicle, indices)
 
-    def _read(self, path: str | Path, layout: str) -> tuple[list[Path], pl.DataFrame]:
+    def _read(
+        self, path: str | Path, layout: str, ring_length: float | None
+    ) -> tuple[list[Path], pl.DataFrame]:  # fmt: skip
         """Write the pieces of a file and return them, with an index of its vehicles in their order."""
         files: list[Path] = []
-        index: pl.DataFrame | None = None
-        lost = 0
+        parts: list[pl.DataFrame] = []
+        filled = clean.Filled()
+        sample: list[pl.DataFrame] = []
         for piece, repairs in batches(path, layout=layout):
             self._counted.add(repairs)
-            check_columns(piece, self.source)
-            piece, repairs = numbers(identifiers(piece, self.source), self.source)
+            usable, repairs = prepare.rows(piece, self.source, ring_length, filled)
             self._counted.add(repairs)
-            whole = piece.filter(pl.all_horizontal(pl.col(*KEY, "time_s").is_not_null()))
-            self._counted.add(_lost("no time", piece.height - whole.height, "rows without a vehicle or a time"))
-            kept = whole.filter(pl.col("position_m").is_not_null())
-            self._counted.add(_lost("no position", whole.height - kept.height, "rows without a position"))
-            lost += piece.height - kept.height
+            kept = usable.filter(pl.col("position_m").is_not_null())
+            if lost := usable.height - kept.height:
+                self._counted.add([Repair("no position", lost, f"{lost} rows without a position were left out.")])
             if kept.height == 0:
                 continue
-            if not files:
-                check_units(kept, self.source)
+            sample += [kept] if sum(some.height for some in sample) < BUCKET_ROWS else []
             files.append(self.folder / f"raw-{len(files):05d}.parquet")
             kept = kept.select(pl.col(name) for name in KEPT if name in kept.columns)
-            # derived leaders wait for _led: the vehicle ahead may be in another piece
-            waits = "leader_id" not in kept.columns and "lane" in kept.columns
-            keep.write(files[-1], (kept if waits else with_leaders(kept)).write_parquet)
-            index = _indexed(index, kept)
-        if index is None:
-            raise DataError(
-                f"{self.source}: none of {lost} rows has a vehicle_id, a time_s and a position_m; fill those columns "
-                "(position_m in metres)."
-            )
-        backward = int(index["backward"].sum())
-        if backward:
-            text = f"{backward} rows are earlier than the row before them of their vehicle; rows were sorted by time."
-            self._counted.add([Repair("time not increasing", backward, text)])
-        self._counted.add(length_assumed(int(index["known"].not_().sum())))
-        index = self._one_way(files, index)
-        order = (natural("run_id"), "run_id", "begin", natural("vehicle_id"), "vehicle_id")
+            keep.write(files[-1], kept.write_parquet)
+            parts.append(_indexed(kept))
+        filled.check(self.source)
+        index = _merged(parts)
+        vehicles = directions.against(index.filter(~pl.col("ring")), self.source)
+        for file in files if vehicles.height else []:
+            keep.write(file, directions.mirrored(pl.read_parquet(file, glob=False), vehicles).write_parquet)
+        self._counted.add(directions.repairs(vehicles))
+        self._sample = directions.mirrored(pl.concat(sample, how="diagonal_relaxed"), vehicles)
+        index = directions.renamed(index, vehicles)
+        order = (clean.natural("run_id"), "run_id", "begin", clean.natural("vehicle_id"), "vehicle_id")
         return files, index.sort(*order).with_row_index("number")
 
-    def _one_way(self, files: list[Path], index: pl.DataFrame) -> pl.DataFrame:
-        """Mirror vehicles that drive against the others, in the pieces; return the index with their new runs."""
-        vehicles = directions.against(index.filter(~pl.col("ring")))
-        for path in files if vehicles.height else []:
-            keep.write(path, directions.mirrored(pl.read_parquet(path, glob=False), vehicles).write_parquet)
-        self._counted.add(directions.repairs(vehicles))
-        return directions.renamed(index, vehicles)
-
-    def _led(self, raw: list[Path], index: pl.DataFrame) -> list[Path]:
-        """Return files whose rows have leaders: the pieces themselves, or what is derived from lanes time by time."""
-        columns = pl.scan_parquet(raw, glob=False, missing_columns="insert").collect_schema().names()
-        if "leader_id" in columns:
-            return raw
-        count = max(1, -(-int(index["rows"].sum()) // BUCKET_ROWS))
-        bucket = pl.struct("run_id", "time_s").hash(seed=0) % count
-        parts = self._partition(raw, pl.lit(0) if count == 1 else bucket, "times")
-        led = []
-        for number in range(count):
-            files = sorted(parts.glob(f"times-{number:03d}-*.parquet"))
-            if not files:
-                continue
-            frame, repairs = prepared(pl.read_parquet(files, glob=False, missing_columns="insert"))
+    def _shelve(self, files: list[Path], index: pl.DataFrame) -> dict[str, float]:
+        """Write the chunks, by the rules for whole vehicles, and return the time step of each run (s)."""
+        per_bucket = max(1, -(-self.chunks // MOST_BUCKETS))
+        number = index.select(*KEY, "number", "chunk")
+        buckets = self._partition(files, "vehicles", pl.col("chunk") // per_bucket, number)
+        paces, twice, unsorted = [], [], int(index["backward"].sum())
+        for chunk in range(self.chunks):
+            parts = buckets.get(chunk // per_bucket, [])
+            rows = pl.scan_parquet(parts, glob=False, missing_columns="insert", extra_columns="ignore")
+            frame, repairs, moved = clean.ordered(rows.filter(pl.col("chunk") == chunk).collect())
+            self._counted.add([repair for repair in repairs if repair.kind != "time not increasing"])
+            frame, repairs = prepare.measured(frame)
             self._counted.add(repairs)
-            led.append(self.folder / f"led-{number:05d}.parquet")
-            keep.write(led[-1], with_leaders(frame).write_parquet)
-            _remove(files)
-        return led
+            paces.append(clock.paces(frame))
+            twice.append(moved)
+            keep.write(self.shelf.path(chunk), frame.drop("chunk").write_parquet)
+        if unsorted:
+            text = f"Time runs backward at {unsorted} rows; the rows were sorted by time."
+            self._counted.add([Repair("time not increasing", unsorted, text)])
+        clean.check_recordings(pl.concat(twice), int(index["rows"].sum()), self.source)
+        units.check(clean.ordered(self._sample)[0], self.source, longest_step=LONGEST_STEP_S)
+        del self._sample
+        _remove(part for parts in buckets.values() for part in parts)
+        return clock.steps_of(pl.concat(paces), index["run_id"].unique(), self.source)
 
-    def _distribute(self, files: list[Path], index: pl.DataFrame) -> None:
-        """Bring the rows together by buckets of vehicles."""
-        firsts = self.shelf.borders[: -1 : self.shelf.per_bucket]
-        self._partition(
-            files, pl.lit(pl.Series(firsts)).search_sorted(pl.col("number"), "right") - 1, "vehicles", index
-        )
+    def _lead(self, steps: dict[str, float], index: pl.DataFrame) -> None:
+        """Give every row its leader: as the file names it, or derived time by time once short holes are filled."""
+        starts = dict(index.group_by("run_id").agg(pl.col("begin").min()).rows())
+        laned = dict(index.group_by("run_id").agg(pl.col("lane").is_not_null().any()).rows())
+        named: list[pl.DataFrame] = []
+        files = []
+        for chunk in range(self.chunks):
+            frame = pl.read_parquet(self.shelf.path(chunk), glob=False)
+            if "leader_id" in frame.columns:
+                frame, counts = leaders.known(frame, index)
+                named.append(counts)
+            ticks, _ = clock.regularise(frame, steps, starts, BRIDGED_S)
+            files.append(self.folder / f"ticks-{chunk:05d}.parquet")
+            keep.write(files[-1], ticks.with_columns(pl.lit(chunk).alias("chunk")).write_parquet)
+        if named:
+            self._counted.add(
+                leaders.named(pl.concat(named).group_by("leader_id", "state").agg(pl.col("len").sum()), self.source)
+            )
+        count = max(1, -(-int(index["rows"].sum()) // BUCKET_ROWS))
+        times = self._partition(files, "times", pl.struct("run_id", "step").hash(seed=0) % count)
+        files = []
+        for bucket, parts in sorted(times.items()):
+            frame = pl.read_parquet(parts, glob=False, missing_columns="insert")
+            if not named:
+                lane = pl.col("run_id").replace_strict(laned, return_dtype=pl.Boolean)
+                frame = frame if "lane" in frame.columns else frame.with_columns(pl.lit(None, pl.Int64).alias("lane"))
+                frame = leaders.derive(frame.with_columns(leaders.in_lane(lane)))
+            if not files:
+                leaders.headways(frame, self.source)  # refuses what is the wrong way round
+            files.append(self.folder / f"led-{bucket:05d}.parquet")
+            keep.write(files[-1], frame.select(*KEY, "chunk", "step", "leader_id").write_parquet)
+            _remove(parts)
+        found = self._partition(files, "led", pl.col("chunk"))
+        followers = 0
+        for chunk, parts in found.items():
+            ticks = pl.read_parquet(parts, glob=False).sort(*clean.NAMES, "step")
+            ticks, repairs = leaders.steady(ticks)
+            self._counted.add(repairs)
+            followers += ticks.filter(pl.col("leader_id").is_not_null()).select(KEY).n_unique()
+            frame = pl.read_parquet(self.shelf.path(chunk), glob=False).drop("leader_id", "gap_m", strict=False)
+            keep.write(self.shelf.path(chunk), _joined(frame, ticks, steps, starts).write_parquet)
+            _remove(parts)
+        if not named and followers:
+            self._counted.add([leaders.derived(followers, any(laned.values()))])
 
     def _partition(
-        self, files: list[Path], bucket: pl.Expr, name: str, index: pl.DataFrame | None = None
-    ) -> Path:  # fmt: skip
-        """Write the rows of every file to one file per bucket, and remove it."""
+        self, files: Sequence[Path], name: str, bucket: pl.Expr, index: pl.DataFrame | None = None
+    ) -> dict[int, list[Path]]:
+        """Bring the rows of files together, a file per bucket and file, and remove them; return the new ones."""
+        found: dict[int, list[Path]] = {}
         for n, path in enumerate(files):
             frame = pl.read_parquet(path, glob=False)
             if index is not None:
-                frame = frame.join(index.select(*KEY, "number"), on=KEY, how="left", maintain_order="left")
+                frame = frame.join(index, on=KEY, how="left", maintain_order="left")
             frame = frame.with_columns(bucket.cast(pl.Int64).alias("bucket"))
             for (key,), part in frame.partition_by("bucket", as_dict=True, include_key=False).items():
-                keep.write(self.folder / f"{name}-{key:03d}-{n:05d}.parquet", part.write_parquet)
+                target = self.folder / f"{name}-{key:05d}-{n:05d}.parquet"
+                keep.write(target, part.write_parquet)
+                found.setdefault(key, []).append(target)
             path.unlink()
-        return self.folder
+        return found
+
+
+def read_table(path: str | Path, layout: str = "auto") -> Table:
+    """Return a whole file as one table, by the rules of ``Spool``, whose DataErrors it raises."""
+    with TemporaryDirectory() as folder:
+        spool = Spool(path, Path(folder) / "spool", layout, 200)
+        return Table(pl.concat([spool.shelf.table(n).frame for n in range(spool.chunks)]), spool.source, spool.repairs)
+
+
+def _joined(
+    frame: pl.DataFrame, ticks: pl.DataFrame, steps: dict[str, float], starts: dict[str, float]
+) -> pl.DataFrame:
+    """Return the rows of a chunk with the leaders at the nearest tick of the clock, "" for none."""
+
+    def of_run(values: dict[str, float]) -> pl.Expr:
+        return pl.col("run_id").replace_strict(values, return_dtype=pl.Float64)
+
+    tick = ((pl.col("time_s") - of_run(starts)) / of_run(steps)).alias("tick")
+    frame = frame.with_row_index("row").with_columns(tick).sort("tick")
+    ticks = ticks.select(*KEY, pl.col("leader_id").fill_null(""), pl.col("step").cast(pl.Float64).alias("tick"))
+    joined = frame.join_asof(
+        ticks.sort("tick"), on="tick", by=KEY, strategy="nearest", tolerance=1.0, check_sortedness=False
+    )
+    return joined.sort("row").drop("row", "tick").with_columns(pl.col("leader_id").fill_null(""))
 
 
 def _borders(runs: Sequence[str], chunk: int) -> tuple[int, ...]:
@@ -213,35 +268,31 @@ def _borders(runs: Sequence[str], chunk: int) -> tuple[int, ...]:
     return (*borders, len(runs))
 
 
-def _indexed(index: pl.DataFrame | None, piece: pl.DataFrame) -> pl.DataFrame:
-    """Return what is known per vehicle, one piece further.
+def _indexed(piece: pl.DataFrame) -> pl.DataFrame:
+    """Return what is known per vehicle of a piece.
 
-    Its first and last time with the positions there, lane, rows, whether a length is known, whether it is on a ring,
-    and how often its time runs backward.
+    Its first and last time with the positions there, lane, rows, whether it is on a ring, and how often its time runs
+    backward.
     """
     time = pl.col("time_s")
     ring = pl.col("ring_length_m").is_not_null().any() if "ring_length_m" in piece.columns else pl.lit(False)
-    new = piece.group_by(KEY, maintain_order=True).agg(
+    return piece.group_by(KEY, maintain_order=True).agg(
         *directions.END, directions.lane_of(piece), pl.len().cast(pl.Int64).alias("rows"), time.first().alias("first"),
-        time.last().alias("last"), (time.diff() < 0).sum().cast(pl.Int64).alias("backward"), has_length(piece),
-        ring.alias("ring"),
+        time.last().alias("last"), (time.diff() < 0).sum().cast(pl.Int64).alias("backward"), ring.alias("ring"),
     )  # fmt: skip
-    if index is None:
-        return new
-    both = pl.concat([index, new])
-    return both.group_by(KEY, maintain_order=True).agg(
-        pl.col("from").sort_by("begin").first(), pl.col("to").sort_by("end").last(), pl.col("begin").min(),
-        pl.col("end").max(), pl.col("lane").first(), pl.col("rows").sum(), pl.col("first").first(),
-        pl.col("last").last(),
+
+
+def _merged(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    """Return what is known per vehicle of the file."""
+    return pl.concat(parts).group_by(KEY, maintain_order=True).agg(
+        pl.col("begin").min(), pl.col("end").max(), pl.col("from").sort_by("begin").first(),
+        pl.col("to").sort_by("end").last(), pl.col("rises").sum(), pl.col("lane").drop_nulls().first(),
+        pl.col("rows").sum(),
         pl.col("backward").sum() + (pl.col("first").shift(-1) < pl.col("last")).sum().cast(pl.Int64),
-        pl.col("known").any(), pl.col("ring").any(),
-    ).select(index.columns)  # fmt: skip
+        pl.col("ring").any(),
+    )  # fmt: skip
 
 
-def _lost(kind: str, count: int, what: str) -> list[Repair]:
-    return [Repair(kind, count, f"{count} {what} were left out.")] if count else []
-
-
-def _remove(files: Sequence[Path]) -> None:
+def _remove(files: Iterable[Path]) -> None:
     for path in files:
         path.unlink()

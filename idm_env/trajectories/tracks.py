@@ -1,4 +1,4 @@
-"""Single trajectories as they were measured: read tolerantly, so that one bad track never stops the others.
+"""Single trajectories as they were measured, cut tolerantly, so that one bad track never stops the others.
 
 Unlike ``data.load``, which prepares followers behind leaders for calibration, a track needs neither a leader nor a
 regular clock. What is left out is counted, by reason.
@@ -8,16 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from idm_env.data import DataError, Repair, directions, units
-from idm_env.data.clean import NO_LEADER, check_columns, identifiers, natural, numbers, without_empty
-from idm_env.data.load import read
-from idm_env.data.schema import DEFAULT_LENGTH_M, HIGHEST_SPEED_MPS, LONGEST_LENGTH_M
-from idm_env.data.speeds import length_assumed, unwrapped
+from idm_env.data import Repair
+from idm_env.data.schema import HIGHEST_SPEED_MPS
 
 SMALLEST_JUMP_M = 8.0
 """A change of position is a jump only above this, whatever the time step (m)."""
@@ -66,99 +62,17 @@ class Track:
 
 @dataclass(frozen=True)
 class Table:
-    """A file of tracks: the table sorted by run, vehicle and time, what was repaired, and each run's time step (s)."""
+    """Rows of vehicles, each sorted by time, with ``leader_id`` ("" for none) and a length; what was repaired."""
 
     frame: pl.DataFrame
-    repairs: tuple[Repair, ...]
     source: str
+    repairs: tuple[Repair, ...] = ()
 
     def vehicles(self) -> list[tuple[str, str, int, int]]:
         """Return (run, vehicle, first row, rows) of every vehicle, in order of the time at which it appears."""
         rows = self.frame.with_row_index("row").group_by("run_id", "vehicle_id", maintain_order=True)
         found = rows.agg(pl.col("row").first(), pl.len().alias("count"), pl.col("time_s").first().alias("begin"))
         return found.sort("run_id", "begin", maintain_order=True).select("run_id", "vehicle_id", "row", "count").rows()
-
-
-def read_table(path: str | Path, layout: str = "auto") -> Table:
-    """Return the table of a csv, csv.gz or parquet file in any layout that ``data.load`` reads.
-
-    DataError, in one line, if the file as a whole cannot be used.
-    """
-    frame, repairs = read(path, layout=layout)
-    return from_frame(frame, Path(path).name, repairs)
-
-
-def from_frame(frame: pl.DataFrame, source: str = "table", repairs: list[Repair] | None = None) -> Table:
-    """Return the table of a tidy frame (vehicle_id, time_s, position_m at least)."""
-    done = list(repairs or ())
-    check_columns(frame, source)
-    frame, more = numbers(identifiers(frame, source), source)
-    done += more
-    frame, more = without_empty(frame, source)
-    done += more
-    lost = frame["position_m"].null_count()
-    if lost:
-        frame = frame.filter(pl.col("position_m").is_not_null())
-        done.append(Repair("no position", lost, f"{lost} rows without a position were left out."))
-    if frame.height == 0:
-        raise DataError(f"{source}: position_m is empty in every row; it must hold positions in metres.")
-    frame, more = directions.one_way(frame)
-    known = frame.group_by("run_id", "vehicle_id").agg(has_length(frame))["known"]
-    done += [*more, *length_assumed(int((~known).sum()))]
-    check_units(frame, source)
-    unsorted = int(frame.select((pl.col("time_s").diff().over("run_id", "vehicle_id") < 0).sum()).item() or 0)
-    if unsorted:
-        text = f"Time runs backward at {unsorted} rows; the rows were sorted by time."
-        done.append(Repair("time not increasing", unsorted, text))
-    order = (natural("run_id"), "run_id", natural("vehicle_id"), "vehicle_id")
-    frame, more = prepared(frame.sort(*order, maintain_order=True))
-    return Table(with_leaders(frame), (*done, *more), source)
-
-
-def check_units(frame: pl.DataFrame, source: str) -> None:
-    """Raise DataError if positions, speeds or lengths look like feet or km/h, by the vehicles that drive forwards."""
-    forwards = (pl.col("position_m").last() > pl.col("position_m").first()).over("run_id", "vehicle_id")
-    rising = frame.filter(forwards)
-    if rising.height:
-        units.check(rising, source, longest_step=float("inf"))
-
-
-def has_length(frame: pl.DataFrame) -> pl.Expr:
-    """Return, per group, whether a vehicle has a length that can be used: the column ``known``."""
-    if "length_m" not in frame.columns:
-        return pl.lit(False).alias("known")
-    median = pl.col("length_m").filter(pl.col("length_m").is_finite()).median()
-    return ((median > 0) & (median <= LONGEST_LENGTH_M)).fill_null(False).alias("known")
-
-
-def prepared(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
-    """Return the rows of vehicles sorted by time within each, without repeats, laps of a ring unwrapped.
-
-    Vehicles stay in the order in which they come.
-    """
-    appearance = pl.col("row").min().over("run_id", "vehicle_id").alias("appearance")
-    frame = frame.with_row_index("row").with_columns(appearance)
-    frame = frame.sort("appearance", "time_s", maintain_order=True).drop("row", "appearance")
-    before = frame.height
-    frame = frame.unique(["run_id", "vehicle_id", "time_s"], keep="first", maintain_order=True)
-    count = before - frame.height
-    text = f"{count} rows repeat a time of their vehicle and were left out; the first of each was kept."
-    frame, repairs = unwrapped(frame)
-    return frame, [*([Repair("duplicated time", count, text)] if count else []), *repairs]
-
-
-def with_leaders(frame: pl.DataFrame) -> pl.DataFrame:
-    """Return the frame with ``leader_id`` ("" for none), derived from lane and position where the column is absent."""
-    if "leader_id" in frame.columns:
-        none = pl.col("leader_id").is_null() | pl.col("leader_id").str.to_lowercase().is_in(NO_LEADER)
-        return frame.with_columns(pl.when(none).then(pl.lit("")).otherwise(pl.col("leader_id")).alias("leader_id"))
-    if "lane" not in frame.columns:
-        # Without lanes, vehicles at one time may be anywhere: nobody is taken for anybody's leader.
-        return frame.with_columns(pl.lit("").alias("leader_id"))
-    order = frame.with_row_index("row").sort("run_id", "lane", "time_s", "position_m")
-    ahead = pl.col("vehicle_id").shift(-1).over("run_id", "lane", "time_s")
-    ahead = pl.when(pl.col("lane").is_not_null()).then(ahead)
-    return order.with_columns(ahead.fill_null("").alias("leader_id")).sort("row").drop("row")
 
 
 class Pieces:
@@ -178,19 +92,16 @@ class Pieces:
         self._lane = (
             frame["lane"].fill_null(-1).to_numpy() if "lane" in frame.columns else np.full(frame.height, -1, np.int64)
         )
-        self._length = frame["length_m"].to_numpy() if "length_m" in frame.columns else None
+        self._length = frame["length_m"].to_numpy()
         self.vehicles = table.vehicles()
 
     def of(self, vehicles: list[tuple[str, str, int, int]]) -> Iterator[Track]:
         """Yield the tracks of some vehicles, as ``vehicles`` lists them."""
         for run, vehicle, first, count in vehicles:
             at = slice(first, first + count)
-            known = self._length[at] if self._length is not None else np.empty(0)
-            length = np.median(known[np.isfinite(known)]) if np.isfinite(known).any() else np.nan
-            good = np.isfinite(length) and 0 < length <= LONGEST_LENGTH_M
             whole = Track(
                 run, vehicle, 0, self._columns["time_s"][at], self._columns["position_m"][at],
-                float(length) if good else DEFAULT_LENGTH_M, self._leader[at], self._lane[at],
+                float(self._length[first]), self._leader[at], self._lane[at],
             )  # fmt: skip
             yield from self._usable(whole)
 

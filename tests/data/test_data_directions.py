@@ -12,8 +12,8 @@ import pytest
 from idm_env.data import DataError, Trajectories, load
 from idm_env.trajectories import spool
 from idm_env.trajectories.files import filter_file
-from idm_env.trajectories.tracks import from_frame
 from tests.data.tables import kinds, platoon
+from tests.trajectories.tracks import read_frame
 
 
 def both_ways(signed: bool = True, lane: int | None = 5) -> pl.DataFrame:
@@ -78,7 +78,7 @@ def test_filter_mirrors_too_whatever_the_pieces(tmp_path: Path, monkeypatch: pyt
     table.write_parquet(path)
     monkeypatch.setattr(importlib.import_module("idm_env.data.load"), "BATCH_ROWS", 100)
     made = spool.Spool(path, tmp_path / "spool", "auto", 100)
-    whole = from_frame(table)
+    whole = read_frame(table)
     for found in (made.shelf.table(0).frame, whole.frame):
         assert {k: v - {""} for k, v in leaders(found).items()} == {
             "1": set(), "2": {"1"}, "3": {"2"}, "7": set(), "8": {"7"}, "9": {"8"},

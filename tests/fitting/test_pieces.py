@@ -165,6 +165,6 @@ def test_what_a_folder_cannot_give_is_one_line(folder: Path, tmp_path: Path) -> 
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="without a parquet file"):
         fit_file(Source(tmp_path / "empty"), OPTIONS, tmp_path / "out")
-    pl.DataFrame({"vehicle_id": [1], "time_s": [0.0], "position_m": [0.0]}).write_parquet(tmp_path / "empty/a.parquet")
-    with pytest.raises(DataError, match="column 'run_id' is missing"):
+    pl.DataFrame({"vehicle_id": [1], "time_s": [0.0], "speed_mps": [0.0]}).write_parquet(tmp_path / "empty/a.parquet")
+    with pytest.raises(DataError, match="column 'position_m' is missing"):
         fit_file(Source(tmp_path / "empty"), OPTIONS, tmp_path / "out")

@@ -15,7 +15,8 @@ from idm_env.trajectories.noise import fit_noise
 from idm_env.trajectories.recipe import Filtered, clock_of, overlaps, recipe
 from idm_env.trajectories.scores import Motion, Tally
 from idm_env.trajectories.smoother import SPARSE, Choices, Noise, Observed, log_likelihood, smooth
-from idm_env.trajectories.tracks import Pieces, Track, read_table
+from idm_env.trajectories.spool import read_table
+from idm_env.trajectories.tracks import Pieces, Track
 from idm_env.types import Driver
 from tests.trajectories.tracks import swinging, track_of
 

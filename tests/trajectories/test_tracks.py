@@ -11,10 +11,13 @@ import numpy as np
 import polars as pl
 import pytest
 
-from idm_env.data import DataError
+from idm_env.data import DataError, Trajectories, episodes, load
 from idm_env.trajectories import spool as spool_module
-from idm_env.trajectories.spool import Spool
-from idm_env.trajectories.tracks import Pieces, from_frame, jumps, read_table
+from idm_env.trajectories.files import filter_file
+from idm_env.trajectories.spool import Spool, read_table
+from idm_env.trajectories.tracks import Pieces, jumps
+from tests.data.tables import platoon
+from tests.trajectories.tracks import read_frame
 
 
 def rows(vehicle: str, time: np.ndarray, position: np.ndarray, **more: object) -> pl.DataFrame:
@@ -36,7 +39,7 @@ def test_one_bad_track_does_not_stop_the_others() -> None:
             rows("spike", TIME, 10 * TIME + 100.0 * (np.abs(TIME - 5) < 0.01)),
         ]
     )
-    pieces = Pieces(from_frame(frame))
+    pieces = Pieces(read_frame(frame))
     tracks = {track.key: track for track in pieces}
     assert sorted(tracks) == ["0/good/0", "0/jump/0", "0/jump/1", "0/parked/0", "0/spike/0", "0/two/0"]
     assert {name: why.split()[0] for name, why in pieces.left_out} == {"0/point": "a", "0/backwards/0": "drives"}
@@ -46,7 +49,7 @@ def test_one_bad_track_does_not_stop_the_others() -> None:
 
 def test_times_are_sorted_and_repeats_counted() -> None:
     time = np.array([0.0, 0.2, 0.1, 0.3, 0.3, 0.4])
-    table = from_frame(rows("a", time, 10 * time))
+    table = read_frame(rows("a", time, 10 * time))
     (track,) = Pieces(table)
     assert np.allclose(track.time_s, [0.0, 0.1, 0.2, 0.3, 0.4])
     assert {repair.kind: repair.count for repair in table.repairs} == {
@@ -56,21 +59,52 @@ def test_times_are_sorted_and_repeats_counted() -> None:
 
 def test_holes_divide_a_track_unless_told_to_bridge() -> None:
     time = np.concatenate([TIME, TIME + 30.0])
-    table = from_frame(rows("a", time, 10 * time))
+    table = read_frame(rows("a", time, 10 * time))
     assert [len(track) for track in Pieces(table)] == [100, 100]
     assert [len(track) for track in Pieces(table, bridge=None)] == [200]
 
 
-def test_leaders_come_from_the_column_or_from_lanes_never_from_nothing() -> None:
+def test_leaders_come_from_the_column_or_from_lanes_or_from_positions_where_there_is_no_lane() -> None:
+    """As in ``load``."""
     both = [rows("front", TIME, 10 * TIME + 30), rows("back", TIME, 10 * TIME)]
-    (front, back) = Pieces(from_frame(pl.concat(both)))
-    assert set(front.leader) == set(back.leader) == {""}
-    laned = pl.concat(both).with_columns(lane=pl.lit(1))
-    found = {track.vehicle_id: set(track.leader) for track in Pieces(from_frame(laned))}
-    assert found == {"front": {""}, "back": {"front"}}
+    alone = pl.when(pl.col("vehicle_id") == "front").then(1)
+    for laned in (pl.lit(None), pl.lit(1), alone):
+        found = {t.vehicle_id: set(t.leader) for t in Pieces(read_frame(pl.concat(both).with_columns(lane=laned)))}
+        assert found == {"front": {""}, "back": {""} if laned is alone else {"front"}}
     named = pl.concat([both[0].with_columns(leader_id=pl.lit("0")), both[1].with_columns(leader_id=pl.lit("front"))])
-    found = {track.vehicle_id: set(track.leader) for track in Pieces(from_frame(named))}
+    found = {track.vehicle_id: set(track.leader) for track in Pieces(read_frame(named))}
     assert found == {"front": {""}, "back": {"front"}}
+
+
+def switches(frame: pl.DataFrame) -> int:
+    leader = pl.col("leader_id").fill_null("")
+    order = frame.sort("run_id", "vehicle_id", "time_s")
+    return int(order.select((leader != leader.shift(1)).over("run_id", "vehicle_id").sum()).item())
+
+
+@pytest.mark.parametrize("how", ["rows are missing", "lanes flicker"])
+def test_missing_rows_and_flickering_lanes_make_no_switch_of_leader(tmp_path: Path, how: str) -> None:
+    """One vehicle of twelve changes lanes; 2 % of rows are missing, also two and three in a row, or lanes flicker."""
+    table = platoon(vehicles=12, seconds=60.0).drop("leader_id").with_columns(lane=pl.col("vehicle_id") % 2)
+    moves = (pl.col("vehicle_id") == 5) & (pl.col("time_s") > 30)
+    table = table.with_columns(lane=pl.when(moves).then(0).otherwise("lane"))
+    rng = np.random.default_rng(3)
+    dropped = rng.random(table.height) < 0.015
+    for after in (1, 2):
+        dropped[after:] |= dropped[:-after] & (rng.random(table.height - after) < 0.3)
+    quiet = (pl.col("time_s") < 1) | (pl.col("time_s") > 59) | pl.col("time_s").is_between(29, 31)
+    if how == "rows are missing":
+        spoilt = table.filter(quiet | ~pl.Series(dropped))
+    else:
+        flicker = (pl.int_range(pl.len()) % 41 == 7) & ~quiet
+        spoilt = table.with_columns(lane=pl.when(flicker).then(1 - pl.col("lane")).otherwise("lane"))
+    clean, found = read_frame(table), read_frame(spoilt)
+    assert switches(clean.frame) == switches(found.frame) == 3  # his own, and those behind him in both lanes
+    spoilt.write_csv(tmp_path / "spoilt.csv")
+    filter_file(tmp_path / "spoilt.csv", tmp_path / "out", baselines=False)
+    written = load(tmp_path / "out" / "trajectories.parquet")
+    assert switches(written.table) == 3
+    assert len(episodes(written)) == len(episodes(Trajectories.from_frame(table))) == 13
 
 
 def test_a_file_without_positions_is_refused_in_one_line() -> None:
@@ -78,7 +112,7 @@ def test_a_file_without_positions_is_refused_in_one_line() -> None:
         {"vehicle_id": [1], "time_s": [0.0], "position_m": [None]}, schema_overrides={"position_m": pl.Float64}
     )
     with pytest.raises(DataError, match="position_m is empty in every row"):
-        from_frame(frame)
+        read_frame(frame)
 
 
 def test_a_jump_stays_away_and_an_outlier_comes_back() -> None:
@@ -89,7 +123,7 @@ def test_a_jump_stays_away_and_an_outlier_comes_back() -> None:
 
 def test_laps_go_on_where_the_ring_has_its_start() -> None:
     frame = rows("a", TIME, (10 * TIME + 50) % 100, ring_length_m=100.0)
-    (track,) = Pieces(from_frame(frame))
+    (track,) = Pieces(read_frame(frame))
     assert np.allclose(track.position_m, 10 * TIME + 50)
 
 
@@ -122,16 +156,14 @@ def test_a_spool_holds_what_the_whole_table_holds(
     frame = frame.with_columns(pl.when(pl.int_range(pl.len()) != 11).then(pl.col("position_m")).alias("position_m"))
     spool = spooled(tmp_path, frame, name=name)
     assert spool.chunks == 3 and [vehicle for _, vehicle in spool.vehicles] == list("01234")
-    whole = {track.key: track for track in Pieces(from_frame(frame))}
+    whole = {track.key: track for track in Pieces(read_frame(frame))}
     tables = [spool.shelf.table(number) for number in range(3)]
     found = {t.key: t for table in tables for t in Pieces(table)}
-    for table in tables:
-        spool.count(table.repairs)
     assert list(found) == list(whole)
     for key, track in whole.items():
         assert np.allclose(found[key].time_s, track.time_s) and np.allclose(found[key].position_m, track.position_m)
         assert found[key].leader.tolist() == track.leader.tolist()
-    assert any(track.leader.any() for track in whole.values()) == laned
+    assert any(track.leader.any() for track in whole.values())
     counts = {repair.kind: repair.count for repair in spool.repairs}
     assert counts["duplicated time"] == 3 and counts["no position"] == 1 and counts["time not increasing"] > 50
     (table,) = spool.picked([3])
@@ -161,12 +193,12 @@ def test_units_that_disagree_are_refused_with_their_cure(
     tmp_path: Path, position: float, speed: float, cure: str
 ) -> None:
     frame = rows("a", TIME, 10 * TIME * position, speed_mps=10.0 * speed)
-    for read in (from_frame, lambda f: spooled(tmp_path, f)):
+    for read in (read_frame, lambda f: spooled(tmp_path, f)):
         with pytest.raises(DataError, match=cure):
             read(frame)
     sparse = rows("a", 10 * TIME, 100 * TIME, speed_mps=10.0)
     backwards = rows("b", 10 * TIME, -100 * TIME, speed_mps=10.0)
-    assert len(list(Pieces(from_frame(pl.concat([sparse, backwards])), bridge=None))) == 2
+    assert len(list(Pieces(read_frame(pl.concat([sparse, backwards])), bridge=None))) == 2
 
 
 SPOOLING = """

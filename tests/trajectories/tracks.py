@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
+import polars as pl
 
 from idm_env.trajectories.scores import Motion
-from idm_env.trajectories.tracks import Track
+from idm_env.trajectories.spool import read_table
+from idm_env.trajectories.tracks import Table, Track
 
 
 def swinging(seconds: float = 60.0, dt: float = 0.1, phase: float = 0.0) -> Motion:
@@ -26,3 +31,10 @@ def track_of(
     return Track(
         "0", name, 0, motion.time_s, motion.position_m + noise, 4.5, np.full(count, leader), np.full(count, lane)
     )
+
+
+def read_frame(frame: pl.DataFrame) -> Table:
+    """Return a table as filter reads it from a file."""
+    with TemporaryDirectory() as folder:
+        frame.write_parquet(Path(folder) / "table.parquet")
+        return read_table(Path(folder) / "table.parquet")
