@@ -326,7 +326,7 @@ class Store:
 
     def kept(self) -> list[str]:
         """Return the names under which contents are kept, sorted."""
-        found = self._memory if self.folder is None else [p.stem for p in self.folder.glob("*.kept")]
+        found = self._memory if self.folder is None else [p.stem for p in self.folder.glob("*.kept") if _PART not in p.name]
         return sorted(found)
 
     def remove(self) -> None:
