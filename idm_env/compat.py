@@ -6,9 +6,13 @@ that no other file touches it.
 
 from __future__ import annotations
 
+import os
 import pickle
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any, Protocol, TypeVar
+from unittest.mock import patch
 
 Function = Callable[..., Any]
 Loaded = TypeVar("Loaded")
@@ -76,3 +80,29 @@ def compiled_callback(
     made._cache = _KeptCode(name, store)
     made.compile()
     return made
+
+
+@contextmanager
+def ray_at_home() -> Iterator[None]:
+    """Let Ray, begun inside, listen on 127.0.0.1 only and ask everybody for its token.
+
+    Why: Ray binds to all interfaces unless a node's address is 127.0.0.1, and turns that address, where it is asked for
+    one, into that of the network. Only its switch for systems without clusters keeps it, which is read when ray is
+    imported. Tried: Ray 2.52.0 and 2.60.0.
+    """
+    given = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+    if "ray" not in sys.modules:  # later only those processes would hear of it that are begun now
+        given["RAY_AUTH_MODE"] = os.environ.get("RAY_AUTH_MODE", "token")
+    with ExitStack() as stack:
+        stack.enter_context(patch.dict(os.environ, given))
+        if (constants := sys.modules.get("ray._private.ray_constants")) is not None:
+            stack.enter_context(patch.object(constants, "ENABLE_RAY_CLUSTER", False))
+        yield
+
+
+@contextmanager
+def ray_elsewhere(attempts: int) -> Iterator[None]:
+    """Let Ray, imported inside, ask a cluster a few times, a second apart. Why: else 20 times. Tried: Ray 2.60.0."""
+    name = "RAY_NUM_REDIS_GET_RETRIES"
+    with patch.dict(os.environ, {name: os.environ.get(name, str(attempts))}):
+        yield

@@ -11,6 +11,7 @@ import logging
 import os
 import pickle
 import signal
+import socket
 import sys
 import threading
 from collections import deque
@@ -18,13 +19,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Protocol, TypeVar
 
-from idm_env import trust
+from idm_env import compat, trust
 from idm_env.extras import needed
 from idm_env.progress import OnProgress, silent
 
 KINDS = ("serial", "processes", "ray")
 PER_WORKER = 2
 """Parts in flight per worker: one that is worked on, and one that waits for it."""
+PATIENCE = 5.0
+"""Seconds in which a cluster has to answer."""
 ATTEMPTS = 3
 """How often a part is given to a worker, where workers die of it."""
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS")
@@ -61,8 +64,8 @@ def opened(kind: str = "serial", jobs: int | None = None, address: str | None = 
     """Give an executor while this lasts: ``serial``, ``processes`` (``jobs`` of them) or ``ray`` (at ``address``).
 
     ``jobs`` is one per processor where it is None; with Ray it bounds how many parts run at a time. Without an
-    ``address`` Ray uses RAY_ADDRESS, or begins on this machine, beside whoever runs it here already. ValueError for
-    other kinds, ImportError without ray.
+    ``address`` Ray uses RAY_ADDRESS, or begins on this machine, beside whoever runs it here already, and listens on
+    127.0.0.1 only. ValueError for other kinds and where no cluster answers, ImportError without ray.
     """
     if kind not in KINDS:
         raise ValueError(f"executor = '{kind}' is unknown. Use one of {', '.join(KINDS)}.")
@@ -330,25 +333,47 @@ def _begin() -> None:
 @contextmanager
 def _connected(address: str | None) -> Iterator[None]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    with needed("executor = 'ray'"):
-        import ray
-    ours = not ray.is_initialized()
     # Left to itself Ray joins whatever cluster somebody runs on this machine.
     address = address or os.environ.get("RAY_ADDRESS")
-    if ours:
-        more: dict[str, Any] = {"include_dashboard": False} if address is None else {}
-        try:
-            ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **more)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            words = " ".join(str(error).split())[:200]
-            raise ValueError(
-                f"ray-address = {address!r} cannot be used ({words}). Start a cluster with `ray start --head`."
-            ) from None
-    try:
-        yield
-    finally:
+    with compat.ray_at_home() if address is None else compat.ray_elsewhere(round(PATIENCE)):
+        with needed("executor = 'ray'"):
+            import ray
+        ours = not ray.is_initialized()
         if ours:
-            ray.shutdown()
+            more: dict[str, Any] = {"include_dashboard": False} if address is None else {}
+            try:
+                if address is not None:
+                    _answers(address)
+                ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **more)
+            except Exception as error:
+                words = " ".join(str(error).split())[:200]
+                raise ValueError(
+                    f"ray-address = {address!r} cannot be used ({words}). Start a cluster with `ray start --head`."
+                ) from None
+        try:
+            yield
+        finally:
+            if ours:
+                ray.shutdown()
+
+
+def _answers(address: str) -> None:
+    """Raise OSError at once where nobody at ``host:port`` speaks as Ray does, who is asked for minutes otherwise."""
+    host, colon, port = address.rpartition("://")[2].rpartition(":")
+    if address == "auto":
+        return
+    if not (host and colon and port.isdecimal() and int(port) < 1 << 16):
+        raise OSError("it is not host:port")
+    with socket.create_connection((host.strip("[]"), int(port)), timeout=PATIENCE) as line:
+        if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
+            return
+        # HTTP/2 begins with SETTINGS (type 4) on either side: RFC 9113, section 3.4.
+        line.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0")
+        said = b""
+        while len(said) < 4 and (more := line.recv(4 - len(said))):
+            said += more
+    if said[3:] != b"\4":
+        raise OSError("what answers there is not Ray")
 
 
 class _Cluster:

@@ -6,8 +6,10 @@ import errno
 import os
 import pickle
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 import types
 from dataclasses import dataclass
@@ -156,6 +158,7 @@ def test_ray_joins_no_cluster_that_nobody_named(monkeypatch: pytest.MonkeyPatch)
     fake.init = lambda address, **more: begun.append(address)  # type: ignore[attr-defined]
     fake.shutdown = lambda: begun.append("over")  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.setattr(executor, "_answers", lambda address: None)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     for named, variable in ((None, None), (None, "10.0.0.1:6379"), ("10.0.0.2:6379", "10.0.0.1:6379")):
         if variable:
@@ -163,6 +166,42 @@ def test_ray_joins_no_cluster_that_nobody_named(monkeypatch: pytest.MonkeyPatch)
         with executor.opened("ray", address=named):
             pass
     assert begun == ["local", "over", "10.0.0.1:6379", "over", "10.0.0.2:6379", "over"]
+
+
+@pytest.mark.parametrize(
+    "kind", ["nobody", "silent", "http", "closing", "no port", "letters", "too high", "no such host"]
+)
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_of_no_cluster_is_one_line_before_ray_is_asked(
+    kind: str, scheme: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray itself asks for minutes."""
+    fake = types.ModuleType("ray")
+    fake.is_initialized = lambda: False  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "ray", fake)  # without init: to ask it is an error of another text
+    monkeypatch.setattr(executor, "PATIENCE", 0.3)
+    monkeypatch.delenv("RAY_USE_TLS", raising=False)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+
+        def answer() -> None:
+            line, _ = server.accept()
+            with line:
+                if kind == "http":
+                    line.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+                if kind == "silent":
+                    line.recv(1 << 16), line.recv(1 << 16)
+
+        if kind in ("silent", "http", "closing"):
+            threading.Thread(target=answer, daemon=True).start()
+        elif kind == "nobody":
+            server.close()
+        host = {"no port": "127.0.0.1", "letters": "127.0.0.1:abc", "too high": "127.0.0.1:70000",
+                "no such host": "no-such-host.invalid:6379"}.get(kind, f"127.0.0.1:{port}")  # fmt: skip
+        told = r"ray-address = '.*' cannot be used \(.*\)\. Start a cluster with `ray start --head`\."
+        with pytest.raises(ValueError, match=told) as error, executor.opened("ray", address=scheme + host):
+            pass
+    assert "\n" not in str(error.value) and "attribute" not in str(error.value)
 
 
 def test_bad_choices_are_one_line() -> None:

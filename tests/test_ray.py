@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -84,6 +85,27 @@ def node_and_wait(part: Part, on_progress: OnProgress) -> str:
     while not go.exists() or go.read_text() == node:
         time.sleep(0.02)
     return node
+
+
+def test_a_cluster_of_this_machine_is_heard_by_nobody_else(tmp_path: Path) -> None:
+    """Whatever of it listens does so on 127.0.0.1, and asks for a token."""
+    code = (
+        "import os, sys; from pathlib import Path; from idm_env import executor\n"
+        "from tests.test_executor import Part, square\n"
+        "if sys.argv[2] == 'imported': import ray\n"
+        "with executor.opened('ray', 1) as run:\n"
+        "    assert list(run.map(square, [Part(3, Path(sys.argv[1]))])) == [(0, 9)]\n"
+        "    import psutil; me = psutil.Process(); family = {p.pid for p in (me, *me.children(recursive=True))}\n"
+        "    heard = {c.laddr.ip for c in psutil.net_connections('inet') if c.status == 'LISTEN' and c.pid in family}\n"
+        "    print(sorted(heard), os.environ.get('RAY_AUTH_MODE'))\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")} | {"PYTHONPATH": str(ROOT)}
+    for when in ("new", "imported"):
+        done = subprocess.run([sys.executable, "-c", code, str(tmp_path), when], env=environment, capture_output=True,
+                              text=True)  # fmt: skip
+        *heard, mode = done.stdout.strip().replace("::ffff:", "").split(" ")
+        assert set(re.findall(r"[\d.:]+", " ".join(heard))) == {"127.0.0.1"} and mode in ("token", "None"), done.stderr
+        assert when == "imported" or mode == "token"
 
 
 def test_workers_that_die_are_replaced_and_the_part_that_raises_is_named(cluster: Any, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ ALLOWED = {
     "fonts": set(),
     "report": {"extras", "fonts", "keep"},
     "progress": set(),
-    "executor": {"extras", "progress", "trust"},
+    "executor": {"compat", "extras", "progress", "trust"},
     "parts": {"extras", "keep", "report"},
     "diagrams": {"extras", "report", "fonts"},
     "config": {"extras", "types", "parameters", "checks", "effects", "roads", "simulator", "keep", "trust"},
