@@ -1,8 +1,8 @@
 """Two nodes fit a folder of drives: a small Ray cluster on this machine, used as one of several machines would be.
 
-On two machines: `export RAY_AUTH_MODE=token` and the same `~/.ray/auth_token` on both, `ray start --head --port 6379` on one,
-`ray start --address HOST:6379` on the other, then `idm-env fit drives/ --out fit --executor ray --ray-address HOST:6379`
-with both folders on a storage that both see. Without a token whoever reaches the port runs code there.
+On two machines: `export RAY_AUTH_MODE=token` and the same `~/.ray/auth_token` on both, `ray start --head --port 6379`
+on one, `ray start --address HOST:6379` on the other, then `idm-env fit drives/ --out fit --executor ray --ray-address
+HOST:6379` with both folders on a storage that both see. Without a token whoever reaches the port runs code there.
 """
 
 import tempfile
