@@ -79,7 +79,10 @@ RingLength = Annotated[
     float | None, _ranged(help="Circumference (m), if the traffic runs on a ring.", low=1.0, high=1e6, unit="m")
 ]
 Place = Annotated[str | None, typer.Option(help="Column that names places, such as track_s_m on a lap.")]
-Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim, openacc, highd, exid, pneuma or i24.")]
+Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim, openacc, ultra_av, highd, exid, pneuma or i24.")]
+Columns = Annotated[
+    str | None, typer.Option(help="Your names and units: time_s=t,vehicle_id=car,position_m=x[ft],speed_mps=v[km/h].")
+]
 MaxGap = Annotated[
     float,
     _ranged(help="Gaps above this (m) mean a lost leader and are left out.", low=0.1, high=math.inf, unit="m"),
@@ -175,6 +178,7 @@ def fit(
     ring_length: RingLength = None,
     place: Place = None,
     layout: Layout = "auto",
+    columns: Columns = None,
     max_gap: MaxGap = 80.0,
     min_seconds: MinSeconds = 5.0,
     window: Window = None,
@@ -202,10 +206,10 @@ def fit(
     and judged on drivers held out; hypothetical accelerations are those of --model or --base.
     """
     if lane_changes:
-        source_of_changes = {"data", "out", "model", "base", "seed", "ring_length", "layout", "where", "lane_changes",
-                             "every", "ahead", "first_lane", "trusted"}  # fmt: skip
+        source_of_changes = {"data", "out", "model", "base", "seed", "ring_length", "layout", "columns", "where",
+                             "lane_changes", "every", "ahead", "first_lane", "trusted"}  # fmt: skip
         _only(context, "--lane-changes", source_of_changes)
-        _fit_lane_changes(data, out, model, base, seed, ring_length, layout, where, every, ahead, first_lane)
+        _fit_lane_changes(data, out, model, base, seed, ring_length, layout, columns, where, every, ahead, first_lane)
         return
     _only(context, "", set(context.params) - {"every", "ahead", "first_lane"})
     share: str | float | None = held_out
@@ -218,7 +222,9 @@ def fit(
         from idm_env.fitting.options import Options, Source
 
         _work_begins()
-        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+        source = Source(
+            data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where, columns=columns
+        )
         options = Options(
             by, share, objective, relative, loss, method, integration, starts, seed, substeps, model, base,  # type: ignore[arg-type]
         )  # fmt: skip
@@ -247,7 +253,7 @@ def _only(context: typer.Context, mode: str, known: set[str]) -> None:
 
 def _fit_lane_changes(
     data: Path, out: Path, model: str | None, base: str | None, seed: int, ring_length: float | None, layout: str,
-    where: list[str] | None, every: float, ahead: float, first_lane: str,
+    columns: str | None, where: list[str] | None, every: float, ahead: float, first_lane: str,
 ) -> None:  # fmt: skip
     with shown(console) as report:
         from idm_env.fitting.lane_changes import ChangeOptions, fit_lane_changes
@@ -255,10 +261,10 @@ def _fit_lane_changes(
 
         _work_begins()
         options = ChangeOptions(model, base, every, ahead, first_lane, None, int(seed))
-        source = Source(data, ring_length, None, layout, where=where)
+        source = Source(data, ring_length, None, layout, where=where, columns=columns)
         result = fit_lane_changes(source, options, out, on_progress=report)
-    columns = ("parameter", "symbol", "unit", "estimate", "standard_error", "identified")
-    _show("MOBIL by the likelihood of lane changes", [{n: row[n] for n in columns} for row in result["parameters"]])
+    shown_of = ("parameter", "symbol", "unit", "estimate", "standard_error", "identified")
+    _show("MOBIL by the likelihood of lane changes", [{n: row[n] for n in shown_of} for row in result["parameters"]])
     names = ("model", "parameters", "fitted", "held_out", "mobil_gains", "standard_error")
     _show("Log-likelihood, of all drivers and of those held out", [{n: r[n] for n in names} for r in result["models"]])
     console.print(result["sentence"], soft_wrap=True, highlight=False)
@@ -283,6 +289,7 @@ def explain(
     ring_length: RingLength = None,
     place: Place = None,
     layout: Layout = "auto",
+    columns: Columns = None,
     where: Where = None,
     resume: Resume = False,
     executor: Workers = "serial",
@@ -301,7 +308,7 @@ def explain(
         files = files_of(data)
         asked = Question(
             by, _names("--effects", effects), _names("--known", known) or (), seed, ring_length, place, layout,
-            None if where is None else tuple(where), base or "idm",
+            None if where is None else tuple(where), base or "idm", columns,
         )  # fmt: skip
         _work_begins()
         rows: list[dict[str, Any]] = []
@@ -376,6 +383,7 @@ def demo(
     data: Annotated[
         Path | None, typer.Option(help="Your own file; default: generated data with a hidden effect.")
     ] = None,
+    columns: Columns = None,
     out: Out = Path("out/demo"),
     seed: Annotated[int, _ranged(help="Seed of the generated data.", low=0, high=1e9)] = 7,
 ) -> None:
@@ -395,10 +403,10 @@ def demo(
             report("generating", 0, 0, "platoon.csv")
             path = folder / "platoon.csv"
             made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
-            columns = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
-            keep.write_csv(path, made.table.select(columns))
+            told = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
+            keep.write_csv(path, made.table.select(told))
             console.print(f"Ten runs of a leader and three followers: {path}", soft_wrap=True)
-        result, models = explain_one(path, out, Question(), on_progress=report)
+        result, models = explain_one(path, out, Question(columns=columns if data else None), on_progress=report)
     _explained(result, models, out)
 
 
@@ -412,6 +420,7 @@ def simulate(
     ring_length: RingLength = None,
     place: Place = None,
     layout: Layout = "auto",
+    columns: Columns = None,
     max_gap: MaxGap = 80.0,
     min_seconds: MinSeconds = 5.0,
     window: Window = None,
@@ -425,7 +434,9 @@ def simulate(
         from idm_env.fitting.options import Source
 
         _work_begins()
-        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where)
+        source = Source(
+            data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where, columns=columns
+        )
         result = simulate_file(source, model, out, base=base, seed=seed, on_progress=report)
     _show("Errors in free simulation", [result["error"]])
     console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)
@@ -440,6 +451,7 @@ def drift(
     ring_length: RingLength = None,
     place: Place = None,
     layout: Layout = "auto",
+    columns: Columns = None,
     max_gap: MaxGap = 80.0,
     min_seconds: MinSeconds = 20.0,
     dt: Step = None,
@@ -454,7 +466,7 @@ def drift(
         from idm_env.fitting.options import Source
 
         _work_begins()
-        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, where=where)
+        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, where=where, columns=columns)
         result = drift_file(source, out, drivers=drivers, on_progress=report)
     _show("Log-likelihood that every sort of drift gains over drivers who do not drift", result["sorts"])
     console.print(result["sentence"], soft_wrap=True, highlight=False)
@@ -528,6 +540,9 @@ def plot(
     panels: Annotated[
         int, _ranged(help="Panels at most, one per run and lane, the largest first.", low=1, high=1000)
     ] = 6,
+    ring_length: RingLength = None,
+    layout: Layout = "auto",
+    columns: Columns = None,
     where: Where = None,
     seconds: Annotated[
         float,
@@ -562,7 +577,7 @@ def plot(
 
             _work_begins()
             report("reading", 0, 0, source.name)
-            trajectories = load(source)
+            trajectories = load(source, ring_length=ring_length, layout=layout, columns=columns)
             if where is not None:
                 trajectories = trajectories.where(where)
             drawn, repairs = diagrams.panels(trajectories), trajectories.repairs
@@ -636,6 +651,8 @@ def filter_(
     fixed_parameters: FixedParameters = False,
     model: Corrected = None,
     layout: Layout = "auto",
+    columns: Columns = None,
+    ring_length: RingLength = None,
     resume: Resume = False,
     executor: Workers = "serial",
     jobs: Jobs = None,
@@ -651,7 +668,7 @@ def filter_(
         with opened(executor, jobs, ray_address) as workers:
             result = filter_file(
                 data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-                model=model, executor=workers, on_progress=report,
+                columns=columns, ring_length=ring_length, model=model, executor=workers, on_progress=report,
             )  # fmt: skip
     _methods(result)
     _done(out, result["account"])
@@ -677,6 +694,8 @@ def reconstruct(
     fixed_parameters: FixedParameters = False,
     model: Corrected = None,
     layout: Layout = "auto",
+    columns: Columns = None,
+    ring_length: RingLength = None,
     resume: Resume = False,
     executor: Workers = "serial",
     jobs: Jobs = None,
@@ -692,7 +711,7 @@ def reconstruct(
         with opened(executor, jobs, ray_address) as workers:
             result = reconstruct_file(
                 data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
-                model=model, executor=workers, on_progress=report,
+                columns=columns, ring_length=ring_length, model=model, executor=workers, on_progress=report,
             )  # fmt: skip
     _methods(result)
     _done(out, result["account"])

@@ -32,7 +32,7 @@ class ReadIt(BaseException):
 
 
 @pytest.fixture
-def read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[[str, Path], object]]:
+def read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., object]]:
     """A function of a command and a file: the one line with which it is refused, or what was read."""
     checked = Trajectories.from_frame.__func__  # type: ignore[attr-defined]
 
@@ -61,12 +61,12 @@ def read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[[
     monkeypatch.setattr(files, "_plan", stop_tracks)
     monkeypatch.setattr(files, "_compile", lambda: None)
 
-    def told(command: str, path: Path) -> object:
+    def told(command: str, path: Path, *more: object) -> object:
         given = ("--data", path) if command == "demo" else (path,)
         name, *flags = command.split()
         out = tmp_path / "a.png" if command == "plot" else tmp_path / "out"
         have.clear()
-        code, words = run(name, *given, *flags, *MORE.get(name, ()), "--out", out)
+        code, words = run(name, *given, *flags, *MORE.get(name, ()), *more, "--out", out)
         if have:
             return tracks(have[0])
         lines = [line for line in words.splitlines() if line.startswith("error: ")]

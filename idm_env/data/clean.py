@@ -76,8 +76,7 @@ def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair
     repairs: list[Repair] = []
     for name in [*NUMBERS, "lane"]:
         if name in frame.columns and not frame[name].dtype.is_numeric():
-            _single(frame[name], source)
-            frame = _parse(frame, name, source)
+            frame = parsed(frame, name, source)
     if "lane" in frame.columns:
         value = frame["lane"].cast(pl.Float64)
         between = (value.is_finite() & ((value - value.round()).abs() > 1e-6)).fill_null(False)
@@ -102,18 +101,45 @@ def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair
     return frame, repairs
 
 
-def _parse(frame: pl.DataFrame, name: str, source: str) -> pl.DataFrame:
-    if frame[name].dtype in (pl.Null, pl.Boolean):
-        return frame.with_columns(pl.col(name).cast(pl.Float64))
-    text = frame[name].cast(pl.String).str.strip_chars()
+def parsed(frame: pl.DataFrame, name: str, source: str) -> pl.DataFrame:
+    """Return the frame with a column as numbers; times may be texts such as 12:30:05.2, or dates (s).
+
+    Raises:
+        DataError: If a cell is no number, or holds several.
+    """
+    column = frame[name]
+    if column.dtype.is_numeric():
+        return frame
+    _single(column, source)
+    if column.dtype in (pl.Null, pl.Boolean):
+        return frame.with_columns(column.cast(pl.Float64))
+    if column.dtype.is_temporal():
+        whole = column.cast(pl.Datetime("us")) if column.dtype == pl.Date else column
+        ticks = {"ns": 1e9, "us": 1e6, "ms": 1e3}[getattr(whole.dtype, "time_unit", None) or "ns"]
+        return frame.with_columns((whole.to_physical().cast(pl.Float64) / ticks).alias(name))
+    text = column.cast(pl.String).str.strip_chars()
     value = text.cast(pl.Float64, strict=False)
+    if name == "time_s":
+        value = pl.select(pl.coalesce(value, _of_day(text), _of_date(text)).alias(name))[name]
     wrong = value.is_null() & text.is_not_null() & ~text.str.to_lowercase().is_in(MISSING_WORDS)
     if wrong.any():
         row = int(wrong.arg_true()[0])
-        raise DataError(
-            f"{source}: {name} = {text[row]!r} in row {row + 1} is not a number; write it with a decimal point."
-        )
+        how = "write it as seconds, 12:30:05.2 or a date" if name == "time_s" else "write it with a decimal point"
+        raise DataError(f"{source}: {name} = {text[row]!r} in row {row + 1} is not a number; {how}.")
     return frame.with_columns(value.alias(name))
+
+
+def _of_day(text: pl.Series) -> pl.Series:
+    """Return the seconds since midnight of texts such as 12:30:05.2 or 12:30:05,2; null for others."""
+    parts = text.str.extract_groups(r"^(\d{1,3}):(\d{1,2}):(\d{1,2}(?:[.,]\d+)?)$").struct.unnest()
+    hours, minutes, seconds = (part.str.replace(",", ".").cast(pl.Float64) for part in parts.iter_columns())
+    return 3600 * hours + 60 * minutes + seconds
+
+
+def _of_date(text: pl.Series) -> pl.Series:
+    """Return the seconds since 1970 of dates such as 2024-05-01 12:30:05.2; null for others."""
+    plain = text.str.replace("T", " ").str.strip_chars_end("Z")
+    return plain.str.to_datetime("%Y-%m-%d %H:%M:%S%.f", strict=False, time_unit="us").to_physical() / 1e6
 
 
 def without_empty(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:

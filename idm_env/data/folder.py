@@ -10,6 +10,7 @@ import polars as pl
 from idm_env.data import clean, tidy
 from idm_env.data.clean import natural
 from idm_env.data.errors import DataError
+from idm_env.data.names import Columns, renamed
 from idm_env.data.trajectories import Trajectories
 
 _FILE = "idm_env_file"
@@ -23,6 +24,7 @@ class Share:
     files: tuple[str, ...]
     runs: tuple[str, ...]
     vehicles: int
+    columns: Columns = None
 
     def __str__(self) -> str:
         if not self.runs:
@@ -33,7 +35,7 @@ class Share:
     def trajectories(self, *, ring_length: float | None = None, place: str | None = None) -> Trajectories:
         """Read and check these runs. DataError for what cannot be used."""
         try:
-            rows = _scan(self.folder, list(self.files)).drop(_FILE)
+            rows = _named(_scan(self.folder, list(self.files)), self.columns, self.folder.name).drop(_FILE)
             table, repairs = tidy.read((rows.filter(_run().is_in(self.runs)) if self.runs else rows).collect())
             source = f"{self.folder.name}, {self}" if self.runs else self.folder.name
             return Trajectories.from_frame(table, source=source, ring_length=ring_length, place=place, repairs=repairs)
@@ -41,7 +43,7 @@ class Share:
             raise _unreadable(self.folder, error) from error
 
 
-def shares(folder: Path, vehicles: int) -> list[Share]:
+def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[Share]:
     """Return the folder's runs, in the order of their names, in shares of about so many ``vehicles``.
 
     Only the columns of identifiers are read, in pieces. A run is never divided: whoever drives in it may be somebody's
@@ -52,12 +54,12 @@ def shares(folder: Path, vehicles: int) -> list[Share]:
     """
     files = files_of(folder)
     try:
-        scan = _scan(folder, files)
+        scan = _named(_scan(folder, files), columns, folder.name)
         names = [name for name in scan.collect_schema().names() if name != _FILE]
         tidy.check(names, folder.name)
         clean.check_columns(tidy.converted(names), folder.name)
         if "run_id" not in names:
-            return [Share(folder, tuple(files), (), 0)]
+            return [Share(folder, tuple(files), (), 0, columns)]
         scan = scan.filter(pl.col("vehicle_id").is_not_null())
         keys = scan.select(_run().alias("run_id"), "vehicle_id", _FILE).group_by("run_id", _FILE)
         found = keys.agg(pl.col("vehicle_id").unique()).collect(engine="streaming")
@@ -72,10 +74,10 @@ def shares(folder: Path, vehicles: int) -> list[Share]:
         if cut and cut[-1].vehicles + count <= vehicles:
             last = cut.pop()
             both = tuple(sorted({*last.files, *where}))
-            cut.append(Share(folder, both, (*last.runs, run), last.vehicles + count))
+            cut.append(Share(folder, both, (*last.runs, run), last.vehicles + count, columns))
         else:
-            cut.append(Share(folder, tuple(where), (run,), count))
-    return [replace(cut[0], runs=())] if len(cut) == 1 else cut or [Share(folder, tuple(files), (), 0)]
+            cut.append(Share(folder, tuple(where), (run,), count, columns))
+    return [replace(cut[0], runs=())] if len(cut) == 1 else cut or [Share(folder, tuple(files), (), 0, columns)]
 
 
 def files_of(folder: Path) -> list[str]:
@@ -103,6 +105,14 @@ def partition(folder: Path, file: str) -> dict[str, str]:
 def _scan(folder: Path, files: list[str]) -> pl.LazyFrame:
     hive = any("=" in file.removeprefix(str(folder)) for file in files)
     return pl.scan_parquet(files, glob=False, hive_partitioning=hive, include_file_paths=_FILE)
+
+
+def _named(scan: pl.LazyFrame, columns: Columns, source: str) -> pl.LazyFrame:
+    """Return the rows with the columns that were asked for; DataError as in ``names.renamed``."""
+    if columns is None:
+        return scan
+    made, _ = renamed(scan.collect_schema().to_frame(), columns, source)
+    return scan.map_batches(lambda rows: renamed(rows, columns, source)[0], schema=made.schema)
 
 
 def _run() -> pl.Expr:

@@ -7,14 +7,16 @@ import io
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
-from idm_env.data import drones, folder, ngsim, openacc, tidy
+from idm_env.data import drones, folder, ngsim, openacc, tidy, ultra_av
 from idm_env.data.errors import DataError, Repair
+from idm_env.data.names import Columns, renamed
 from idm_env.data.trajectories import Trajectories
 
-LAYOUTS = ("auto", "tidy", "ngsim", "openacc", *drones.CSV, *drones.FILES)
+LAYOUTS = ("auto", "tidy", "ngsim", "openacc", "ultra_av", *drones.CSV, *drones.FILES)
 EXTENSIONS = (".csv", ".csv.gz", ".parquet")
 BATCH_BYTES, BATCH_ROWS = 16_000_000, 200_000
 """Text and rows that ``batches`` holds at a time."""
@@ -23,7 +25,12 @@ _UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError,
 
 
 def load(
-    path: str | Path, *, ring_length: float | None = None, place: str | None = None, layout: str = "auto"
+    path: str | Path,
+    *,
+    ring_length: float | None = None,
+    place: str | None = None,
+    layout: str = "auto",
+    columns: Columns = None,
 ) -> Trajectories:
     """Return the trajectories of a file; the file itself is only read.
 
@@ -31,13 +38,15 @@ def load(
         path: A csv, csv.gz or parquet file: a tidy table, an NGSIM file or an OpenACC file.
         ring_length: Length in m of a closed road, on which a leader may be behind.
         place: Column with the coordinate of places (hills, zones), such as ``"track_s_m"``; position_m if None.
-        layout: ``"tidy"``, ``"ngsim"``, ``"openacc"``, ``"highd"``, ``"exid"``, ``"pneuma"``, ``"i24"``, or ``"auto"``
-            to tell by the file.
+        layout: ``"tidy"``, ``"ngsim"``, ``"openacc"``, ``"highd"``, ``"exid"``, ``"pneuma"``, ``"i24"``,
+            ``"ultra_av"``, or ``"auto"`` to tell by the file.
+        columns: Names of the file's columns where they are not tidy, with their units: ``"time_s=t,vehicle_id=car,
+            position_m=x[ft]"``, or a mapping. The layout is then a tidy one.
 
     Raises:
         DataError: If the file cannot be read or used; one line that names the value, the rule and the cure.
     """
-    frame, repairs = read(path, layout=layout)
+    frame, repairs = read(path, layout=layout, columns=columns)
     path = Path(path)
     try:
         return Trajectories.from_frame(frame, source=path.name, ring_length=ring_length, place=place, repairs=repairs)
@@ -46,64 +55,71 @@ def load(
         raise _unreadable(path, error) from error
 
 
-def read(path: str | Path, *, layout: str = "auto") -> tuple[pl.DataFrame, list[Repair]]:
+def read(path: str | Path, *, layout: str = "auto", columns: Columns = None) -> tuple[pl.DataFrame, list[Repair]]:
     """Return the tidy frame of a file, in SI units and not checked yet, and what its reader repaired.
 
     Raises:
         DataError: If the file cannot be read or its layout is unknown.
     """
-    path = Path(path)
-    if layout not in LAYOUTS:
-        raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
+    path, layout = Path(path), _layout(layout, columns)
     if own := _own_reader(path, layout):
         return own(path)
-    extension, lines = _checked(path)
+    extension, lines, written = _checked(path)
     above = openacc.header_line(lines)
     try:
         if layout == "openacc" or (layout == "auto" and above is not None):
             above = openacc.HEADER_LINES if above is None else above
-            table = _once(_table(path, extension, skip=above), path.name)
+            table = _once(_table(path, extension, written, skip=above), path.name)
             return openacc.read(table, lines[:above], path.name.split(".")[0], path.name)
-        return _plain_layout(_table(path, extension), layout, path.name)
+        return _plain_layout(_table(path, extension, written), layout, path.name, columns)
     except pl.exceptions.PolarsError as error:
         raise _unreadable(path, error) from error
 
 
-def batches(path: str | Path, *, layout: str = "auto") -> Iterator[tuple[pl.DataFrame, list[Repair]]]:
+def batches(
+    path: str | Path, *, layout: str = "auto", columns: Columns = None
+) -> Iterator[tuple[pl.DataFrame, list[Repair]]]:
     """Yield what ``read`` returns piece by piece, so that a file of any size needs little memory.
 
     Of a folder of parquet files, one after the other; ``name=value`` in the names of folders below it is a column.
     Files whose rows explain each other come as one piece: OpenACC, NGSIM of several places or periods, and drones'.
     """
-    path = Path(path)
-    if layout not in LAYOUTS:
-        raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
+    path, layout = Path(path), _layout(layout, columns)
     if path.is_dir():
         for file in folder.files_of(path):
             given = [pl.lit(value).alias(name) for name, value in folder.partition(path, file).items()]
-            for frame, repairs in batches(file, layout=layout):
+            for frame, repairs in batches(file, layout=layout, columns=columns):
                 yield frame.with_columns(given), repairs
         return
     if own := _own_reader(path, layout):
         yield own(path)
         return
-    extension, lines = _checked(path)
+    extension, lines, written = _checked(path)
     if layout == "openacc" or (layout == "auto" and openacc.header_line(lines) is not None):
         yield read(path, layout=layout)
         return
     try:
-        for number, table in enumerate(_pieces(path, extension)):
+        for number, table in enumerate(_pieces(path, extension, written)):
             names = [name.strip().lower() for name in table.columns]
             explain_each_other = ngsim.matches(names) and ("location" in names or "frame_id" not in names)
-            if number == 0 and (explain_each_other or drones.layout_of(table.columns)):
+            if number == 0 and columns is None and (explain_each_other or drones.layout_of(table.columns)):
                 yield read(path, layout=layout)
                 return
-            yield _plain_layout(table, layout, path.name)
+            yield _plain_layout(table, layout, path.name, columns)
     except pl.exceptions.PolarsError as error:
         raise _unreadable(path, error) from error
 
 
-def _pieces(path: Path, extension: str) -> Iterator[pl.DataFrame]:
+def _layout(layout: str, columns: Columns) -> str:
+    """Return the layout to read, which is tidy where columns are named. DataError for an unknown one."""
+    if layout not in LAYOUTS:
+        raise DataError(f"layout = {layout!r} is unknown; use one of {', '.join(LAYOUTS)}.")
+    if columns is not None and layout not in ("auto", "tidy"):
+        raise DataError(f"columns are named, and layout = {layout!r} has its own. Leave one of them out.")
+    return layout if columns is None else "tidy"
+
+
+def _pieces(path: Path, extension: str, written: dict[str, Any]) -> Iterator[pl.DataFrame]:
     """Yield the table of a file in pieces, at least one."""
     try:
         if extension == ".parquet":
@@ -124,7 +140,7 @@ def _pieces(path: Path, extension: str) -> Iterator[pl.DataFrame]:
             rows = file.readlines(BATCH_BYTES)
             while True:
                 text = io.BytesIO(head + b"".join(rows))
-                yield pl.read_csv(text, infer_schema_length=None, null_values=_MISSING, glob=False)
+                yield pl.read_csv(text, infer_schema_length=None, null_values=_MISSING, glob=False, **written)
                 rows = file.readlines(BATCH_BYTES)
                 if not rows:
                     return
@@ -145,8 +161,16 @@ def _own_reader(path: Path, layout: str) -> Callable[[Path], tuple[pl.DataFrame,
     return None
 
 
-def _plain_layout(table: pl.DataFrame, layout: str, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+def _plain_layout(
+    table: pl.DataFrame, layout: str, source: str, columns: Columns = None
+) -> tuple[pl.DataFrame, list[Repair]]:
     table = _once(table, source)
+    if columns is not None:
+        table, named = renamed(table, columns, source)
+        frame, repairs = tidy.read(table)
+        return frame, [*named, *repairs]
+    if layout == "ultra_av" or (layout == "auto" and ultra_av.matches(table.columns)):
+        return ultra_av.read(table, source)
     if layout == "ngsim" or (layout == "auto" and ngsim.matches(table.columns)):
         return ngsim.read(table, source)
     found = layout if layout in drones.CSV else drones.layout_of(table.columns) if layout == "auto" else None
@@ -168,8 +192,12 @@ def _once(table: pl.DataFrame, source: str) -> pl.DataFrame:
     return table.rename(dict(zip(table.columns, names, strict=True)))
 
 
-def _checked(path: Path) -> tuple[str, list[str]]:
-    """Return the file's extension and first lines of text, or raise DataError for no readable file of a known kind."""
+def _checked(path: Path) -> tuple[str, list[str], dict[str, Any]]:
+    """Return the file's extension, its first lines of text, and how its cells are written, as polars is told it.
+
+    Cells are separated by commas, or by semicolons or tabs, whose decimals may have commas. DataError for no readable
+    file of a known kind.
+    """
     if path.is_dir():
         raise DataError(f"{path} is a directory; name one file in it ({', '.join(EXTENSIONS)}).")
     if not path.exists():
@@ -180,12 +208,12 @@ def _checked(path: Path) -> tuple[str, list[str]]:
     if path.stat().st_size == 0:
         raise DataError(f"{path.name} is empty (0 bytes); it needs a header and rows.")
     if extension == ".parquet":
-        return extension, []
+        return extension, [], {}
     lines = _first_lines(path, openacc.SEARCHED_LINES)
-    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
-        if lines[0].count(mark) > lines[0].count(","):
-            raise DataError(f"{path.name} is separated by {name}; separate it by commas, with points in the decimals.")
-    return extension, lines
+    mark = max(",;\t", key=lines[0].count)
+    rows = "".join(lines[1:])
+    comma = mark != "," and bool(re.search(r"\d,\d", rows)) and not re.search(r"\d\.\d", rows)
+    return extension, lines, {"separator": mark, "decimal_comma": comma}
 
 
 def _first_lines(path: Path, count: int) -> list[str]:
@@ -197,11 +225,13 @@ def _first_lines(path: Path, count: int) -> list[str]:
         raise _unreadable(path, error) from None
 
 
-def _table(path: Path, extension: str, skip: int = 0) -> pl.DataFrame:
+def _table(path: Path, extension: str, written: dict[str, Any], skip: int = 0) -> pl.DataFrame:
     try:
         if extension == ".parquet":
             return pl.read_parquet(path.absolute(), glob=False)  # polars takes a leading ~ for a home
-        return pl.read_csv(path.absolute(), skip_rows=skip, infer_schema_length=None, null_values=_MISSING, glob=False)
+        return pl.read_csv(
+            path.absolute(), skip_rows=skip, infer_schema_length=None, null_values=_MISSING, glob=False, **written
+        )
     except _UNREADABLE as error:
         raise _unreadable(path, error) from None
 

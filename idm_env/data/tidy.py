@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
-
 import polars as pl
 
 from idm_env.data.errors import DataError, Repair, listed
-from idm_env.data.schema import REQUIRED
+from idm_env.data.names import guessed
 
 FOOT_M, MILE_M = 0.3048, 1609.344
 NAMED: dict[str, tuple[tuple[str, float], ...]] = {
@@ -34,12 +32,9 @@ def check(columns: list[str], source: str) -> None:
     """Raise DataError if the header is that of no tidy table."""
     if matches(columns):
         return
-    plain = {re.sub(r"\W+", "_", name.lower()).strip("_"): name for name in columns}
-    near = [f"'{plain[name]}' to {name}" for name in REQUIRED if plain.get(name, name) != name]
-    cure = f" Rename {' and '.join(near)}." if near else ""
     raise DataError(
-        f"{source}: no known layout has the columns {listed(columns, 8)}; a tidy table, separated by commas, "
-        f"needs vehicle_id, time_s and position_m.{cure}"
+        f"{source}: no known layout has the columns {listed(columns, 8)}; a tidy table needs vehicle_id, time_s and "
+        f"position_m. Name them: {guessed(columns)}"
     )
 
 

@@ -39,6 +39,7 @@ class Question:
     layout: str = "auto"
     where: tuple[str, ...] | None = None
     base: str = "idm"
+    columns: str | None = None
 
 
 def explain(
@@ -48,7 +49,13 @@ def explain(
     progress = on_progress or silent
     with keep.results(out, OUTPUT, [path]):
         progress("reading", 0, 0, path.name)
-        trajectories = load(path, ring_length=question.ring_length, place=question.place, layout=question.layout)
+        trajectories = load(
+            path,
+            ring_length=question.ring_length,
+            place=question.place,
+            layout=question.layout,
+            columns=question.columns,
+        )
         if question.where is not None:
             trajectories = trajectories.where(question.where)
         found = discover(

@@ -132,7 +132,7 @@ def _fit_folder(work: _Work) -> dict[str, Any]:
     if options.held_out is not None:
         raise ValueError("held_out cannot be drawn from a folder. Keep a file back, and simulate the model on it.")
     work.progress("reading", 0, 0, source.path.name)
-    found = work.fit(shares(source.path, work.part), "driver", "fit")
+    found = work.fit(shares(source.path, work.part, source.columns), "driver", "fit")
     tracks = [track for told in found.summaries for track in told["tracks"]]
     return _write(work, found, None, pieces.account_of(found, source.path.name), tracks)
 

@@ -10,6 +10,7 @@ from idm_env.config import Model, load_model
 from idm_env.data import LEADER_LOST_GAP_M, Episodes, Trajectories, episodes, load
 from idm_env.data.episode import windows
 from idm_env.data.folder import Share
+from idm_env.data.names import Columns
 from idm_env.effects import Effect, Replay, base_named
 from idm_env.fitting.fit import Method, base_simulator
 from idm_env.fitting.problem import Loss, Objective
@@ -36,13 +37,16 @@ class Source:
     smooth: bool = False
     window: float | None = None
     where: str | Sequence[str] | None = None
+    columns: Columns = None
 
     def trajectories(self, share: Share | None = None) -> Trajectories:
         """Read and check the file, or a ``share`` of the folder."""
         if share is not None:
             read = share.trajectories(ring_length=self.ring_length, place=self.place)
         else:
-            read = load(self.path, ring_length=self.ring_length, place=self.place, layout=self.layout)
+            read = load(
+                self.path, ring_length=self.ring_length, place=self.place, layout=self.layout, columns=self.columns
+            )
         return read if self.where is None else read.where(self.where)
 
     def episodes(self, trajectories: Trajectories) -> Episodes:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -20,6 +20,7 @@ import polars as pl
 from idm_env import keep
 from idm_env.data import DataError
 from idm_env.data.folder import stamp
+from idm_env.data.names import Columns
 from idm_env.executor import Executor, Serial
 from idm_env.parts import Parts
 from idm_env.progress import OnProgress, silent
@@ -41,6 +42,14 @@ SHOWN = 4
 """Tracks of which the report has pictures."""
 
 
+class Reading(NamedTuple):
+    """How a file is read: see ``data.load``."""
+
+    layout: str = "auto"
+    columns: Columns = None
+    ring_length: float | None = None
+
+
 def filter_file(
     path: str | Path,
     out: str | Path,
@@ -50,6 +59,8 @@ def filter_file(
     baselines: bool = True,
     model: str | None = None,
     layout: str = "auto",
+    columns: Columns = None,
+    ring_length: float | None = None,
     chunk: int = CHUNK,
     resume: bool = False,
     executor: Executor | None = None,
@@ -68,7 +79,8 @@ def filter_file(
         DataError: If the file as a whole cannot be used, or ``resume`` finds a run with other data or settings.
     """
     settings = Settings("filter", None, recipe, fixed_parameters, baselines, chunk, model)
-    return run(path, out, settings, layout=layout, resume=resume, executor=executor, on_progress=on_progress)
+    how = Reading(layout, columns, ring_length)
+    return run(path, out, settings, how, resume=resume, executor=executor, on_progress=on_progress)
 
 
 def reconstruct_file(
@@ -81,6 +93,8 @@ def reconstruct_file(
     baselines: bool = True,
     model: str | None = None,
     layout: str = "auto",
+    columns: Columns = None,
+    ring_length: float | None = None,
     chunk: int = CHUNK,
     resume: bool = False,
     executor: Executor | None = None,
@@ -93,15 +107,16 @@ def reconstruct_file(
     if not 0.01 <= dt <= 2.0:
         raise DataError(f"dt = {dt:g} s is outside [0.01, 2] s; 0.1 s suits vehicles.")
     settings = Settings("reconstruct", dt, recipe, fixed_parameters, baselines, chunk, model)
-    return run(path, out, settings, layout=layout, resume=resume, executor=executor, on_progress=on_progress)
+    how = Reading(layout, columns, ring_length)
+    return run(path, out, settings, how, resume=resume, executor=executor, on_progress=on_progress)
 
 
 def run(
     path: str | Path,
     out: str | Path,
     settings: Settings,
+    how: Reading,
     *,
-    layout: str = "auto",
     resume: bool = False,
     executor: Executor | None = None,
     on_progress: OnProgress | None = None,
@@ -113,17 +128,17 @@ def run(
     progress("compiling", 0, 0, "the loops")
     _compile()
     with keep.results(out, OUTPUT, (path, settings.model)) as folder:
-        return _run(Path(path), folder.absolute(), settings, layout, resume, executor or Serial(), progress)
+        return _run(Path(path), folder.absolute(), settings, how, resume, executor or Serial(), progress)
 
 
 def _run(
-    path: Path, out: Path, settings: Settings, layout: str, resume: bool, executor: Executor, progress: OnProgress
+    path: Path, out: Path, settings: Settings, how: Reading, resume: bool, executor: Executor, progress: OnProgress
 ) -> dict[str, Any]:  # fmt: skip
     progress("reading", 0, 0, path.name)
     model = None if settings.model is None else Path(settings.model)
-    parts = Parts(out / keep.UNFINISHED / settings.task, keep.fingerprint(settings, layout, stamp(path), model), resume)
+    parts = Parts(out / keep.UNFINISHED / settings.task, keep.fingerprint(settings, how, stamp(path), model), resume)
     try:
-        spool = Spool(path, parts.folder / "spool", layout, settings.chunk)
+        spool = Spool(path, parts.folder / "spool", how.layout, settings.chunk, how.ring_length, how.columns)
         bridge = 2.0 if settings.task == "filter" else None
         plan = _plan(spool, settings, bridge)
     except DataError:

@@ -19,6 +19,7 @@ from idm_env import keep
 from idm_env.data import Repair, clean, clock, directions, leaders, prepare, units
 from idm_env.data.errors import Counted
 from idm_env.data.load import batches
+from idm_env.data.names import Columns
 from idm_env.trajectories.tracks import Table
 
 KEPT = ("run_id", "vehicle_id", "time_s", "position_m", "leader_id", "lane", "length_m", "ring_length_m", "gap_m")
@@ -75,7 +76,8 @@ class Spool:
     """
 
     def __init__(
-        self, path: str | Path, folder: Path, layout: str, chunk: int, ring_length: float | None = None
+        self, path: str | Path, folder: Path, layout: str, chunk: int, ring_length: float | None = None,
+        columns: Columns = None,
     ) -> None:  # fmt: skip
         self.source = Path(path).name
         self.folder = folder
@@ -83,7 +85,7 @@ class Spool:
         if folder.exists():
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
-        files, index = self._read(path, layout, ring_length)
+        files, index = self._read(path, layout, ring_length, columns)
         self.vehicles: list[tuple[str, str]] = index.select(KEY).rows()
         self.shelf = Shelf(self.source, folder, _borders([run for run, _ in self.vehicles], chunk))
         chunks = pl.Series(self.shelf.borders[1:-1], dtype=pl.UInt32)
@@ -110,14 +112,14 @@ class Spool:
         yield from map(self.shelf.vehicle, indices)
 
     def _read(
-        self, path: str | Path, layout: str, ring_length: float | None
+        self, path: str | Path, layout: str, ring_length: float | None, columns: Columns
     ) -> tuple[list[Path], pl.DataFrame]:  # fmt: skip
         """Write the pieces of a file and return them, with an index of its vehicles in their order."""
         files: list[Path] = []
         parts: list[pl.DataFrame] = []
         filled = clean.Filled()
         sample: list[pl.DataFrame] = []
-        for piece, repairs in batches(path, layout=layout):
+        for piece, repairs in batches(path, layout=layout, columns=columns):
             self._counted.add(repairs)
             usable, repairs = prepare.rows(piece, self.source, ring_length, filled)
             self._counted.add(repairs)

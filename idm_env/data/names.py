@@ -1,0 +1,132 @@
+"""Columns under names and units of their own: ``position_m=x[ft]``, and the best guess at a header that is unknown."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Mapping
+from functools import partial
+
+import polars as pl
+
+from idm_env.data.clean import parsed
+from idm_env.data.errors import DataError, Repair, listed, nearest
+from idm_env.data.schema import REQUIRED, TIDY
+
+LENGTHS = {"m": 1.0, "ft": 0.3048, "feet": 0.3048, "km": 1000.0, "mi": 1609.344, "cm": 0.01, "mm": 0.001}
+TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+SPEEDS = {
+    "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "ft/s": 0.3048,
+    "fps": 0.3048, "ftps": 0.3048, "cm/s": 0.01, "mm/s": 0.001,
+}  # fmt: skip
+ACCELERATIONS = {"m/s2": 1.0, "m/s^2": 1.0, "m/s²": 1.0, "mps2": 1.0, "ft/s2": 0.3048, "ft/s^2": 0.3048, "g": 9.80665}
+UNITS: dict[str, dict[str, float]] = {
+    "time_s": TIMES, "position_m": LENGTHS, "speed_mps": SPEEDS, "accel_mps2": ACCELERATIONS, "length_m": LENGTHS,
+    "gap_m": LENGTHS, "ring_length_m": LENGTHS,
+}  # fmt: skip
+"""Units by column, and what they are multiplied by."""
+SHORT = {re.sub(r"_(id|s|m|mps2?)$", "", name): name for name in (*TIDY, *UNITS)}
+"""``time`` for ``time_s``, and so on."""
+GUESSES = {
+    "vehicle_id": r"(veh|vehicle|car|track|agent|object|actor)?_?(id|no|nr|number|name)?",
+    "time_s": r"t|time|time_?stamp|seconds|clock",
+    "position_m": r"x|s|y|pos|position|local_y|station|chainage|distance|odometer|x_?pos(ition)?",
+    "run_id": r"(run|trip|drive|recording|scenario|scene|session|trajectory)_?(id|no|nr)?",
+    "leader_id": r"(lead|leader|preceding|predecessor|front)_?(id|vehicle|car)*",
+    "lane": r"lane_?(id|index|no|nr|number)?",
+    "speed_mps": r"v|vx|vel|velocity|speed",
+    "length_m": r"(veh|vehicle)?_?(l|len|length)",
+    "gap_m": r"gap|space_?gap|spacing|net_distance",
+}
+"""What a column is perhaps called that has no tidy name."""
+
+Columns = Mapping[str, str] | str | None
+"""``"time_s=t,position_m=x[ft]"``, or the same as a mapping from the tidy name to the file's."""
+
+
+def pairs(columns: Columns) -> tuple[tuple[str, str], ...]:
+    """Return what is asked for as pairs of a tidy name and the text behind it. DataError for what names no column."""
+    if isinstance(columns, str):
+        given = [tuple(part.strip() for part in text.split("=", 1)) for text in columns.split(",")]
+    else:
+        given = list((columns or {}).items())
+    found: dict[str, str] = {}
+    for pair in given:
+        if len(pair) != 2 or not all(pair):
+            raise DataError(f"columns = {columns!r} is no list such as time_s=t,vehicle_id=car,position_m=x[ft].")
+        name = SHORT.get(str(pair[0]), str(pair[0]))
+        if name not in SHORT.values():
+            guess = nearest(name, [*SHORT, *SHORT.values()])
+            cure = f"did you mean {guess!r}?" if guess else f"use one of {listed(TIDY, 20)}."
+            raise DataError(f"columns: {name!r} is no column that is read; {cure}")
+        found[name] = str(pair[1])
+    return tuple(found.items())
+
+
+def place(name: str, told: str, there: list[str], source: str) -> tuple[str, float | None]:
+    """Return the column of a file that ``told`` names for ``name``, and the factor of its unit; None without one.
+
+    A name that is there with its brackets is that column, and the brackets are its unit where they hold one.
+    """
+    column, unit = told, None
+    if found := re.fullmatch(r"(.+?)\s*[\[(]([^\[\]()]+)[\])]", told):
+        known = found[2].strip() in UNITS.get(name, {})
+        column, unit = (told, found[2].strip() if known else None) if told in there else (found[1], found[2].strip())
+    if column not in there:
+        guess = nearest(column, there)
+        cure = f"did you mean {guess!r}?" if guess else f"it has {listed(there)}."
+        raise DataError(f"{source}: there is no column {column!r} for {name}; {cure}")
+    if unit is None:
+        return column, None
+    factor = UNITS.get(name, {}).get(unit)
+    if factor is None and name in UNITS:
+        factor = float(unit) if re.fullmatch(r"\d*\.?\d+(e-?\d+)?", unit) else None
+    if not factor:
+        known_units = f"use one of {', '.join(UNITS[name])}, or a factor" if name in UNITS else "leave it out"
+        raise DataError(f"{source}: {name} = {told} has the unit {unit!r}; {known_units}.")
+    return column, factor
+
+
+def renamed(frame: pl.DataFrame, columns: Columns, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the frame with the columns that were asked for under their tidy names, in SI units.
+
+    Raises:
+        DataError: If a column is not there, a unit is unknown, or a cell is no number.
+    """
+    repairs, taken, made = [], set(), frame
+    for name, told in pairs(columns):
+        column, factor = place(name, told, frame.columns, source)
+        made = made.with_columns(frame[column].alias(name))
+        taken.add(column)
+        if factor is not None:
+            made = parsed(made, name, source).with_columns(pl.col(name).cast(pl.Float64) * factor)
+        text = f"Column {column!r} was read as {name}" + (f" (× {factor:.6g})." if factor is not None else ".")
+        repairs.append(Repair("column named", 1, text))
+    asked = {name for name, _ in pairs(columns)}
+    return made.drop(taken - asked), repairs
+
+
+def guessed(columns: list[str]) -> str:
+    """Return the option ``--columns`` that a header may need; ``?`` where nothing fits."""
+    found: dict[str, str] = {}
+    for name, pattern in GUESSES.items():
+        if name in columns:
+            continue
+        here = next(filter(None, map(partial(_like, name, pattern), columns)), None)
+        if here and here not in found.values():
+            found[name] = here
+        elif name in REQUIRED:
+            found[name] = "?"
+    told = ",".join(f"{name}={column}" for name, column in found.items())
+    return f"--columns {shlex.quote(told)}"
+
+
+def _like(name: str, pattern: str, column: str) -> str | None:
+    """Return a column with its unit, if it may be what ``name`` wants."""
+    bare = re.sub(r"\s*[\[(].*[\])]\s*$", "", column)
+    plain = re.sub(r"\W+", "_", bare.lower()).strip("_")
+    unit = next((u for u in UNITS.get(name, {}) if plain.endswith(f"_{u}")), None)
+    stem = plain.removesuffix(f"_{unit}") if unit else plain
+    if not stem or not re.fullmatch(pattern, stem):
+        return None
+    return f"{column}[{unit}]" if unit and UNITS[name][unit] != 1.0 else column
