@@ -326,8 +326,9 @@ class Store:
 
     def kept(self) -> list[str]:
         """Return the names under which contents are kept, sorted."""
-        found = self._memory if self.folder is None else [p.stem for p in self.folder.glob("*.kept") if _PART not in p.name]
-        return sorted(found)
+        if self.folder is None:
+            return sorted(self._memory)
+        return sorted(p.stem for p in self.folder.glob("*.kept") if _PART not in p.name)
 
     def remove(self) -> None:
         """Remove everything: the run has ended."""
