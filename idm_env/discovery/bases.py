@@ -3,64 +3,84 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from idm_env.discovery import judge, search
-from idm_env.discovery.compare import compare
+from idm_env.discovery.compare import Comparison, compare
+from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
-from idm_env.discovery.model import Frozen, Model
-from idm_env.discovery.records import Records, whole
-from idm_env.discovery.solve import Solution, Task, solve
+from idm_env.discovery.model import Model
+from idm_env.discovery.solve import Solution
+from idm_env.discovery.verdict import improves
 from idm_env.effects import BASES, CarFollowing, base_named
 
 
-def judged(law: CarFollowing, null: Solution, fit: Records, kept: Records, adapt: bool) -> judge.Judged:
-    """Return a law's errors on the runs kept back, with what the null has beside its own law, as it stands there.
+class Law(NamedTuple):
+    """A law alone: drivers' parameters, its errors on runs kept back, and how these compare with the null's.
 
-    Drivers' spread is estimated on the runs that fit, in free simulation, and is the prior for those kept back. With
-    ``adapt`` their parameters come from every other block of time than what is scored; without it groups keep the
-    parameters of the runs that fit.
+    ``is_better`` follows the rule by which effects are added (``verdict.improves``), on the runs kept back alone.
     """
-    model, values = Model(null.model.terms, Catalogue(tuple(null.model.named), law, located=False)), null.values
-    weak, rows = search.first_prior(law), whole(fit).settled()
-    task = Task(rows, None, weak)
-    centre = np.tile(weak.centre, (task.groups, 1))
-    first = solve(task, Frozen(model, values), centre, np.zeros(0), iterations=15, tolerance=1e-3)
-    prior = replace(search.population(first.theta, rows, law), alike_s=null.prior.alike_s)
-    own = None if adapt else judge.calibrate(fit, model, values, prior, start=first.theta).theta
-    return judge.judge(kept, model, values, prior, own, adapt)
+
+    law: CarFollowing
+    solution: Solution
+    errors: Judged
+    against: dict[str, Comparison]
+    is_better: bool = False
+
+    @property
+    def mean_ratio(self) -> float:
+        """Geometric mean of the ratios of errors to those of the null; 1 for the null."""
+        ratios = [c.ratio for c in self.against.values() if math.isfinite(c.ratio)]
+        return float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
 
 
 def compared(
-    null: Solution, fit: Records, kept: Records, *, adapt: bool, seed: int, on_law: Callable[[int, int, str], None]
-) -> list[dict[str, Any]]:
-    """Return one row per law, that of the null first: its errors, and how they compare with those of the first.
+    null: Model, first: tuple[Solution, Judged], judged: Callable[[Model], tuple[Solution, Judged]], seed: int,
+    on_law: Callable[[int, int, str], None],
+) -> list[Law]:  # fmt: skip
+    """Return all laws, that of the null first.
 
-    ``against`` has for every error the ratio with its 95 % interval and ``better``, ``same`` or ``worse``.
+    Args:
+        null: The law that is completed, with what is known beside it.
+        first: What ``judged`` says of it.
+        judged: Calibrates and judges a model.
+        seed: Of the bootstrap.
+        on_law: Called before each with its number, how many there are, and its title.
     """
-    law = null.model.catalogue.base
-    others = [base_named(name) for name in BASES if name != law.kind]
-    rows: list[dict[str, Any]] = []
-    reference: judge.Judged | None = None
-    for i, each in enumerate((law, *others)):
-        on_law(i, 1 + len(others), each.title)
-        found = judged(each, null, fit, kept, adapt)
-        reference = found if reference is None else reference
-        rows.append({
-            "base": each.kind, "title": each.title or each.kind, "equation": each.equation,
-            **{key: _finite(x) for key, x in found.summary().items()},
+    own = null.catalogue.base
+    laws = [Law(own, *first, {})]
+    others = [base_named(name) for name in BASES if name != own.kind]
+    for i, law in enumerate(others):
+        on_law(1 + i, 1 + len(others), law.title)
+        found = judged(Model(null.terms, Catalogue(tuple(null.named), law, located=False)))
+        against = compare(first[1], found[1], seed)
+        laws.append(Law(law, *found, against, improves(against, found[1].median_ratio(first[1]), shown=False)))
+    return laws
+
+
+def best_of(laws: Iterable[Law]) -> Law:
+    """Return the law that predicts best of those that are better than the null, or the null."""
+    first, *others = laws
+    return min((law for law in others if law.is_better), key=lambda law: law.mean_ratio, default=first)
+
+
+def rows(laws: Iterable[Law]) -> list[dict[str, Any]]:
+    """Return what a report says of laws: errors, and ``against`` the first the ratio, its interval, and a word."""
+    return [
+        {
+            "base": each.law.kind, "title": each.law.title or each.law.kind, "equation": each.law.equation,
+            **{key: _finite(x) for key, x in each.errors.summary().items()},
             "against": {
                 key: {
                     "verdict": c.light.value, "ratio": _finite(c.ratio), "low": _finite(c.low), "high": _finite(c.high),
                 }
-                for key, c in (compare(reference, found, seed).items() if found is not reference else ())
+                for key, c in each.against.items()
             },
-        })  # fmt: skip
-    return rows
+        }
+        for each in laws
+    ]  # fmt: skip
 
 
 def _finite(x: float) -> float | None:

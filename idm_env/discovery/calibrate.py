@@ -1,52 +1,80 @@
-"""The calibration that a discovery starts from: a law by exact gradients through the simulator, in free simulation."""
+"""One calibration for all: the null, models with terms, and other laws are fitted alike before they are judged.
+
+Whatever is calibrated more carefully looks better. So every model has its own population of drivers and its own weight
+of that population, both from closed-loop simulation of the runs that fit, by one procedure.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from idm_env.data.episode import windows
-from idm_env.discovery.march import BASE, Catalogue
-from idm_env.discovery.records import Records
+from idm_env.discovery import judge
+from idm_env.discovery.free import Stand, stand
+from idm_env.discovery.march import BASE
+from idm_env.discovery.model import Model
+from idm_env.discovery.records import Records, Rows
+from idm_env.discovery.solve import Prior, Solution
 from idm_env.effects import CarFollowing
-from idm_env.fitting.evaluate import errors
-from idm_env.fitting.fit import base_simulator, fit, own_names
-from idm_env.progress import OnProgress, silent
 
-LONGEST_S = 180.0
-"""Longer episodes are simulated in windows of this length, each from its own measured state."""
+POPULATION = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
+WIDTH = 0.6
+"""Width of the first, weak prior of log θ; later the drivers' own spread is taken, between 0.3 and this."""
 
 
-def calibrate(
-    records: Records, by: str, centre: np.ndarray, base: CarFollowing = BASE, on_progress: OnProgress = silent
-) -> tuple[np.ndarray, dict[str, Any]]:
-    """Calibrate a law to these records and return log θ [groups, P], and what a report says of it.
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """A model with values [Q] of its terms, calibrated on some runs: log θ [G, P] of their drivers, and the prior.
 
-    Free simulation behind the replayed measured leader, Levenberg–Marquardt on the spacing with forward-mode Jacobians
-    of the simulator (``idm_env.fitting``). Groups without a record here keep ``centre`` [P].
+    ``prior`` is the population with its weight; ``stand`` has what every weight that was tried leaves.
     """
-    items = windows(records.episodes, LONGEST_S)
-    simulator = base_simulator(base=base)
-    names = [p.name for p in base.declared]
-    found = fit(
-        items, by=by, simulator=simulator, loss="mse", starts=1, iterations=25, substeps=1, on_progress=on_progress
-    )
-    error, _ = errors(found.problem, found.own, found.shared)
-    assert found.names == own_names(simulator)
-    own = np.log(found.own.numpy())
-    group_of = {episode.key: g for episode, g in zip(items, found.problem.group.tolist(), strict=True)}
-    theta = np.tile(centre, (len(records.groups), 1))
-    for record, episode in enumerate(records.episodes):
-        theta[records.group[record]] = own[group_of[episode.key]]
-    standard = found.uncertainty.standard_error.median(0).values.numpy()
-    told = {
-        "method": "Levenberg-Marquardt with forward-mode Jacobians of the simulator, spacing, free simulation",
-        **error.summary(),
-        "converged": int(found.converged.sum()),
-        "groups": len(found.problem.groups),
-        "median": dict(zip(names, np.exp(np.median(own, axis=0)).tolist(), strict=True)),
-        "median_standard_error": dict(zip(names, standard.tolist(), strict=True)),
-    }
-    low, high = Catalogue((), base).bounds.T
-    return np.clip(theta, low, high), told
+
+    model: Model
+    values: np.ndarray
+    theta: np.ndarray
+    prior: Prior
+    stand: Stand
+
+
+def calibrate(records: Records, model: Model, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
+    """Calibrate a model in closed-loop simulation of ``records``, φ as it stands.
+
+    1. Drivers one by one, with a prior that hardly weighs anything, from the law's usual values and ``start`` [G, P].
+    2. Their median and spread are the population, the prior of everyone.
+    3. Its weight is the one that predicts best what a driver's parameters have not seen (``free.stand``).
+    """
+    law = model.catalogue.base
+    task, theta = judge.unweighed(records, model, values, first_prior(law), start=start)
+    there = stand(records, model, values, population(theta, task.rows, law), theta)
+    return Calibrated(model, values, there.theta, there.task.prior, there)
+
+
+def judged(
+    found: Calibrated, fit: Records, kept: Records | None, everybody: Records, adapt: bool
+) -> tuple[Solution, judge.Judged | None]:
+    """Return every driver's parameters by a calibrated model, and its errors on the runs kept back.
+
+    With ``adapt`` drivers kept back have parameters of their own, each fitted to the time between what is scored.
+    """
+    model, values, prior = found.model, found.values, found.prior
+    own = judge.calibrate(everybody if adapt else fit, model, values, prior, start=found.theta)
+    if kept is None:
+        return own, None
+    return own, judge.judge(kept, model, values, prior, None if adapt else own.theta, adapt)
+
+
+def population(theta: np.ndarray, rows: Rows, base: CarFollowing = BASE) -> Prior:
+    """Return the drivers' own spread as prior: median and scaled median deviation of log θ over fitted groups."""
+    seen = np.unique(rows.group)
+    if len(seen) < 5:
+        return first_prior(base)
+    centre = np.median(theta[seen], axis=0)
+    spread = 1.4826 * np.median(np.abs(theta[seen] - centre), axis=0)
+    return Prior(centre, np.clip(1.5 * spread, 0.3, WIDTH))
+
+
+def first_prior(base: CarFollowing = BASE) -> Prior:
+    """Return the weak prior that a search starts from, of the parameters of a car-following law."""
+    centre = [POPULATION.get(p.name, p.default) for p in base.declared]
+    return Prior(np.log(centre), np.full(len(centre), WIDTH))

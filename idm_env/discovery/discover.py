@@ -4,7 +4,7 @@ much better is the corrected model on runs that had no part in it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,15 @@ from idm_env.checks import nearest
 from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import bases, ceilings, free, judge, places, records, search, shared, summary, words
+from idm_env.discovery import bases, calibrate, ceilings, free, judge, places, records, search, shared, summary, words
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
-from idm_env.discovery.calibrate import calibrate
 from idm_env.discovery.decide import Decided, Round, decide
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
 from idm_env.discovery.solve import Solution, Task
-from idm_env.discovery.verdict import Reason, Refusal, Verdict, holds, improves
+from idm_env.discovery.verdict import Reason, Refusal, Verdict
 from idm_env.effects import (
     ALL,
     CANDIDATES,
@@ -121,48 +120,25 @@ def discover(
     options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
     mark = keep.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
     saved = keep.Store(None if out is None else out / keep.UNFINISHED / "explain", mark, resume)
-    task = Task(rows, search.first_noise(rows), search.first_prior(law))
+    task = Task(rows, search.first_noise(rows), calibrate.first_prior(law))
     told = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
     given = [*own, *(terms.known_effect(term) for term in told)]
     bare = Model(told, twin.Catalogue.of(given, prepared.period, law))
     searching = Search(task, names, located and effects is None, saved, progress, bare)
-    progress("calibration", 0, 0, law.name)
-    theta, calibrated = calibrate(
-        prepared.of_runs(fit_runs), by, task.prior.centre, law, lambda _, *state: progress("calibration", *state)
-    )
     progress("null", 0, 0, law.name)
-    null = searching.null(bare, theta)
+    values = search.starting_values(bare)
+    null = searching.null(bare, judge.unweighed(rows.records, bare, values, task.prior)[1], values)
     decided = decide(searching, null, seed)
     saved.remove()
     progress("final check", 0, 0, "runs kept for the end")
-    discovery = _finish(
-        trajectories,
-        prepared,
-        fit_runs,
-        kept_runs,
-        searching,
-        decided,
-        refused | searching.unplaced,
-        by,
-        seed,
+
+    def on_law(*state: Any) -> None:
+        progress("other laws", *state)
+
+    return _finish(
+        trajectories, prepared, fit_runs, kept_runs, searching, decided, refused | searching.unplaced, by, seed, on_law
     )
-    report = discovery.report
-    report["calibration"] = calibrated
-    report["prior"] = {
-        "alike_s": decided.null.prior.alike_s, "tried_s": list(free.GRID_S), "gap_rmse_m": list(decided.stand.rmse_m),
-    }  # fmt: skip
-    kept = prepared.of_runs(kept_runs) if kept_runs else prepared
-    report["ceilings"] = ceilings.told(decided.stand, kept, decided.null, decided.rounds[0].left)
-    report["error"]["floor"] = ceilings.floor(kept, ceilings.drift(trajectories))
-    report["bases"] = [] if not kept_runs else bases.compared(
-        decided.null, prepared.of_runs(fit_runs), prepared.of_runs(kept_runs), adapt=by == "driver", seed=seed,
-        on_law=lambda *state: progress("other laws", *state),
-    )  # fmt: skip
-    for key in ("sentence", "details", "found", "partial"):
-        report[key] = words.of_law(report[key], law.title)
-    report["details"] += words.cautions(report["data"]["at_bounds"], calibrated["groups"], calibrated["converged"])
-    return discovery
 
 
 # -- before the search -----------------------------------------------------------------------------------------------
@@ -266,12 +242,67 @@ def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]
 
 def _finish(
     trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], searching: Search,
-    decided: Decided, refused: dict[str, str], by: str, seed: int,
+    decided: Decided, refused: dict[str, str], by: str, seed: int, on_law: Callable[[int, int, str], None],
 ) -> Discovery:  # fmt: skip
     adapt = by == "driver"
     null, rounds = decided.null, decided.rounds
     fit_records = prepared.of_runs(fit_runs)
     kept = prepared.of_runs(kept_runs) if kept_runs else None
+
+    def judged(model: Model, values: np.ndarray, start: np.ndarray | None = None) -> tuple[Solution, Any]:
+        # The null, what is added and other laws go the same way: whatever is calibrated better looks better.
+        found = calibrate.calibrate(fit_records, model, values, start)
+        return calibrate.judged(found, fit_records, kept, prepared, adapt)
+
+    first, before = judged(null.model, null.values, null.theta)
+    judgement, last = _judgement(searching, decided, kept, fit_records, judged, (first, before), seed)
+    laws = []
+    if before is not None:
+        laws = bases.compared(
+            null.model, (first, before), lambda model: judged(model, null.values), seed, on_law
+        )  # fmt: skip
+        judgement = judgement.beside(bases.best_of(laws))
+    final = judgement.compared if judgement.added and judgement.compared is not None else null
+    judgement = replace(judgement, shared=shared.find(judge.everywhere(prepared, searching.task, final), seed))
+    report = summary.report(
+        trajectories, prepared, fit_runs, kept_runs, searching.task, judgement, rounds, refused, [first, last], by
+    )
+    report["prior"] = {
+        "alike_s": decided.stand.task.prior.alike_s, "tried_s": list(decided.stand.rmse_m),
+        "gap_rmse_m": list(decided.stand.rmse_m.values()),
+    }  # fmt: skip
+    scored = prepared if kept is None else kept
+    report["ceilings"] = ceilings.told(decided.stand, scored, decided.null, rounds[0].left)
+    report["error"]["floor"] = ceilings.floor(scored, ceilings.drift(trajectories))
+    report["bases"] = bases.rows(laws)
+    for key in ("sentence", "details", "found", "partial"):
+        report[key] = words.of_law(report[key], null.model.catalogue.base.title)
+    if judgement.law is not None:
+        report["sentence"] = f"{words.law_first(judgement.law, null.model.catalogue.base.title)} {report['sentence']}"
+    report["details"] += words.cautions(report["data"]["at_bounds"], len(np.unique(prepared.group)))
+    # Drivers who adapt are calibrated on parts of the held-out runs too.
+    seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in (prepared if adapt else fit_records).episodes])
+    shown = null if judgement.compared is None else judgement.compared
+    pairs = [(null, first), (shown, last)][: len(judgement.titles)]
+    if judgement.law is not None:
+        pairs.append((judgement.law.solution, judgement.law.solution))
+    saved = [replace(corrected(prepared, s, theta.theta, by), fitted_on=seen) for s, theta in pairs]
+    models = dict(zip(judgement.names(), saved, strict=True))
+    return Discovery(
+        report, models, prepared, null, shown, searching.task, rounds, judgement, places.respond(searching.task, shown)
+    )
+
+
+Calibrates = Callable[[Model, np.ndarray, np.ndarray | None], tuple[Solution, judge.Judged | None]]
+"""A model, φ and log θ to begin with → drivers' parameters, and errors on the runs kept back if there are any."""
+
+
+def _judgement(
+    searching: Search, decided: Decided, kept: Records | None, fit_records: Records, calibrates: Calibrates,
+    first: tuple[Solution, judge.Judged | None], seed: int,
+) -> tuple[summary.Judgement, Solution]:  # fmt: skip
+    """Return what the runs kept back say of what was found, and the drivers' parameters beside it."""
+    null, rounds = decided.null, decided.rounds
     final, refusal = null, rounds[0].refusal
     confirmed: list[Solution] = []
     if kept is not None:
@@ -284,30 +315,25 @@ def _finish(
             confirmed.append(s)
 
     def judged(s: Solution) -> tuple[Solution, judge.Judged | None]:
-        # All models are calibrated alike, with the weight of the population that serves the null best.
-        prior = replace(s.prior, alike_s=null.prior.alike_s)
-        theta = judge.calibrate(prepared if adapt else fit_records, s.model, s.values, prior, start=s.theta)
-        if kept is None:
-            return theta, None
-        return theta, judge.judge(kept, s.model, s.values, prior, None if adapt else theta.theta, adapt)
+        return calibrates(s.model, s.values, s.theta)
 
     # Where nothing was added, what came nearest is compared with the null and says what it would have done.
     added = final is not null
     nearest_one = None if kept is None or rounds[0].partial is None else rounds[0].scored[rounds[0].partial].solution
     compared = final if added else nearest_one
-    first, before = judged(null)
-    last, after = (first, before) if compared is None else judged(compared)
+    before = first[1]
+    last, after = first if compared is None else judged(compared)
     judgement = summary.Judgement(null, compared, added, refusal, before, after, seed)
-    if added and judgement.errors and not improves(judgement.errors):
+    if added and judgement.errors and not judgement.improves:
         judgement = replace(judgement, added=False, refusal=Refusal(Reason.HELD_OUT))
         # What the last additions spoil does not speak against the first.
         for s in reversed(confirmed[:-1]):
             theta, there = judged(s)
             fewer = replace(judgement, compared=s, added=True, refusal=None, after=there)
-            if improves(fewer.errors):
+            if fewer.improves:
                 judgement, compared, last, after = fewer, s, theta, there
                 break
-    if compared is not None and judgement.errors and not judgement.added and not holds(judgement.errors) and added:
+    if compared is not None and judgement.errors and not judgement.added and added:
         # The right effect with a strength fitted in windows may be off over minutes: it is fitted by these once more.
         again, intervals = free.refitted(fit_records, compared)
         theta, there = judged(again)
@@ -315,8 +341,8 @@ def _finish(
             judgement, compared=free.in_windows(searching.task, again), added=True, refusal=None, after=there,
             intervals=intervals,
         )  # fmt: skip
-        if improves(other.errors):
-            judgement, last, after, compared = other, theta, there, other.compared
+        if other.improves:
+            judgement, last, after = other, theta, there
     if decided.joined is not None and before is not None:
         # What was found in free simulation takes the place of what windows found where it does better there.
         theta, there = judged(decided.joined.solution)
@@ -327,24 +353,9 @@ def _finish(
                 judgement, compared=free.in_windows(searching.task, decided.joined.solution), added=True, refusal=None,
                 after=there, intervals=decided.joined.intervals,
             )  # fmt: skip
-            if improves(other.errors):
+            if other.improves:
                 judgement, last = other, theta
-                compared = other.compared
-    final = compared if judgement.added and compared is not None else null
-    judgement = replace(judgement, shared=shared.find(judge.everywhere(prepared, searching.task, final), seed))
-    report = summary.report(
-        trajectories, prepared, fit_runs, kept_runs, searching.task, judgement, rounds, refused, [first, last], by
-    )
-    shown = null if compared is None else compared
-    # Drivers who adapt are calibrated on parts of the held-out runs too.
-    seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in (prepared if adapt else fit_records).episodes])
-    pair = [
-        replace(corrected(prepared, s, theta.theta, by), fitted_on=seen) for s, theta in ((null, first), (shown, last))
-    ]
-    models = dict(zip(judgement.names(), pair, strict=False))
-    return Discovery(
-        report, models, prepared, null, shown, searching.task, rounds, judgement, places.respond(searching.task, shown)
-    )
+    return judgement, last
 
 
 def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:

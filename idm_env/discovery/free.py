@@ -7,6 +7,7 @@ blocks between are scored.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,15 +21,19 @@ from idm_env.discovery.units import MANY_RUNS, Units, units
 
 GRID_S = (5.0, 15.0, 50.0, 150.0, 500.0)
 """Times (s) over which errors of free simulation may be taken to be alike: the longer, the more the prior weighs."""
+BEYOND = 10.0**0.5
+"""Factor by which the grid goes on where its best value is an end of it."""
+ENDS_S = (0.5, 5e5)
+"""Weights beyond these change nothing: a sample counts for itself, or everybody is the population's middle."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stand:
     """A model in free simulation: ``task`` over all time, θ from the part that is not ``scored``, and errors (m) there.
 
-    ``rmse_m`` are the gap's errors on the scored time with every weight of ``GRID_S``, of which ``task.prior.alike_s``
-    is the best. ``absorb`` [G, P, P] is the inverse curvature of that calibration, ``weight`` [R] what a row's squares
-    count: one over its own mean square plus the usual one, so that a few hopeless followers do not decide.
+    ``rmse_m`` are the gap's errors on the scored time by weight (s), of which ``task.prior.alike_s`` is the best.
+    ``absorb`` [G, P, P] is the inverse curvature of that calibration, ``weight`` [R] what a row's squares count: one
+    over its own mean square plus the usual one, so that a few hopeless followers do not decide.
     """
 
     task: Task
@@ -40,7 +45,7 @@ class Stand:
     absorb: np.ndarray
     weight: np.ndarray
     units: Units
-    rmse_m: tuple[float, ...]
+    rmse_m: dict[float, float]
 
     def across(self, response: np.ndarray) -> np.ndarray:
         """Return a response [R, m, Q] on the scored time, after θ has followed it on the rest."""
@@ -76,28 +81,41 @@ def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, thet
     part = replace(rows, valid=rows.valid & ~scored)
     task = Task(part, None, replace(prior, free=False))
     near = solve(task, frozen, theta, np.zeros(0), iterations=15, tolerance=1e-4).theta
-    tasks: list[Task] = []
-    fits: list[Solution] = []
-    for seconds in GRID_S:
-        heavier = replace(task, prior=replace(task.prior, alike_s=seconds))
-        tasks.append(judge.scaled(heavier, model, values, near))
-        start = fits[-1].theta if fits else near
-        fits.append(solve(tasks[-1], frozen, start, np.zeros(0), iterations=10, tolerance=1e-4))
-    errors = replace(task, rows=replace(rows, valid=scored)).errors(
-        np.stack([f.theta for f in fits]), frozen, np.zeros((len(fits), 0))
-    )
-    squares = (errors**2).sum((1, 2)) / max(int(scored.sum()), 1)
-    task, fitted = tasks[int(squares.argmin())], fits[int(squares.argmin())]
+    heard = replace(task, rows=replace(rows, valid=scored))
+    fits: dict[float, tuple[Task, Solution]] = {}
+    square: dict[float, float] = {}
+    wanted: Sequence[float] = GRID_S
+    while wanted:
+        for seconds in wanted:
+            heavier = judge.scaled(replace(task, prior=replace(task.prior, alike_s=seconds)), model, values, near)
+            start = min(fits.items(), key=lambda known: abs(np.log(known[0] / seconds)))[1][1].theta if fits else near
+            fits[seconds] = heavier, solve(heavier, frozen, start, np.zeros(0), iterations=10, tolerance=1e-4)
+            errors = heard.errors(fits[seconds][1].theta[None], frozen, np.zeros((1, 0)))
+            square[seconds] = float((errors**2).sum()) / max(int(scored.sum()), 1)
+        wanted = _further(square)
+    alike_s = min(square, key=lambda seconds: square[seconds])
+    task, fitted = fits[alike_s]
     matrix = task.per_group(np.einsum("rmi,rmj->rij", fitted.linear.by_theta, fitted.linear.by_theta))
     matrix += np.diag(prior.width**-2.0)
     meters = linearise(replace(task, rows=rows, sigma=1.0), frozen, fitted.theta, np.zeros(0))
-    square = (meters.residual**2 * scored).sum(1) / np.maximum(scored.sum(1), 1)
-    usual = max(float(np.median(square)), 1e-6)
+    of_row = (meters.residual**2 * scored).sum(1) / np.maximum(scored.sum(1), 1)
+    usual = max(float(np.median(of_row)), 1e-6)
     return Stand(
         replace(task, rows=rows), scored, model, values, fitted.theta, meters,
-        np.linalg.inv(matrix + 1e-9 * np.eye(matrix.shape[-1])), 1.0 / (square + usual), units(records, MANY_RUNS),
-        tuple(np.sqrt(squares).tolist()),
+        np.linalg.inv(matrix + 1e-9 * np.eye(matrix.shape[-1])), 1.0 / (of_row + usual), units(records, MANY_RUNS),
+        {seconds: float(np.sqrt(square[seconds])) for seconds in sorted(square)},
     )  # fmt: skip
+
+
+def _further(square: dict[float, float]) -> Sequence[float]:
+    """Return the next weight (s) where the best of those tried is at an end and better than its neighbour, or none."""
+    known = sorted(square)
+    best = min(known, key=lambda seconds: square[seconds])
+    if best == known[-1] and best < ENDS_S[1] and square[best] < (1.0 - 1e-3) * square[known[-2]]:
+        return (best * BEYOND,)
+    if best == known[0] and best > ENDS_S[0] and square[best] < (1.0 - 1e-3) * square[known[1]]:
+        return (max(best / BEYOND, ENDS_S[0]),)
+    return ()
 
 
 @dataclass(frozen=True, eq=False)

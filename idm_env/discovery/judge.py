@@ -72,6 +72,11 @@ class Judged:
         square, count = self.squares["gap_rmse_m"]
         return np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.nan)
 
+    def median_ratio(self, before: Judged) -> float:
+        """Return the median follower's gap RMSE over that of another model; NaN where there is none."""
+        was, now = (x.summary()["gap_rmse_median_driver_m"] for x in (before, self))
+        return now / was if was > 0.0 else float("nan")
+
     def summary(self) -> dict[str, float]:
         """Return the four errors of the report; the pooled ones weigh every sample alike."""
         pooled = {

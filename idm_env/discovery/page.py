@@ -153,7 +153,7 @@ def _errors(d: Discovery) -> Iterator[Block]:
     files = "; ".join(f"{file} is {name}" for file, name in r["models"].items())
     best = " model.yaml predicts best: the smaller geometric mean of the three errors." if r["helps"] else ""
     yield pages.note(
-        f"Models: {files}.{best} Both are calibrated the same way. Runs kept back: "
+        f"Models: {files}.{best} All are calibrated the same way. Runs kept back: "
         + ", ".join(pages.shortened(r["error"]["held_out_runs"], 20))
     )
     told = words.ceilings(r["ceilings"], r["error"]["before"]["gap_rmse_m"], r["error"]["floor"]["gap_rmse_m"])
@@ -187,9 +187,7 @@ def _laws(r: dict[str, Any]) -> Iterator[Block]:
     yield pages.table(rows)
     yield pages.note(
         "Each alone, without what was added, calibrated and judged alike; changes are against "
-        f"{r['bases'][0]['title']}. Drivers' spread, which is the prior of drivers kept back, comes from free "
-        "simulation here, so that the first row is not to the digit the one above. Another law is completed by explain "
-        "--base."
+        f"{r['bases'][0]['title']}. Another law is completed by explain --base."
     )
 
 
@@ -242,15 +240,7 @@ TERMS_OF_TESTS = {
 def _moved(d: Discovery) -> Iterator[Block]:
     r = d.report
     yield pages.heading("How the drivers' own parameters moved")
-    start = r.get("calibration")
-    if start:
-        yield pages.note(
-            f"The search starts from {d.null.model.catalogue.base.title} calibrated in free simulation behind the "
-            "measured leaders, by exact gradients "
-            f"through the simulator: {start['episodes']} windows of the fitting runs, mean gap RMSE "
-            f"{number(start['gap_rmse_m'])} m, {start['converged']} of {start['groups']} groups converged. "
-            + words.weight(r["prior"])
-        )
+    yield pages.note(words.weight(r["prior"]))
     declared = {p.name: p for p in d.null.model.catalogue.own}
     rows = []
     for p in r["parameters"]:

@@ -11,21 +11,18 @@ import torch
 from idm_env.discovery import judge, places
 from idm_env.discovery import model as terms
 from idm_env.discovery import noise as noises
-from idm_env.discovery.free import Stand, stand
-from idm_env.discovery.march import BASE
+from idm_env.discovery.calibrate import calibrate, population
+from idm_env.discovery.free import Stand
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out, log_gain
-from idm_env.discovery.solve import Linear, Prior, Solution, Task, finish, linearise, projected, solve
+from idm_env.discovery.solve import Linear, Solution, Task, finish, linearise, projected, solve
 from idm_env.discovery.units import Units, units
-from idm_env.effects import CarFollowing, Effect
+from idm_env.effects import Effect
 from idm_env.effects.base import Sought
 from idm_env.keep import Store
 from idm_env.progress import OnProgress
 
-POPULATION = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
-WIDTH = 0.6
-"""Width of the first, weak prior of log θ; later the drivers' own spread is taken, between 0.3 and this."""
 FAINT = 0.002
 """Share of the squared error, at best on the very data, below which a candidate is fitted in one step only."""
 NEAR, RACED = 0.3, 3
@@ -68,7 +65,7 @@ class Search:
 
     def null(self, model: Model, theta: np.ndarray, values: np.ndarray | None = None) -> Solution:
         """Fit a null and its noise in turn until both stand, from log θ [G, P] and φ [Q]; updates ``task``."""
-        values = _starting_values(model) if values is None else values
+        values = starting_values(model) if values is None else values
         solution = solve(self.task, model, theta, values)
         for _ in range(3):
             self.task = self._renoised(solution)
@@ -76,15 +73,14 @@ class Search:
         return solution
 
     def weighed(self, now: Solution) -> tuple[Stand, Solution]:
-        """Return how a model of windows stands in free simulation of the runs that may choose, and it with that weight.
+        """Return how a model of windows stands in free simulation of the runs that may choose, and it with that prior.
 
-        The weight of the prior becomes that of the task.
+        In windows its drivers stay as they are. The weight of the prior becomes that of the task.
         """
         if self.stood is None or self.stood[1] is not now:
-            at = stand(self.task.rows.records, now.model, now.values, now.prior, now.theta)
-            alike_s = at.task.prior.alike_s
-            self.task = replace(self.task, prior=replace(self.task.prior, alike_s=alike_s))
-            self.stood = at, replace(now, prior=replace(now.prior, alike_s=alike_s))
+            found = calibrate(self.task.rows.records, now.model, now.values, now.theta)
+            self.task = replace(self.task, prior=replace(self.task.prior, alike_s=found.prior.alike_s))
+            self.stood = found.stand, replace(now, prior=found.prior)
         return self.stood
 
     def free_run_squares(self, now: Solution) -> np.ndarray:
@@ -321,24 +317,9 @@ def _knots(values: np.ndarray, distance: float, most: int, period: float = 0.0) 
     return low, max((high - low) / (count - 1), 1e-6), count
 
 
-def _starting_values(model: Model) -> np.ndarray:
+def starting_values(model: Model) -> np.ndarray:
+    """Return φ [Q] to begin with: the first start of every term."""
     return np.concatenate([np.zeros(0), *(np.array(t.starts[0]) for t in model.terms)])
-
-
-def population(theta: np.ndarray, rows: Rows, base: CarFollowing = BASE) -> Prior:
-    """Return the drivers' own spread as prior: median and scaled median deviation of log θ over fitted groups."""
-    seen = np.unique(rows.group)
-    if len(seen) < 5:
-        return first_prior(base)
-    centre = np.median(theta[seen], axis=0)
-    spread = 1.4826 * np.median(np.abs(theta[seen] - centre), axis=0)
-    return Prior(centre, np.clip(1.5 * spread, 0.3, WIDTH))
-
-
-def first_prior(base: CarFollowing = BASE) -> Prior:
-    """Return the weak prior that a search starts from, of the parameters of a car-following law."""
-    centre = [POPULATION.get(p.name, p.default) for p in base.declared]
-    return Prior(np.log(centre), np.full(len(centre), WIDTH))
 
 
 def first_noise(rows: Rows) -> noises.Noise:

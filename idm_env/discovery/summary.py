@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
-from idm_env.discovery import judge, words
+from idm_env.discovery import bases, judge, words
 from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
 from idm_env.discovery.decide import LEAST_GAIN, Round
 from idm_env.discovery.model import Term
@@ -19,11 +19,11 @@ from idm_env.discovery.score import FREE_SHARE, interval_of, level
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
-from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude
+from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
 from idm_env.effects import ALL
 from idm_env.report import versions
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +44,8 @@ class Judgement:
     """Estimates of φ with their intervals [Q, 3], where they are not those of predictions in windows."""
     shared: Shared | None = None
     """What vehicles of one run do alike, beyond the model."""
+    law: bases.Law | None = None
+    """A law that predicts better than the null, and than what was added to it."""
 
     @cached_property
     def errors(self) -> dict[str, Comparison]:
@@ -53,11 +55,31 @@ class Judgement:
         return compare(self.before, self.after, self.seed)
 
     @property
+    def mean_ratio(self) -> float:
+        """Geometric mean of the ratios of errors on runs kept back, compared model / null; 1 where there is none."""
+        ratios = [c.ratio for c in self.errors.values() if np.isfinite(c.ratio)]
+        return float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
+
+    @property
     def corrected_is_best(self) -> bool:
-        """Whether the compared model predicts best: a smaller geometric mean of the errors on runs kept back."""
-        if self.compared is None or not self.errors:
+        """Whether the compared model predicts better than the null."""
+        return self.mean_ratio < 1.0
+
+    @property
+    def improves(self) -> bool:
+        """Whether the compared model may be called better than the null."""
+        if self.before is None or self.after is None:
             return False
-        return bool(np.prod([c.ratio for c in self.errors.values() if np.isfinite(c.ratio)]) < 1.0)
+        # What was added or joined has gained beyond chance on the runs that chose.
+        return improves(self.errors, self.after.median_ratio(self.before), shown=True)
+
+    def beside(self, best: bases.Law) -> Judgement:
+        """Return the judgement beside the best law: where that does better than an addition, nothing is added."""
+        if not best.against or best.mean_ratio >= (self.mean_ratio if self.added else 1.0):
+            return self
+        if self.refusal is not None and self.refusal.reason is Reason.FEW_RUNS:
+            return replace(self, law=best)
+        return replace(self, law=best, added=False, refusal=Refusal(Reason.LAW))
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -78,7 +100,13 @@ class Judgement:
         return tuple(" with ".join([law, *([" and ".join(names)] if names else [])]) for names in lists)
 
     def names(self) -> dict[str, str]:
-        """Return which model every file holds: the law alone first, then the model beside it."""
+        """Return which model every file holds: the law alone, then the model beside it, then another law.
+
+        ``model.yaml`` is the one that predicts best on the runs kept back.
+        """
+        if self.law is not None:
+            files = ("model_idm.yaml", *(["model_corrected.yaml"] if self.compared is not None else []), "model.yaml")
+            return dict(zip(files, (*self.titles, self.law.law.title), strict=True))
         if self.compared is None:
             return {"model.yaml": self.titles[0]}
         files = ("model_idm.yaml", "model.yaml") if self.corrected_is_best else ("model.yaml", "model_corrected.yaml")
@@ -122,7 +150,8 @@ def report(
         "verdict": verdict.value,
         "reason": None if refusal is None else refusal.reason.value,
         "sentence": words.headline(
-            verdict, [f["clause"] for f in found], refusal, judged.tried, errors, common, others, strengths
+            verdict, [f["clause"] for f in found], refusal, judged.tried, errors, common, others, strengths,
+            1.0 if before is None or after is None else after.median_ratio(before),
         ),
         "details": [*words.details(verdict, found, [] if judged.added else entries, left),
                     *words.excluded(verdict, strengths)],

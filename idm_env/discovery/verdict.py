@@ -38,6 +38,7 @@ class Reason(str, Enum):
     FREE_SIMULATION = "free_simulation"
     LOCKBOX = "lockbox"
     HELD_OUT = "held_out"
+    LAW = "law"
 
 
 @dataclass(frozen=True)
@@ -55,17 +56,24 @@ Beyond chance it may not rise at all; drivers' own noise alone moves it by some 
 """
 
 
-def improves(errors: Mapping[str, Comparison]) -> bool:
-    """Tell whether a model may be called better: an error falls, none is worse, and free simulation holds."""
-    falls = any(c.ratio < 1.0 for c in errors.values())
-    worse = any(c.light is Light.WORSE for c in errors.values())
-    return falls and not worse and holds(errors)
+def improves(errors: Mapping[str, Comparison], median_ratio: float, shown: bool) -> bool:
+    """Tell whether a model may be called better than one that was calibrated as well as it.
 
+    No error rises beyond chance; their geometric mean falls; free simulation holds (``HOLDS``), and so does the median
+    driver. Unless a gain beyond chance was shown on other runs, an error has to fall beyond chance on these.
 
-def holds(errors: Mapping[str, Comparison]) -> bool:
-    """Tell whether the gap in free simulation holds, where it was compared."""
+    Args:
+        errors: How errors on runs kept back changed.
+        median_ratio: The median driver's gap RMSE in free simulation, after / before.
+        shown: Whether a gain beyond chance was shown on other runs, against all candidates.
+    """
+    lights = [c.light for c in errors.values()]
+    ratios = [c.ratio for c in errors.values() if np.isfinite(c.ratio)]
+    if not ratios or Light.WORSE in lights or not (shown or Light.BETTER in lights):
+        return False
     gap = errors.get("gap_rmse_m")
-    return gap is None or not gap.ratio > HOLDS
+    holds = (gap is None or not gap.ratio > HOLDS) and not median_ratio > HOLDS
+    return holds and float(np.mean(np.log(ratios))) < 0.0
 
 
 def conclude(
@@ -86,6 +94,8 @@ def conclude(
     """
     if added:
         return (Verdict.NAMED if apart else Verdict.ONE_OF) if named else Verdict.LOCATED
+    if refusal is not None and refusal.reason is Reason.LAW:
+        return Verdict.UNEXPLAINED
     if shared:
         return Verdict.LOCATED
     if refusal is not None and refusal.reason is Reason.FEW_RUNS:

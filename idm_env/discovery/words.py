@@ -7,11 +7,12 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from idm_env.discovery.bases import Law
 from idm_env.discovery.compare import Comparison, Light
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Strength
 from idm_env.discovery.shared import Shared
-from idm_env.discovery.verdict import Reason, Refusal, Verdict
+from idm_env.discovery.verdict import HOLDS, Reason, Refusal, Verdict
 from idm_env.effects import ALL
 from idm_env.parameters import Parameter
 
@@ -125,12 +126,14 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
         Reason.FREE_SIMULATION: f"{tried} makes free simulation worse",
         Reason.LOCKBOX: f"the runs kept back do not confirm {tried}",
         Reason.HELD_OUT: f"predictions of the runs kept back get no better with {tried}",
+        Reason.LAW: "another law predicts better than all that was added to IDM",
     }[refusal.reason]  # fmt: skip
 
 
 def headline(
     verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison],
     shared: Shared | None = None, others: Sequence[str] = (), strengths: Mapping[str, Strength] | None = None,
+    median_ratio: float = 1.0,
 ) -> str:  # fmt: skip
     """Say in one sentence what is missing, or why nothing can be said.
 
@@ -143,7 +146,11 @@ def headline(
         shared: What vehicles of one run do alike, told where nothing was added.
         others: Effects that these data do not tell from what was added.
         strengths: What the data say of the strengths of absent effects, by name.
+        median_ratio: The median follower's gap RMSE on runs kept back, with what came nearest / without.
     """
+    if refusal is not None and refusal.reason is Reason.LAW:
+        nearest = f" The nearest was {tried}." if tried else ""
+        return f"No effect added to IDM predicts as well.{nearest}"
     if shared is not None and not clauses:
         return common(shared)
     if verdict in (Verdict.NAMED, Verdict.ONE_OF, Verdict.LOCATED):
@@ -167,7 +174,7 @@ def headline(
     if refusal is not None and refusal.reason is Reason.HELD_OUT:
         return (
             f"Something is missing, but no model tried predicts better: with {tried}, found on the runs that chose, "
-            f"{_rises(errors)} on the runs kept back."
+            f"{_rises(errors, median_ratio)} on the runs kept back."
         )
     return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
 
@@ -182,14 +189,18 @@ def common(shared: Shared) -> str:
     )
 
 
-def _rises(errors: Mapping[str, Comparison]) -> str:
+def _rises(errors: Mapping[str, Comparison], median_ratio: float) -> str:
     """Say what the errors on runs kept back have against an addition."""
     worse = [ERRORS[k][0] for k, c in errors.items() if c.light is Light.WORSE]
     if not any(c.ratio < 1.0 for c in errors.values()):
         return "no error falls"
     if worse:
         return f"the error of the {' and the '.join(worse)} gets worse"
-    return f"the error of the gap in free simulation rises by {percent(errors['gap_rmse_m'].ratio)}"
+    if errors["gap_rmse_m"].ratio > HOLDS:
+        return f"the error of the gap in free simulation rises by {percent(errors['gap_rmse_m'].ratio)}"
+    if median_ratio > HOLDS:
+        return f"the median follower's gap in free simulation errs by {percent(median_ratio)} more"
+    return "errors rise on the whole"
 
 
 def _but(errors: Mapping[str, Comparison]) -> str:
@@ -275,15 +286,26 @@ def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:
     ]
 
 
-def cautions(at_bounds: Mapping[str, int], groups: int, converged: int) -> list[str]:
-    """Say what else speaks against the figures: parameters at their bounds, and calibrations without an end."""
-    parts = [
+def cautions(at_bounds: Mapping[str, int], groups: int) -> list[str]:
+    """Say what else speaks against the figures: parameters at their bounds."""
+    return [
         f"The fitted {name.replace('_', ' ')} is at its bound for {n} of {groups} groups of drivers."
         for name, n in at_bounds.items() if n > 0.2 * groups
     ]  # fmt: skip
-    if converged < 0.9 * groups:
-        parts.append(f"Only {converged} of {groups} groups of drivers were calibrated to an end before the search.")
-    return parts
+
+
+def law_first(law: Law, null: str) -> str:
+    """Say that another law predicts better than the null, and in what."""
+    better = [
+        f"{ERRORS[key][0]} {percent(c.ratio)} (95 %: {percent(c.low)} to {percent(c.high)})"
+        for key, c in law.against.items() if c.light is Light.BETTER
+    ]  # fmt: skip
+    same = [ERRORS[key][0] for key, c in law.against.items() if c.light is Light.SAME]
+    rest = f"; {' and '.join(same)} the same beyond chance" if same else ""
+    return (
+        f"{law.law.title[:1].upper()}{law.law.title[1:]} predicts better than {null} calibrated alike: "
+        f"{', '.join(better)}{rest} (what it lacks: explain --base {law.law.kind})."
+    )
 
 
 def weight(prior: Mapping[str, Any]) -> str:

@@ -11,10 +11,10 @@ import torch
 from idm_env.config import load_model
 from idm_env.data import synthetic
 from idm_env.discovery import discover, write_report
+from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import Records, whole
-from idm_env.discovery.search import first_prior
 from idm_env.discovery.solve import Task
 from idm_env.effects import BASES, Brakes, Replay, base_named
 from idm_env.fitting.batch import Batch

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import discover, judge
+from idm_env.discovery import calibrate, discover, judge
+from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import Records, gather, whole
-from idm_env.discovery.search import Search, first_prior
+from idm_env.effects import BASES
 
 POSITION = 14
 
@@ -54,21 +55,25 @@ def test_all_time_is_scored_and_by_parameters_that_have_not_seen_it(records: Rec
     assert judged.squares["gap_rmse_m"][1].sum() == rows.valid.sum()
 
 
-def test_all_models_are_calibrated_with_the_weight_of_the_null(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else the choice of the weight, and not the effect, would decide which of them errs less."""
-    weights, right, weigh = [], judge.judge, Search.weighed
+def test_null_addition_and_other_laws_are_calibrated_by_one_procedure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the calibration, and not the effect, would decide which of them errs less."""
+    calibrated, judged = [], []
+    right, judge_right = calibrate.calibrate, judge.judge
 
-    def kept(records, model, values, prior, *rest):  # type: ignore[no-untyped-def]
-        weights.append((bool(model.terms), prior.alike_s))
-        return right(records, model, values, prior, *rest)
+    def kept(records, model, values, start=None):  # type: ignore[no-untyped-def]
+        calibrated.append((len(records), right(records, model, values, start)))
+        return calibrated[-1][1]
 
-    def weighed(self, now):  # type: ignore[no-untyped-def]
-        at, now = weigh(self, now)
-        return at, replace(now, prior=replace(now.prior, alike_s=500.0 if now.model.terms else 15.0))
+    def seen(records, model, values, prior, *rest):  # type: ignore[no-untyped-def]
+        judged.append((model, prior))
+        return judge_right(records, model, values, prior, *rest)
 
-    monkeypatch.setattr(judge, "judge", kept)
-    monkeypatch.setattr(Search, "weighed", weighed)
+    monkeypatch.setattr(calibrate, "calibrate", kept)
+    monkeypatch.setattr(judge, "judge", seen)
     made, _ = synthetic.generate(5, runs=8, followers=2, seconds=80.0, effect="lag")
-    assert discover(made, effects=["lag"]).verdict == "named"
-    assert {terms for terms, _ in weights} == {False, True}
-    assert {alike_s for _, alike_s in weights} == {15.0}
+    found = discover(made, effects=["lag"])
+    assert found.verdict == "named"
+    assert {size for size, _ in calibrated} == {12}, "all on the runs that fit"
+    of = {id(c.prior): c.model for _, c in calibrated}
+    assert all(of[id(prior)] is model for model, prior in judged), "each judged by its own population and weight"
+    assert len({m.catalogue.base.kind for m, _ in judged}) == len(BASES) and any(m.terms for m, _ in judged)

@@ -14,11 +14,11 @@ import torch
 
 from idm_env.discovery import march
 from idm_env.discovery import model as terms
+from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.judge import Frozen
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records, Rows, whole, windows
-from idm_env.discovery.search import first_prior
 from idm_env.discovery.solve import Task
 from idm_env.effects import CANDIDATES, IDM, Brakes, Replay
 from idm_env.fitting.batch import Batch

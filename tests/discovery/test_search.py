@@ -9,6 +9,7 @@ import torch
 from idm_env.data import episodes, synthetic
 from idm_env.discovery import model as terms
 from idm_env.discovery import search
+from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.decide import _same_class
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import Records, gather, whole, windows
@@ -20,7 +21,7 @@ from idm_env.keep import Store
 def begun(records: Records, *names: str) -> tuple[Search, Solution]:
     """Return a search with its null."""
     rows = windows(records)
-    task = Task(rows, search.first_noise(rows), search.first_prior())
+    task = Task(rows, search.first_noise(rows), first_prior())
     searching = Search(task, names, False, Store(None, "", False), lambda *_: None)
     return searching, searching.null(Model(), np.tile(task.prior.centre, (task.groups, 1)))
 

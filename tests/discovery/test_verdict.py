@@ -13,11 +13,11 @@ import pytest
 from idm_env.data import Trajectories, episodes, synthetic
 from idm_env.discovery import Discovery, compare, discover, judge, verdict, words, write_report
 from idm_env.discovery import model as terms
+from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.compare import ERRORS, Comparison, Light
 from idm_env.discovery.model import Model
 from idm_env.discovery.power import Strength
 from idm_env.discovery.records import gather
-from idm_env.discovery.search import first_prior
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
 from idm_env.effects import ALL, CANDIDATES
 
@@ -30,22 +30,28 @@ def errors(*three: Comparison) -> dict[str, Comparison]:
 
 
 @pytest.mark.parametrize(
-    ("three", "may"),
+    ("three", "median", "may"),
     [
-        ((BETTER, BETTER, BETTER), True),
-        ((WORSE, BETTER, SAME), False),
-        ((BETTER, WORSE, SAME), False),
-        ((UP, BETTER, SAME), True),
-        ((FAR_UP, BETTER, SAME), False),
-        ((dataclasses.replace(FAR_UP, improved=0.75), BETTER, SAME), False),
-        ((UP, UP, UP), False),
-        ((UP, UP, SAME), True),
-        ((WORSE, SAME, SAME), False),
-        ((WORSE, WORSE, UP), False),
+        ((BETTER, BETTER, BETTER), 0.9, True),
+        ((BETTER, BETTER, BETTER), 1.2, False),  # the median driver gets worse
+        ((WORSE, BETTER, SAME), 1.0, False),
+        ((BETTER, WORSE, SAME), 1.0, False),
+        ((UP, BETTER, SAME), 1.0, True),
+        ((FAR_UP, BETTER, SAME), 1.0, False),
+        ((dataclasses.replace(FAR_UP, improved=0.75), BETTER, SAME), 1.0, False),
+        ((UP, UP, UP), 1.0, False),
+        ((SAME, SAME, SAME), 0.9, True),
+        ((SAME, UP, UP), 0.9, False),  # errors rise on the whole
+        ((WORSE, SAME, SAME), 1.0, False),
+        ((WORSE, WORSE, UP), 1.0, False),
     ],
 )
-def test_nothing_is_an_improvement_whose_errors_rise(three: tuple[Comparison, ...], may: bool) -> None:
-    assert improves(errors(*three)) == may
+def test_a_better_model_lowers_errors_on_the_whole_and_makes_none_worse(
+    three: tuple[Comparison, ...], median: float, may: bool
+) -> None:
+    assert improves(errors(*three), median, shown=True) == may
+    beyond = any(c.light is Light.BETTER for c in three)
+    assert improves(errors(*three), median, shown=False) == (may and beyond)
 
 
 def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
@@ -58,6 +64,7 @@ def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
     assert conclude(False, False, Refusal(Reason.NO_GAIN), False, flat) is Verdict.NONE
     assert conclude(False, False, Refusal(Reason.NO_GAIN), False, steep) is Verdict.UNEXPLAINED
     assert conclude(False, False, Refusal(Reason.HELD_OUT), True, flat) is Verdict.UNEXPLAINED
+    assert conclude(False, False, Refusal(Reason.LAW), False, flat, shared=True) is Verdict.UNEXPLAINED
 
 
 def test_a_light_needs_the_whole_interval_on_one_side() -> None:
@@ -204,10 +211,10 @@ def test_what_makes_every_error_worse_is_not_named(monkeypatch: pytest.MonkeyPat
     assert 'class="light worse"' in paths["report.html"].read_text()
 
 
-def test_bounds_and_unfinished_calibrations_are_told() -> None:
-    assert words.cautions({"comfort_decel": 3, "time_gap": 0}, 38, 38) == []
-    told = " ".join(words.cautions({"comfort_decel": 15, "time_gap": 0}, 38, 26))
-    assert "comfort decel is at its bound for 15 of 38" in told and "26 of 38" in told
+def test_bounds_are_told() -> None:
+    assert words.cautions({"comfort_decel": 3, "time_gap": 0}, 38) == []
+    told = " ".join(words.cautions({"comfort_decel": 15, "time_gap": 0}, 38))
+    assert "comfort decel is at its bound for 15 of 38" in told
 
 
 def test_words_of_none_claim_no_cause() -> None:

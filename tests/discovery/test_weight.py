@@ -8,9 +8,10 @@ import numpy as np
 
 from idm_env.data import episodes, synthetic
 from idm_env.discovery import free, judge, words
+from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import Records, gather, windows
-from idm_env.discovery.search import first_noise, first_prior
+from idm_env.discovery.search import first_noise
 from idm_env.discovery.solve import Solution, Task, solve
 
 
@@ -24,16 +25,21 @@ def fitted(seconds: float, ou: float, spread: float, seed: int = 5) -> tuple[Rec
     return records, replace(null, prior=replace(first_prior(), centre=np.median(seen, axis=0), width=np.full(5, 0.3)))
 
 
-def weight(records: Records, null: Solution) -> tuple[float, tuple[float, ...]]:
+def weight(records: Records, null: Solution) -> tuple[float, dict[float, float]]:
+    """Return the weight that was chosen and the errors of all; the best is no end of what was tried."""
     at = free.stand(records, null.model, null.values, null.prior, null.theta)
-    return at.task.prior.alike_s, at.rmse_m
+    tried, best = sorted(at.rmse_m), at.task.prior.alike_s
+    for end, beside in ((0, 1), (-1, -2)):
+        if best == tried[end] and best not in free.ENDS_S:
+            assert at.rmse_m[best] > 0.9994 * at.rmse_m[tried[beside]]
+    return best, at.rmse_m
 
 
 def test_short_noisy_records_of_like_drivers_lean_on_the_population() -> None:
     records, null = fitted(60.0, ou=0.3, spread=0.05)
     alike_s, errors_m = weight(records, null)
     assert alike_s >= 50.0
-    assert min(errors_m) < 0.9 * errors_m[0]
+    assert min(errors_m.values()) < 0.9 * errors_m[5.0]
     # Drivers that were never seen are predicted better, too.
     others, _ = fitted(60.0, ou=0.3, spread=0.05, seed=6)
     errors = [
@@ -45,7 +51,7 @@ def test_short_noisy_records_of_like_drivers_lean_on_the_population() -> None:
 
 def test_long_clean_records_of_unlike_drivers_speak_for_themselves() -> None:
     records, null = fitted(120.0, ou=0.0, spread=0.5)
-    assert weight(records, null)[0] == 5.0
+    assert weight(records, null)[0] <= 5.0
 
 
 def test_the_weight_is_told() -> None:
