@@ -6,34 +6,33 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from idm_env.discovery.compare import Comparison, compare
+from idm_env.discovery.compare import Comparison, Light, compare
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Model
 from idm_env.discovery.solve import Solution
-from idm_env.discovery.verdict import improves
+from idm_env.discovery.verdict import mean_ratio
 from idm_env.effects import BASES, CarFollowing, base_named
 
 
 class Law(NamedTuple):
-    """A law alone: drivers' parameters, its errors on runs kept back, and how these compare with the null's.
-
-    ``is_better`` follows the rule by which effects are added (``verdict.improves``), on the runs kept back alone.
-    """
+    """A law alone: drivers' parameters, its errors on runs kept back, and how these compare with the null's."""
 
     law: CarFollowing
     solution: Solution
     errors: Judged
     against: dict[str, Comparison]
-    is_better: bool = False
+
+    @property
+    def is_better(self) -> bool:
+        """Whether an error is lower beyond chance and none higher, and they are lower on the whole."""
+        lights = [c.light for c in self.against.values()]
+        return Light.BETTER in lights and Light.WORSE not in lights and self.mean_ratio < 1.0
 
     @property
     def mean_ratio(self) -> float:
         """Geometric mean of the ratios of errors to those of the null; 1 for the null."""
-        ratios = [c.ratio for c in self.against.values() if math.isfinite(c.ratio)]
-        return float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
+        return mean_ratio(self.against)
 
 
 def compared(
@@ -55,8 +54,7 @@ def compared(
     for i, law in enumerate(others):
         on_law(1 + i, 1 + len(others), law.title)
         found = judged(Model(null.terms, Catalogue(tuple(null.named), law, located=False)))
-        against = compare(first[1], found[1], seed)
-        laws.append(Law(law, *found, against, improves(against, found[1].median_ratio(first[1]), shown=False)))
+        laws.append(Law(law, *found, compare(first[1], found[1], seed)))
     return laws
 
 

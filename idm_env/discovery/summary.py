@@ -19,7 +19,7 @@ from idm_env.discovery.score import FREE_SHARE, interval_of, level
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
-from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
+from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves, mean_ratio
 from idm_env.effects import ALL
 from idm_env.report import versions
 
@@ -57,8 +57,7 @@ class Judgement:
     @property
     def mean_ratio(self) -> float:
         """Geometric mean of the ratios of errors on runs kept back, compared model / null; 1 where there is none."""
-        ratios = [c.ratio for c in self.errors.values() if np.isfinite(c.ratio)]
-        return float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
+        return mean_ratio(self.errors)
 
     @property
     def corrected_is_best(self) -> bool:
@@ -70,8 +69,7 @@ class Judgement:
         """Whether the compared model may be called better than the null."""
         if self.before is None or self.after is None:
             return False
-        # What was added or joined has gained beyond chance on the runs that chose.
-        return improves(self.errors, self.after.median_ratio(self.before), shown=True)
+        return improves(self.errors, self.after.median_ratio(self.before))
 
     def beside(self, best: bases.Law) -> Judgement:
         """Return the judgement beside the best law: where that does better than an addition, nothing is added."""

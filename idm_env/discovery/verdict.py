@@ -56,24 +56,27 @@ Beyond chance it may not rise at all; drivers' own noise alone moves it by some 
 """
 
 
-def improves(errors: Mapping[str, Comparison], median_ratio: float, shown: bool) -> bool:
-    """Tell whether a model may be called better than one that was calibrated as well as it.
+def improves(errors: Mapping[str, Comparison], median_ratio: float) -> bool:
+    """Tell whether an addition, which gained beyond chance on the runs that chose, holds on those kept back.
 
     No error rises beyond chance; their geometric mean falls; free simulation holds (``HOLDS``), and so does the median
-    driver. Unless a gain beyond chance was shown on other runs, an error has to fall beyond chance on these.
+    driver.
 
     Args:
         errors: How errors on runs kept back changed.
         median_ratio: The median driver's gap RMSE in free simulation, after / before.
-        shown: Whether a gain beyond chance was shown on other runs, against all candidates.
     """
-    lights = [c.light for c in errors.values()]
-    ratios = [c.ratio for c in errors.values() if np.isfinite(c.ratio)]
-    if not ratios or Light.WORSE in lights or not (shown or Light.BETTER in lights):
+    if any(c.light is Light.WORSE for c in errors.values()):
         return False
     gap = errors.get("gap_rmse_m")
     holds = (gap is None or not gap.ratio > HOLDS) and not median_ratio > HOLDS
-    return holds and float(np.mean(np.log(ratios))) < 0.0
+    return holds and mean_ratio(errors) < 1.0
+
+
+def mean_ratio(errors: Mapping[str, Comparison]) -> float:
+    """Return the geometric mean of the ratios of errors, after / before; 1 where there is none."""
+    ratios = [c.ratio for c in errors.values() if np.isfinite(c.ratio)]
+    return float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
 
 
 def conclude(

@@ -13,13 +13,15 @@ import pytest
 from idm_env.data import Trajectories, episodes, synthetic
 from idm_env.discovery import Discovery, compare, discover, judge, verdict, words, write_report
 from idm_env.discovery import model as terms
+from idm_env.discovery.bases import Law, best_of
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.compare import ERRORS, Comparison, Light
 from idm_env.discovery.model import Model
 from idm_env.discovery.power import Strength
 from idm_env.discovery.records import gather
+from idm_env.discovery.summary import Judgement
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
-from idm_env.effects import ALL, CANDIDATES
+from idm_env.effects import ALL, CANDIDATES, base_named
 
 BETTER, SAME, WORSE = (Comparison(1.0, ratio, ratio, ratio - 0.05, ratio + 0.05) for ratio in (0.9, 0.99, 1.1))
 UP, FAR_UP = (Comparison(1.0, ratio, ratio, 0.9, 1.2) for ratio in (1.01, 1.08))
@@ -49,9 +51,26 @@ def errors(*three: Comparison) -> dict[str, Comparison]:
 def test_a_better_model_lowers_errors_on_the_whole_and_makes_none_worse(
     three: tuple[Comparison, ...], median: float, may: bool
 ) -> None:
-    assert improves(errors(*three), median, shown=True) == may
-    beyond = any(c.light is Light.BETTER for c in three)
-    assert improves(errors(*three), median, shown=False) == (may and beyond)
+    assert improves(errors(*three), median) == may
+
+
+def test_a_law_is_better_where_an_error_is_lower_beyond_chance() -> None:
+    """None of them higher; its interval alone counts, as no run chose it."""
+
+    def law(*three: Comparison) -> Law:
+        return Law(base_named("gipps"), None, None, errors(*three) if three else {})  # type: ignore[arg-type]
+
+    null, gipps = law(), law(UP, BETTER, SAME)
+    assert gipps.is_better and law(FAR_UP, BETTER, SAME).is_better
+    assert not any(law(*x).is_better for x in ((SAME, SAME, SAME), (WORSE, BETTER, BETTER), (FAR_UP, FAR_UP, BETTER)))
+    assert best_of([null, gipps, law(BETTER, BETTER, SAME)]).mean_ratio == pytest.approx((0.9 * 0.9 * 0.99) ** (1 / 3))
+    assert best_of([null, law(SAME, SAME, SAME)]) is null
+    judgement = Judgement(None, None, False, Refusal(Reason.NO_GAIN), None, None, 0)  # type: ignore[arg-type]
+    first = judgement.beside(gipps)
+    assert first.law is gipps and first.refusal == Refusal(Reason.LAW) and judgement.beside(null) is judgement
+    told = words.law_first(gipps, "IDM")
+    assert told.startswith("Gipps' model predicts better than IDM calibrated alike: gap 5 s ahead −10.0")
+    assert "explain --base gipps" in told
 
 
 def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
