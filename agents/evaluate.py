@@ -337,7 +337,9 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, human: int,
     palette.putpalette([part for each in colours for part in each])
     for step, env in enumerate(shown(environment, policy, human, steps, seed, render_mode="rgb_array")):
         if step >= first and step % every == 0:
-            picture = Image.fromarray(env.render())
+            drawn = env.render()
+            assert drawn is not None
+            picture = Image.fromarray(drawn)
             picture = picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.LANCZOS)
             frames.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0, optimize=True)
