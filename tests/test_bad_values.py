@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
 import signal
 import subprocess
@@ -28,31 +26,9 @@ from idm_env.config import load_environment, load_model
 from idm_env.data import synthetic
 from idm_env.effects import ALL
 from idm_env.envs.pettingzoo import parallel_env
+from tests.commands import refused, typed
 
 QUICK = settings(max_examples=60)
-
-
-def run(*arguments: object) -> tuple[int, str]:
-    """Run the command line in this process; return its exit code and what it said, a traceback being a failure."""
-    before, words = sys.argv, io.StringIO()
-    sys.argv = ["idm-env", *map(str, arguments)]
-    try:
-        with contextlib.redirect_stderr(words), contextlib.redirect_stdout(io.StringIO()):
-            cli.run()
-    except SystemExit as end:
-        return int(end.code or 0), words.getvalue()
-    finally:
-        sys.argv = before
-    raise AssertionError("the command line has no end")
-
-
-def refused(*arguments: object) -> str:
-    """Return the one line with which a command refuses what it was given."""
-    code, words = run(*arguments)
-    lines = [line for line in words.splitlines() if line.startswith("error: ")]
-    assert code == 1 and len(lines) == 1 and "Traceback" not in words, words
-    assert len(lines[0]) < 1100
-    return lines[0]
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +112,7 @@ def test_a_file_of_effects_that_ends_the_process_is_one_line(data: Path, tmp_pat
     }
     words = [paths.get(str(word), word) for word in USES[use]]
     if ending == "exits when it is asked" and words[0] == "effects":
-        assert run(*words)[0] == 0  # it is not asked
+        assert typed(*words).returncode == 0  # it is not asked
         return
     line = refused(*words, *(() if {"--out", "--cite"} & set(words) else ("--out", tmp_path / "out")))
     assert "mine.py" in line or "odd" in line or "ended from within (SystemExit: 0)" in line
@@ -356,8 +332,8 @@ def test_any_environment_is_made_or_refused_in_one_line(tmp_path: Path, content:
 
     path = tmp_path / "env.yaml"
     path.write_text(yaml.safe_dump({"configures": "environment", "warmup": 1, **content}), encoding="utf-8")
-    code, words = run("plot", path, "--seconds", 0.2, "--out", tmp_path / "a.png")
-    assert code in (0, 1) and (code == 0 or words.count("error: ") == 1), words
+    done = typed("plot", path, "--seconds", 0.2, "--out", tmp_path / "a.png")
+    assert done.returncode == 0 or (done.returncode == 1 and done.stderr.count("error: ") == 1), done.stderr
 
 
 @given(st.binary(max_size=300) | st.text(alphabet="[]{}:,-&*!|>'\"#%@ \n\tab01.", max_size=200).map(str.encode))
@@ -378,8 +354,8 @@ def test_any_bytes_as_yaml_are_refused_in_one_line(data: Path, tmp_path: Path, c
 def test_any_bytes_as_data_are_refused_in_one_line(tmp_path: Path, name: str, content: bytes) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    code, words = run("plot", path, "--out", tmp_path / "a.png")
-    assert code in (0, 1) and (code == 0 or words.count("error: ") == 1), words
+    done = typed("plot", path, "--out", tmp_path / "a.png")
+    assert done.returncode == 0 or (done.returncode == 1 and done.stderr.count("error: ") == 1), done.stderr
 
 
 @given(

@@ -17,13 +17,7 @@ import pytest
 
 from idm_env import keep
 from idm_env.data import synthetic
-
-
-def call(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-    """Run the command and return what it printed."""
-    return subprocess.run(
-        [sys.executable, "-m", "idm_env", *map(str, arguments)], capture_output=True, text=True, **options
-    )
+from tests.commands import spawned, typed
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +31,12 @@ def frame() -> pl.DataFrame:
 
 def test_help_teaches() -> None:
     """What a file needs, what to type first, and every command."""
-    done = call("--help")
+    done = spawned("--help")
     assert done.returncode == 0
     for word in ("vehicle_id", "position_m", "idm-env demo", "fit", "explain", "simulate", "--resume"):
         assert word in done.stdout
     for command in ("fit", "explain", "simulate"):
-        assert "--out" in call(command, "--help").stdout
+        assert "--out" in typed(command, "--help").stdout
 
 
 def bad_files(frame: pl.DataFrame) -> dict[str, tuple[Callable[[Path], None], str]]:
@@ -72,7 +66,7 @@ def test_bad_input_is_one_line_and_exit_code_1(frame: pl.DataFrame, tmp_path: Pa
     write, words = bad_files(frame)[name]
     path = tmp_path / "data.csv"
     write(path)
-    done = call("fit", path, "--out", tmp_path / "out")
+    done = typed("fit", path, "--out", tmp_path / "out")
     assert done.returncode == 1, done.stderr
     lines = done.stderr.strip().splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: ")
@@ -100,11 +94,11 @@ def test_bad_paths_and_options(frame: pl.DataFrame, tmp_path: Path) -> None:
         (("fit", good, "--lane-changes"), "Lane changes need the lane of every row"),
     ):
         options = () if "--out" in arguments else ("--out", tmp_path / "out")
-        done = call(*arguments, *options)
+        done = typed(*arguments, *options)
         assert done.returncode == 1, (arguments, done.stderr)
         assert len(done.stderr.strip().splitlines()) == 1 and words in done.stderr, done.stderr
-    assert call("fit").returncode == 2
-    assert call("fitt", good).returncode == 2
+    assert typed("fit").returncode == 2
+    assert typed("fitt", good).returncode == 2
 
 
 def test_bad_rows_are_repaired_and_counted(frame: pl.DataFrame, tmp_path: Path) -> None:
@@ -114,7 +108,7 @@ def test_bad_rows_are_repaired_and_counted(frame: pl.DataFrame, tmp_path: Path) 
     dirty = frame.with_columns(pl.Series("position_m", position))
     path = tmp_path / "dirty.csv"
     pl.concat([dirty, dirty[100:110]]).write_csv(path)
-    done = call("fit", path, "--by", "all", "--out", tmp_path / "out")
+    done = typed("fit", path, "--by", "all", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "out" / "report.html").read_text()
     assert "10 rows repeat" in page, page[-800:]
@@ -132,7 +126,7 @@ def test_two_conditions_both_hold(tmp_path: Path) -> None:
     path = tmp_path / "two.parquet"
     table.write_parquet(path)
     out = tmp_path / "out"
-    done = call("fit", path, "--where", "site=a", "--where", "sky=wet", "--starts", "1", "--out", out)
+    done = typed("fit", path, "--where", "site=a", "--where", "sky=wet", "--starts", "1", "--out", out)
     assert done.returncode == 0, done.stderr
     assert json.loads((out / "report.json").read_text())["fit"]["episodes"] == 2
 
@@ -142,7 +136,7 @@ def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
     path = tmp_path / "good.csv"
     synthetic.generate(2, runs=6, followers=3, seconds=120.0)[0].table.drop("gap_m").write_csv(path)
     options = ("--method", "adam", "--out")
-    assert call("fit", path, *options, tmp_path / "whole").returncode == 0
+    assert typed("fit", path, *options, tmp_path / "whole").returncode == 0
     for number in (signal.SIGINT, signal.SIGKILL):
         out = tmp_path / number.name
         running = subprocess.Popen(
@@ -157,14 +151,14 @@ def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
         if number == signal.SIGINT:
             assert running.returncode == 130 and "--resume" in words
         assert kept.exists()
-        assert call("fit", path, *options, out, "--resume").returncode == 0
+        assert typed("fit", path, *options, out, "--resume").returncode == 0
         whole, resumed = (pl.read_parquet(folder / "parameters.parquet") for folder in (tmp_path / "whole", out))
         assert whole.equals(resumed)
 
 
 def test_the_demo_finds_what_its_generator_hid(tmp_path: Path) -> None:
     """The README's main job, from the command to a report: the hidden delay is named, and the held-out error falls."""
-    done = call("demo", "--out", tmp_path)
+    done = typed("demo", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "report.html" in done.stderr.replace("\n", "")
     columns = pl.read_csv(tmp_path / "platoon.csv").columns
@@ -177,7 +171,7 @@ def test_the_demo_finds_what_its_generator_hid(tmp_path: Path) -> None:
     assert any(line.startswith("Data: ") for line in done.stderr.splitlines())
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image") >= 5 and 'src="http' not in page
-    again = call("simulate", tmp_path / "platoon.csv", "--model", tmp_path / "model.yaml", "--out", tmp_path / "again")
+    again = typed("simulate", tmp_path / "platoon.csv", "--model", tmp_path / "model.yaml", "--out", tmp_path / "again")
     assert again.returncode == 0, again.stderr
 
 
@@ -188,17 +182,17 @@ def test_plot_and_effects(frame: pl.DataFrame, tmp_path: Path) -> None:
     ring = Path(__file__).resolve().parents[1] / "configs" / "ring.yaml"
     for source, options in ((path, ()), (ring, ("--seconds", "20"))):
         picture = tmp_path / f"{source.stem}.png"
-        done = call("plot", source, "--out", picture, "--html", *options)
+        done = typed("plot", source, "--out", picture, "--html", *options)
         assert done.returncode == 0, done.stderr
         page = picture.with_suffix(".html")
         text = page.read_text()
         assert "http" not in text and ('"marked": true' if source is ring else '"marked": false') in text
         assert picture.read_bytes().startswith(b"\x89PNG")
-        assert call("plot", source, "--out", picture, "--html", *options).returncode == 0  # its own page is replaced
+        assert typed("plot", source, "--out", picture, "--html", *options).returncode == 0  # its own page is replaced
     page.write_text("mine")
-    done = call("plot", path, "--out", tmp_path / f"{ring.stem}.png", "--html")
+    done = typed("plot", path, "--out", tmp_path / f"{ring.stem}.png", "--html")
     assert done.returncode == 1 and "was not written by idm-env plot" in done.stderr and page.read_text() == "mine"
-    listed = call("effects", env={**os.environ, "COLUMNS": "200"})
+    listed = spawned("effects", env={**os.environ, "COLUMNS": "200"})
     assert "second_leader.weight" in listed.stdout
 
 
@@ -206,9 +200,9 @@ def test_explain_reads_effects_from_files(frame: pl.DataFrame, tmp_path: Path) -
     """A class that is not there is one line; one that is there is tried: two runs are too few to decide."""
     path, example = tmp_path / "data.csv", Path(__file__).parents[1] / "examples" / "add_an_effect.py"
     frame.write_csv(path)
-    done = call("explain", path, "--effects", f"{example}:Nobody", "--out", tmp_path / "out")
+    done = typed("explain", path, "--effects", f"{example}:Nobody", "--out", tmp_path / "out")
     assert done.returncode == 1 and "no class Nobody of effects. It has: Fatigue." in " ".join(done.stderr.split())
-    done = call("explain", path, "--effects", f"{example}:Fatigue", "--out", tmp_path / "out")
+    done = typed("explain", path, "--effects", f"{example}:Fatigue", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert [c["effect"] for c in report["candidates"]] == ["fatigue"] and "only" not in report["candidates"][0]["note"]

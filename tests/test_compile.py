@@ -63,18 +63,31 @@ def compare(simulator, tolerance=1e-9, dtype=torch.float64, **choices):
             torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in ALL if kind not in ("idm", "brakes")])
-def test_every_effect_is_one_graph(kind):
+MANY = [kind for kind, cls in ALL.items() if kind not in (*BASES, "brakes") and cls.hook != "change"]
+GROUPS = [tuple(MANY[i::6]) for i in range(6)]
+"""A graph costs two seconds and a further effect in it a tenth of that."""
+
+
+def effect(kind):
     choices = {"feature": "speed", "knots": (0.0, 10.0, 20.0)} if ALL[kind] in (Curve, DriverCurve) else {}
-    laws = () if kind in BASES else (IDM(),)
-    compare(Simulator(Lane(), (*laws, Brakes(), make(kind, **choices))), backend="aot_eager")
+    return make(kind, **choices)
+
+
+@pytest.mark.parametrize("group", range(len(GROUPS)), ids=lambda i: "-".join(GROUPS[i]))
+def test_every_effect_is_in_one_graph(group):
+    road = Ring() if group % 2 else Lane()
+    compare(Simulator(road, (IDM(), Brakes(), *(effect(kind) for kind in GROUPS[group]))), backend="aot_eager")
+
+
+@pytest.mark.parametrize("law", [law for law in BASES if law != "idm"])
+def test_every_law_is_one_graph(law):
+    compare(Simulator(Lane(), (make(law), Brakes())), backend="aot_eager")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", [Lane(), Ring()])
-def test_inductor_gives_the_same(road):
+def test_inductor_gives_the_same():
     many = ("drag", "second_leader", "speed_dependent_gap", "memory", "lag", "control", "noise")
-    compare(Simulator(road, (IDM(), Brakes(), *(make(kind) for kind in many))))
+    compare(Simulator(Ring(), (IDM(), Brakes(), *(make(kind) for kind in many))))
 
 
 def test_compiled_rollouts_say_so_and_repeat_the_step():

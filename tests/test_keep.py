@@ -23,6 +23,7 @@ from idm_env.fitting.options import Options, Source
 from idm_env.parts import Parts
 from idm_env.prediction.files import predict_files
 from idm_env.trajectories import files
+from tests.commands import refused
 
 NAMES = ("report.json", "table.parquet")
 
@@ -140,13 +141,13 @@ def test_fit_and_simulate_refuse_to_overwrite_what_they_read(data: Path, tmp_pat
     simulate_file(Source(data), out / "model.yaml", out)
     before = content(out)
     assert set(before) == {*job.FITTED, *job.SIMULATED, keep.MARK}
-    for refused in (
+    for given in (
         lambda: fit_file(Source(data), Options(by="all", model=str(out / "model.yaml")), out),
         lambda: fit_file(Source(out / "parameters.parquet"), Options(), out),
         lambda: simulate_file(Source(out / "simulated.parquet"), out / "model.yaml", out),
     ):
         with pytest.raises(ValueError, match="is an input"):
-            refused()
+            given()
     assert content(out) == before
 
 
@@ -324,14 +325,6 @@ def test_what_determines_a_run_is_in_its_fingerprint(tmp_path: Path) -> None:
 
 
 # -- commands --------------------------------------------------------------------------------------------------------
-
-
-def refused(*arguments: object) -> str:
-    """Return the one line with which a command refuses what it was given."""
-    done = subprocess.run([sys.executable, "-m", "idm_env", *map(str, arguments)], capture_output=True, text=True)
-    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert done.returncode == 1 and len(lines) == 1 and "Traceback" not in done.stderr, done.stderr
-    return lines[0]
 
 
 def test_filter_keeps_a_user_s_parts_and_refuses_its_own_output_as_input(data: Path, tmp_path: Path) -> None:

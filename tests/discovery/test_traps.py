@@ -11,11 +11,10 @@ from idm_env.discovery import discover
 from tests.discovery import sumo
 
 
-@pytest.mark.parametrize("hidden", ["lag", "leader_acceleration"])
-def test_a_response_at_the_same_bends_is_no_place(hidden: str) -> None:
-    laps, _ = synthetic.generate(1, effect=hidden, laps=True, runs=8, followers=2, seconds=120.0)
+def test_a_response_at_the_same_bends_is_no_place() -> None:
+    laps, _ = synthetic.generate(1, effect="lag", laps=True, runs=8, followers=2, seconds=120.0)
     found = discover(laps, seed=1, place="track_s_m")
-    assert [f["effect"] for f in found.report["found"]] == [hidden]
+    assert [f["effect"] for f in found.report["found"]] == ["lag"]
     # The trap is there: alone, a profile of slopes over the lap explains something, too.
     grade = next(c for c in found.report["candidates"] if c["effect"] == "grade")
     assert grade["held_out_gain"] > 0.02
@@ -61,11 +60,11 @@ class TestSumo:
         pytest.importorskip("libsumo", reason="SUMO is not installed: pip install libsumo")
 
     def test_its_idm_lacks_nothing_but_half_a_step(self) -> None:
-        for slope in (0.0, 0.04):
-            found = discover(sumo.platoons(5, slope=slope))
-            assert found.verdict == "none"
-            (known,) = found.report["known"]
-            assert known["effect"] in ("lag", "delay") and 0.02 < known["estimate"] < 0.1
+        """On slopes, too, to which it does not react."""
+        found = discover(sumo.platoons(5, slope=0.04))
+        assert found.verdict == "none"
+        (known,) = found.report["known"]
+        assert known["effect"] in ("lag", "delay") and 0.02 < known["estimate"] < 0.1
 
     def test_drivers_that_decide_once_a_second_are_late(self) -> None:
         report = discover(sumo.platoons(5, decides_every=1.0)).report

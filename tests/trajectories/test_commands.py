@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import polars as pl
 import pytest
 
+from tests.commands import typed
 from tests.prediction import scenes
 from tests.prediction.test_womd import write_json
 from tests.trajectories.test_files import OUTPUT, lane
 
 pytest.importorskip("numba", reason="numba is not installed")
-
-
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "idm_env", *map(str, arguments)], capture_output=True, text=True, check=False
-    )  # fmt: skip
 
 
 def methods(out: Path) -> list[str]:
@@ -29,7 +22,7 @@ def methods(out: Path) -> list[str]:
 
 def test_filter_and_its_ablation(tmp_path: Path) -> None:
     path = lane(tmp_path / "lane.csv", vehicles=3, seconds=15.0)
-    done = call("filter", path, "--out", tmp_path / "out")
+    done = typed("filter", path, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert {p.name for p in (tmp_path / "out").iterdir()} == OUTPUT
     assert "3/3" in done.stderr + done.stdout  # the progress at its end
@@ -37,18 +30,18 @@ def test_filter_and_its_ablation(tmp_path: Path) -> None:
     named = methods(tmp_path / "out")
     assert named[0] == "simulator, imagined leader" and {"linear", "Savitzky–Golay", "bounded spline"} <= set(named)
     assert "Driver parameters" in (tmp_path / "out" / "report.html").read_text()
-    fixed = call("filter", path, "--out", tmp_path / "fixed", "--fixed-parameters")
+    fixed = typed("filter", path, "--out", tmp_path / "fixed", "--fixed-parameters")
     assert fixed.returncode == 0, fixed.stderr
     assert pl.read_parquet(tmp_path / "fixed" / "parameters.parquet").is_empty()
     assert "Driver parameters" not in (tmp_path / "fixed" / "report.html").read_text()
-    paper = call("filter", path, "--out", tmp_path / "paper", "--recipe", "paper")
+    paper = typed("filter", path, "--out", tmp_path / "paper", "--recipe", "paper")
     assert paper.returncode == 0 and methods(tmp_path / "paper")[0] == "the paper's recipe"
 
 
 def test_reconstruct_with_holes_and_missing_rows(tmp_path: Path) -> None:
     path = lane(tmp_path / "sparse.csv", vehicles=2, seconds=60.0, every=20)
     pl.read_csv(path).filter(pl.int_range(pl.len()) % 5 != 3).write_csv(path)
-    done = call("reconstruct", path, "--dt", 0.2, "--out", tmp_path / "out")
+    done = typed("reconstruct", path, "--dt", 0.2, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     table = pl.read_parquet(tmp_path / "out" / "trajectories.parquet")
     steps = table.group_by("vehicle_id").agg(pl.col("time_s").diff().drop_nulls().round(6).unique())
@@ -61,7 +54,7 @@ def test_predict_does_the_whole_records_of_a_truncated_file(tmp_path: Path) -> N
     record = womd_record.frame(scenes.as_record([0]))
     (tmp_path / "cut.tfrecord").write_bytes(record + record[:-9])
     files = tmp_path / "cut.tfrecord", write_json(tmp_path / "old.json"), tmp_path / "missing.json"
-    done = call("predict", *files, "--out", tmp_path / "out")
+    done = typed("predict", *files, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "Data: 2 bad files: cut.tfrecord, missing.json." in done.stderr.splitlines()
     report = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -84,7 +77,7 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, arguments: tuple[str, ...], w
     lane(tmp_path / "lane.csv", vehicles=1, seconds=5.0)
     (tmp_path / "broken.json").write_text("{")
     name, file, *more = arguments
-    done = call(name, tmp_path / file, *more, "--out", tmp_path / "out")
+    done = typed(name, tmp_path / file, *more, "--out", tmp_path / "out")
     assert done.returncode == 1 and not (tmp_path / "out" / "idm-env-unfinished").exists()
     (line,) = [line for line in done.stderr.strip().splitlines() if line.startswith("error:")]
     assert words in line
