@@ -303,7 +303,7 @@ class _Team:
         """End all processes at once: what they have not finished is done again by whoever goes on."""
         if self._pool is None:
             return
-        processes = list((self._pool._processes or {}).values())
+        processes = compat.processes_of(self._pool)
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.terminate()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from idm_env import instead, parameters
+from idm_env import compat, instead, parameters
 from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead, normals
 from idm_env.types import Inputs, Params, State, mapped
 
@@ -197,7 +197,7 @@ class Compiled(Simulator):
         try:
             after = self._compiled(state, inputs, params)
             return super().step(state, inputs, params) if self.own and bool(after.speed.isnan().any()) else after
-        except torch._dynamo.exc.TorchDynamoException as error:
+        except compat.compile_error() as error:
             self.__dict__["failed"] = True
             first = str(error).strip().splitlines()[0]
             warnings.warn(

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from idm_env import compat
 from idm_env.types import Driver, Motion, Scene, Wish
 
 RETURNS: Mapping[str, type] = {
@@ -31,7 +32,7 @@ def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(method)
     def call(self: Any, *given: Any, **named: Any) -> Any:
-        if named or torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
+        if named or torch.compiler.is_compiling() or compat.transforming():
             return method(self, *given, **named)
         who = f"effect '{self.name}': {name}"
         seen = [_Limited.of(x, self.looks_back, who) if isinstance(x, Scene) else x for x in given]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 from typing import Any
 
 import gymnasium
@@ -11,6 +10,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from torch import Tensor
 
+from idm_env import compat
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
@@ -27,13 +27,11 @@ def asked_of_make() -> int | None:
     Gymnasium keeps it for its own TimeLimit and tells the environment nothing, but a task must know the end: starts in
     a record, the cost of a crash and whether the record is long enough all depend on it. So it is read where it stands.
     """
-    frame = inspect.currentframe()
-    while frame is not None and frame.f_code is not gymnasium.make.__code__:
-        frame = frame.f_back
-    if frame is None:
+    made = compat.locals_of(gymnasium.make.__code__)
+    if made is None:
         return None
-    given = frame.f_locals.get(LIMIT)
-    return getattr(frame.f_locals.get("env_spec"), LIMIT, None) if given is None else given
+    given = made.get(LIMIT)
+    return getattr(made.get("env_spec"), LIMIT, None) if given is None else given
 
 
 class Face:

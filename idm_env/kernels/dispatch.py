@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from idm_env import compat
 from idm_env.history import PAST
 from idm_env.instead import off, switched_off
 from idm_env.kernels import available
@@ -47,7 +48,7 @@ def surroundings() -> str | None:
         return "IDM_ENV_KERNELS=0"
     if not available():
         return "numba is not installed; pip install 'idm-env[kernels]'"
-    if torch._C._are_functorch_transforms_active() or torch.autograd.forward_ad._current_level >= 0:
+    if compat.transforming() or compat.forward_mode():
         return "a torch.func transform or forward-mode differentiation is active"
     if torch.compiler.is_compiling():
         return "torch is compiling"

@@ -16,8 +16,8 @@ from idm_env.extras import needed
 
 with needed("a compiled loop"):
     from llvmlite import ir
-    from numba import extending
-    from numba.core import cgutils, types
+    from numba import extending, types
+    from numba.core import cgutils
 
 intrinsic: Any = extending.intrinsic
 

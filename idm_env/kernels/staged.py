@@ -19,7 +19,8 @@ from idm_env.extras import needed
 
 with needed("a compiled loop"):
     from llvmlite import ir
-    from numba.core import cgutils, types
+    from numba import types
+    from numba.core import cgutils
     from numba.core.typing.templates import signature
     from numba.extending import intrinsic
 

@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import math
-import sys
 import threading
 from typing import Any
 
 import numpy as np
 
+from idm_env import compat
 from idm_env.kernels.memory import LINE
 from idm_env.kernels.tiles import Array
 
@@ -27,7 +27,7 @@ _kept: list[Array] = []
 
 def _free(size: int, arrays: list[Array], unheld: int) -> Array | None:
     for base in arrays:
-        if base.nbytes == size and sys.getrefcount(base) <= unheld:
+        if base.nbytes == size and compat.references(base) <= unheld:
             return base
     return None
 
