@@ -6,6 +6,8 @@ env steps per CPU second of ``highway`` beside HighwayEnv.
 HighwayEnv's, with the same IDM. Rings of four lanes; HighwayEnv has none, and drives a stretch of 1.6 km of which the
 middle half counts. Its MOBIL, and ours, have politeness 0.2, threshold 0.1 m/s² and safe deceleration 4 m/s²; SUMO's
 models have their own parameters. Rows are kept under ``out/``; those that are there are not driven again.
+``python -m benchmarks.lanes standing`` prints how long vehicles stand at ends of lanes in the open tasks, and what gets
+in and out, with drivers as they come and without gap acceptance, courtesy and zipper.
 ``python -m benchmarks.lanes laws [vehicle-steps]`` draws worlds (a ring, a lane drop, ramps, each with 2 to 5 lanes;
 drivers, politeness and what is safe at random; a tenth of the drivers commanded anywhere at random), runs them as users
 do, compiled where they can be, and looks after every step (gaps) and every decision (the rest). What breaks a law is
@@ -41,6 +43,9 @@ from idm_env.effects import IDM, Brakes, LaneCommand, MandatoryChange, Mobil
 from idm_env.progress import OnProgress
 from idm_env.roads import Lanes, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator
+from idm_env.tasks import BottleneckTask, MergeTask
+from idm_env.tasks.open_lanes import OpenLanesTask
+from idm_env.tasks.random import Draw
 from idm_env.types import State
 
 LANES, EACH, DT = 4, 1000, 0.1
@@ -509,6 +514,64 @@ def counted(found: dict[str, Counts]) -> str:
     return "\n".join(lines)
 
 
+class Stood(NamedTuple):
+    """Of some episodes: the longest stand of any vehicle (s, each), vehicles an hour from lane 0, and out.
+
+    ``hard`` are seconds in which a vehicle brakes by more than 6 m/s², an episode; ``touched`` those with a gap ≤ 0.
+    """
+
+    longest: list[float]
+    merged: float
+    out: float
+    hard: float
+    touched: float
+
+
+BEFORE = ({"gap_acceptance": {"strength": 0.0}, "courtesy": {"weight": 0.0}, "mandatory_change": {"turns": 0.0}}, {})
+DEMANDS = {
+    "merge 2400 + 500": (MergeTask, {"inflow": 2400.0, "ramp_inflow": 500.0}),
+    "merge 3000 + 800": (MergeTask, {"inflow": 3000.0, "ramp_inflow": 800.0}),
+    "bottleneck 1900": (BottleneckTask, {"inflow": 1900.0}),
+}
+
+
+def stood(task: OpenLanesTask, rows: int = 8, seconds: int = 600) -> Stood:
+    """Drive some episodes of a task with nobody controlled; a vehicle stands below 0.5 m/s."""
+    params = task.params(torch.float32, "cpu")
+    simulator = task.simulator.without("control")
+    state = task.begin(Draw.of(torch.arange(rows), torch.zeros(rows, dtype=torch.int64)), params).state
+    now = torch.zeros_like(state.speed)
+    longest, merged, hard, touched = now, 0, 0, 0
+    for _ in range(seconds):
+        before = state
+        state, kept = simulator.rollout(state, {}, params, round(1.0 / simulator.dt))
+        assert before.links and state.links and before.trips and state.trips and state.present is not None
+        same = (state.present > 0) & (state.trips.entered == before.trips.entered)
+        now = torch.where(same & (state.speed < 0.5), now + 1.0, 0.0)
+        longest = torch.maximum(longest, now)
+        hard += int((same & (kept.accel < -6.0).any(0)).sum())
+        touched += int((same & (kept.gap <= 0.0).any(0)).sum())
+        merged += int((same & (before.links.lane == 0) & (state.links.lane != 0)).sum())
+    assert state.trips is not None
+    hourly = 3600.0 / seconds / rows
+    return Stood(
+        longest.amax(-1).tolist(), merged * hourly, float(state.trips.left.sum()) * hourly, hard / rows, touched / rows
+    )
+
+
+def standing() -> None:
+    """Print how long vehicles stand in the open tasks."""
+    print("| | drivers | longest stand in each of 8 × 600 s (s) | from lane 0, vehicles/h | out, vehicles/h "
+          "| hard brakings, s | touched, s |")  # fmt: skip
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name, (kind, demand) in DEMANDS.items():
+        for drivers, changed in zip(("without", "as they come"), BEFORE, strict=True):
+            found = stood(kind(parameters=changed, **demand))
+            each = ", ".join(f"{x:.0f}" for x in found.longest)
+            print(f"| {name} | {drivers} | {each} | {found.merged:.0f} | {found.out:.0f} "
+                  f"| {found.hard:.0f} | {found.touched:.0f} |")  # fmt: skip
+
+
 def laws(steps: float) -> None:
     """Print how often random traffic broke a law, and what else it did."""
     with progress.shown(Console(stderr=True)) as on_progress:
@@ -524,12 +587,15 @@ def main() -> None:
     parts = commands.add_parser("speed").add_argument("parts", nargs="?", choices=("rollouts", "highway"))
     parts.default = "rollouts,highway"
     add_executor(commands.add_parser("flow"))
+    commands.add_parser("standing")
     commands.add_parser("laws").add_argument("steps", nargs="?", type=_steps, default=1e9)
     given = parser.parse_args()
     if given.what == "speed":
         speed(given.parts)
     elif given.what == "flow":
         flow(given)
+    elif given.what == "standing":
+        standing()
     else:
         laws(given.steps)
 

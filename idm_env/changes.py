@@ -89,10 +89,27 @@ def wished(stepping: Stepping, scene: Scene, params: Params) -> Wish:
                 torch.minimum(total.right_margin, wish.right_margin),
                 torch.maximum(total.left_most, wish.left),
                 torch.maximum(total.right_most, wish.right),
+                _larger(total.left_despite, wish.left_despite),
+                _larger(total.right_despite, wish.right_despite),
+                _larger(total.left_must, wish.left_must),
+                _larger(total.right_must, wish.right_must),
             )
         total = wish
     assert total is not None
-    return total
+    left, right = _larger(total.left_margin, total.left_despite), _larger(total.right_margin, total.right_despite)
+    assert left is not None and right is not None
+    if total.left_must is not None and total.right_must is not None:
+        assert total.left_most is not None and total.right_most is not None
+        total = total._replace(
+            left=total.left + total.left_must * (total.left_most - total.left),
+            right=total.right + total.right_must * (total.right_most - total.right),
+        )
+    return total._replace(left_margin=left, right_margin=right)
+
+
+def _larger(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    """Return the larger of two margins, of which either may not be said."""
+    return b if a is None else a if b is None else torch.maximum(a, b)
 
 
 def beside(

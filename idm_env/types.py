@@ -160,7 +160,9 @@ class Wish(NamedTuple):
 
     Utility (m/s²): a change is wished where the sum over effects is above 0. Margin (m/s²): it is safe where the least
     of all effects is at least 0. The sum over effects also has the largest single utility of each side, for which a
-    driver signals: he may have to go where the sum, which knows of dangers, does not want him to.
+    driver signals: he may have to go where the sum, which knows of dangers, does not want him to. An effect may say a
+    margin of its own that counts ``despite`` a smaller one of others, that of a driver who accepts more, and how much
+    he ``must`` (0 to 1): by as much what one effect wishes for most counts instead of the sum.
     """
 
     left: Tensor
@@ -169,6 +171,10 @@ class Wish(NamedTuple):
     right_margin: Tensor
     left_most: Tensor | None = None
     right_most: Tensor | None = None
+    left_despite: Tensor | None = None
+    right_despite: Tensor | None = None
+    left_must: Tensor | None = None
+    right_must: Tensor | None = None
 
 
 class Past(Protocol):

@@ -14,7 +14,7 @@ from idm_env.effects.actions import Control, Replay
 from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
 from idm_env.effects.base import CarFollowing, Effect
 from idm_env.effects.bases import FVDM, IIDM, ConstantTimeGap, Gipps, IDMPlus
-from idm_env.effects.changes import LaneCommand, MandatoryChange, Mobil
+from idm_env.effects.changes import GapAcceptance, LaneCommand, MandatoryChange, Mobil
 from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
 from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
@@ -72,6 +72,7 @@ ALL: dict[str, type[Effect]] = {
         DriverCurve,
         Mobil,
         MandatoryChange,
+        GapAcceptance,
         LaneCommand,
     )
 }
@@ -211,6 +212,7 @@ __all__ = [
     "DriverCurve",
     "Effect",
     "Follower",
+    "GapAcceptance",
     "GapBias",
     "Gipps",
     "Grade",

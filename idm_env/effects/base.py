@@ -231,3 +231,34 @@ class CarFollowing(Effect):
     def driver(self, p: P) -> Driver:
         """Return the driver before any adaptation."""
         raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Remembering(Effect):
+    """The memory of an effect that changes lanes, in the steps between two decisions."""
+
+    kind: ClassVar[str] = "remembering"
+    adds: ClassVar[bool] = False
+    of: Effect
+
+    @property
+    def name(self) -> str:
+        """That of the effect."""
+        return self.of.name
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Those of the effect."""
+        return self.of.parameters
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Change nothing."""
+        return driver
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:
+        """Return the effect's."""
+        return self.of.initial_memory(scene, driver, p)
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the effect's."""
+        return self.of.remember(scene, driver, p)

@@ -11,11 +11,18 @@ from torch import Tensor
 
 from idm_env.effects import references
 from idm_env.effects.base import Effect, P
+from idm_env.effects.idm import interaction
 from idm_env.parameters import Parameter
 from idm_env.types import Beside, Driver, Scene, Wish
 
 COMMANDED = 1e12
 """Utility of an agent's command (m/s²): more than any driver's, who may think of a place inside another vehicle."""
+
+STANDS = 1.0
+"""Below this speed (m/s) a driver waits."""
+
+QUEUES = 3.0
+"""Behind somebody below this speed (m/s) a driver queues."""
 
 _BLOCK = 256
 """The fewest slots that decide together."""
@@ -102,7 +109,8 @@ class MandatoryChange(Effect):
     """Away from lanes that end: ``+ A (u_here − u_there)``, urgency ``u = max(0, 1 − d/D)`` at d before an end.
 
     Strength A (m/s²), reach D (m). What a driver must do is a bias in MOBIL (Kesting, Treiber, Helbing 2007); here it
-    grows towards the end.
+    grows towards the end. ``turns`` z makes a zipper: whoever queues in his lane, at most 20 m behind somebody below
+    3 m/s, feels an urgency of ``(1 − z) u`` until he is the first at the end; 0 is nobody waiting for his turn.
     """
 
     kind: ClassVar[str] = "mandatory_change"
@@ -111,14 +119,18 @@ class MandatoryChange(Effect):
         Parameter("strength", "A", "m/s²", 4.0, 0.0, 100.0, role="shape"),
         Parameter("reach", "D", "m", 300.0, 1.0, 5000.0, role="shape"),
         _SAFE_DECEL,
+        Parameter("turns", "z", "1", 0.0, 0.0, 1.0, null=0.0, role="shape"),
     )
 
     def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
         """Return how much more urgent it is here than there."""
         here, left, right = _lanes(scene)
 
+        queues = (here.leader.gap < here.ends) & (here.leader.speed < QUEUES) & (here.leader.gap < 20.0)
+        turn = torch.where(queues, 1.0 - p["turns"], 1.0)
+
         def urgency(lane: Beside) -> Tensor:
-            return p["strength"] * torch.relu(1.0 - lane.ends / p["reach"])
+            return p["strength"] * torch.relu(1.0 - lane.ends / p["reach"]) * turn
 
         return Wish(
             (urgency(here) - urgency(left)) * left.exists,
@@ -126,6 +138,77 @@ class MandatoryChange(Effect):
             margin(left, here, p["safe_decel"]),
             margin(right, here, p["safe_decel"]),
         )
+
+
+@dataclass(frozen=True)
+class GapAcceptance(Effect):
+    """Gaps that drivers accept near the end of a lane, and where they have waited: closer ones, and harder braking.
+
+    ::
+
+        d = c (u + (1 − u) m) where u > 0,   u = max(0, u_here − u_there),   u_x = max(0, 1 − x/D)
+        T_d = T (1 − γ d),   s0_d = s0 (1 − d),   b_d = b_safe + d (b_most − b_safe),   safe where A_d ≥ −b_d
+        τ dm/dt = [v < 1 m/s] − m,   utility → (1 − d) · (sum over effects) + d · (largest of one effect)
+
+    u says how near the end x of the lane is, m how long the driver has stood. A_d is what the follower there would
+    want, and the driver himself, with T_d and s0_d in IDM's ``a (s*/s)²``. After the desire of LMRS: with it the
+    accepted headway shrinks, the accepted deceleration grows, and voluntary reasons count less (Schakel, Knoop, van
+    Arem 2012). A gap accepted so counts as safe whatever other effects say. Absent at c = 0.
+    """
+
+    kind: ClassVar[str] = "gap_acceptance"
+    sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2012,)
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("strength", "c", "1", 1.0, 0.0, 1.0, null=0.0),
+        Parameter("reach", "D", "m", 300.0, 1.0, 5000.0, role="shape"),
+        Parameter("closer", "γ", "1", 0.8, 0.0, 0.9, role="shape"),
+        _SAFE_DECEL,
+        Parameter("most_decel", "b_most", "m/s²", 9.0, 0.5, 9.0, role="shape"),
+        Parameter("patience", "τ", "s", 10.0, 1.0, 300.0, role="shape"),
+    )
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return m = 0."""
+        return torch.zeros_like(scene.speed)
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return m after a step, by its exact law."""
+        level = scene.memory[self.name]
+        stands = torch.where(scene.speed < STANDS, 1.0, 0.0)
+        return level + (stands - level) * -torch.expm1(-scene.dt / p["patience"])
+
+    def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
+        """Return no wish, and the margins of a driver who accepts more, where he does."""
+        here, left, right = _lanes(scene)
+        none = torch.zeros_like(scene.speed)
+
+        def near(lane: Beside) -> Tensor:
+            return torch.relu(1.0 - lane.ends / p["reach"])
+
+        def wished(side: Beside) -> Tensor:
+            must = torch.relu(near(here) - near(side)) * side.exists
+            return p["strength"] * torch.where(must > 0, must + (1.0 - must) * scene.memory[self.name], 0.0)
+
+        def despite(side: Beside, desire: Tensor) -> Tensor:
+            closer = driver._replace(
+                time_gap=driver.time_gap * (1.0 - p["closer"] * desire), min_gap=driver.min_gap * (1.0 - desire)
+            )
+            most = p["safe_decel"] + desire * torch.relu(p["most_decel"] - p["safe_decel"])
+
+            def eased(wanted: Tensor, speed: Tensor, gap: Tensor, lead_speed: Tensor) -> Tensor:
+                less = interaction(driver, speed, gap, lead_speed) - interaction(closer, speed, gap, lead_speed)
+                return wanted + driver.max_accel * less
+
+            own = eased(side.wanted, scene.speed, side.leader.gap, side.leader.speed)
+            other = eased(side.with_me, side.follower.speed, side.follower.gap, scene.speed)
+            follower = torch.where(side.follower.present > 0, other + most, most)
+            safe = torch.minimum(follower, own - torch.minimum(here.wanted, -most))
+            return torch.where(desire > 0, safe, -COMMANDED)
+
+        sure, desires = none + COMMANDED, (wished(left), wished(right))
+        return Wish(
+            none, none, sure, sure, None, None, despite(left, desires[0]), despite(right, desires[1]), *desires
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

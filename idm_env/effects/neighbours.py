@@ -141,13 +141,13 @@ class Courtesy(Effect):
 
     ::
 
-        − w min(b, v / 1 s, a max(0, (s*_m / s_m)² − (s* / s)²))
+        − w min(b, v / 1 s + z b, a max(0, (s*_m / s_m)² − (s* / s)²))
 
     s_m (m) is the gap to a vehicle in a lane beside that wished for this one at the last decision and was not granted
     it, taken to drive on at the speed that it had then. With w = 1 a driver follows whichever is nearer, within b;
-    after the gap creation of LMRS (Schakel, Knoop, van Arem 2012). A driver slows down for another, but does not stand
-    for him: two that wait for each other side by side would wait for ever. Whom to let in plays no part in his own
-    wishes.
+    after the gap creation of LMRS (Schakel, Knoop, van Arem 2012). With z = 0 a driver slows down for another,
+    but does not stand for him. With z = 1 he does, as at a zipper: behind the end of a lane that is closed, of which
+    only the first wants in (``turns`` of ``mandatory_change``). Whom to let in plays no part in his own wishes.
     """
 
     kind: ClassVar[str] = "courtesy"
@@ -164,6 +164,7 @@ class Courtesy(Effect):
     beyond: ClassVar[Neighbour] = "vehicle in an adjacent lane"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("weight", "w", "1", 0.5, -0.5, 1.0, null=0.0, starts=(0.1,)),
+        Parameter("zipper", "z", "1", 0.0, 0.0, 1.0, null=0.0, role="shape"),
     )
     needs: ClassVar[frozenset[str]] = frozenset({"merger"})
 
@@ -173,7 +174,7 @@ class Courtesy(Effect):
         assert other is not None
         own = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed) * scene.leader.present
         more = torch.relu(interaction(driver, scene.speed, other.gap, other.speed) - own)
-        most = torch.minimum(driver.comfort_decel, scene.speed / STANDSTILL_S)
+        most = torch.minimum(driver.comfort_decel, scene.speed / STANDSTILL_S + p["zipper"] * driver.comfort_decel)
         return -p["weight"] * other.present * torch.minimum(most, driver.max_accel * more)
 
 

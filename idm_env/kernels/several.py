@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.effects.base import Remembering
 from idm_env.history import PAST
 from idm_env.kernels import lanes, tiles
 from idm_env.kernels.deciding import Traffic, decision
@@ -33,7 +34,8 @@ def between(simulator: Simulator) -> Simulator:
     found: Simulator | None = simulator.__dict__.get("_between")
     if found is None:
         assert isinstance(simulator.road, Lanes)
-        still = tuple(e for e in simulator.effects if e.hook != "change")
+        kept = (Remembering(e) if e.hook == "change" else e for e in simulator.effects)
+        still = tuple(e for e in kept if not isinstance(e, Remembering) or e.of.remembers)
         found = dataclasses.replace(simulator, road=Chains(simulator.road.closed), effects=still)
         simulator.__dict__["_between"] = found
     return found

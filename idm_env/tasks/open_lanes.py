@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from idm_env import population
-from idm_env.effects import IDM, Brakes, Effect, MandatoryChange, Mobil
+from idm_env.effects import IDM, Brakes, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
 from idm_env.roads import Lanes, lane_drop, on_ramp
 from idm_env.tasks.base import World
 from idm_env.tasks.checks import at_least, whole
@@ -34,6 +34,9 @@ class OpenLanesTask(LanesTask):
     Whoever finds no room at his entry waits and is counted (``idm_env.population.counts``). Agents act as ``LanesTask``
     says; while an agent's vehicle waits or has left, its observation is zeros and its command does nothing.
 
+    Drivers let in whoever signals, accept closer gaps near the end of a lane and where they have stood
+    (``GapAcceptance``), and take turns at an end as at a zipper (``Courtesy``, ``MandatoryChange``).
+
     Observation, per agent: own speed, lane, 1 if it is on the road, how far its lane goes on (m, at most 500); then the
     nearest vehicles as in ``highway``. Reward, per agent: ``V/40 − 0.1 (u/u_max)²``, V the sum of the speeds of all on
     the road over the number of these and of those queued: keeping others out pays nothing. Terminated where vehicles
@@ -41,9 +44,13 @@ class OpenLanesTask(LanesTask):
     off after 3000 steps.
     """
 
-    own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Mobil(), MandatoryChange(), Brakes())
+    own_effects: ClassVar[tuple[Effect, ...]] = (
+        IDM(), Mobil(), MandatoryChange(), GapAcceptance(), Courtesy(), Brakes(),
+    )  # fmt: skip
     own_parameters: ClassVar = {
-        "idm": {"max_accel": 1.5, "comfort_decel": 2.0, "time_gap": 1.2, "min_gap": 2.0, "desired_speed": 30.0}
+        "idm": {"max_accel": 1.5, "comfort_decel": 2.0, "time_gap": 1.2, "min_gap": 2.0, "desired_speed": 30.0},
+        "mandatory_change": {"turns": 1.0},
+        "courtesy": {"weight": 1.0, "zipper": 1.0},
     }
 
     vehicles: int = 80
@@ -162,7 +169,6 @@ class OpenHighwayTask(OpenLanesTask):
     """
 
     name: ClassVar[str] = "open_highway"
-    own_effects: ClassVar[tuple[Effect, ...]] = (IDM(), Mobil(), Brakes())
 
     lanes_count: int = 4
     length: float = 1000.0

@@ -8,9 +8,11 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401
-from idm_env import population
+from benchmarks import lanes
+from idm_env import instead, population
 from idm_env.envs.pettingzoo import parallel_env
-from idm_env.tasks import Draw, make_task
+from idm_env.kernels import dispatch
+from idm_env.tasks import BottleneckTask, Draw, MergeTask, make_task
 
 OPEN = ("merge", "bottleneck", "open_highway")
 
@@ -135,3 +137,50 @@ def test_bad_choices_are_one_line() -> None:
         make_task("merge", ramp_inflow=0.0)
     with pytest.raises(ValueError, match="entry_speed = 0"):
         make_task("bottleneck", entry_speed=0.0)
+
+
+@pytest.mark.parametrize(("name", "least"), [("merge 2400 + 500", 450.0), ("merge 3000 + 800", 500.0),
+                                             ("bottleneck 1900", 0.0)])  # fmt: skip
+def test_nobody_stands_for_ever_where_a_lane_ends(name: str, least: float) -> None:
+    """No vehicle stands for more than a minute, and the ramp gets in, in eight episodes of ten minutes."""
+    pytest.importorskip("numba")
+    kind, demand = lanes.DEMANDS[name]
+    found = lanes.stood(kind(**demand))
+    assert max(found.longest) <= 60.0 and found.merged >= least and found.touched == 0.0
+
+
+def test_without_them_drivers_are_as_they_were() -> None:
+    """Gap acceptance, courtesy and turns at their nulls leave no trace: a road on which many stand, to the last bit."""
+    task = MergeTask(parameters=lanes.BEFORE[0], inflow=3000.0, ramp_inflow=800.0)
+    params = task.params(torch.float64, "cpu")
+    world = task.begin(Draw.of(torch.arange(2), torch.zeros(2, dtype=torch.int64)), params)
+    full = task.simulator.without("control")
+    bare = full.without("gap_acceptance", "courtesy")
+    state, memory = world.state, {n: x for n, x in world.state.memory.items() if n in bare.by_name}
+    with instead.off():
+        one, kept = full.rollout(state, {}, params, 300)
+        other, told = bare.rollout(state._replace(memory=memory), {}, params, 300)
+    assert one.links is not None and other.links is not None and int(one.links.changed.sum()) > 10
+    for a, b in zip((*kept, *one.links), (*told, *other.links), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_compiled_decisions_accept_the_gaps_that_the_step_does() -> None:
+    """A jam before a lane drop: memory of waiting, closer gaps, turns and zippers, on both paths."""
+    pytest.importorskip("numba")
+    task = BottleneckTask(inflow=3000.0, vehicles=40)
+    params = task.params(torch.float64, "cpu")
+    state = task.begin(Draw.of(torch.arange(1), torch.zeros(1, dtype=torch.int64)), params).state
+    simulator = task.simulator.without("control")
+    assert dispatch.refusal(simulator, state, {}, params) is None
+    state, _ = simulator.rollout(state, {}, params, 900, keep=None)
+    assert float(state.memory["gap_acceptance"].max()) > 0.5
+    compiled, kept = simulator.rollout(state, {}, params, 200)
+    with instead.off():
+        plain, told = simulator.rollout(state, {}, params, 200)
+    assert compiled.links is not None and plain.links is not None and state.links is not None
+    assert int((compiled.links.changed - state.links.changed).sum()) > 3
+    assert torch.equal(compiled.links.lane, plain.links.lane)
+    torch.testing.assert_close(kept.position, told.position, rtol=0, atol=1e-6)
+    for name, x in plain.memory.items():
+        torch.testing.assert_close(compiled.memory[name], x, rtol=0, atol=1e-6)
