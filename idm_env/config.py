@@ -40,7 +40,7 @@ from idm_env.checks import nearest, one_of, shown, whole
 from idm_env.effects import CarFollowing, Effect
 from idm_env.extras import needed
 from idm_env.keep import write_text
-from idm_env.roads import Lane, Road
+from idm_env.roads import Lanes, Road
 from idm_env.simulator import INTEGRATORS, Integration, Simulator
 
 SCHEMA = 1
@@ -86,7 +86,7 @@ class Model:
     def __post_init__(self) -> None:
         one_of("integration", self.integration, INTEGRATORS)
         if any(isinstance(effect, CarFollowing) for effect in self.effects):
-            Simulator(Lane(), self.effects, self.dt, self.integration)  # its rules on effects and dt
+            Simulator(Lanes(2), self.effects, self.dt, self.integration)  # its rules on effects and dt
         elif not self.dt > 0.0:
             raise ValueError(f"dt = {self.dt} s must be positive.")
         if self.substeps is not None:

@@ -143,12 +143,13 @@ def discovery() -> dict[str, Any]:
     """
     from idm_env.data import synthetic
     from idm_env.discovery import discover, model, records, search
+    from idm_env.discovery.calibrate import first_prior
     from idm_env.discovery.discover import prepare
     from idm_env.discovery.solve import Task, linearise
 
     trajectories, _ = synthetic.generate(0)
     rows = records.windows(prepare(trajectories, "driver"))
-    task = Task(rows, search.first_noise(rows), search.first_prior())
+    task = Task(rows, search.first_noise(rows), first_prior())
     theta = np.tile(task.prior.centre, (task.groups, 1))
 
     def jacobian(name: str) -> Case:

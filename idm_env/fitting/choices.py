@@ -134,7 +134,7 @@ class Wishes(Choice):
 
 
 def _coefficient(name: str, default: float = 0.0) -> Parameter:
-    return Parameter(name, name, "1", default, -50.0, 50.0, role="shape")
+    return Parameter(name, name.replace("_", " "), "1", default, -50.0, 50.0, role="shape")
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class GapAcceptance(Choice):
     def parameters(self) -> tuple[Parameter, ...]:
         """Two constants and four coefficients."""
         sides = _coefficient("left", -4.0), _coefficient("right", -4.0)
-        return (*sides, *(_coefficient(n) for n in ("lead gap", "lag gap", "lead speed", "lag speed")))
+        return (*sides, *(_coefficient(n) for n in ("lead_gap", "lag_gap", "lead_speed", "lag_speed")))
 
     def values(self, theta: Tensor, decisions: Decisions) -> Tensor:
         """Return the linear form."""

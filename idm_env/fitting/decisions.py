@@ -186,7 +186,7 @@ def _decided(
 ) -> list[tuple[Scene, Params, Tensor, Tensor, Tensor]]:  # fmt: skip
     """Return scene, parameters, possible sides, choices and vehicles of some times of a run."""
     there = np.isfinite(run.position[times]) & np.isfinite(run.speed[times]) & (run.lane[times] >= 0)
-    if not there.any():
+    if run.count == 1 or not there.any():
         return []
     # Slots are those who are there at one time: of a long record these are few.
     slot = np.argsort(~there, axis=1, kind="stable")[:, : int(there.sum(1).max())]
