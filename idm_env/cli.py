@@ -12,15 +12,25 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import idm_env
-from idm_env import checks, keep, trust
+from idm_env import checks, keep, refusals, trust
 from idm_env.extras import needed
 from idm_env.progress import OnProgress, shown
 
 with needed("the command line"):
     import typer
+    import typer.core
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+
+class _Refusing(typer.core.TyperCommand):
+    """A command that says what it refuses before its function imports anything slow."""
+
+    def invoke(self, ctx: Any) -> Any:
+        refusals.refuse(ctx.params)
+        return super().invoke(ctx)
+
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -301,7 +311,8 @@ def explain(
     Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
     """
     with shown(console) as report:
-        from idm_env.discovery.sets import Question, explain_sets, files_of
+        from idm_env.data.load import files_of
+        from idm_env.discovery.sets import Question, explain_sets
         from idm_env.discovery.sets import explain as explain_one
         from idm_env.executor import opened
 
@@ -429,6 +440,8 @@ def simulate(
     trusted: Trust = False,
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
+    if (model is None) == (base is None):
+        raise ValueError("simulate takes either a model (--model) or a car-following law (--base). Give one of them.")
     with shown(console) as report:
         from idm_env.fitting.job import simulate_file
         from idm_env.fitting.options import Source
@@ -785,6 +798,10 @@ def _told(word: str, path: Path) -> None:
 def _done(out: Path, account: str) -> None:
     console.print(account, soft_wrap=True, highlight=False)
     _told("Report", out / "report.html")
+
+
+for _command in app.registered_commands:
+    _command.cls = _Refusing
 
 
 def run() -> None:

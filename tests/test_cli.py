@@ -114,7 +114,7 @@ def test_bad_rows_are_repaired_and_counted(frame: pl.DataFrame, tmp_path: Path) 
     assert "10 rows repeat" in page, page[-800:]
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("Data: ")]
     assert "duplicated time 10" in line and line.removeprefix("Data: ") in page
-    assert any(line.startswith("Bounds: ") for line in done.stderr.splitlines())
+    assert any(line.startswith(("On its bound: ", "No parameter is on a bound.")) for line in done.stderr.splitlines())
 
 
 def test_two_conditions_both_hold(tmp_path: Path) -> None:

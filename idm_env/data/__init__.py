@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from idm_env.extras import needed
 
 with needed("a trajectory file"):
-    from idm_env.data import synthetic
     from idm_env.data.episode import Episode, Episodes
     from idm_env.data.episodes import episodes
     from idm_env.data.errors import DataError, Repair
@@ -14,6 +16,9 @@ with needed("a trajectory file"):
     from idm_env.data.schema import LEADER_LOST_GAP_M
     from idm_env.data.smooth import Motion, noise_sigma, smooth
     from idm_env.data.trajectories import Trajectories
+
+if TYPE_CHECKING:
+    from idm_env.data import synthetic
 
 __all__ = [
     "LEADER_LOST_GAP_M",
@@ -30,3 +35,9 @@ __all__ = [
     "smooth",
     "synthetic",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "synthetic":  # a second of scipy, which those who read files do not wait for
+        return importlib.import_module("idm_env.data.synthetic")
+    raise AttributeError(f"module 'idm_env.data' has no attribute '{name}'")

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import glob
 import gzip
 import io
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from idm_env.data import drones, folder, ngsim, openacc, tidy, ultra_av
-from idm_env.data.errors import DataError, Repair
+from idm_env.data.clean import check_columns
+from idm_env.data.errors import DataError, Repair, missing_column, nearest
 from idm_env.data.names import Columns, renamed
-from idm_env.data.trajectories import Trajectories
+from idm_env.data.schema import TIDY
+from idm_env.data.trajectories import Trajectories, parted
 
 LAYOUTS = ("auto", "tidy", "ngsim", "openacc", "ultra_av", *drones.CSV, *drones.FILES)
 EXTENSIONS = (".csv", ".csv.gz", ".parquet")
 BATCH_BYTES, BATCH_ROWS = 16_000_000, 200_000
 """Text and rows that ``batches`` holds at a time."""
+HEAD_ROWS = 100
+"""Rows that ``refuse_head`` reads."""
 _MISSING = ["", "NA", "N/A", "NaN", "nan", "null", "None"]
 _UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, EOFError, UnicodeError, ValueError)
 
@@ -55,8 +60,53 @@ def load(
         raise _unreadable(path, error) from error
 
 
-def read(path: str | Path, *, layout: str = "auto", columns: Columns = None) -> tuple[pl.DataFrame, list[Repair]]:
+def files_of(given: Sequence[Path]) -> list[Path]:
+    """Return the files that paths, folders and patterns such as ``drives/*.csv`` name, in order, each once.
+
+    DataError for a folder or a pattern without a file.
+    """
+    found: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            some = sorted(p for p in path.iterdir() if p.name.lower().endswith(EXTENSIONS) and p.is_file())
+        elif path.exists() or not glob.has_magic(str(path)):
+            some = [path]
+        else:
+            some = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
+        if not some:
+            raise DataError(f"{path} holds no data set; name files that end in {', '.join(EXTENSIONS)}.")
+        found += some
+    return list(dict.fromkeys(found))
+
+
+def refuse_head(
+    path: Path, layout: str, conditions: Iterable[str], place: str | None, by: str | None, columns: Columns = None
+) -> None:
+    """Raise DataError for what ``load`` refuses in the first rows of a file, and for columns that it has not.
+
+    ``conditions`` are of the form ``column=value``; ``by`` is a column that tells groups apart. Of layouts that are no
+    table only the path is looked at.
+    """
+    named = [column for column, _ in map(parted, conditions)]
+    if _own_reader(path, _layout(layout, columns)):
+        return
+    frame, _ = read(path, layout=layout, columns=columns, rows=HEAD_ROWS)
+    check_columns(frame.columns, path.name)
+    has = dict.fromkeys((*frame.columns, *TIDY))
+    for name in [*named, *([] if place is None else [place])]:
+        if name not in has:
+            raise missing_column(name, has, path.name)
+    if by is not None and by not in has:
+        guess = nearest(by, has)
+        raise DataError(f"cannot group by {by!r}: no such column.{f' Did you mean {guess!r}?' if guess else ''}")
+
+
+def read(
+    path: str | Path, *, layout: str = "auto", columns: Columns = None, rows: int | None = None
+) -> tuple[pl.DataFrame, list[Repair]]:
     """Return the tidy frame of a file, in SI units and not checked yet, and what its reader repaired.
+
+    ``rows`` are read at most, where it is a table.
 
     Raises:
         DataError: If the file cannot be read or its layout is unknown.
@@ -69,9 +119,9 @@ def read(path: str | Path, *, layout: str = "auto", columns: Columns = None) -> 
     try:
         if layout == "openacc" or (layout == "auto" and above is not None):
             above = openacc.HEADER_LINES if above is None else above
-            table = _once(_table(path, extension, written, skip=above), path.name)
+            table = _once(_table(path, extension, written, above, rows), path.name)
             return openacc.read(table, lines[:above], path.name.split(".")[0], path.name)
-        return _plain_layout(_table(path, extension, written), layout, path.name, columns)
+        return _plain_layout(_table(path, extension, written, 0, rows), layout, path.name, columns)
     except pl.exceptions.PolarsError as error:
         raise _unreadable(path, error) from error
 
@@ -225,13 +275,14 @@ def _first_lines(path: Path, count: int) -> list[str]:
         raise _unreadable(path, error) from None
 
 
-def _table(path: Path, extension: str, written: dict[str, Any], skip: int = 0) -> pl.DataFrame:
+def _table(path: Path, extension: str, written: dict[str, Any], skip: int = 0, rows: int | None = None) -> pl.DataFrame:
     try:
         if extension == ".parquet":
-            return pl.read_parquet(path.absolute(), glob=False)  # polars takes a leading ~ for a home
-        return pl.read_csv(
-            path.absolute(), skip_rows=skip, infer_schema_length=None, null_values=_MISSING, glob=False, **written
-        )
+            return pl.read_parquet(path.absolute(), n_rows=rows, glob=False)  # polars takes a leading ~ for a home
+        whole: Path | bytes = path.absolute()
+        if rows is not None:  # polars would unpack a csv.gz as a whole
+            whole = "".join(_first_lines(path, skip + 1 + rows)).encode()
+        return pl.read_csv(whole, skip_rows=skip, infer_schema_length=None, null_values=_MISSING, glob=False, **written)
     except _UNREADABLE as error:
         raise _unreadable(path, error) from None
 

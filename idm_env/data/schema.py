@@ -5,9 +5,10 @@ One row per vehicle and time. Positions are front bumpers along the lane, gaps a
 
 from __future__ import annotations
 
-import pandera.polars as pa
+from functools import cache
+from typing import Any
+
 import polars as pl
-from pandera.errors import SchemaError, SchemaErrors
 
 from idm_env.data.errors import DataError
 
@@ -42,21 +43,26 @@ LONGEST_LENGTH_M = 30.0
 SHORTEST_TRACK_S = 5.0
 """Stretches shorter than this say nothing about a driver; they are left out (s)."""
 
-SCHEMA = pa.DataFrameSchema(
-    {
-        "run_id": pa.Column(pl.String),
-        "vehicle_id": pa.Column(pl.String),
-        "leader_id": pa.Column(pl.String, nullable=True),
-        "lane": pa.Column(pl.Int64, nullable=True),
-        "time_s": pa.Column(pl.Float64),
-        "position_m": pa.Column(pl.Float64),
-        "speed_mps": pa.Column(pl.Float64, pa.Check.in_range(LOWEST_SPEED_MPS, HIGHEST_SPEED_MPS)),
-        "length_m": pa.Column(pl.Float64, pa.Check.in_range(0.0, LONGEST_LENGTH_M, include_min=False)),
-        "gap_m": pa.Column(pl.Float64, nullable=True),
-        "gap_measured": pa.Column(pl.Boolean),
-    },
-    strict=False,
-)
+
+@cache
+def _schema() -> Any:
+    import pandera.polars as pa  # a second, which a refusal does not wait for
+
+    return pa.DataFrameSchema(
+        {
+            "run_id": pa.Column(pl.String),
+            "vehicle_id": pa.Column(pl.String),
+            "leader_id": pa.Column(pl.String, nullable=True),
+            "lane": pa.Column(pl.Int64, nullable=True),
+            "time_s": pa.Column(pl.Float64),
+            "position_m": pa.Column(pl.Float64),
+            "speed_mps": pa.Column(pl.Float64, pa.Check.in_range(LOWEST_SPEED_MPS, HIGHEST_SPEED_MPS)),
+            "length_m": pa.Column(pl.Float64, pa.Check.in_range(0.0, LONGEST_LENGTH_M, include_min=False)),
+            "gap_m": pa.Column(pl.Float64, nullable=True),
+            "gap_measured": pa.Column(pl.Boolean),
+        },
+        strict=False,
+    )
 
 
 def check(table: pl.DataFrame, source: str) -> pl.DataFrame:
@@ -65,11 +71,13 @@ def check(table: pl.DataFrame, source: str) -> pl.DataFrame:
     Raises:
         DataError: If a column is missing, has another type, or breaks a bound; names the column and the rule.
     """
-    for name in SCHEMA.columns:
+    from pandera.errors import SchemaError, SchemaErrors
+
+    for name in _schema().columns:
         if name not in table.columns:
             raise DataError(f"{source}: column {name!r} of the tidy table is missing.")
     try:
-        SCHEMA.validate(table)
+        _schema().validate(table)
     except (SchemaError, SchemaErrors) as error:
         column = getattr(getattr(error, "schema", None), "name", None)
         rule = getattr(error, "check", None)

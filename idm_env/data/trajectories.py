@@ -81,9 +81,7 @@ class Trajectories:
         """
         if not isinstance(condition, str):
             return reduce(Trajectories.where, condition, self)
-        column, equals, value = (part.strip() for part in condition.partition("="))
-        if not equals or not column:
-            raise DataError(f"{condition!r} is no condition; write it as column=value, such as split=test.")
+        column, value = parted(condition)
         if column not in self.table.columns:
             raise missing_column(column, self.table.columns, self.source)
         text = pl.col(column).cast(pl.String).str.to_lowercase().fill_null("")
@@ -175,3 +173,11 @@ class Trajectories:
         if not rest:
             raise DataError(f"{self.source}: everything would be held out and nothing is left to fit; hold out less.")
         return make(rest)
+
+
+def parted(condition: str) -> tuple[str, str]:
+    """Return column and value of ``column=value``. DataError for what has another form."""
+    column, equals, value = (part.strip() for part in condition.partition("="))
+    if not equals or not column:
+        raise DataError(f"{condition!r} is no condition; write it as column=value, such as split=test.")
+    return column, value

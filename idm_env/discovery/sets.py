@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +12,7 @@ import polars as pl
 
 from idm_env import keep
 from idm_env import report as page
-from idm_env.data import DataError, load
-from idm_env.data.load import EXTENSIONS
+from idm_env.data import load
 from idm_env.discovery.discover import discover
 from idm_env.discovery.write import OUTPUT, write_report
 from idm_env.executor import Executor, Serial
@@ -66,25 +64,6 @@ def explain(
         write_report(found, out)
     result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
     return result, found.judgement.titles
-
-
-def files_of(given: Sequence[Path]) -> list[Path]:
-    """Return the files that paths, folders and patterns such as ``drives/*.csv`` name, in order, each once.
-
-    DataError for a folder or a pattern without a file.
-    """
-    found: list[Path] = []
-    for path in given:
-        if path.is_dir():
-            some = sorted(p for p in path.iterdir() if p.name.lower().endswith(EXTENSIONS) and p.is_file())
-        elif path.exists() or not glob.has_magic(str(path)):
-            some = [path]
-        else:
-            some = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
-        if not some:
-            raise DataError(f"{path} holds no data set; name files that end in {', '.join(EXTENSIONS)}.")
-        found += some
-    return list(dict.fromkeys(found))
 
 
 @dataclass(frozen=True)

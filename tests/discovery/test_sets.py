@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 
 from idm_env.data import DataError
+from idm_env.data.load import files_of
 from idm_env.discovery import sets
 from idm_env.executor import opened
 
@@ -25,13 +26,13 @@ def test_folders_and_patterns_are_files_in_order_and_each_once(tmp_path: Path) -
     """A quoted pattern is the same on every shell."""
     files = drives(tmp_path / "drives")
     (tmp_path / "drives" / "notes.txt").write_text("none")
-    assert sets.files_of([tmp_path / "drives"]) == files
-    assert sets.files_of([tmp_path / "drives" / "*.csv", files[0], files[2]]) == files
-    assert sets.files_of([tmp_path / "absent.csv"]) == [tmp_path / "absent.csv"]  # whoever reads it says so
+    assert files_of([tmp_path / "drives"]) == files
+    assert files_of([tmp_path / "drives" / "*.csv", files[0], files[2]]) == files
+    assert files_of([tmp_path / "absent.csv"]) == [tmp_path / "absent.csv"]  # whoever reads it says so
     for nothing in (tmp_path / "drives" / "*.parquet", tmp_path / "empty"):
         (tmp_path / "empty").mkdir(exist_ok=True)
         with pytest.raises(DataError, match="holds no data set"):
-            sets.files_of([nothing])
+            files_of([nothing])
 
 
 def test_every_set_has_its_row_and_a_resumed_run_does_none_twice(
