@@ -49,8 +49,8 @@ class Parameter:
     def __post_init__(self) -> None:
         if not self.low < self.high or not self.low <= self.default <= self.high:
             raise ValueError(f"parameter '{self.name}': default {self.default} is outside [{self.low}, {self.high}].")
-        if not re.fullmatch(r"[\w-]+", self.name):
-            raise ValueError(f"parameter {self.name!r}: a name has letters, digits, '_' and '-'.")
+        if not re.fullmatch(r"[\w -]+", self.name):
+            raise ValueError(f"parameter {self.name!r}: a name has letters, digits, spaces, '_' and '-'.")
         inside = self.null is None or self.low <= self.null <= self.high
         if not inside and not (self.role == "threshold" and math.isfinite(self.null or 0.0)):
             raise ValueError(
