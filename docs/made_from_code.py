@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import inspect
 import json
@@ -32,10 +31,10 @@ MODULES = (
 def write(folder: Path) -> None:
     """Write all of them under ``folder/generated``, only what changed, so that a second build is quick."""
     out = folder / "generated"
-    (out / "pictures").mkdir(parents=True, exist_ok=True)
+    for name in ("pictures", "tasks"):
+        (out / name).mkdir(parents=True, exist_ok=True)
     pages = {
-        "environments.md": environments(), "effects.md": effects(out / "pictures"), "commands.md": commands(),
-        "api.rst": api(),
+        **environments(), "effects.md": effects(out / "pictures"), "commands.md": commands(), "api.rst": api(),
     }  # fmt: skip
     for name, text in pages.items():
         path = out / name
@@ -48,19 +47,27 @@ def write(folder: Path) -> None:
 # -- environments ----------------------------------------------------------------------------------------------------
 
 
-def environments() -> str:
-    """Return one card per task."""
+def environments() -> dict[str, str]:
+    """Return the page of every task by its name, and their index, ``environments.md``."""
     from idm_env.tasks import TASKS
 
     lines = [
         "# Tasks", "",
         '`gymnasium.make("DiffIDM-v0", task=NAME, …)`; `make_vec` for a native batch; `idm_env.envs.pettingzoo` for '
-        "one agent per controlled vehicle. Every keyword below is one of `make`, and may stand in YAML.", "",
+        "one agent per controlled vehicle. Every task has a page with its picture, spaces, observation, reward, ends "
+        "and keywords.", "",
+        "| task | | what it is |", "| --- | --- | --- |",
     ]  # fmt: skip
+    pages = {}
     for name, cls in TASKS.items():
-        lines += _environment(name, cls)
-    lines += ["## Keywords of every task", "", *_keywords(_base(TASKS["ring"]), None), ""]
-    return "\n".join(lines) + "\n"
+        pages[f"tasks/{name}.md"] = "\n".join(_environment(name, cls)) + "\n"
+        lines.append(f"| [`{name}`](tasks/{name}.md) | ![{name}](../tasks/{name}.png) | {_described(cls)[0]} |")
+    lines += [
+        "", "## Keywords of every task", "", "Each is a keyword of `make`, and may stand in YAML.", "",
+        *_keywords(_base(TASKS["ring"]), None), "", "```{toctree}", ":hidden:", "",
+        *(f"tasks/{name}" for name in TASKS), "```",
+    ]  # fmt: skip
+    return pages | {"environments.md": "\n".join(lines) + "\n"}
 
 
 def _base(cls: type) -> type:
@@ -68,45 +75,46 @@ def _base(cls: type) -> type:
 
 
 def _environment(name: str, cls: Any) -> list[str]:
+    first, parts = _described(cls)
+    lines = [f"# {name}", "", first, "", f"![After 40 s without commands](../../tasks/{name}.png)", ""]
+    lines += [paragraph + "\n" for paragraph in parts]
+    lines += [f'```text\nenv = gymnasium.make("DiffIDM-v0", task="{name}")\n```', "", *_faces(name)]
+    own = _keywords(cls, _base(cls))
+    if own:
+        lines += ["## Keywords", "", *own]
+    return [*lines, "Those that every task has: [tasks](../environments.md#keywords-of-every-task).", ""]
+
+
+def _faces(name: str) -> list[str]:
+    """Return spaces, observation, action, reward and ends of a task as it is by default."""
     import gymnasium
 
-    task = _task(name)
-    with contextlib.suppress(Exception):
-        env: Any = gymnasium.make("DiffIDM-v0", task=name)
-    first, parts = _described(cls)
-    lines = [f"## {name}", "", first, ""]
-    lines += [paragraph + "\n" for paragraph in parts]
-    if task is None:
-        return [*lines, *_keywords(cls, _base(cls))]
+    env: Any = gymnasium.make("DiffIDM-v0", task=name)
+    task = env.unwrapped.task
     features = task.features
-    lines += [
-        "| entry of an agent's observation | unit | divided by | lowest | highest |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+    lines = [
+        "## Spaces", "",
+        f"| | by default |\n| --- | --- |\n| observation | `{env.observation_space}` |\n"
+        f"| action | `{env.action_space}` |", "",
+        "## Observation", "",
+        "Of each agent. An entry is divided by its scale, unless `observation=\"raw\"`.", "",
+        "| entry | unit | divided by | lowest | highest |", "| --- | --- | --- | --- | --- |",
+    ]  # fmt: skip
     for entry, scale, low, high in zip(features.names, features.scales, features.low, features.high, strict=True):
         lines.append(f"| `{entry}` | {_unit(entry)} | {scale:g} | {low:g} | {high:g} |")
     actions = ", ".join(f"`{c}`" for c in task.commands)
     low, high = task.command_limits
-    lines += [
-        "",
-        f"**Action**, per agent: {actions} in [−1, 1]; −1 and 1 command {low:g} and {high:g} m/s². **Spaces** by "
-        f"default: observation `{env.observation_space}`, action `{env.action_space}`.",
-        "",
-        f"**Reward** of a step without a crash: between {task.pay.low:g} and {task.pay.high:g}; a crash costs "
-        f"{task.cost_of_crash:g} by default. **Ends**: terminated where vehicles touch, truncated after "
-        f"{task.horizon} steps of {task.simulator.dt:g} s.",
-        "",
-    ]
-    return [*lines, *_keywords(cls, _base(cls))]
-
-
-def _task(name: str) -> Any:
-    from idm_env.tasks import make_task
-
-    try:
-        return make_task(name)
-    except ValueError:  # it needs a file
-        return None
+    return [
+        *lines, "",
+        "## Action", "",
+        f"Per agent: {actions} in [−1, 1]; −1 and 1 command {low:g} and {high:g} m/s².", "",
+        "## Reward", "",
+        f"A step without a crash pays between {task.pay.low:g} and {task.pay.high:g}. A crash costs "
+        f"{task.cost_of_crash:g} by default.", "",
+        "## Ends", "",
+        f"An episode is terminated where vehicles touch, and truncated after {task.horizon} steps of "
+        f"{task.simulator.dt:g} s.", "",
+    ]  # fmt: skip
 
 
 def _unit(entry: str) -> str:

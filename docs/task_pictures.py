@@ -1,4 +1,4 @@
-"""Small pictures of the tasks for README: ``python docs/task_pictures.py`` writes docs/tasks/TASK.png."""
+"""Small pictures of the tasks for README and the site: ``python docs/task_pictures.py`` writes docs/tasks/TASK.png."""
 
 from __future__ import annotations
 
@@ -16,12 +16,10 @@ SECONDS, WIDTH = 40.0, 300
 
 
 def pictures(folder: Path = FOLDER) -> list[Path]:
-    """Draw every task but `replay_lanes`, which needs a file, after 40 s without commands; return the files."""
+    """Draw every task after 40 s without commands; return the files."""
     folder.mkdir(exist_ok=True)
     written = []
     for name in TASKS:
-        if name == "replay_lanes":
-            continue
         keywords: dict[str, Any] = {"warmup": 3000} if name == "ring" else {}
         env = gymnasium.make("DiffIDM-v0", task=name, render_mode="rgb_array", **keywords)
         env.reset(seed=1)

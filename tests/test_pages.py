@@ -14,6 +14,7 @@ from idm_env import diagrams, report
 from idm_env.data import synthetic
 from idm_env.fitting.job import fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
+from idm_env.tasks import TASKS, make_task
 from idm_env.trajectories.files import filter_file, reconstruct_file
 from tests.browser import after, check, chromium
 
@@ -21,7 +22,7 @@ __all__ = ["chromium"]  # a fixture
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "build" / "site"
-FIVE = ("index", "jobs/explain", "generated/effects", "generated/environments", "architecture")
+FIVE = ("index", "jobs/explain", "generated/effects", "generated/tasks/ring", "architecture")
 
 
 @pytest.fixture(scope="module")
@@ -98,12 +99,21 @@ def test_a_dead_link_is_seen(tmp_path: Path) -> None:
 
 
 def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
-    """What the observation of ring means, how to use one's own csv, what an effect's equation is."""
-    first = check._Links()
-    first.feed((site / "index.html").read_text(encoding="utf-8"))
+    """What a task's observation means, how to use one's own csv, what an effect's equation is."""
+    near = links(site, "index.html")
+    near |= {link for first in near for link in links(site, first)}
     for page, words in (
-        ("generated/environments.html", "relative_speed"),
+        *((f"generated/tasks/{name}.html", make_task(name).features.names[-1]) for name in TASKS),
         ("jobs/files.html", "position_m"),
         ("generated/effects.html", "speed-dependent gap"),
     ):
-        assert page in first.links and words in (site / page).read_text(encoding="utf-8")
+        assert page in near and words in (site / page).read_text(encoding="utf-8")
+
+
+def links(site: Path, page: str) -> set[str]:
+    """Return the pages of the site to which one leads."""
+    read = check._Links()
+    if page.endswith(".html"):
+        read.feed((site / page).read_text(encoding="utf-8"))
+    there = [link.split("#")[0] for link in read.links if not re.match(r"\w+:|#", link)]
+    return {(site / page).parent.joinpath(link).resolve().relative_to(site.resolve()).as_posix() for link in there}
