@@ -29,9 +29,13 @@ from idm_env.types import Params, State, mapped
 
 if TYPE_CHECKING:
     from idm_env.envs.values import Values
+    from idm_env.envs.window import Unrolled
 
 _POOL_STREAM = 2
 _NORMALS_AT_ONCE = 1 << 12
+_WINDOW = 1 << 20
+"""Most normals that are drawn ahead of steps one by one, and of a window."""
+_MARKED = ("_world", "_loaded", "_seen", "_draw", "_driven", "_block", "_drawn", "_drawn_steps", "used", "_pool")
 
 
 class Whole(NamedTuple):
@@ -91,7 +95,7 @@ class Batch:
         self._beginnings = Beginnings(self._begin, count)
         self._block: dict[str, Tensor] | None = None
         self._drawn: dict[str, np.ndarray] = {}
-        self._used = 0
+        self.used = self._drawn_steps = 0
         self._ahead = max(1, _NORMALS_AT_ONCE // (count * self.task.vehicles))
 
     def _compiled(self) -> Values | None:
@@ -209,14 +213,98 @@ class Batch:
         """Return the normals of a block of steps, drawn ahead where the batch is small; ``_used − 1`` is this step."""
         if not self.task.simulator.draws:
             return None
-        if self._block is None or self._used >= self._ahead:
+        self._fill(clock, self._ahead)
+        self.used += 1
+        return self._block
+
+    def _fill(self, clock: Callable[[], Tensor], steps: int) -> None:
+        """See that normals of at least one step are drawn that were not used."""
+        if self._block is None or self.used >= self._drawn_steps:
             assert self._draw is not None
-            self._block = self.task.normals(self._draw, clock(), self._ahead, self.settings.dtype)
-            self._used = 0
+            self._block = self.task.normals(self._draw, clock(), steps, self.settings.dtype)
+            self.used, self._drawn_steps = 0, steps
             if self._values is not None:
                 self._drawn = {name: x.numpy().reshape(-1) for name, x in self._block.items()}
-        self._used += 1
-        return self._block
+
+    def ahead(self) -> tuple[int, dict[str, np.ndarray] | None]:
+        """Return for how many steps normals are there, and these; ``used`` counts those that are gone."""
+        values = self._values
+        assert values is not None
+        if not self.task.simulator.draws:
+            return 64, None
+        self._fill(values.clock, max(self._ahead, min(64, _WINDOW // (self.count * self.task.vehicles)) or 1))
+        return self._drawn_steps - self.used, self._drawn
+
+    def driven(self) -> Params:
+        """Return the parameters of steps in these episodes."""
+        if self._driven is None:
+            self._driven = self.task.driven(self.glance().episode, self.params)
+        return self._driven
+
+    def seen(self) -> Tensor:
+        """Return what is observed now, shape ``(n, agents · features)``, with its graph."""
+        if self._loaded and isinstance(self._seen, Tensor):
+            return self._seen.reshape(self.count, -1)
+        assert self.world is not None
+        return self.task.observe(self.world).reshape(self.count, -1)
+
+    def saw(self, seen: Tensor) -> None:
+        """Note what is observed now, after steps that were done elsewhere."""
+        self._world, self._loaded, self._seen = None, True, seen.view(self.count, len(self.task.agents), -1)
+
+    def settle(self) -> None:
+        """See that the present worlds lie where compiled loops step them."""
+        if self._world is not None and not self._loaded and self._values is not None:
+            self._values.load(self._world)
+            self.saw(self.task.observe(self._world))
+
+    def mark(self) -> tuple[Any, ...]:
+        """Return what ``back_to`` goes back to."""
+        assert self._values is not None
+        own = {n: self.__dict__[n] for n in _MARKED}
+        return {**own, "episodes": self.episodes.copy()}, self._values.mark()
+
+    def back_to(self, mark: tuple[Any, ...]) -> None:
+        """Undo steps, and resets within them."""
+        assert self._values is not None
+        self.__dict__.update(mark[0])
+        self._values.back_to(mark[1])
+        self._beginnings.forget()
+
+    def unroll(self, policy: Callable[[Tensor], Tensor], steps: int, push: Tensor | None) -> Unrolled:
+        """Return a window of steps with a policy between them; see ``Face.unroll``."""
+        from idm_env.envs import window
+
+        shape = (self.count, len(self.task.agents) * len(self.task.commands))
+        extra = torch.zeros(shape, dtype=self.settings.dtype) if push is None else push.expand(shape).contiguous()
+        values = self._values
+        fits = values is not None and not self.task.simulator.untried and dispatch.surroundings() is None
+        if values is not None and fits:
+            try:
+                self.settle()
+                made = window.compiled(self, values, policy, steps, extra)
+                if made is not None:
+                    return made
+            except Untraceable:
+                pass
+        kept: list[tuple[Tensor, ...]] = []
+        seen = self.seen()
+        first = [seen]
+        for _ in range(steps):
+            action = policy(seen) + extra
+            if action.shape != shape or not bool(action.isfinite().all()):
+                raise ValueError(
+                    f"policy gives actions of shape {tuple(action.shape)}; finite ones of shape {shape} are needed."
+                )
+            outcome = self.step(action)
+            seen = final = outcome.observation.reshape(self.count, -1)
+            over = np.flatnonzero((outcome.whole.terminated | outcome.whole.truncated).numpy())
+            if len(over):
+                seen = torch.as_tensor(self.reset(over)).reshape(self.count, -1)
+            first.append(seen)
+            kept.append((action, *outcome.whole, final))
+        action, reward, terminated, truncated, final = (torch.stack(x) for x in zip(*kept, strict=True))
+        return window.Unrolled(torch.stack(first), action, reward, terminated, truncated, final)
 
     def step(self, action: Tensor | np.ndarray | None, live: Tensor | None = None) -> Outcome:
         """Advance every row; ``action`` has shape ``(n, agents)``, None leaves everybody to the drivers.
@@ -238,7 +326,7 @@ class Batch:
         before = self.world
         assert before is not None
         block = self._normals(lambda: before.state.step)
-        normals = None if block is None else {name: x[self._used - 1] for name, x in block.items()}
+        normals = None if block is None else {name: x[self.used - 1] for name, x in block.items()}
         driven = self.task.driven(before.episode, self.params)
         self.world, told = self._moves.step(before, action, live, normals, driven)
         # What a task tells may be a part of its state: whoever is told gets numbers of his own.
@@ -252,22 +340,20 @@ class Batch:
         if self.settings.output == "torch" and dispatch.surroundings() is not None:
             self._world, self._loaded = self.world, False
             return None
-        used, block = self._used, self._block
+        used, block = self.used, self._block
         try:
             if world is not None and not self._loaded:
                 values.load(world)
             normals = self._normals(values.clock)
             noise = None if normals is None else self._drawn
             who = None if live is None else live.numpy().reshape(-1)
-            if self._driven is None:
-                self._driven = self.task.driven(self.glance().episode, self.params)
-            told = values.step(action, who, noise, max(self._used - 1, 0), self._driven)
+            told = values.step(action, who, noise, max(self.used - 1, 0), self.driven())
         except Untraceable as why:
             # Where an effect is why it was said before (``kernels.printed``); NaN the step itself tells.
             if self.settings.output == "torch" and not isinstance(self.task.road, Lanes):
                 warnings.warn(f"no compiled step, the torch path runs instead: {why}.", stacklevel=4)
             self._world, self._loaded = self.world, False
-            self._values, self._used, self._block = None, used, block
+            self._values, self.used, self._block = None, used, block
             return None
         # What is told is written to by whom it pleases.
         seen = told["observation"]

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from idm_env import compat
+from idm_env.checks import whole
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.tasks import Task
 from idm_env.types import Params, State, mapped
+
+if TYPE_CHECKING:
+    from idm_env.envs.window import Unrolled
 
 LIMIT = "max_episode_steps"
 
@@ -66,6 +72,31 @@ class Face:
     @params.setter
     def params(self, params: Params) -> None:
         self.batch.set_params(params)
+
+    def unroll(self, policy: Callable[[Tensor], Tensor], steps: int, push: Tensor | None = None) -> Unrolled:
+        """Do a window of steps with a policy between them, in one call; needs ``output="torch"``.
+
+        ``policy`` maps observations ``(n, features)`` to actions ``(n, actions)``; ``push`` is added to its actions.
+        Episodes that end begin anew within the window, and gradients are cut there. A torch module of small layers
+        (linear, tanh, ReLU, ELU, SiLU, layer norm, sums and products with constants) is compiled with the steps, and
+        the window is one node of autograd, with rewards, observations and actions as outputs; what such a policy does
+        is torch's to rounding. Every other callable runs between compiled steps. Kept are the worlds of all steps.
+
+        Raises:
+            RuntimeError: Before the first reset.
+            ValueError: For steps below 1, numpy output, and a policy whose actions are not finite or of another shape;
+                with a compiled policy nothing has changed then.
+        """
+        if not self.batch.begun:
+            raise RuntimeError("unroll was called before reset. Call reset() first.")
+        if self.batch.settings.output != "torch":
+            raise ValueError("output = 'numpy' has no gradients to unroll. Make the environment with output='torch'.")
+        mode = self.batch.settings.autoreset_mode
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(
+                f"autoreset_mode = '{mode.value}': unroll begins anew within the step. Make it with 'SameStep'."
+            )
+        return self.batch.unroll(policy, whole("steps", steps, 1), push)
 
     def detach(self) -> None:
         """Cut the graph behind the present states, for truncated back-propagation."""

@@ -62,6 +62,11 @@ class Past:
             self.newest = self.slots - 1
             self._last()[:] = last
 
+    def room(self) -> int:
+        """Return how many more steps fit in, at least one."""
+        self.make_room()
+        return len(self.rows) // self._signals - self.newest - 1
+
     def tensor(self) -> Tensor:
         """Return a copy as the state holds it: newest step first."""
         newest_first = np.ascontiguousarray(self._last()[::-1])

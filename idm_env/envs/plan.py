@@ -113,6 +113,15 @@ class _Table:
             made[place] = given[name]
         return made
 
+    def each(self, now: Array, later: Array, given: Mapping[str, Any]) -> Array:
+        """Return the addresses for some calls, of which the worlds' and what is given are one a call."""
+        made = np.repeat(self._stays[None], len(now), 0)
+        made[:, self._now] = self._now_at + now[:, None]
+        made[:, self._later] = self._later_at + later[:, None]
+        for name, place in self.given.items():
+            made[:, place] = given[name]
+        return made
+
 
 class _Room:
     """Arrays of fixed shapes that are taken together: one piece of memory for each of their types."""
@@ -211,21 +220,21 @@ class Plan:
         self.real = real = np.dtype(np.float32 if world.state.speed.dtype == torch.float32 else np.float64)
         self.count = rows * size
         self.pitch = self.count * real.itemsize
-        self._between = _Room({n: (rows, *s) for n, s in made.before.shapes.items()}, made.before.types)
-        self._reused = self._between.take()
-        self._told = _Room({n: (rows, *s) for n, s in made.after.shapes.items()}, made.after.types)
+        self.between = _Room({n: (rows, *s) for n, s in made.before.shapes.items()}, made.before.types)
+        self._reused = self.between.take()
+        self.told = _Room({n: (rows, *s) for n, s in made.after.shapes.items()}, made.after.types)
         self._same = [(n, other, (rows, *s)) for n, (other, s) in made.after.same.items()]
-        self._constant = {n: np.repeat(x[None], rows, 0) for n, x in made.after.constants.items()}
+        self.constant = {n: np.repeat(x[None], rows, 0) for n, x in made.after.constants.items()}
         past = world.state.memory.get(PAST)
         self.slots = past.shape[-2] if past is not None and kernel.signals else 0
         wide = tiles.width(size, self.slots)
         around = tiles.halo(1, kernel.program.reach)
-        self._groups = tiles.tiles(rows, size, wide, around) if size <= wide else rows
+        self.groups = tiles.tiles(rows, size, wide, around) if size <= wide else rows
         self._one = tiles.tiles(rows, size, wide, around) == 1
         self.extent = np.array((self.slots, rows, size, wide, around))
         self._small = rows * size < 2 * pool.GRAIN
-        self._work = workspaces(kernel, self.slots, real)
-        self._loops = (
+        self.work = workspaces(kernel, self.slots, real)
+        self.loops = (
             kernel.measures, kernel.forward(real.name), kernel.looks, kernel.recalls,
             kernel.read, kernel.constants[real.name], self.extent,
         )  # fmt: skip
@@ -234,6 +243,7 @@ class Plan:
         self._carried = [i for i, n in enumerate(layout.blocks) if i not in states]
         program = kernel.program
         self.fixed = len(program.statics) + len(program.parameters)
+        self.layout = layout
         self._laid = Laid(self, layout)
         self._bound: Bound | None = None
         self._loaded: Bound | None = None
@@ -257,37 +267,37 @@ class Plan:
         bound = moment.bound
         moment.now, moment.later = now.data_ptr(), later.data_ptr()
         assert bound is not None
-        between, there = self._between.take() if tape else self._reused
+        between, there = self.between.take() if tape else self._reused
         moment.asked = between
         given = dict(there)
         if moment.action is not None:
-            given["action"] = _address(moment.action)
+            given["action"] = address(moment.action)
         if moment.live is not None:
-            given["live"] = _address(moment.live)
-        given["state_step"] = _address(moment.clock)
-        told, where = self._told.take()
+            given["live"] = address(moment.live)
+        given["state_step"] = address(moment.clock)
+        told, where = self.told.take()
         where |= {n: there[n] for n in _GIVEN if n in there}
         where |= {n: there[o] for n, (o, _) in self.recorded.before.same.items() if n in _GIVEN}
         clock = np.empty_like(moment.clock)
-        where["state_step"], where["later_state_step"] = given["state_step"], _address(clock)
+        where["state_step"], where["later_state_step"] = given["state_step"], address(clock)
         asks, tells = (
             bound.laid.ask.filled(moment.now, moment.later, given),
             bound.laid.tell.filled(moment.now, moment.later, where),
         )
         places = self._places(moment, there)
-        call = (moment.past, moment.newest, *self._loops, moment.at)
+        call = (moment.past, moment.newest, *self.loops, moment.at)
         made = self.recorded
         head = (made.before.call, asks, made.after.call, tells, moment.clock, clock, places, bound.strides)
         threads = 1 if self._small else pool.count(self.count)
         if threads == 1:
-            step_worlds(*head, *self._work, *call, self._one and self._loaded is bound, 0, self._groups)
+            step_worlds(*head, *self.work, *call, self._one and self._loaded is bound, 0, self.groups)
             self._loaded = bound
         else:
 
             def part(begin: int, end: int) -> None:
                 step_worlds(*head, *workspaces(self.kernel, self.slots, self.real), *call, False, begin, end)
 
-            pool.split(part, self._groups, 1, threads)
+            pool.split(part, self.groups, 1, threads)
         for i in self._carried:
             later[i].copy_(now[i])
         if self.task.simulator.own and bool(later[bound.laid.layout.blocks.index("state_speed")].isnan().any()):
@@ -295,7 +305,7 @@ class Plan:
         told["clock"] = clock
         for name, other, shape in self._same:
             told[name] = told[other].reshape(shape)
-        for name, value in self._constant.items():
+        for name, value in self.constant.items():
             told[name] = value.copy()
         return told
 
@@ -307,13 +317,26 @@ class Plan:
         places[:states] = self._states + moment.now
         places[states : 2 * states] = self._states + moment.later
         for place, name in moment.bound.laid.given.items():
-            places[place] = between[name] if name in between else _address((moment.normals or {})[name])
+            places[place] = between[name] if name in between else address((moment.normals or {})[name])
+        return places
+
+    def places_of(
+        self, bound: Bound, normals: Mapping[str, Array] | None, now: Array, later: Array, between: Mapping[str, Any]
+    ) -> Array:
+        """Return the addresses of states and operands of some steps, one row each."""
+        states = len(self._states)
+        places = np.repeat(bound.places[None], len(now), 0)
+        places[:, :states] = self._states + now[:, None]
+        places[:, states : 2 * states] = self._states + later[:, None]
+        for place, name in bound.laid.given.items():
+            places[:, place] = between[name] if name in between else address((normals or {})[name])
         return places
 
     # -- backwards -----------------------------------------------------------------------------------------------
 
     @cached_property
-    def _scratch(self) -> Scratch:
+    def scratch(self) -> Scratch:
+        """Memory of the adjoint."""
         return Scratch(self)
 
     def back(
@@ -324,14 +347,14 @@ class Plan:
         ``on_told`` is what falls on ``flowing``, ``on_later`` on the blocks of the world Δt later and ``on_past`` on
         the past (slots · signals, vehicles; newest first); None is nothing.
         """
-        bound, room = moment.bound, self._scratch
+        bound, room = moment.bound, self.scratch
         assert bound is not None
         layout, (asks, tells) = bound.laid.layout, bound.laid.back
         on_now = np.zeros((len(layout.blocks), self.count), self.real)
         on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
         on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
-        seeded, begun = room.zeros if on_later is None else _address(on_later), _address(on_now)
-        given = {**room.there, **{f"on_{n}": room.zeros if x is None else _address(x) for n, x in on_told.items()}}
+        seeded, begun = room.zeros if on_later is None else address(on_later), address(on_now)
+        given = {**room.there, **{f"on_{n}": room.zeros if x is None else address(x) for n, x in on_told.items()}}
         for i, name in enumerate(layout.blocks):
             step = i * self.pitch
             given[f"seed_{name}"] = room.zeros if on_later is None else seeded + step
@@ -339,14 +362,14 @@ class Plan:
         if on_later is not None:
             for i in self._carried:
                 on_now[i] = on_later.reshape(on_now.shape)[i]
-        given["state_step"] = _address(moment.clock)
+        given["state_step"] = address(moment.clock)
         clock = moment.clock + 1
-        given["later_state_step"] = _address(clock)
+        given["later_state_step"] = address(clock)
         if moment.action is not None:
-            given["action"], given["on_action"] = _address(moment.action), _address(on_action)
+            given["action"], given["on_action"] = address(moment.action), address(on_action)
         if moment.live is not None:
-            given["live"] = _address(moment.live)
-        between = {n: _address(x) for n, x in moment.asked.items()}
+            given["live"] = address(moment.live)
+        between = {n: address(x) for n, x in moment.asked.items()}
         given |= {n: between[n] for n in _GIVEN if n in between}
         given |= {n: between[o] for n, (o, _) in self.recorded.before.same.items() if n in _GIVEN}
         before, after = self.recorded.backward
@@ -358,7 +381,7 @@ class Plan:
             before.call, asks.filled(moment.now, moment.later, given), self._places(moment, between),
             bound.strides, *room.work, moment.past, moment.newest, room.ends, room.begins, on_past.ctypes.data,
             past.ctypes.data, on_parameters.ctypes.data, room.on_inputs.ctypes.data, *room.loops, moment.at, 0,
-            self._groups,
+            self.groups,
         )  # fmt: skip
         return on_now, on_action, on_parameters, past
 
@@ -373,12 +396,12 @@ class Scratch:
         shapes = {**dict.fromkeys(named, (plan.count,)), "on_command": (plan.count,), "on_given": (plan.count,)}
         self._made, self.there = _Room(shapes, dict.fromkeys(shapes, real)).take()
         self.on_inputs = np.zeros((len(kernel.numbers), plan.count), real)
-        self.there |= {f"on_{_plain(n)}": _address(x) for n, x in zip(kernel.numbers, self.on_inputs, strict=True)}
+        self.there |= {f"on_{_plain(n)}": address(x) for n, x in zip(kernel.numbers, self.on_inputs, strict=True)}
         self.ends, self.begins = (np.array([self.there[f"{k}_{n}"] for n in moving]) for k in ("end", "carried"))
         told = plan.recorded.after
         most = max([plan.count, *(plan.rows * math.prod(s) for s in told.shapes.values())])
         self._zeros = np.zeros(most, real)
-        self.zeros = _address(self._zeros)
+        self.zeros = address(self._zeros)
         work, past = workspaces(kernel, plan.slots, real)
         self.work = work, past, past.copy()
         self.loops = (
@@ -542,7 +565,8 @@ def _plain(slot: str) -> str:
     return slot.replace(" ", "_")
 
 
-def _address(x: Array | None) -> int:
+def address(x: Array | None) -> int:
+    """Return where an array begins."""
     assert x is not None
     return x.__array_interface__["data"][0]  # type: ignore[no-any-return]
 

@@ -38,12 +38,12 @@ class Values:
         self._moves, self._graph = moves, graph
         self._plans: dict[tuple[bool, bool], Plan] = {}
         self._key: Any = None
-        self._layout = Layout((), {}, 0)
-        self._blocks: Tensor
+        self.layout = Layout((), {}, 0)
+        self.blocks: Tensor
         self._spare: Tensor | None = None
         self._token: Tensor | None = None
         self._clock: Array
-        self._past: Past
+        self.past: Past
         self._world: World
 
     # -- worlds --------------------------------------------------------------------------------------------------
@@ -61,12 +61,12 @@ class Values:
         self._key, self._world = key, mapped(lambda x: x.detach(), world)
         still = {n: np.array(x.numpy(), order="C").reshape(-1) for n, x in leaves.items() if n not in blocks}
         self._clock = still.pop("state_step")
-        old = self._layout.still
+        old = self.layout.still
         if still.keys() != old.keys() or not all(np.array_equal(x, old[n]) for n, x in still.items()):
-            self._layout = Layout((*blocks, "clock"), still, self._layout.version + 1)
-        self._blocks = _block(world, self._layout.blocks)
-        self._past = Past(world.state, kept=self._graph)
-        self._past.load(world.state)
+            self.layout = Layout((*blocks, "clock"), still, self.layout.version + 1)
+        self.blocks = _block(world, self.layout.blocks)
+        self.past = Past(world.state, kept=self._graph)
+        self.past.load(world.state)
         kept = world.state.memory.get(PAST)
         self._token = None
         if kept is not None and kept.requires_grad:
@@ -74,18 +74,18 @@ class Values:
 
     def replace(self, rows: Array, fresh: World) -> None:
         """Replace some rows (indices) by the worlds of ``fresh``, with their graph; that of the rows before is cut."""
-        index, blocks = torch.from_numpy(np.asarray(rows)), _block(fresh, self._layout.blocks)
+        index, blocks = torch.from_numpy(np.asarray(rows)), _block(fresh, self.layout.blocks)
         leaves = {n: x.detach().numpy() for n, x in named(fresh).items()}
         if self._graph:
-            self._blocks = self._blocks.index_copy(1, index, blocks)
-            self._clock, self._past = self._clock.copy(), self._past.copy()
+            self.blocks = self.blocks.index_copy(1, index, blocks)
+            self._clock, self.past = self._clock.copy(), self.past.copy()
             if self._token is not None:
                 self._token = _Forget.apply(self._token, index, tuple(fresh.state.speed.shape))
         else:
-            self._blocks[:, index] = blocks
+            self.blocks[:, index] = blocks
         self._clock[rows] = leaves["state_step"]
-        self._past.replace(rows, fresh.state)
-        for name, held in self._layout.still.items():
+        self.past.replace(rows, fresh.state)
+        for name, held in self.layout.still.items():
             values = leaves[name]
             old = held.reshape(len(self._clock), *values.shape[1:])
             if np.array_equal(old[rows], values):
@@ -93,24 +93,24 @@ class Values:
             if self._graph:
                 # What earlier steps have read stays as it was.
                 old = old.copy()
-                still = {**self._layout.still, name: old.reshape(-1)}
-                self._layout = self._layout._replace(still=still, version=self._layout.version + 1)
+                still = {**self.layout.still, name: old.reshape(-1)}
+                self.layout = self.layout._replace(still=still, version=self.layout.version + 1)
             old[rows] = values
 
     def current(self, own: bool = True) -> World:
         """Return the worlds as tensors of their own, or as views until the next step, without graph and past."""
-        held, clock, layout = self._blocks if own else self._blocks.detach(), self._clock, self._layout
+        held, clock, layout = self.blocks if own else self.blocks.detach(), self._clock, self.layout
         if own:
             clock, layout = clock.copy(), layout._replace(still={n: x.copy() for n, x in layout.still.items()})
             held = held if self._graph else held.clone()
-        past = self._past.tensor() if own and self._past.slots else None
+        past = self.past.tensor() if own and self.past.slots else None
         if past is not None and self._token is not None:
             past = _Leave.apply(self._token, past)
         return _world(self._world, layout, held, clock, past)
 
     def detach(self) -> None:
         """Cut the graph behind the worlds."""
-        self._blocks, self._token = self._blocks.detach(), None
+        self.blocks, self._token = self.blocks.detach(), None
 
     def clock(self) -> Tensor:
         """Return the steps of all rows, as they are now."""
@@ -126,35 +126,54 @@ class Values:
 
         ``live`` says whose actions count (all, where it is None). Arrays are told; tensors where there may be a graph.
         """
-        plan = self._plan((action is None, live is None), tuple(normals or ()))
-        bound = plan.of(self._layout, params)
+        plan = self.plan((action is None, live is None), tuple(normals or ()))
+        bound = plan.of(self.layout, params)
         given = action.detach().numpy() if isinstance(action, Tensor) else action
-        if self._past.slots:
-            self._past.make_room()
+        if self.past.slots:
+            self.past.make_room()
         moment = Moment(
-            0, 0, self._clock, given, live, normals, at, self._past.rows, self._past.newest, bound
+            0, 0, self._clock, given, live, normals, at, self.past.rows, self.past.newest, bound
         )  # fmt: skip
         told: dict[str, Any]
         if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
             told = self._noted(plan, moment, action, bound)
         else:
-            later = self._spare if self._spare is not None else torch.empty_like(self._blocks)
-            told = plan.run(moment, self._blocks, later, tape=False)
-            self._spare = None if self._graph else self._blocks
-            self._blocks, self._token = later, None
+            later = self._spare if self._spare is not None else torch.empty_like(self.blocks)
+            told = plan.run(moment, self.blocks, later, tape=False)
+            self._spare = None if self._graph else self.blocks
+            self.blocks, self._token = later, None
             if self._graph:
                 clock = told.pop("clock")
                 told = {n: torch.from_numpy(x) for n, x in told.items()} | {"clock": clock}
         self._clock = told.pop("clock")
-        if self._past.slots:
-            self._past.newest += 1
+        if self.past.slots:
+            self.past.newest += 1
         return told
 
-    def _plan(self, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Plan:
+    def arrive(self, blocks: Tensor, clock: Array, token: Tensor | None = None) -> None:
+        """Go on from other worlds of the same episodes."""
+        self.blocks, self._clock, self._token = blocks, clock, token
+
+    def token_of(self, plan: Plan) -> Tensor | None:
+        """Return the token that stands for the past, if there is one."""
+        if self._token is None and self.past.slots:
+            return self.blocks.new_zeros(1).expand(plan.slots * plan.kernel.signals, plan.count)
+        return self._token
+
+    def mark(self) -> tuple[Any, ...]:
+        """Return what ``back_to`` goes back to."""
+        return self.blocks, self._clock, self._token, self.layout, self.past, self.past.rows, self.past.newest
+
+    def back_to(self, mark: tuple[Any, ...]) -> None:
+        """Go back to the worlds as they were: steps have written nothing that these read."""
+        self.blocks, self._clock, self._token, self.layout, self.past, self.past.rows, self.past.newest = mark
+
+    def plan(self, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Plan:
+        """Return the plan of steps of a kind (``Plan``), made once."""
         plan = self._plans.get(kind)
         if plan is None:
             world = self.current(own=False)
-            plan = Plan(self._moves, world, self._layout, kind, draws)
+            plan = Plan(self._moves, world, self.layout, kind, draws)
             if self._graph:
                 _ = plan.recorded.backward
             self._plans[kind] = plan
@@ -162,7 +181,7 @@ class Values:
 
     def _differentiated(self, action: Any, bound: Bound) -> bool:
         return bool(
-            self._blocks.requires_grad
+            self.blocks.requires_grad
             or self._token is not None
             or bound.wanted
             or (isinstance(action, Tensor) and action.requires_grad)
@@ -172,12 +191,10 @@ class Values:
         """Do a step as a node of autograd."""
         told: dict[str, Any] = {}
         wanted = [x for _, x in bound.wanted]
-        token = self._token
-        if token is None and self._past.slots:
-            token = self._blocks.new_zeros(1).expand(plan.slots * plan.kernel.signals, plan.count)
-        out = _Step.apply(plan, moment, told, self._blocks, action, token, *wanted)
-        self._blocks = out[0]
-        self._token = out[1] if self._past.slots else None
+        token = self.token_of(plan)
+        out = _Step.apply(plan, moment, told, self.blocks, action, token, *wanted)
+        self.blocks = out[0]
+        self._token = out[1] if self.past.slots else None
         told.update(zip(plan.recorded.flowing, out[2:], strict=True))
         return told
 

@@ -177,3 +177,39 @@ def log1p_float32(x):
     y = n * _LN2_HIGH_32 + (_TWO * s + (_TWO * s * z * p + (n * _LN2_LOW_32 + lost)))
     y = y if u > _ZERO else (-_INFINITE if u == _ZERO else _NAN)
     return x if x == _INFINITE else y
+
+
+_UP = [np.float32(x) for x in (
+    -2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08, 1.48572235717979e-05,
+    6.37261928875436e-04, 4.89352455891786e-03,
+)]  # fmt: skip
+_DOWN = [
+    np.float32(x) for x in (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)
+]
+_U6, _U5, _U4, _U3, _U2, _U1, _U0 = _UP
+_D3, _D2, _D1, _D0 = _DOWN
+_MOST_32 = np.float32(7.90531110763549805)
+
+
+@compiler(forceinline=True)
+def tanh_float32(x):
+    """Return tanh of a float, within some units in the last place: the quotient of polynomials that Eigen takes."""
+    y = -_MOST_32 if x < -_MOST_32 else x
+    y = _MOST_32 if y > _MOST_32 else y
+    z = y * y
+    p = z * _U6 + _U5
+    p = p * z + _U4
+    p = p * z + _U3
+    p = p * z + _U2
+    p = p * z + _U1
+    p = (p * z + _U0) * y
+    q = z * _D3 + _D2
+    q = q * z + _D1
+    q = q * z + _D0
+    return p / q
+
+
+@compiler(forceinline=True)
+def tanh_float64(x):
+    """Return tanh of a double."""
+    return np.tanh(x)

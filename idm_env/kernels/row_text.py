@@ -11,6 +11,8 @@ UNARY = {
     "abs": "abs({0})",
     "sqrt": "np.sqrt({0})",
     "exp": "np.exp({0})",
+    "expm1": "np.expm1({0})",
+    "rsqrt": "(F(1.0) / np.sqrt({0}))",
     "log": "np.log({0})",
     "sin": "np.sin({0})",
     "cos": "np.cos({0})",

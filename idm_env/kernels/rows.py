@@ -25,8 +25,8 @@ from idm_env.scalar.record import Untraceable
 _TEXT = {"f": "F", "i": "np.int64", "b": "np.bool_"}
 KINDS = {torch.float32: "f", torch.float64: "f", torch.int64: "i", torch.bool: "b"}
 TYPES = {"i": np.dtype(np.int64), "b": np.dtype(np.bool_)}
-_BLANK = {"new_zeros": 0.0, "zeros_like": 0.0, "zeros": 0.0, "new_ones": 1.0, "ones_like": 1.0}
-_FULL = {"new_full": 2, "full_like": 1, "full": 1}
+_BLANK = {"new_zeros": 0.0, "zeros_like": 0.0, "zeros": 0.0, "new_ones": 1.0, "ones_like": 1.0, "empty_like": 0.0}
+_FULL = {"new_full": 2, "full_like": 1, "full": 1, "fill_": 1}
 """Constants of one value, which backward passes write to: the value, or the place of the argument that it is."""
 
 HEADER = '''"""Printed by idm_env from one call of a task's functions; see idm_env/kernels/rows.py. Delete at will."""
@@ -40,7 +40,7 @@ from idm_env.kernels.memory import located
 F = np.{kind}
 SIZE = (1 << 40,)
 inlined = njit(nogil=True, error_model="numpy", forceinline=True)
-
+{imports}
 
 @inlined
 def larger(x, y):
@@ -53,7 +53,7 @@ def smaller(x, y):
     return y if x > y else x
 
 
-@phase(types.void(types.int64, types.int64, types.CPointer(types.int64)))
+@phase(types.void(types.int64, types.int64, types.CPointer(types.int64)){options})
 def run(begin, end, at):
 {arguments}    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
     for r in range(begin, end):
@@ -73,11 +73,15 @@ class Place(NamedTuple):
 class _Recorder(TorchDispatchMode):
     """Keeps every operation with what went in and what came out."""
 
-    def __init__(self) -> None:
+    def __init__(self, simpler: Mapping[Any, Callable[..., Any]]) -> None:
         super().__init__()
+        self._simpler = simpler
         self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any], Any]] = []
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in self._simpler:
+            with self:
+                return self._simpler[func](*args, **(kwargs or {}))
         out = func(*args, **(kwargs or {}))
         self.calls.append((func._schema.name.removeprefix("aten::"), args, kwargs or {}, out))
         return out
@@ -95,6 +99,11 @@ class RowFunction:
         Untraceable: For an operation that is not known here, or mixes rows.
     """
 
+    options, imports, unary = "", "", UNARY
+    """How it is compiled, what is imported for that, and operations on single numbers."""
+    simpler: Mapping[Any, Callable[..., Any]] = {}
+    """What stands for an operation, by its name in torch."""
+
     def __init__(
         self, function: Callable[..., Mapping[str, Tensor]], inputs: Mapping[str, Tensor], rows: int, *,
         apart: bool = False,
@@ -107,20 +116,24 @@ class RowFunction:
         self._tables: list[np.ndarray] = []
         self._table_of: dict[int, str] = {}
         self._parts: list[list[str]] = []
-        with torch.no_grad(), _Recorder() as recorder:
+        with torch.no_grad(), _Recorder(self.simpler) as recorder:
             found = dict(function(**inputs))
         self._floats = next(x.dtype for x in (*inputs.values(), *found.values()) if x.is_floating_point())
         for name, x in inputs.items():
-            kind, width = self._kind(x), x.numel() // rows
-            self._keep(x, f"in_{name}", f"r * {width}", width, kind)
-        self._blanks = {id(call[3]): call for call in recorder.calls if call[0] in _BLANK or call[0] in _FULL}
+            self._given(name, x)
+        self._blanks: dict[int, float] = {}
+        for called, args, _, out in recorder.calls:
+            if called in _BLANK:
+                self._blanks[storage(out)] = _BLANK[called]
+            elif called in _FULL:
+                self._blanks[storage(out)] = args[_FULL[called]]
         calls = _needed(recorder.calls, list(found.values()))
         for call in calls:
             self._print(*call)
         self.constants = {name: self._plain(x) for name, x in found.items() if not (apart or self._known(x))}
         moving = {name: x for name, x in found.items() if name not in self.constants}
         self.same = {} if apart else self._twice(moving)
-        moving = {name: x for name, x in moving.items() if name not in self.same}
+        moving = {name: x for name, x in moving.items() if name not in self.same and self._by_row(name, x)}
         self.shapes = {name: tuple(x.shape[1:]) for name, x in moving.items()}
         kinds = {name: self._kind(x) for name, x in moving.items()}
         real = np.dtype(np.float32 if self._floats == torch.float32 else np.float64)
@@ -141,11 +154,13 @@ class RowFunction:
         typed += [(f"t{k}", x.dtype.kind) for k, x in enumerate(self._tables)]
         typed += [(f"in_{n}", self._kind(inputs[n])) for n in self.needs]
         typed += [(f"out_{n}", kinds[n]) for n in moving]
+        typed += [(n, "f") for n in self._more()]
         arguments = "".join(
             f"    {n} = carray(located(at[{k}], {_TEXT[kind]}), SIZE)\n" for k, (n, kind) in enumerate(typed)
         )
         room = {kind: max(1, size) for kind, size in self._room.items()}
-        header = HEADER.format(kind=real.name, arguments=arguments, **room)
+        said = {"options": self.options, "imports": self.imports.format(kind=real.name)}
+        header = HEADER.format(kind=real.name, arguments=arguments, **said, **room)
         self._held = [np.array(list(self._constants) or [0.0], real), *self._tables]
         self.fixed = addresses(self._held)
         """Addresses that every call begins with."""
@@ -154,12 +169,25 @@ class RowFunction:
 
     def table(self, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the addresses for a call, from arrays by name; those that are missing are 0."""
-        names = (*self.needs, *self.outs)
+        names = (*self.needs, *self.outs, *self._more())
         return np.concatenate((self.fixed, addresses([arrays.get(n) for n in names])))
 
     def place(self, name: str) -> int:
         """Return where in the table the address of an input or an output stands."""
-        return len(self.fixed) + (*self.needs, *self.outs).index(name)
+        return len(self.fixed) + (*self.needs, *self.outs, *self._more()).index(name)
+
+    def _given(self, name: str, x: Tensor) -> None:
+        """Enter an input."""
+        width = x.numel() // self._rows
+        self._keep(x, f"in_{name}", f"r * {width}", width, self._kind(x))
+
+    def _by_row(self, name: str, x: Tensor) -> bool:
+        """Return whether an output has a value for every row."""
+        return True
+
+    def _more(self) -> list[str]:
+        """Return the names of arrays that are filled beside the outputs."""
+        return []
 
     def _twice(self, found: Mapping[str, Tensor]) -> dict[str, tuple[str, tuple[int, ...]]]:
         """Return outputs that are the numbers of another one, with its name and their own shape without rows."""
@@ -180,12 +208,12 @@ class RowFunction:
         return KINDS[x.dtype]
 
     def _keep(self, x: Tensor, array: str, start: str, width: int, kind: str) -> None:
-        self._stores[_storage(x)] = (array, start, width)
+        self._stores[storage(x)] = (array, start, width)
         self._view(x, kind)
 
     def _known(self, x: Tensor) -> bool:
         """Return whether a tensor depends on the inputs."""
-        return _storage(x) in self._stores
+        return storage(x) in self._stores
 
     def _place(self, x: Tensor) -> Place:
         """Return where a known tensor lies; autograd keeps other tensors of the same memory."""
@@ -195,7 +223,7 @@ class RowFunction:
 
     def _view(self, x: Tensor, kind: str) -> None:
         """Enter a tensor that looks into a known storage."""
-        array, start, width = self._stores[_storage(x)]
+        array, start, width = self._stores[storage(x)]
         if x.dim() == 0 or x.shape[0] != self._rows or x.stride(0) != width or x.storage_offset() >= max(width, 1):
             raise Untraceable("an operation mixes rows")
         self._places[id(x)] = Place(array, start, int(x.storage_offset()), tuple(x.stride()[1:]), kind)
@@ -278,10 +306,9 @@ class RowFunction:
 
     def _began(self, x: Tensor) -> None:
         """Give a constant of one value, that is written to now, a place."""
-        made = self._blanks.get(id(x))
-        if made is None or x.dim() == 0 or x.shape[0] != self._rows:
+        value = self._blanks.get(storage(x))
+        if value is None or x.dim() == 0 or x.shape[0] != self._rows:
             raise Untraceable("a constant is written to")
-        value = made[1][_FULL[made[0]]] if made[0] in _FULL else _BLANK[made[0]]
         to = self._fresh(x)
         self._parts.append(loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._number(value, to.kind)}"))
 
@@ -293,8 +320,8 @@ class RowFunction:
             return self._added(args, to)
         if name == "masked_fill":
             name, args = "where", (args[1], args[2], args[0])
-        if name in UNARY or name in ("_to_copy", "clone"):
-            form = UNARY.get(name, "{0}")
+        if name in self.unary or name in ("_to_copy", "clone"):
+            form = self.unary.get(name, "{0}")
             return loops(shape, lambda at: f"{index(to, at)} = " + form.format(self._at(args[0], at, to.kind)))
         if name in BINARY or name in COMPARE:
             kind = to.kind if name in BINARY else self._common(args)
@@ -470,7 +497,8 @@ class RowFunction:
         )
 
 
-def _storage(x: Tensor) -> int:
+def storage(x: Tensor) -> int:
+    """Return what tells the memory of a tensor from that of others."""
     return x.untyped_storage().data_ptr()
 
 
@@ -480,11 +508,11 @@ def _tensors(args: Sequence[Any]) -> list[Tensor]:
 
 def _needed(calls: Sequence[Any], found: Sequence[Tensor]) -> list[Any]:
     """Return the calls on which some results depend."""
-    wanted, kept = {_storage(x) for x in found}, []
+    wanted, kept = {storage(x) for x in found}, []
     for call in reversed(calls):
         made = call[3] if isinstance(call[3], (list, tuple)) else (call[3],)
-        if any(_storage(x) in wanted for x in made if isinstance(x, Tensor)):
-            wanted |= {_storage(x) for x in _tensors(call[1])}
+        if any(storage(x) in wanted for x in made if isinstance(x, Tensor)):
+            wanted |= {storage(x) for x in _tensors(call[1])}
             kept.append(call)
     return kept[::-1]
 

@@ -1,0 +1,342 @@
+"""A window of an environment in one call: policy and steps compiled together, one node of autograd for all of it."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from idm_env.envs.plan import Array, Bound, Plan, address
+from idm_env.kernels.policy_rows import PolicyRows
+from idm_env.kernels.rows import RowFunction, adjoint
+from idm_env.kernels.window_loop import window, window_back
+from idm_env.scalar.record import Untraceable
+
+if TYPE_CHECKING:
+    from idm_env.envs.batch import Batch
+    from idm_env.envs.values import Values
+
+_MANY = 1009
+"""Rows of the recording of a policy: no other dimension."""
+
+
+class Unrolled(NamedTuple):
+    """A window of n environments, time first, with its graph.
+
+    ``observation`` ``(steps + 1, n, features)`` is what the policy saw, and sees next: where an episode ended, that of
+    the next one, through which no gradient flows. ``action`` ``(steps, n, actions)`` is what it did. ``reward``,
+    ``terminated`` and ``truncated`` ``(steps, n)`` are those of ``step``. ``final`` ``(steps, n, features)`` is what is
+    observed after each step, before any reset.
+    """
+
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    final: Tensor
+
+
+class Driver:
+    """A policy as compiled loops: what it does, and the vector-Jacobian product of that.
+
+    Raises:
+        Untraceable: For a policy of other operations than those of small networks.
+        ValueError: For one that does not take these observations, or gives no actions.
+    """
+
+    def __init__(self, policy: nn.Module, width: int, actions: int, dtype: torch.dtype) -> None:
+        own = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
+        self.names = dict(zip(own, (f"w{i}" for i in range(len(own))), strict=True))
+        self.learned = [self.names[n] for n, _ in policy.named_parameters()]
+        sample = {self.names[n]: x.detach().clone() for n, x in own.items()}
+        if any(x.dtype != dtype or not x.is_contiguous() for x in sample.values()):
+            raise Untraceable("a policy in another precision than the environment")
+
+        try:
+            with torch.no_grad():
+                done = policy(torch.zeros(2, width, dtype=dtype))
+        except RuntimeError as error:
+            why = str(error).splitlines()[0]
+            raise ValueError(f"policy does not take observations of shape (n, {width}): {why}.") from None
+        if not isinstance(done, Tensor) or done.shape != (2, actions):
+            shape = tuple(done.shape[1:]) if isinstance(done, Tensor) else type(done).__name__
+            raise ValueError(f"policy gives {shape} for each observation, and {actions} actions are needed.")
+
+        def act(**given: Tensor) -> dict[str, Tensor]:
+            weights = {n: given[short] for n, short in self.names.items()}
+            done = torch.func.functional_call(policy, weights, (given["seen"],))
+            return {"action": done + given["push"]}
+
+        leaves = {"seen": torch.zeros(_MANY, width, dtype=dtype), "push": torch.zeros(_MANY, actions, dtype=dtype)}
+        self.forward: PolicyRows = PolicyRows(act, {**leaves, **sample}, _MANY, list(sample))
+        back = adjoint(act, ["action"], ["seen", *self.learned])
+
+        def pulled(**given: Tensor) -> dict[str, Tensor]:
+            return {f"to_{n}": x for n, x in back(**given).items()}
+
+        leaves["on_action"] = torch.zeros(_MANY, actions, dtype=dtype)
+        self.backward: PolicyRows = PolicyRows(pulled, {**leaves, **sample}, _MANY, list(sample))
+
+    def weights(self, policy: nn.Module) -> dict[str, Tensor]:
+        """Return the policy's weights and buffers as they are now, by their short names."""
+        own = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
+        return {short: own[n] for n, short in self.names.items()}
+
+
+_DRIVERS: weakref.WeakKeyDictionary[nn.Module, dict[Any, Driver | None]] = weakref.WeakKeyDictionary()
+
+
+def driver_of(policy: Any, width: int, actions: int, dtype: torch.dtype) -> Driver | None:
+    """Return a policy as compiled loops, recorded once; None where it runs by torch between the steps."""
+    if not isinstance(policy, nn.Module):
+        return None
+    kept = _DRIVERS.setdefault(policy, {})
+    key = (width, actions, dtype, policy.training, tuple((n, x.shape) for n, x in policy.state_dict().items()))
+    if key not in kept:
+        try:
+            kept[key] = Driver(policy, width, actions, dtype)
+        except Untraceable:
+            kept[key] = None
+    return kept[key]
+
+
+class _Segment(NamedTuple):
+    """Steps ``first`` to ``last`` between two resets, or two blocks of normals: what held for them."""
+
+    first: int
+    last: int
+    bound: Bound
+    normals: Any
+    at: int
+    past: Array
+    newest: int
+
+
+def _each(x: Array, part: slice) -> Array:
+    """Return the addresses of what an array holds for some steps."""
+    return address(x) + np.arange(part.start, part.stop, dtype=np.int64) * (x.nbytes // len(x))
+
+
+def _columns(loops: RowFunction, given: Mapping[str, Any], part: slice) -> Array:
+    """Return tables of the loops of a policy, one for each step."""
+    made = np.empty((part.stop - part.start, len(loops.table({}))), np.int64)
+    made[:] = loops.table({})
+    for name in (*loops.needs, *loops.outs, *getattr(loops, "sums", ())):
+        made[:, loops.place(name)] = given[name]
+    return made
+
+
+class Tape:
+    """What a window keeps: worlds before and after every step, and what was seen, done and commanded between.
+
+    Everything else is computed once more backwards.
+    """
+
+    def __init__(self, plan: Plan, driver: Driver, steps: int, blocks: Tensor, seen: Tensor, push: Tensor) -> None:
+        self.plan, self.driver, self.steps = plan, driver, steps
+        rows, kind = plan.rows, plan.real
+        self.worlds = torch.empty((steps, *blocks.shape), dtype=blocks.dtype)
+        self.held: list[Any] = [blocks, push]
+        self.between, self.told = plan.between.take(steps)[0], plan.told.take(steps)[0]
+        self.seen = np.empty((steps + 1, seen.numel()), kind)
+        self.seen[0] = seen.reshape(-1).numpy()
+        self.final = self.told["observation"].reshape(steps, -1)
+        self.push = push.numpy()
+        self.action = np.empty((steps, push.numel()), kind)
+        self.later = self.worlds.data_ptr() + np.arange(steps, dtype=np.int64) * blocks.numel() * blocks.element_size()
+        self.now = np.concatenate(([blocks.data_ptr()], self.later[:-1]))
+        self.clocks, self.later_clocks = np.empty((2, steps, rows), np.int64)
+        self.ends, self.cuts = (self._flag(n) for n in ("whole_terminated", "whole_truncated"))
+        self.segments: list[_Segment] = []
+
+    def _flag(self, name: str) -> Array:
+        return self.tell(name).reshape(self.steps, self.plan.rows)
+
+    def tell(self, name: str) -> Array:
+        """Return what is told of every step under a name."""
+        after = self.plan.recorded.after
+        other, shape = after.same.get(name, (name, ()))
+        if other in self.told:
+            return self.told[other].reshape(self.steps, self.plan.rows, *(shape or after.shapes[other]))
+        return np.repeat(self.plan.constant[name][None], self.steps, 0)
+
+    def given(self, part: slice) -> dict[str, Any]:
+        """Return the addresses of what steps are given beside their worlds."""
+        found: dict[str, Any] = {n: _each(x, part) for n, x in self.between.items()}
+        found |= {n: found[o] for n, (o, _) in self.plan.recorded.before.same.items()}
+        found |= {"action": _each(self.action, part), "state_step": _each(self.clocks, part)}
+        return found | {"later_state_step": _each(self.later_clocks, part)}
+
+    def run(self, batch: Batch, values: Values, weights: Mapping[str, Array]) -> None:
+        """Do all steps; episodes that end begin anew."""
+        plan, done = self.plan, 0
+        self.clocks[0] = values.clock().numpy()
+        while done < self.steps:
+            ahead, normals = batch.ahead()
+            room = values.past.room() if values.past.slots else ahead
+            part = slice(done, min(self.steps, done + ahead, done + room))
+            bound = plan.of(values.layout, batch.driven())
+            given, now, later = self.given(part), self.now[part], self.later[part]
+            to = {n: _each(x, part) for n, x in self.told.items()}
+            to |= {n: given[n] for n in ("command", "given", "state_step", "later_state_step") if n in given}
+            own = {"seen": _each(self.seen, part), "push": address(self.push), "action": given["action"]}
+            own |= {n: address(x) for n, x in weights.items()}
+            acts = _columns(self.driver.forward, own, part)
+            tables = (
+                self.driver.forward.call, acts, plan.recorded.before.call, bound.laid.ask.each(now, later, given),
+                plan.recorded.after.call, bound.laid.tell.each(now, later, to), self.clocks[part],
+                self.later_clocks[part], plan.places_of(bound, normals, now, later, given),
+            )  # fmt: skip
+            past = values.past
+            count = window(
+                *tables, bound.strides, *plan.work, past.rows, past.newest, *plan.loops, batch.used, plan.groups, 0,
+                part.stop - done, self.ends[part], self.cuts[part], self.seen[done:], self.final[part],
+            )  # fmt: skip
+            self.segments.append(_Segment(done, done + count, bound, normals, batch.used, past.rows, past.newest))
+            batch.used += count
+            past.newest += count if past.slots else 0
+            done += count
+            values.arrive(self.worlds[done - 1], self.later_clocks[done - 1].copy())
+            over = np.flatnonzero(self.ends[done - 1] | self.cuts[done - 1])
+            batch.saw(torch.from_numpy(self.tell("observation")[done - 1].copy()))
+            if len(over):
+                fresh = batch.reset(over)
+                batch.settle()
+                self.seen[done] = fresh.reshape(-1).numpy()  # type: ignore[union-attr]
+                self.held.append(values.blocks)
+                if done < self.steps:
+                    self.now[done] = values.blocks.data_ptr()
+            if done < self.steps:
+                self.clocks[done] = values.clock().numpy()
+
+    def back(
+        self, weights: Mapping[str, Array], on_seen: Array, on_last: Array, on_action: Array, on_reward: Array,
+        on_worlds: Array, on_past: Array,
+    ) -> tuple[Array, Array, Array, Array, dict[str, Array]]:  # fmt: skip
+        """Return what falls on first worlds, the past then, parameters, actions (every step), and sums of weights."""
+        plan, scratch, driver = self.plan, self.plan.scratch, self.driver
+        two = np.zeros((2, *on_worlds.shape), plan.real)
+        two[self.steps % 2] = on_worlds
+        pasts = np.zeros((2, *on_past.shape), plan.real)
+        pasts[self.steps % 2] = on_past
+        on_parameters = np.zeros((len(plan.kernel.program.parameters), plan.count), plan.real)
+        acted = np.zeros_like(self.action)
+        told, looked = np.zeros((2, self.seen.shape[1]), plan.real)
+        total = on_seen[self.steps].copy()
+        sums = {n: np.zeros(size, plan.real) for n, size in driver.backward.sums.items()}
+        moving = [i for i, n in enumerate(plan.layout.blocks) if f"end_{n}" in scratch.there]
+        carried = np.array([i for i, n in enumerate(plan.layout.blocks) if n.startswith("memory_") and i not in moving])
+        for segment in reversed(self.segments):
+            part = slice(segment.first, segment.last)
+            now, later, given = self.now[part], self.later[part], self.given(part)
+            side = np.arange(part.start, part.stop) % 2
+            own = {**scratch.there, **{f"on_{n}": scratch.zeros for n in plan.recorded.flowing}, **given}
+            own |= {"on_observation": address(told), "on_whole_reward": _each(on_reward, part)}
+            own["on_action"] = _each(acted, part)
+            for i, name in enumerate(plan.layout.blocks):
+                first = address(two) + i * plan.pitch
+                own[f"begin_{name}"] = first + side * two[0].nbytes
+                own[f"seed_{name}"] = first + (1 - side) * two[0].nbytes
+            asks, tells = segment.bound.laid.back
+            see = {"seen": _each(self.seen, part), "push": address(self.push), "on_action": own["on_action"]}
+            see |= {n: address(x) for n, x in (*weights.items(), *sums.items())} | {"to_seen": address(looked)}
+            acts = _columns(driver.backward, see, part)
+            before, after = plan.recorded.backward
+            window_back(
+                driver.backward.call, acts, before.call, asks.each(now, later, own), after.call,
+                tells.each(now, later, own), plan.places_of(segment.bound, segment.normals, now, later, given),
+                segment.bound.strides, *scratch.work, segment.past, segment.newest, scratch.ends, scratch.begins,
+                np.array([address(x) for x in pasts]), address(on_parameters), address(scratch.on_inputs),
+                *scratch.loops, segment.at, plan.groups, segment.first % 2, segment.last - segment.first,
+                self.ends[part], self.cuts[part], two, pasts, carried.astype(np.int64), on_seen[part], on_last[part],
+                on_action[part], acted[part], told, looked, total,
+            )  # fmt: skip
+        return two[0], pasts[0], on_parameters, acted, {**sums, "seen": total}
+
+
+class _Window(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, tape: Tape, batch: Batch, values: Values, names: tuple[str, ...], blocks: Tensor,
+        token: Tensor | None, seen: Tensor, push: Tensor, *given: Tensor,
+    ) -> tuple[Tensor | None, ...]:  # fmt: skip
+        weights = {n: x.detach().numpy() for n, x in zip(names, given, strict=False)}
+        tape.run(batch, values, weights)
+        if not np.isfinite(tape.action).all():
+            raise ValueError("policy returned NaN or infinite actions. Give finite numbers in [-1, 1].")
+        rows, steps = tape.plan.rows, tape.steps
+        wanted = [x for _, x in tape.segments[0].bound.wanted]
+        ctx.tape, ctx.names, ctx.shapes = tape, names, [x.shape for x in wanted]
+        ctx.save_for_backward(blocks, seen, push, *given)
+        ctx.set_materialize_grads(False)
+        shaped = (steps, rows, -1)
+        return (
+            values.blocks.clone(), None if token is None else token.new_zeros(1).expand(token.shape),
+            torch.from_numpy(tape.seen).view(steps + 1, rows, -1), torch.from_numpy(tape.action).view(shaped),
+            torch.from_numpy(tape.tell("whole_reward")).view(steps, rows), torch.from_numpy(tape.final).view(shaped),
+        )  # fmt: skip
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *on: Tensor | None) -> Any:  # type: ignore[override]
+        tape, plan = ctx.tape, ctx.tape.plan
+        blocks, seen, push, *given = ctx.saved_tensors
+        weights = {n: x.detach().numpy() for n, x in zip(ctx.names, given, strict=False)}
+        signals = plan.slots * plan.kernel.signals
+
+        def dense(x: Tensor | None, *shape: int) -> Array:
+            return np.zeros(shape, plan.real) if x is None else np.ascontiguousarray(x.numpy()).reshape(shape)
+
+        steps, wide, acts = tape.steps, tape.seen.shape[1], tape.action.shape[1]
+        on_now, on_past, on_parameters, acted, sums = tape.back(
+            weights, dense(on[2], steps + 1, wide), dense(on[5], steps, wide), dense(on[3], steps, acts),
+            dense(on[4], steps, plan.rows), dense(on[0], len(blocks), plan.count), dense(on[1], signals, plan.count),
+        )  # fmt: skip
+        found: list[Tensor | None] = [torch.from_numpy(on_now).view(blocks.shape)]
+        found.append(torch.from_numpy(on_past) if signals else None)
+        found.append(torch.from_numpy(sums["seen"]).view(seen.shape))
+        found.append(torch.from_numpy(acted.sum(0)).view(push.shape))
+        summed = tape.driver.backward.summed
+        for name, x in zip(ctx.names, given, strict=False):
+            if f"to_{name}" not in summed:
+                found.append(None)
+                continue
+            array, shape, strides, offset = summed[f"to_{name}"]
+            found.append(torch.from_numpy(sums[array]).as_strided(shape, strides, offset).reshape(x.shape))
+        for (i, x), shape in zip(tape.segments[0].bound.wanted, ctx.shapes, strict=True):
+            found.append(torch.from_numpy(on_parameters[i]).view(blocks.shape[1:]).sum_to_size(shape).to(x.dtype))
+        return (None,) * 4 + tuple(found)
+
+
+def compiled(batch: Batch, values: Values, policy: Any, steps: int, push: Tensor) -> Unrolled | None:
+    """Return a window whose policy runs inside the loops, or None where it cannot; all or nothing is done."""
+    seen = batch.seen()
+    driver = driver_of(policy, seen[0].numel(), push.shape[-1], seen.dtype)
+    if driver is None:
+        return None
+    plan = values.plan((False, True), batch.task.simulator.draws)
+    if plan.size > plan.extent[3]:
+        return None
+    first = values.blocks
+    tape = Tape(plan, driver, steps, first.detach(), seen.detach(), push.detach())
+    bound = plan.of(values.layout, batch.driven())
+    token = values.token_of(plan)
+    weights = driver.weights(policy)
+    given = (*weights.values(), *(x for _, x in bound.wanted))
+    kept = batch.mark()
+    try:
+        out = _Window.apply(tape, batch, values, tuple(weights), first, token, seen, push, *given)
+    except BaseException:
+        batch.back_to(kept)
+        raise
+    values.arrive(out[0], values.clock().numpy(), out[1])
+    rows = plan.rows
+    batch.saw(out[2][-1].view(rows, len(batch.task.agents), -1))
+    ends, cuts = (torch.from_numpy(x.copy()) for x in (tape.ends, tape.cuts))
+    return Unrolled(out[2], out[3], out[4], ends, cuts, out[5])
