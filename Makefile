@@ -1,4 +1,4 @@
-# `make demo` and `make test` do all set-up themselves: one environment, .venv, in the checkout.
+# `make demo` and `make test` do all set-up themselves, in one environment, .venv, in the checkout.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,13 +9,18 @@ OUT ?= out/demo
 
 setup: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+# Stamps: .data is what the command line needs, .installed what tests need besides, in the same environment.
+$(VENV)/.data: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[data,kernels]'
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.data
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-demo: setup
+demo: $(VENV)/.data
 	$(BIN)/idm-env demo $(if $(DATA),--data '$(DATA)') --out '$(OUT)'
 
 test: setup

@@ -17,6 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import idm_env
 from idm_env.extras import OF
 from idm_env.tasks import TASKS
 
@@ -85,6 +86,15 @@ def test_it_declares_what_it_imports_and_no_extra_for_what_it_does_not_carry(whe
     known = importlib.metadata.packages_distributions()
     for module, extra in OF.items():
         assert {canonicalize_name(name) for name in known[module]} & declared[extra]
+
+
+def test_versions_agree(wheel: zipfile.ZipFile) -> None:
+    """Of the package, of what is cited, and of the changelog's newest heading."""
+    declared = Path(str(wheel.filename)).name.split("-")[1]
+    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert cited is not None and newest is not None
+    assert declared == idm_env.__version__ == cited[1] == newest[1]
 
 
 def environment(wheel: zipfile.ZipFile, place: Path, *extras: str) -> Path:
