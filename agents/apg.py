@@ -17,11 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from agents import common, environments
 from agents.monitor import Monitor
 from agents.policy import Driving, Past
 from idm_env.checks import finite, shown
+from idm_env.envs.vector import DiffIDMVectorEnv
 
 
 @dataclass
@@ -59,6 +61,21 @@ class Arguments(common.Arguments):
             )
 
 
+def lost(
+    env: DiffIDMVectorEnv, driving: Driving, observation: Tensor, push: Tensor, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Drive one window; return what is observed after it and minus the mean reward, with its graph."""
+    if not driving.policy.remembers:
+        window = env.unroll(driving.policy, steps, push)
+        return window.observation[-1], -window.reward.mean()
+    total = torch.zeros(())
+    for _ in range(steps):
+        observation, reward, terminated, truncated, _ = env.step(driving(observation) + push)
+        driving.begin(terminated | truncated)
+        total = total + reward.mean()
+    return observation, -total / steps
+
+
 def train(arguments: Arguments) -> list[dict[str, Any]]:
     """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
     began = time.process_time()
@@ -85,16 +102,12 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             rate = common.fall(arguments.learning_rate, update, arguments.updates)
             optimiser.param_groups[0]["lr"] = rate
             env.detach()
-            observation, total = observation.detach(), torch.zeros(())
+            observation = observation.detach()
             # Seeded by the update, so that a resumed training repeats it.
             torch.manual_seed(environments.first_seed(arguments.seed, update))
             share = rate / arguments.learning_rate
             push = arguments.explore * share * torch.randn(arguments.count, len(env.task.agents))
-            for _ in range(arguments.window):
-                observation, reward, terminated, truncated, _ = env.step(driving(observation) + push)
-                driving.begin(terminated | truncated)
-                total = total + reward.mean()
-            loss = -total / arguments.window
+            observation, loss = lost(env, driving, observation, push, arguments.window)
             norm = common.descend(loss, policy.parameters(), optimiser, arguments.clip, update, monitor.last)
             driving.detach()
             training = {

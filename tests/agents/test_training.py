@@ -231,22 +231,26 @@ def raising(error: type[BaseException]):
     return fail
 
 
-def break_rewards(monkeypatch, after: int) -> None:
-    """Make rewards NaN after some steps of training (those with a graph), or all of them for 0."""
-    plain, calls = RingTask.reward, [0]
+def break_losses(monkeypatch, update: int) -> None:
+    """Make losses NaN in one update of training."""
+    plain = common.descend
 
-    def reward(self, *given):
-        result = plain(self, *given)
-        calls[0] += result.requires_grad
-        return result * torch.nan if calls[0] > after or not after else result
+    def descend(loss, *given):
+        return plain(loss * torch.nan if given[3] == update else loss, *given)
 
-    monkeypatch.setattr(RingTask, "reward", reward)
+    monkeypatch.setattr(common, "descend", descend)
+
+
+def break_rewards(monkeypatch) -> None:
+    """Make all rewards NaN."""
+    plain = RingTask.reward
+    monkeypatch.setattr(RingTask, "reward", lambda self, *given: plain(self, *given) * torch.nan)
 
 
 @pytest.mark.parametrize("name", AGENTS)
 def test_nan_before_the_first_checkpoint_is_told_as_such(name, quick, monkeypatch):
     module, kind, small = AGENTS[name]
-    break_rewards(monkeypatch, after=0)
+    break_rewards(monkeypatch)
     with pytest.raises(
         DivergedError, match=r"update [01]: .* must be finite\. (None was kept yet|The last good)"
     ) as told:
@@ -259,7 +263,7 @@ def test_nan_before_the_first_checkpoint_is_told_as_such(name, quick, monkeypatc
 
 def test_a_critic_that_diverges_before_the_actor_learns_is_not_kept(quick, monkeypatch):
     module, kind, small = AGENTS["shac"]
-    break_rewards(monkeypatch, after=25)
+    break_losses(monkeypatch, update=1)
     with pytest.raises(DivergedError, match="update 1"):
         module.train(kind(**quick, **{**small, "critic_first": 3}))
     kept = common.load(quick["out"] / "last.pt")[1]["training"]
@@ -281,7 +285,7 @@ def test_the_log_is_closed_on_every_way_out(name, way_out, quick, loggers, monke
 @pytest.mark.parametrize("name", ["apg", "shac"])
 def test_nan_stops_with_update_norm_and_the_last_good_checkpoint(name, quick, monkeypatch):
     module, kind, small = AGENTS[name]
-    break_rewards(monkeypatch, after=45)
+    break_losses(monkeypatch, update=2)
     with pytest.raises(DivergedError, match=r"update 2: loss nan and gradient norm nan.*last\.pt") as told:
         module.train(kind(**quick, **small))
     assert "\n" not in str(told.value)
