@@ -33,6 +33,7 @@ exclude_patterns = [
     "**/sg_execution_times*",
 ]
 highlight_language = "none"
+smartquotes = False  # options begin with two hyphens
 html_theme = "furo"
 html_title = "idm_env"
 html_static_path: list[str] = []

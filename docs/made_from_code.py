@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import inspect
 import json
 import re
@@ -118,6 +119,8 @@ def _faces(name: str) -> list[str]:
 
 
 def _unit(entry: str) -> str:
+    if re.fullmatch(r"(ahead|left)_\d+", entry):
+        return "m" if entry.startswith("ahead") else "lanes"
     known = next((unit for key, unit in UNITS.items() if entry.endswith(key)), None)
     if known is None:
         known = "m/s" if "speed" in entry else "m/s²" if "accel" in entry else "m" if "gap" in entry else "–"
@@ -167,29 +170,82 @@ def effects(pictures: Path) -> str:
     """Return the catalogue, each effect with its picture where a platoon shows it."""
     from idm_env.effects import ALL
 
+    kinds: dict[str, dict[str, Any]] = {}
+    for name, cls in ALL.items():
+        kinds.setdefault(_kind(cls), {})[name] = cls
     lines = [
-        "# Catalogue of effects", "",
+        "# Catalogue of effects", "", EQUATIONS, "",
         "Made from the classes: what stands here stands beside the equation. Pictures: the third driver of a platoon "
         "whose first brakes and accelerates again, plain (grey) and with the effect (blue); what an effect does not "
         "change is not drawn.", "",
+        "| behaviour | effects |", "| --- | --- |",
     ]  # fmt: skip
-    for name, cls in ALL.items():
-        lines += _effect(name, cls, pictures)
+    for kind, members in kinds.items():
+        lines.append(f"| {kind} | {', '.join(f'[{_titled(n, c)}](#effect-{n})' for n, c in members.items())} |")
+    for kind, members in kinds.items():
+        lines += ["", f"## {kind}", ""]
+        for name, cls in members.items():
+            lines += _effect(name, cls, pictures)
     return "\n".join(lines) + "\n"
+
+
+EQUATIONS = """<style>
+.eq { font-family: "STIX Two Math", "Cambria Math", "Times New Roman", serif; font-size: 1.08em }
+p.eq { margin: 1em 1.5em; line-height: 1.9; overflow-x: auto }
+.eq sub, .eq sup { line-height: 0 }
+</style>"""
+
+
+def typeset(text: str) -> str:
+    """Return an equation as HTML: variables in italics, indices and powers in their places."""
+    text = re.sub(
+        r"(?:Δ?[a-zA-Zα-ω]\u0302?|Δ)(?![a-zA-Zα-ω])(?<![a-zA-Zα-ω]{2})", r"<i>\g<0></i>", html.escape(text, quote=False)
+    )
+    for mark, tag in (("_", "sub"), (r"\^", "sup")):
+        text = re.sub(rf"{mark}\(([^()]*)\)|{mark}(<i>.</i>|\w+)", rf"<{tag}>\1\2</{tag}>", text)
+    text = re.sub(r"</i>(\d)", r"</i><sub>\1</sub>", text)
+    for sign in "*[]_`|":  # Markdown reads what stands between tags
+        text = text.replace(sign, f"&#{ord(sign)};")
+    return text
+
+
+def _inline(paragraph: str) -> str:
+    """Return a paragraph with the equations among its code typeset."""
+
+    def shown(found: re.Match[str]) -> str:
+        code = found[1]
+        equation = " " in code and not re.match(r"[A-Z]\w+\(", code)
+        return f'<span class="eq">{typeset(code)}</span>' if equation else found[0]
+
+    return re.sub("`([^`]+)`", shown, paragraph)
+
+
+def _kind(cls: Any) -> str:
+    """Return what drivers do in effects of one module: the first words of what it says of itself."""
+    told = (inspect.getmodule(cls).__doc__ or "").strip().split("\n")[0]  # type: ignore[union-attr]
+    return re.split(r" \(|[:,]|\.$", told)[0]
+
+
+def _titled(name: str, cls: Any) -> str:
+    return str(cls.title or name.replace("_", " "))
 
 
 def _effect(name: str, cls: Any, pictures: Path) -> list[str]:
     effect = cls()
-    title = cls.title or name.replace("_", " ")
-    lines = [f"## {title}", "", f"`{name}`, class `idm_env.effects.{cls.__name__}`; hook `{cls.hook}`.", ""]
-    if cls.equation:
-        lines += [f"> {cls.equation}", ""]
+    title = _titled(name, cls)
+    lines = [f"(effect-{name})=", f"### {title}", ""]
+    lines += [f"`{name}`, class `idm_env.effects.{cls.__name__}`; hook `{cls.hook}`.", ""]
+    paragraphs = []
     doc = inspect.cleandoc(cls.__doc__ or "").replace("``", "`")
     for paragraph in (part.strip("\n") for part in re.sub(r"\n?::\n", "\n", doc).split("\n\n")):
         if paragraph.startswith("    "):
-            lines += ["```text", textwrap.dedent(paragraph), "```", ""]
+            rows = [typeset(row) for row in textwrap.dedent(paragraph).splitlines()]
+            paragraphs += [f'<p class="eq">{"<br>".join(rows)}</p>', ""]
         elif paragraph.strip():
-            lines += [" ".join(paragraph.split()), ""]
+            paragraphs += [_inline(" ".join(paragraph.split())), ""]
+    if cls.equation and not any('class="eq"' in line for line in paragraphs):
+        paragraphs[2:2] = [f'<p class="eq">{typeset(cls.equation)}</p>', ""]
+    lines += paragraphs
     if effect.parameters:
         lines += [
             "| parameter | symbol | unit | default | lowest | highest | null |",

@@ -12,6 +12,7 @@ import pytest
 
 from idm_env import diagrams, report
 from idm_env.data import synthetic
+from idm_env.effects import ALL
 from idm_env.fitting.job import fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
 from idm_env.tasks import TASKS, make_task
@@ -96,6 +97,20 @@ def test_a_dead_link_is_seen(tmp_path: Path) -> None:
         '<a href="b.html">b</a><a href="#there">c</a><p id="here"></p><a href="a.html#here">'
     )
     assert [line.split("leads to ")[1].split(",")[0] for line in check.dead(tmp_path)] == ["b.html", "#there"]
+
+
+def test_effects_have_one_equation_each_and_options_their_hyphens(site: Path) -> None:
+    """Typeset, in the prose or above it, and all effects in the index by behaviour."""
+    page = (site / "generated" / "effects.html").read_text(encoding="utf-8")
+    sections = dict(re.findall(r'<section id="effect-([\w-]+)">(.*?)</section>', page, re.DOTALL))
+    assert set(sections) == {name.replace("_", "-") for name in ALL} and "&lt;span" not in page
+    for name, cls in ALL.items():
+        section = sections[name.replace("_", "-")]
+        shown = re.findall(r'<(?:p|span) class="eq">(.*?)</(?:p|span)>', section)
+        assert len(shown) == len(set(shown)) >= bool(cls.equation), name
+        assert "<blockquote" not in section and f'href="#effect-{name.replace("_", "-")}"' in page
+    commands = (site / "generated" / "commands.html").read_text(encoding="utf-8")
+    assert "--lane-changes" in commands and "–lane-changes" not in commands
 
 
 def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
