@@ -70,11 +70,13 @@ def finite(name: str, value: Any, unit: str = "") -> float:
     raise ValueError(f"{name} = {shown(value)} must be a finite number{' of ' + unit if unit else ''}.")
 
 
-def at_least(name: str, value: Any, low: float, unit: str = "") -> float:
-    """Return a finite number of at least ``low``."""
-    if finite(name, value, unit) < low:
-        raise ValueError(f"{name} = {value:g}{' ' + unit if unit else ''} must be at least {low:g}.")
-    return float(value)
+def at_least(name: str, value: Any, low: float, unit: str = "", high: float = math.inf) -> float:
+    """Return a finite number of at least ``low``, and at most ``high``."""
+    number = finite(name, value, unit)
+    if not low <= number <= high:
+        bound = f"at least {low:g}" if number < low else f"at most {high:g}"
+        raise ValueError(f"{name} = {number:g}{' ' + unit if unit else ''} must be {bound}.")
+    return number
 
 
 def within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:

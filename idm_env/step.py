@@ -331,6 +331,9 @@ class Stepping:
             state = decided(self, state, inputs, params)
         accel, scene, driver = self._respond(state, inputs, params)
         displacement, speed, accel = INTEGRATORS[self.integration](state.speed, accel, self.dt)
+        if state.present is not None:  # whoever is not there stands still, whatever he wants or is commanded
+            there = state.present > 0
+            displacement, speed, accel = (torch.where(there, x, 0.0) for x in (displacement, speed, accel))
         motion = Motion(displacement, state.position + displacement, speed, accel, state.present)
         for effect in self._hooks["place"]:
             motion = effect.place(motion, scene, params[effect.name])  # type: ignore[arg-type]

@@ -21,6 +21,8 @@ _VEHICLES = (*(f"links.{name}" for name in Links._fields[1:3]), "moving.shadow")
 _ENDLESS = ("trips.departs", "trips.again")
 _LATER = ("choices.", "moving.")
 """Parts that a state has only once a decision about lanes was made."""
+_STEP_ASIDE = 1e-3
+"""By how much a number may lie below its bound, as differences for a derivative at rest need."""
 _SLACK, _SHARE = 1.0, 1e-4
 """By how much gaps may differ from what positions say: in metres, and as a share of these, for float32's sake."""
 
@@ -95,7 +97,7 @@ def _fitting(name: str, x: Any, like: Tensor | None, state: State, road: Road) -
     elif name in ("present", "choices.shares"):
         high = 1.0
     values = x.detach()
-    good = (values >= low) & (values <= high)
+    good = (values >= low - _STEP_ASIDE) & (values <= high)
     if not bool(good.all()):
         worst = values[~good].reshape(-1)[0].item()
         raise ValueError(f"{here} = {worst:g} is outside [{low:g}, {high:g}].")

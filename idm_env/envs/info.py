@@ -4,6 +4,7 @@
     Executed accelerations of the agents (m/s²), shape ``(agents,)``: what drivers' brakes and the failsafe left.
 ``command``
     Commanded accelerations (m/s²): the clipped action times its ``max_command``; NaN where nobody commands.
+    Like ``accel`` 0 where an agent's vehicle is not on the road: who is absent is told nothing of, and pays nothing.
 ``failsafe``
     Whether the failsafe cut each command (bool).
 ``crash``, ``crash_reason``

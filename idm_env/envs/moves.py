@@ -84,15 +84,17 @@ class Moves:
         """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
         task, asked, found = self.task, self._info, dict[str, Tensor]()
         if "accel" in asked:
-            found["accel"] = task.pick(after.state.accel)
+            found["accel"] = task.there(after.state, task.pick(after.state.accel))
         if "command" in asked:
             shape = (len(after.state.speed), len(task.agents))
-            found["command"] = after.state.accel.new_full(shape, torch.nan) if command is None else command
+            found["command"] = (
+                after.state.accel.new_full(shape, torch.nan) if command is None else task.there(after.state, command)
+            )
         if "failsafe" in asked:
             if command is None or given is None or not task.failsafe:
                 found["failsafe"] = torch.zeros_like(crashed)
             else:
-                found["failsafe"] = given < command
+                found["failsafe"] = task.there(after.state, given < command)
         if "crash" in asked:
             found["crash"] = crashed
         return found | {name: x for name, x in task.told(after).items() if name in asked} if asked else found

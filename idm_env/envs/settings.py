@@ -107,7 +107,7 @@ def settings(
         )
     with trust.trusting(trusted):
         made = chosen if isinstance(chosen, Task) else task_with(cast(str, chosen), choices, KEYWORDS)
-    return Settings(
+    found = Settings(
         task=made,
         output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),
         device=_device(own["device"] or "cpu"),
@@ -117,6 +117,8 @@ def settings(
         limit=made.horizon,
         info=_info(own["info"]),
     )
+    affordable(found, 1)
+    return found
 
 
 def _mode(value: Any) -> AutoresetMode:
@@ -163,13 +165,15 @@ def affordable(made: Settings, count: int) -> None:
     """Raise ValueError where ``count`` environments would need more memory than the device has."""
     task, size = made.task, made.dtype.itemsize
     features = len(task.bounds.names) * len(task.agents)
-    needed = count * (size * (TENSORS * task.vehicles + SPACES * features) + ROW_BYTES)
+    needed = count * (size * (TENSORS * task.vehicles + SPACES * (features + task.pairs)) + ROW_BYTES)
     if made.device.type == "cuda":
         there = torch.cuda.get_device_properties(made.device).total_memory
     else:
         there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else sys.maxsize
     if needed > there:
+        what = f"num_envs = {count}" if count > 1 else f"vehicles = {task.vehicles} with {len(task.agents)} agents"
+        most = int(count * there / needed / 2)
         raise ValueError(
-            f"num_envs = {count} would take about {needed / 1e9:,.0f} GB, and {made.device} has {there / 1e9:,.0f} GB. "
-            f"Take at most {int(count * there / needed / 2)}."
+            f"{what} would take about {needed / 1e9:,.0f} GB, and {made.device} has {there / 1e9:,.0f} GB. "
+            f"Take {f'at most {most}' if most else 'fewer vehicles or agents'}."
         )

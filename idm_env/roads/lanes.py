@@ -102,12 +102,20 @@ class Lanes(Road):
             if end.lane in seen:
                 raise ValueError(f"lane {end.lane} has two ends. Give one for each lane.")
             seen.add(end.lane)
+            if end.closed and end.end <= max(end.begin, 0.0):
+                begin = max(end.begin, 0.0)
+                raise ValueError(
+                    f"lane {end.lane} ends at {end.end:g} m, and begins at {begin:g} m: it must end later."
+                )
             last = ENDLESS if self.length is None else self.length
             if not end.begin <= max(end.opens, end.begin) < end.closes <= end.end <= last:
                 raise ValueError(
                     f"lane {end.lane} opens at {end.opens:g} m, closes at {end.closes:g} m and ends at {end.end:g} m: "
                     f"these must rise, and lie on the road of {last:g} m."
                 )
+
+        if sum(end.closed for end in self.ends) == self.count:
+            raise ValueError("all lanes of this road end. Leave one that goes on.")
 
     @property
     def beside(self) -> bool:  # type: ignore[override]

@@ -23,7 +23,7 @@ from idm_env.effects import Control, Effect, Noise
 from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
-from idm_env.tasks.checks import agents_of, at_least, limits_of, ranges_of, whole
+from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges, ranges_of, whole
 from idm_env.tasks.crash import contact, lawful_cost
 from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.nouns import Advance, Bounds, Ended, Features, Pay, World
@@ -31,6 +31,7 @@ from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params, State
 
 _NORMALS_AT_ONCE = 1 << 16
+_MOST_STEPS = 1_000_000_000
 OBSERVATIONS = ("scaled", "raw")
 
 
@@ -102,35 +103,43 @@ class Task(abc.ABC):
     own_parameters: ClassVar[Mapping[str, Mapping[str, float]]]
     machinery: ClassVar[tuple[Effect, ...]] = (Control(),)
     """Effects through which the task itself acts; they are always there, and take inputs that the task gives."""
+    ranges: ClassVar[Mapping[str, Range]] = {
+        "vehicles": Range(0, 100_000, whole=True),
+        "vehicle_length": Range(0.1, 100.0, "m"),
+        "dt": Range(1e-3, 5.0, "s"),
+        "noise": Range(0.0, 10.0, "m/s²"),
+        "warmup": Range(0, 100_000, whole=True),
+        "warmup_pool": Range(0, 100_000, whole=True),
+        "failsafe": Range(0.0, 100.0, "m/s²"),
+        "failsafe_time": Range(0.0, 60.0, "s"),
+        "crash_cost": Range(0.0, 1e12),
+    }
+    """Where numbers may lie: of a kind of task its own, beside those that it inherits."""
     first_free: ClassVar[int] = 0
     """Vehicles before this one cannot be controlled: they are recorded."""
 
     def __post_init__(self) -> None:
+        in_ranges(self)
         whole("vehicles", self.vehicles, self.first_free + 1)
         agents_of(self.controlled, self.vehicles, self.first_free)
-        at_least("vehicle_length", self.vehicle_length, 0.1, "m")
-        at_least("noise", self.noise, 0.0, "m/s²")
-        whole("warmup", self.warmup, 0)
-        whole("warmup_pool", self.warmup_pool, 0)
         if self.warmup_pool and not self.warmup:
             raise ValueError(f"warmup_pool = {self.warmup_pool} has no use without warm-up. Give warmup=750 as well.")
-        limits_of(self.max_command)
-        at_least("failsafe", self.failsafe, 0.0, "m/s²")
-        at_least("failsafe_time", self.failsafe_time, 0.0, "s")
         self._check_episode()
         self.params(torch.float64, "cpu")
         _ = self._ranges
 
     def _check_episode(self) -> None:
-        """Check what every task says of its episodes, observations and crashes."""
+        """Check what every task says of its commands, episodes and observations."""
+        limits_of(self.max_command)
         steps = self.max_episode_steps
-        if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or (steps < 1 and steps != -1)):
+        if steps is not None and (
+            isinstance(steps, bool) or not isinstance(steps, int) or not (1 <= steps <= _MOST_STEPS or steps == -1)
+        ):
             raise ValueError(
-                f"max_episode_steps = {shown(steps)} must be a whole number of at least 1, or -1 for no limit."
+                f"max_episode_steps = {shown(steps)} must be a whole number of at least 1 and at most {_MOST_STEPS}, "
+                "or -1 for no limit."
             )
         one_of("observation", self.observation, OBSERVATIONS)
-        if self.crash_cost is not None:
-            at_least("crash_cost", self.crash_cost, 0.0)
 
     # -- static facts --------------------------------------------------------------------------------------------
 
@@ -213,6 +222,7 @@ class Task(abc.ABC):
         made = behaviour(
             self.own_effects, extra, own, self.effects, self.parameters, self.dt, self.integration, self.drivers
         )
+        ranges(type(self))["dt"].check("dt", made.dt)
         if self.noise:
             made.parameters.setdefault("noise", {}).setdefault("sigma", self.noise * math.sqrt(made.dt))
         given = {effect.name for effect in self.machinery}
@@ -265,10 +275,17 @@ class Task(abc.ABC):
         return found
 
     def _is_agent(self) -> list[bool]:
-        return [i in self.agents for i in range(self.vehicles)]
+        own = set(self.agents)
+        return [i in own for i in range(self.vehicles)]
 
     def _agent_slots(self) -> list[int]:
-        return [self.agents.index(i) if i in self.agents else 0 for i in range(self.vehicles)]
+        own = {vehicle: slot for slot, vehicle in enumerate(self.agents)}
+        return [own.get(i, 0) for i in range(self.vehicles)]
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs of vehicles an observation looks at, for which it takes memory."""
+        return 0
 
     def pick(self, x: Tensor) -> Tensor:
         """Return what belongs to the controlled vehicles, shape ``(…, agents)``."""
@@ -448,11 +465,17 @@ class Task(abc.ABC):
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return the rewards of a step without a crash, within ``pay``, shape ``(…, agents)``; ``command`` in m/s²."""
 
+    def there(self, state: State, x: Tensor) -> Tensor:
+        """Return what belongs to the agents, shape ``(…, agents)``, 0 for those who are not on the road."""
+        return x if state.present is None else torch.where(self.pick(state.present) > 0, x, torch.zeros_like(x))
+
     def reward(self, before: World, command: Tensor, after: World, crashed: Tensor | None = None) -> Tensor:
         """Return the rewards of a step, shape ``(…, agents)``: what is ``earned``, or ``−cost_of_crash``.
 
-        ``command`` in m/s²; ``crashed``, where the caller has it already, is ``self.crashed(after)``.
+        ``command`` in m/s², which costs nothing where an agent is not on the road; ``crashed``, where the caller has it
+        already, is ``self.crashed(after)``.
         """
+        command = self.there(after.state, command)
         crashed = self.crashed(after) if crashed is None else crashed
         return torch.where(crashed, -self.cost_of_crash, self.earned(before, command, after))
 

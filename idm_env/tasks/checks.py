@@ -2,29 +2,71 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from idm_env.checks import at_least, finite, shown, whole
 from idm_env.config import nested
 
-__all__ = ["KeywordError", "agents_of", "at_least", "limits_of", "span", "whole"]
+__all__ = ["KeywordError", "Range", "agents_of", "at_least", "in_ranges", "limits_of", "ranges", "span", "whole"]
 
-_WEAKEST = 1e-3
+_WEAKEST, _STRONGEST = 1e-3, 100.0
+
+
+class Range(NamedTuple):
+    """Where an option of a task may lie, ends included, in its unit; a whole number, or one number or two ends.
+
+    Above are values for which nobody has a use, and that would take time and memory without an end.
+    """
+
+    low: float
+    high: float
+    unit: str = ""
+    whole: bool = False
+    ends: bool = False
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise ValueError, in one line, for what lies outside or is no such number."""
+        if self.whole:
+            whole(name, value, int(self.low), int(self.high))
+        elif self.ends:
+            span(name, value, self.low, self.unit, self.high)
+        else:
+            at_least(name, value, self.low, self.unit, self.high)
+
+
+def ranges(task: type) -> dict[str, Range]:
+    """Return the ranges of all options of a kind of task: its own ``ranges``, and those of what it inherits."""
+    return {name: x for kind in reversed(task.__mro__) for name, x in vars(kind).get("ranges", {}).items()}
+
+
+def in_ranges(task: Any) -> None:
+    """Raise ValueError, in one line, for an option that lies outside its range, or for no truth value where one is due.
+
+    None stands for what the task decides, where that is an option's default.
+    """
+    known = ranges(type(task))
+    for field in dataclasses.fields(task):
+        value = getattr(task, field.name)
+        if isinstance(field.default, bool) and not isinstance(value, bool):
+            raise ValueError(f"{field.name} = {shown(value)} must be True or False.")
+        if field.name in known and not (value is None and field.default is None):
+            known[field.name].check(field.name, value)
 
 
 class KeywordError(TypeError, ValueError):
     """A keyword that does not exist: a TypeError as for any call, and a ValueError as for any value of a YAML file."""
 
 
-def span(name: str, value: Any, low: float, unit: str) -> tuple[float, float]:
+def span(name: str, value: Any, low: float, unit: str, high: float = math.inf) -> tuple[float, float]:
     """Return a range from one number or from ``[lowest, highest]``."""
     ends = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value, value]
     told = f" ({unit})" if unit else ""
     if len(ends) != 2:
         raise ValueError(f"{name} = {shown(value)} must be one number or [lowest, highest]{told}.")
-    first, last = (at_least(name, end, low, unit) for end in ends)
+    first, last = (at_least(name, end, low, unit, high) for end in ends)
     if first > last:
         raise ValueError(f"{name} = {shown(value)} must rise: write [{last:g}, {first:g}]{told}.")
     return first, last
@@ -45,13 +87,14 @@ def limits_of(max_command: Any) -> tuple[float, float]:
     """Return the accelerations (m/s²) that actions of −1 and 1 command, from one number or from both."""
     if isinstance(max_command, Sequence) and not isinstance(max_command, str):
         ends = [finite("max_command", x, "m/s²") for x in max_command]
-        if len(ends) != 2 or ends[0] > -_WEAKEST or ends[1] < _WEAKEST:
+        if len(ends) != 2 or not (-_STRONGEST <= ends[0] <= -_WEAKEST and _WEAKEST <= ends[1] <= _STRONGEST):
             raise ValueError(
                 f"max_command = {shown(list(max_command))} must be one number, or [hardest braking, strongest "
-                "acceleration] with a braking below 0 and an acceleration above 0, such as [-4.5, 2.6] (m/s²)."
+                f"acceleration] with a braking below 0 and an acceleration above 0, such as [-4.5, 2.6] (m/s²), none "
+                f"beyond {_STRONGEST:g}."
             )
         return ends[0], ends[1]
-    top = at_least("max_command", max_command, _WEAKEST, "m/s²")
+    top = at_least("max_command", max_command, _WEAKEST, "m/s²", _STRONGEST)
     return -top, top
 
 

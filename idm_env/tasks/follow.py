@@ -17,7 +17,7 @@ from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Ended, Features, Pay, Task, World
-from idm_env.tasks.checks import at_least, whole
+from idm_env.tasks.checks import Range
 from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import Leaders, head, made_up_leader, queue, recorded_leaders, starts
@@ -82,6 +82,7 @@ class FollowTask(Task):
     }
     machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
     first_free: ClassVar[int] = 1
+    ranges: ClassVar[Mapping[str, Range]] = {"fuel_weight": Range(0.0, 1e6), "lag_weight": Range(0.0, 1e6)}
 
     vehicles: int = 7
     max_command: float | Sequence[float] = 3.0
@@ -91,10 +92,7 @@ class FollowTask(Task):
     leader: str | None = None
 
     def __post_init__(self) -> None:
-        whole("vehicles", self.vehicles, 2)
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
-        at_least("fuel_weight", self.fuel_weight, 0.0)
-        at_least("lag_weight", self.lag_weight, 0.0)
         super().__post_init__()
         longest = self._longest
         if (self.max_episode_steps or 0) > longest:

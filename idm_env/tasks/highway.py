@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -12,7 +13,7 @@ from torch import Tensor
 from idm_env.effects import IDM, Brakes, Effect, Mobil
 from idm_env.roads import Lanes
 from idm_env.tasks.base import World
-from idm_env.tasks.checks import at_least, whole
+from idm_env.tasks.checks import Range
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.types import Params
@@ -45,13 +46,16 @@ class HighwayTask(LanesTask):
         "idm": {"max_accel": 1.5, "comfort_decel": 2.0, "time_gap": 1.2, "min_gap": 2.0, "desired_speed": 30.0}
     }
 
+    ranges: ClassVar[Mapping[str, Range]] = {
+        "lanes_count": Range(2, 100, whole=True),
+        "length": Range(10.0, 1e6, "m"),
+    }
+
     vehicles: int = 50
     lanes_count: int = 4
     length: float = 1000.0
 
     def __post_init__(self) -> None:
-        whole("lanes_count", self.lanes_count, 1)
-        at_least("length", self.length, 10.0, "m")
         super().__post_init__()
         if self._room < self.vehicle_length + 1.0:
             raise ValueError(

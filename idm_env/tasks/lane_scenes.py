@@ -53,6 +53,8 @@ def recorded_lanes(path: str, dt: float, run: str | None, first_lane: str) -> La
     known = np.unique(np.concatenate([track.lanes[np.isfinite(track.lanes)] for track in tracks]))
     if not len(known):
         raise DataError(f"{path}: no vehicle has a lane. Give a column 'lane', or take task 'replay'.")
+    if len(known) == 1:
+        raise DataError(f"{path} has one lane, {known[0]:g}. Take task 'replay'.")
     for track in tracks:
         nowhere = np.isfinite(track.position) & ~np.isfinite(track.lanes)
         if nowhere.any():

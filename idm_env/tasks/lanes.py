@@ -6,6 +6,7 @@ import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from torch import Tensor
 from idm_env.effects import Control, Effect, LaneCommand
 from idm_env.roads import Lanes
 from idm_env.tasks.base import Features, Pay, Task, World
-from idm_env.tasks.checks import at_least, whole
+from idm_env.tasks.checks import Range
 from idm_env.tasks.random import Draw
 from idm_env.types import Inputs, Params, State
 
@@ -42,6 +43,12 @@ class LanesTask(Task):
             left. 0 is continuous.
     """
 
+    ranges: ClassVar[Mapping[str, Range]] = {
+        "spread": Range(0.0, 1.0),
+        "seen": Range(1, 1000, whole=True),
+        "discrete": Range(0, 10_000, whole=True),
+    }
+
     spread: float = 0.2
     seen: int = 4
     lane_commands: bool = False
@@ -50,13 +57,15 @@ class LanesTask(Task):
     def _check_episode(self) -> None:
         """Check what every task on several lanes says, too."""
         super()._check_episode()
-        whole("seen", self.seen, 1)
-        whole("discrete", self.discrete, 0)
         if self.discrete == 1:
             raise ValueError("discrete = 1 leaves agents no choice. Take at least 2 levels, or 0 for any acceleration.")
-        at_least("spread", self.spread, 0.0)
         if self.spread >= 1.0:
             raise ValueError(f"spread = {self.spread:g} must be below 1: desired speeds are positive.")
+
+    @property
+    def pairs(self) -> int:
+        """Every agent looks at all vehicles, to find the nearest."""
+        return len(self.agents) * self.vehicles
 
     @cached_property
     @abc.abstractmethod
@@ -193,7 +202,7 @@ class LanesTask(Task):
 
         there = (away.gather(-1, near) <= FAR_AWAY).to(lane.dtype)
         told = [there, *(x * there for x in (ahead.gather(-1, near), beside(lane), beside(state.speed)))]
-        features = self.seen_of_self(state)
+        features = [self.there(state, x) for x in self.seen_of_self(state)]
         nobody = torch.zeros_like(features[0])
         for k in range(self.seen):
             features += [x[..., k] for x in told] if k < count else [nobody] * 4

@@ -16,12 +16,13 @@ from idm_env import population
 from idm_env.effects import IDM, Brakes, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
 from idm_env.roads import Lanes, lane_drop, on_ramp
 from idm_env.tasks.base import World
-from idm_env.tasks.checks import at_least, whole
+from idm_env.tasks.checks import Range, at_least
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.types import Params, State, Trips
 
 _PLACE_STREAM = 37
+_FLOW = Range(0.0, 1e5, "vehicles an hour")
 _SIGHT = 500.0
 """How far ahead an agent sees that its lane ends (m)."""
 
@@ -32,7 +33,8 @@ class OpenLanesTask(LanesTask):
 
     An episode begins with free traffic up to ``filled``, where lanes are still all there; the first slots are in front.
     Whoever finds no room at his entry waits and is counted (``idm_env.population.counts``). Agents act as ``LanesTask``
-    says; while an agent's vehicle waits or has left, its observation is zeros and its command does nothing.
+    says; while an agent's vehicle waits or has left, it stands still, its observation and infos are zeros, and its
+    command does and costs nothing: its reward is what the traffic earns.
 
     Drivers let in whoever signals, accept closer gaps near the end of a lane and where they have stood
     (``GapAcceptance``), and take turns at an end as at a zipper (``Courtesy``, ``MandatoryChange``).
@@ -53,16 +55,23 @@ class OpenLanesTask(LanesTask):
         "courtesy": {"weight": 1.0, "zipper": 1.0},
     }
 
+    ranges: ClassVar[Mapping[str, Range]] = {"entry_speed": Range(1.0, 70.0, "m/s"), "inflow": _FLOW}
+
     vehicles: int = 80
     controlled: int | float | str | Sequence[int] = (4,)
     entry_speed: float = 20.0
 
     def __post_init__(self) -> None:
-        at_least("entry_speed", self.entry_speed, 1.0, "m/s")
-        for lane, flow in self.inflows.items():
-            at_least(f"inflow of lane {lane}", flow, 1.0, "vehicles an hour")
         super().__post_init__()
-        population.trips(self.inflows, 1.0, slots=self.vehicles)
+        flows = self.inflows
+        total = sum(flows.values())
+        for lane, flow in flows.items():
+            at_least(f"inflow of lane {lane}", flow, 1.0, "vehicles an hour")
+            if self.vehicles * flow < total:
+                raise ValueError(
+                    f"vehicles = {self.vehicles} leaves none for lane {lane}, where {flow:g} of {total:g} vehicles an "
+                    f"hour enter. Take at least {math.ceil(total / flow)}, or a less uneven inflow."
+                )
 
     @property
     @abc.abstractmethod
@@ -116,11 +125,10 @@ class OpenLanesTask(LanesTask):
         return (*super().own_features, ("present", 1.0, 0.0, 1.0), ("ends", 100.0, 0.0, _SIGHT))
 
     def seen_of_self(self, state: State) -> list[Tensor]:
-        """Return ``own_features``, 0 for those not on the road."""
+        """Return ``own_features``."""
         assert state.links is not None and state.present is not None
         ends = (self.road.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT)
-        there = self.pick(state.present)
-        return [x * there for x in (*super().seen_of_self(state), torch.ones_like(there), self.pick(ends))]
+        return [*super().seen_of_self(state), self.pick(state.present), self.pick(ends)]
 
     def told(self, world: World) -> dict[str, Tensor]:
         """As in ``LanesTask``, and how many wait at the entries: a queue that grows is an inflow beyond capacity."""
@@ -170,14 +178,14 @@ class OpenHighwayTask(OpenLanesTask):
 
     name: ClassVar[str] = "open_highway"
 
+    ranges: ClassVar[Mapping[str, Range]] = {
+        "lanes_count": Range(2, 100, whole=True),
+        "length": Range(100.0, 1e6, "m"),
+    }
+
     lanes_count: int = 4
     length: float = 1000.0
     inflow: float = 5000.0
-
-    def __post_init__(self) -> None:
-        whole("lanes_count", self.lanes_count, 1)
-        at_least("length", self.length, 100.0, "m")
-        super().__post_init__()
 
     @cached_property
     def road(self) -> Lanes:  # type: ignore[override]
@@ -205,6 +213,7 @@ class MergeTask(OpenLanesTask):
     """
 
     name: ClassVar[str] = "merge"
+    ranges: ClassVar[Mapping[str, Range]] = {"ramp_inflow": _FLOW}
 
     inflow: float = 2400.0
     ramp_inflow: float = 500.0

@@ -15,7 +15,7 @@ from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Features, Pay, Task, World
-from idm_env.tasks.checks import at_least, span, whole
+from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import head, queue
@@ -57,6 +57,11 @@ class PlatoonTask(Task):
     }
     machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
     first_free: ClassVar[int] = 1
+    ranges: ClassVar[Mapping[str, Range]] = {
+        "speed": Range(0.0, 70.0, "m/s"),
+        "disturbance": Range(1e-3, 35.0, "m/s"),
+        "period": Range(1.0, 1e4, "s", ends=True),
+    }
 
     vehicles: int = 11
     max_command: float | Sequence[float] = 2.0
@@ -65,11 +70,8 @@ class PlatoonTask(Task):
     period: float | Sequence[float] = (40.0, 90.0)
 
     def __post_init__(self) -> None:
-        whole("vehicles", self.vehicles, 2)
         super().__post_init__()
-        at_least("disturbance", self.disturbance, 1e-3, "m/s")
         at_least("speed", self.speed, 2.0 * self.disturbance, "m/s")
-        span("period", self.period, 1.0, "s")
 
     @property
     def features(self) -> Features:

@@ -16,7 +16,7 @@ from idm_env.checks import nearest, one_of, shown
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Ended, Features, Pay, Task, World
-from idm_env.tasks.checks import count_of
+from idm_env.tasks.checks import count_of, in_ranges
 from idm_env.tasks.crash import floored
 from idm_env.tasks.follow import HIGHEST, KNEE, LOWEST, SEEN, headway_penalty
 from idm_env.tasks.nouns import NOBODY
@@ -41,6 +41,7 @@ class ReplayTask(Task):
     speed, gap 1000 m).
     Reward, per agent: ``"imitation"``: ``−|x − x_record|/10``; ``"follow"``: ``1 − fuel/10 − 0.002 u² − 2 p``, the
     terms of task ``follow`` with the agent's own fuel. Below −5 and −2 they saturate towards −10 and −4 (``floored``).
+    An agent whose vehicle is not there observes and gets zeros.
     Each agent for itself: terminated where it touches its leader, truncated where its record ends. All are truncated
     after ``max_episode_steps``: 300, or for as long as the record of any agent goes on. A crash pays ``−crash_cost``
     instead, by default 3001 (imitation) or 1501 (follow) times the number of agents, whose mean a single environment
@@ -71,6 +72,7 @@ class ReplayTask(Task):
     reward_terms: str = "imitation"
 
     def __post_init__(self) -> None:
+        in_ranges(self)
         if self.vehicles:
             raise ValueError(f"vehicles = {self.vehicles}, but the file of task 'replay' decides. Leave it out.")
         if self.warmup:
@@ -262,20 +264,21 @@ class ReplayTask(Task):
         return inputs
 
     def observe(self, world: World) -> Tensor:
-        """Return ``v/40, v_lead/40, gap/100`` of every agent."""
+        """Return ``v/40, v_lead/40, gap/100`` of every agent, 0 of those who are not there."""
         state = world.state
         seen = [self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)]
-        return self.clip(seen)
+        return self.clip([self.there(state, x) for x in seen])
 
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
-        """Return minus the distance to the record (10 m), or the terms of ``follow``."""
+        """Return minus the distance to the record (10 m), or the terms of ``follow``; 0 of those who are not there."""
         state = after.state
         if self.reward_terms == "imitation":
             return floored(-0.1 * self.distance(after), 0.5 * _FARTHEST, _FARTHEST)
         speed, gap = self.pick(state.speed), self.pick(state.gap)
         fuel = 0.951 * metrics.fuel(speed, self.pick(state.accel))
         far = torch.where(gap < 1e3, headway_penalty(gap, speed), 0.0)
-        return floored(1.0 - 0.1 * fuel - 0.002 * command * command - 2.0 * far, KNEE, LOWEST)
+        terms = 1.0 - 0.1 * fuel - 0.002 * command * command - 2.0 * far
+        return self.there(state, floored(terms, KNEE, LOWEST))
 
     def distance(self, world: World) -> Tensor:
         """Return how far the agents are from their records (m), 0 where these have ended, shape ``(…, agents)``."""

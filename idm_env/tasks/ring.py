@@ -16,7 +16,7 @@ from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Ring, Road
 from idm_env.tasks.base import Features, Pay, Task, World
-from idm_env.tasks.checks import at_least, span, whole
+from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params
@@ -71,6 +71,17 @@ class RingTask(Task):
         "idm": {"max_accel": 1.0, "comfort_decel": 1.5, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 30.0}
     }
 
+    ranges: ClassVar[Mapping[str, Range]] = {
+        "length": Range(1.0, 1e6, "m", ends=True),
+        "tailgating": Range(0.0, 1e6),
+        "tailgating_below": Range(0.1, 60.0, "s"),
+        "fuel": Range(0.0, 1e6),
+        "shock": Range(0.0, 100.0, "m/s²"),
+        "shock_after": Range(0.0, 1e6, "s"),
+        "shock_seconds": Range(0.0, 1e4, "s"),
+        "shock_vehicle": Range(0, 100_000, whole=True),
+    }
+
     length: float | Sequence[float] = (220.0, 270.0)
     noise: float = 0.2
     warmup: int = 750
@@ -93,12 +104,7 @@ class RingTask(Task):
                 f"{shortest:g} m. Take fewer vehicles or a longer ring."
             )
         one_of("start", self.start, STARTS)
-        at_least("tailgating", self.tailgating, 0.0)
-        at_least("tailgating_below", self.tailgating_below, 0.1, "s")
-        at_least("fuel", self.fuel, 0.0)
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
-        at_least("shock", self.shock, 0.0, "m/s²")
-        at_least("shock_after", self.shock_after, 0.0, "s")
         at_least("shock_seconds", self.shock_seconds, self.simulator.dt, "s")
         if self.shock or self.shock_vehicle is not None:
             self._check_shocked()
@@ -113,7 +119,7 @@ class RingTask(Task):
         vehicle = self.shock_vehicle
         if vehicle is None:
             return
-        if whole("shock_vehicle", vehicle, 0) >= self.vehicles or vehicle in self.agents:
+        if vehicle >= self.vehicles or vehicle in self.agents:
             raise ValueError(
                 f"shock_vehicle = {vehicle} must be a human driver of vehicles 0 … {self.vehicles - 1}; agents control "
                 f"{', '.join(map(str, self.agents))}."
