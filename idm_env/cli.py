@@ -198,6 +198,9 @@ def fit(
     executor: Workers = "serial",
     jobs: Jobs = None,
     ray_address: RayAddress = None,
+    sumo: Annotated[
+        Path | None, typer.Option(help="Also write the drivers as SUMO's vTypes, an additional file: vtypes.add.xml.")
+    ] = None,
     lane_changes: Annotated[
         bool, typer.Option("--lane-changes", help="Fit MOBIL to the lane changes of the file, by their likelihood.")
     ] = False,
@@ -227,10 +230,15 @@ def fit(
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
         checks.within("--held-out", share, 0.001, 0.999)
     with shown(console) as report:
+        from idm_env.config import load_model
         from idm_env.executor import opened
+        from idm_env.fitting import sumo as vtypes
         from idm_env.fitting.job import fit_file
         from idm_env.fitting.options import Options, Source
 
+        if sumo is not None:
+            keep.not_an_input(sumo, [data])
+            vtypes.refuse(sumo, base or "idm")
         _work_begins()
         source = Source(
             data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where, columns=columns
@@ -240,6 +248,8 @@ def fit(
         )  # fmt: skip
         with opened(executor, jobs, ray_address) as workers:
             result = fit_file(source, options, out, resume=resume, executor=workers, on_progress=report)
+        if sumo is not None:
+            vtypes.write(sumo, load_model(out / "model.yaml"))
     if result["over_fitting"]:
         console.print(result["over_fitting"], soft_wrap=True, highlight=False)
     rows = [{"": "fitted", **result["fit"]}]

@@ -40,7 +40,8 @@ def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> 
     if report["notes"]:
         items = [f"{item['scenario']}: {item['note']}" for item in report["notes"]]
         blocks += [page.heading("Notes"), page.bullets(page.shortened(items))]
-    title = f"Predictions of {report['agents']} agents in {report['scenarios']} scenarios"
+    several = "" if report["scenarios"] == 1 else "s"
+    title = f"Predictions of {report['agents']} agents in {report['scenarios']} scenario{several}"
     page.write_page(out / "report.html", title, blocks)
 
 

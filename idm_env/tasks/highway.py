@@ -23,7 +23,7 @@ _PLACE_STREAM = 31
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HighwayTask(LanesTask):
-    """Vehicles on a ring of several lanes, whose drivers follow IDM and change lanes by MOBIL; agents accelerate.
+    """A ring of lanes: agents accelerate, their drivers change lanes by MOBIL, or they do with ``lane_commands=True``.
 
     After ``highway-v0`` of HighwayEnv (Leurent 2018, https://github.com/Farama-Foundation/HighwayEnv), on a ring, so
     that traffic stays as dense as it begins. Desired speeds differ between drivers by up to ``spread`` either way.
