@@ -21,21 +21,26 @@ UNITS = {
     "lead_accel": "m/s²",
 }  # fmt: skip
 JOBS = ("explain", "fit", "filter", "reconstruct", "predict", "simulate")
-MODULES = (
-    "simulator", "types", "parameters", "effects", "roads", "tasks", "envs.gym", "envs.vector",
-    "envs.pettingzoo", "data", "data.episode", "data.synthetic", "fitting.fit", "fitting.job",
-    "fitting.options", "discovery.discover", "discovery.sets", "trajectories.files", "prediction.files",
-    "drift.forecast", "executor", "keep", "parts", "config", "metrics", "progress", "report",
-)  # fmt: skip
+MODULES = {
+    "core": ("Simulate", ("simulator", "types", "parameters", "roads")),
+    "effects": ("Effects", ("effects",)),
+    "environments": ("Environments and tasks", ("envs.gym", "envs.vector", "envs.pettingzoo", "tasks", "metrics")),
+    "data": ("Read and generate data", ("data", "data.episode", "data.synthetic", "config")),
+    "fitting": ("Calibrate", ("fitting.fit", "fitting.job", "fitting.options")),
+    "discovery": ("Find what a model lacks", ("discovery.discover", "discovery.sets", "drift.forecast")),
+    "trajectories": ("Filter, reconstruct, predict", ("trajectories.files", "prediction.files")),
+    "work": ("Long work and reports", ("executor", "keep", "parts", "progress", "report")),
+}
+"""Pages of the reference by job, those that everything else needs first."""
 
 
 def write(folder: Path) -> None:
     """Write all of them under ``folder/generated``, only what changed, so that a second build is quick."""
     out = folder / "generated"
-    for name in ("pictures", "tasks"):
+    for name in ("pictures", "tasks", "api"):
         (out / name).mkdir(parents=True, exist_ok=True)
     pages = {
-        **environments(), "effects.md": effects(out / "pictures"), "commands.md": commands(), "api.rst": api(),
+        **environments(), "effects.md": effects(out / "pictures"), "commands.md": commands(), **api(),
     }  # fmt: skip
     for name, text in pages.items():
         path = out / name
@@ -79,7 +84,11 @@ def _environment(name: str, cls: Any) -> list[str]:
     first, parts = _described(cls)
     lines = [f"# {name}", "", first, "", f"![After 40 s without commands](../../tasks/{name}.png)", ""]
     lines += [paragraph + "\n" for paragraph in parts]
-    lines += [f'```text\nenv = gymnasium.make("DiffIDM-v0", task="{name}")\n```', "", *_faces(name)]
+    lines += [
+        f'```text\nenv = gymnasium.make("DiffIDM-v0", task="{name}")\n```',
+        "",
+        *_faces(name),
+    ]
     own = _keywords(cls, _base(cls))
     if own:
         lines += ["## Keywords", "", *own]
@@ -368,13 +377,19 @@ def commands() -> str:
     return "\n".join(lines) + "\n"
 
 
-def api() -> str:
-    """Return the reference of the modules that people call."""
-    lines = ["API reference", "=============", ""]
-    for name in MODULES:
-        full = f"idm_env.{name}"
-        lines += [full, "-" * len(full), "", f".. automodule:: {full}", "   :members:", ""]
-    return "\n".join(lines)
+def api() -> dict[str, str]:
+    """Return the reference of the modules that people call, a page per job, and their index."""
+    pages = {}
+    index = ["API reference", "=============", "", "By job; what everything else needs comes first.", ""]
+    index += [".. toctree::", "   :maxdepth: 2", ""]
+    for page, (title, modules) in MODULES.items():
+        lines = [title, "=" * len(title), ""]
+        for name in modules:
+            full = f"idm_env.{name}"
+            lines += [full, "-" * len(full), "", f".. automodule:: {full}", "   :members:", ""]
+        pages[f"api/{page}.rst"] = "\n".join(lines)
+        index.append(f"   api/{page}")
+    return pages | {"api.rst": "\n".join([*index, ""])}
 
 
 def examples() -> None:

@@ -113,6 +113,13 @@ def test_effects_have_one_equation_each_and_options_their_hyphens(site: Path) ->
     assert "--lane-changes" in commands and "–lane-changes" not in commands
 
 
+def test_the_reference_is_divided_by_job(site: Path) -> None:
+    """No page of it is too long to search, and the core comes first."""
+    pages = sorted((site / "generated" / "api").glob("*.html"))
+    assert len(pages) > 5 and max(page.stat().st_size for page in pages) < 500_000
+    assert (site / "generated" / "api.html").read_text(encoding="utf-8").split('href="api/')[1].startswith("core.html")
+
+
 def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
     """What a task's observation means, how to use one's own csv, what an effect's equation is."""
     near = links(site, "index.html")
