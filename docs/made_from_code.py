@@ -81,11 +81,13 @@ def _base(cls: type) -> type:
 
 
 def _environment(name: str, cls: Any) -> list[str]:
+    from idm_env import _task_id
+
     first, parts = _described(cls)
     lines = [f"# {name}", "", first, "", f"![After 40 s without commands](../../tasks/{name}.png)", ""]
     lines += [paragraph + "\n" for paragraph in parts]
     lines += [
-        f'```text\nenv = gymnasium.make("DiffIDM-v0", task="{name}")\n```',
+        f'```text\nenv = gymnasium.make("{_task_id(name)}")  # or "DiffIDM-v0", task="{name}"\n```',
         "",
         *_faces(name),
     ]

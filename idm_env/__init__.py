@@ -1,8 +1,9 @@
 """Differentiable, vectorised lanes of Intelligent-Driver-Model vehicles, and a closed loop with measured traffic.
 
 Public names are loaded when first used, so ``import idm_env`` is quick and imports no torch; it registers the
-Gymnasium ids ``DiffIDM-v0`` and ``DiffIDM-Fit-v0``. Gymnasium (1.1 and later) loads no plug-ins: a process that has not
-imported this package, such as a remote worker, finds them as ``"idm_env:DiffIDM-v0"``.
+Gymnasium ids ``DiffIDM-v0``, one more for each task (``DiffIDM/Ring-v0``) and ``DiffIDM-Fit-v0``. Gymnasium (1.1 and
+later) loads no plug-ins: a process that has not imported this package, such as a remote worker, finds them as
+``"idm_env:DiffIDM-v0"``.
 """
 
 from __future__ import annotations
@@ -34,6 +35,11 @@ _LAZY = {
     "Control": "idm_env.effects",
     "Replay": "idm_env.effects",
 }
+
+_TASKS = (
+    "follow", "platoon", "replay", "ring", "highway", "open_highway", "merge", "bottleneck", "replay_lanes",
+)  # fmt: skip
+"""The keys of ``idm_env.tasks.TASKS``, which needs torch."""
 
 __all__ = [
     "IDM",
@@ -75,19 +81,26 @@ def _end_quietly() -> None:
         signal.signal(signal.SIGINT, _end)
 
 
+def _task_id(task: str) -> str:
+    """Return the Gymnasium id of a task: ``open_highway`` is ``DiffIDM/OpenHighway-v0``."""
+    return f"DiffIDM/{task.title().replace('_', '')}-v0"
+
+
 def _register() -> None:
     """Register the environment ids; entry points are text, so that nothing heavy is imported here."""
     from gymnasium.envs.registration import register, registry
 
-    if "DiffIDM-v0" not in registry:
-        register(
-            id="DiffIDM-v0",
-            entry_point="idm_env.envs.gym:DiffIDMEnv",
-            vector_entry_point="idm_env.envs.vector:DiffIDMVectorEnv",
-            # Each task has its own number of steps: the environment cuts episodes off, and its own spec says when.
-            # The checker's wrapper costs more than a step; tests run the full checker instead.
-            disable_env_checker=True,
-        )
+    for name, keywords in {"DiffIDM-v0": {}, **{_task_id(task): {"task": task} for task in _TASKS}}.items():
+        if name not in registry:
+            register(
+                id=name,
+                entry_point="idm_env.envs.gym:DiffIDMEnv",
+                vector_entry_point="idm_env.envs.vector:DiffIDMVectorEnv",
+                kwargs=keywords,
+                # Each task has its own number of steps: the environment cuts episodes off, and its own spec says when.
+                # The checker's wrapper costs more than a step; tests run the full checker instead.
+                disable_env_checker=True,
+            )
     if "DiffIDM-Fit-v0" not in registry:
         register(
             id="DiffIDM-Fit-v0",
