@@ -29,7 +29,10 @@ MODULES = {
     "fitting": ("Calibrate", ("fitting.fit", "fitting.job", "fitting.options")),
     "discovery": ("Find what a model lacks", ("discovery.discover", "discovery.sets", "drift.forecast")),
     "trajectories": ("Filter, reconstruct, predict", ("trajectories.files", "prediction.files")),
-    "work": ("Long work and reports", ("executor", "keep", "parts", "progress", "report")),
+    "work": (
+        "Long work, pictures and reports",
+        ("plot", "diagrams", "executor", "keep", "parts", "progress", "report"),
+    ),
 }
 """Pages of the reference by job, those that everything else needs first."""
 

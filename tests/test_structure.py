@@ -45,6 +45,7 @@ ALLOWED = {
     "executor": {"compat", "extras", "progress", "trust"},
     "parts": {"extras", "keep", "report"},
     "diagrams": {"extras", "report", "fonts"},
+    "plot": {"extras", "diagrams"},
     "config": {"extras", "types", "parameters", "checks", "effects", "roads", "simulator", "keep", "trust"},
     "data": {"extras"},
     "fitting": {
