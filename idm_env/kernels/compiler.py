@@ -12,11 +12,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import llvmlite
-import numba
-
 from idm_env import compat
+from idm_env.extras import needed
 from idm_env.scalar.library import MachineCode
+
+with needed("a compiled loop"):
+    import llvmlite
+    import numba
 
 _STORE = MachineCode()
 
