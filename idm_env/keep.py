@@ -188,6 +188,7 @@ def alone(folder: Path) -> Iterator[None]:
     Raises:
         ValueError: If another job holds it, with its process, machine and beginning; and if it cannot be made.
     """
+    new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -208,6 +209,9 @@ def alone(folder: Path) -> Iterator[None]:
             with suppress(OSError):
                 (folder / LOCK).unlink()
             os.close(lock)
+        if new:
+            with suppress(OSError):  # a refusal leaves nothing behind, and what was written stays
+                folder.rmdir()
 
 
 _holders: dict[Path, tuple[int, int]] = {}

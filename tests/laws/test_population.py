@@ -32,7 +32,8 @@ def begun(
     road: Lanes, per_hour: dict[int, float], seconds: float, *, slots: int | None = None, seed: int = 0
 ) -> tuple[Simulator, State, dict[str, dict[str, Tensor]]]:
     """Return an empty road and drivers of different desired speeds who wait for it."""
-    simulator = Simulator(road, (IDM(), Mobil(), MandatoryChange(), Brakes()))
+    changing = (Mobil(), MandatoryChange()) if road.count > 1 else ()
+    simulator = Simulator(road, (IDM(), *changing, Brakes()))
     params = simulator.defaults(dtype=DTYPE)
     trips = population.trips(per_hour, seconds, slots=slots, dtype=DTYPE)
     generator = torch.Generator().manual_seed(seed)
