@@ -17,7 +17,8 @@ def edie(drawn: Sequence[Panel], *, seconds: float = 60.0, metres: float = 100.0
     Edie (1963): with the area A of a cell, density is the time that vehicles spend in it over A, flow the distance
     that they cover in it over A. On a ring a cell is the whole lap. ValueError where no cell is whole.
     """
-    density, flow = [], []
+    density: list[np.ndarray] = []
+    flow: list[np.ndarray] = []
     for panel in drawn:
         ring = panel.ring_length
         ends = [(line.time[1:], line.position[1:] % ring if ring else line.position[1:]) for line in panel.lines]
