@@ -136,9 +136,9 @@ class _Limited:
         allowed = self._most * (1.0 + 1e-6)
         if hasattr(seconds, "suspected"):
             torch.where(seconds > allowed, torch.nan, 0.0).suspected()  # type: ignore[attr-defined]
-        elif float(torch.as_tensor(seconds).max()) > allowed:
+        elif (most := float(torch.as_tensor(seconds).detach().max())) > allowed:
             raise ValueError(
-                f"{self._who} looks {float(torch.as_tensor(seconds).max()):g} s back, and its looks_back is "
+                f"{self._who} looks {most:g} s back, and its looks_back is "
                 f"{self._most:g} s. Let looks_back return the most that it needs."
             )
         found: Scene = self.past.at(scene._replace(history=self.past), seconds)
