@@ -7,9 +7,11 @@ rates depend on the machine. Run: python benchmarks/environments.py [--quick]
 from __future__ import annotations
 
 import argparse
+import statistics
 import time
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -127,6 +129,42 @@ def rings(effect: str) -> bool:
     return True
 
 
+def gradients(turns: int) -> None:
+    """Print the least and the median CPU time of a step with its gradients: a 32 × 32 policy behind a failsafe.
+
+    A window of steps is a loop over ``env.step`` or one call of ``unroll``; the first of each is not counted.
+    """
+    print("\nring of 22, torch output, policy in torch, forward + backward: ms of CPU time a step, least (median)")
+    for count, steps in ((1, 600), (64, 600), (1024, 100)):
+        torch.manual_seed(0)
+        layers = (torch.nn.Linear(3, 32), torch.nn.Linear(32, 32), torch.nn.Linear(32, 1))
+        policy = torch.nn.Sequential(*(part for layer in layers for part in (layer, torch.nn.Tanh())))
+        env = gym.make_vec("DiffIDM-v0", num_envs=count, output="torch", failsafe=3.0, max_command=0.02)
+        own: Any = env.unwrapped
+
+        def loop(observation: torch.Tensor, env=env, policy=policy, steps=steps) -> torch.Tensor:
+            total = torch.zeros(())
+            for _ in range(steps):
+                observation, reward, *_ = env.step(policy(observation))
+                total = total + reward.mean()
+            return total / steps
+
+        def window(_: torch.Tensor, own=own, policy=policy, steps=steps) -> torch.Tensor:
+            return own.unroll(policy, steps).reward.mean()
+
+        found: dict[str, list[float]] = {"env.step": [], "unroll": []}
+        for turn in range(1 + turns):
+            for name, ahead in (("env.step", loop), ("unroll", window)):
+                observation, _ = env.reset(seed=turn)
+                begin = time.process_time()
+                ahead(observation).backward()
+                if turn:
+                    found[name].append((time.process_time() - begin) / steps * 1e3)
+                policy.zero_grad()
+        told = (f"{name} {min(x):7.3f} ({statistics.median(x):.3f})" for name, x in found.items())
+        print(f"  {count:5d} rings x {steps} steps   {'   '.join(told)}", flush=True)
+
+
 def warmup(count: int) -> None:
     print("\nwarm-up of 750 steps, CPU ms per environment that ends")
     for ending in (1, 64, count):
@@ -152,8 +190,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="short measurements")
     parser.add_argument("--envs", type=int, default=4096)
+    parser.add_argument("--gradients", action="store_true", help="only steps with their gradients")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    gradients(3 if options.quick else 7)
+    if options.gradients:
+        return
     seconds = 0.3 if options.quick else 4.0
     faces(seconds)
     single(seconds)

@@ -26,6 +26,12 @@ def typed(*arguments: object) -> Done:
     raise AssertionError("the command line has no end")
 
 
+def run(*arguments: object) -> tuple[int, str]:
+    """Return the exit code of a command, and what it said beside its results."""
+    done = typed(*arguments)
+    return done.returncode, done.stderr
+
+
 def spawned(*arguments: object, **options: object) -> Done:
     """Return the same of a process of its own."""
     command = [sys.executable, "-m", "idm_env", *map(str, arguments)]

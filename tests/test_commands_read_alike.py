@@ -14,8 +14,8 @@ from idm_env import cli
 from idm_env.data import Trajectories
 from idm_env.trajectories import files
 from idm_env.trajectories.spool import Spool
+from tests.commands import run
 from tests.data import bad
-from tests.test_bad_values import run
 
 NO_TRAJECTORIES = {"effects", "doctor", "bench", "predict"}
 MORE = {"simulate": ("--base", "idm"), "fit --lane-changes": ("--lane-changes",)}

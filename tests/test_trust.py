@@ -25,7 +25,7 @@ from idm_env.effects import ALL
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.progress import OnProgress
 from idm_env.tasks import make_task
-from tests.test_bad_values import run
+from tests.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
 EVIL = """
