@@ -314,7 +314,7 @@ READERS = {
     "yaml.parse": {"config.py"},
     "torch.load": {"keep.py", "agents/common.py", "agents/ppo.py"},
     "pickle.loads": {"executor.py", "compat.py"},
-    "import_module": {"__init__.py", "instead.py", "effects/registry.py", "cli.py"},
+    "import_module": {"data/__init__.py", "__init__.py", "instead.py", "effects/registry.py", "cli.py"},
     "spec_from_file_location": {"modules.py"},
     "exec": {"kernels/staged.py"},
 }
