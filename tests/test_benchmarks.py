@@ -49,7 +49,7 @@ def test_rows_are_kept_and_not_done_again(tmp_path: Path) -> None:
         ("flow fast", "unrecognized arguments: fast"),
         ("speed rings", "(choose from 'rollouts', 'highway')"),
         ("laws 1000 --jobs 2", "unrecognized arguments: --jobs 2"),
-        ("merge", "(choose from 'speed', 'flow', 'laws')"),
+        ("merge", "(choose from 'speed', 'flow', 'standing', 'laws')"),
     ],
 )
 def test_what_would_not_be_heeded_is_refused_in_one_line(
