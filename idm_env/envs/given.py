@@ -14,13 +14,13 @@ from idm_env.types import FAR, Links, State
 
 _MOST = 1e9
 """No number of a state is further from 0, but the times of trips that never begin."""
-_FROM_0 = ("speed", "length", "step", "present", "links.", "moving.", "choices.shares", "trips.again", "trips.lane",
-           "trips.speed", "trips.entered", "trips.left")  # fmt: skip
+_FROM_0 = ("speed", "length", "step", "present", "links.", "moving.", "trips.again", "trips.lane", "trips.speed",
+           "trips.entered", "trips.left")  # fmt: skip
 _LANES = ("links.lane", "trips.lane", "moving.origin")
 _VEHICLES = (*(f"links.{name}" for name in Links._fields[1:3]), "moving.shadow")
 _ENDLESS = ("trips.departs", "trips.again")
-_LATER = ("choices.", "moving.")
-"""Parts that a state has only once a decision about lanes was made."""
+_LATER = "moving."
+"""Part that a state has only once a decision about lanes was made, where changes take time."""
 _STEP_ASIDE = 1e-3
 """By how much a number may lie below its bound, as differences for a derivative at rest need."""
 _SLACK, _SHARE = 1.0, 1e-4
@@ -76,8 +76,7 @@ def _fitting(name: str, x: Any, like: Tensor | None, state: State, road: Road) -
     """Return a copy of a tensor in its full shape, all of whose numbers lie where they can."""
     here, (rows, vehicles), lanes = f"options['state'].{name}", state.position.shape, getattr(road, "count", 1)
     if like is None:
-        more = (lanes,) if name == "choices.shares" else ()
-        like = (state.step if name.startswith("moving") else state.speed).new_empty(()).expand(rows, vehicles, *more)
+        like = state.step.new_empty(()).expand(rows, vehicles)
     if not isinstance(x, Tensor) or x.dtype != like.dtype or x.device != like.device:
         kind = f"torch.Tensor of {x.dtype} on {x.device}" if isinstance(x, Tensor) else type(x).__name__
         raise ValueError(f"{here} is a {kind}, and a torch.Tensor of {like.dtype} on {like.device} is needed.")
@@ -94,7 +93,7 @@ def _fitting(name: str, x: Any, like: Tensor | None, state: State, road: Road) -
         high = lanes - 1
     elif name in _VEHICLES:
         high = vehicles - 1
-    elif name in ("present", "choices.shares"):
+    elif name == "present":
         high = 1.0
     values = x.detach()
     good = (values >= low - _STEP_ASIDE) & (values <= high)
