@@ -246,12 +246,12 @@ def _finish(
 ) -> Discovery:  # fmt: skip
     adapt = by == "driver"
     null, rounds = decided.null, decided.rounds
-    fit_records = prepared.of_runs(fit_runs)
+    fit_records = searching.task.rows.records
     kept = prepared.of_runs(kept_runs) if kept_runs else None
 
     def judged(model: Model, values: np.ndarray, start: np.ndarray | None = None) -> tuple[Solution, Any]:
         # The null, what is added and other laws go the same way: whatever is calibrated better looks better.
-        found = calibrate.calibrate(fit_records, model, values, start)
+        found = searching.calibrated(model, values, start)
         return calibrate.judged(found, fit_records, kept, prepared, adapt)
 
     first, before = judged(null.model, null.values, null.theta)

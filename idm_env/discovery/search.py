@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from idm_env.discovery import judge, places
+from idm_env.discovery import calibrate, judge, places
 from idm_env.discovery import model as terms
 from idm_env.discovery import noise as noises
-from idm_env.discovery.calibrate import calibrate, population
+from idm_env.discovery.calibrate import Calibrated, population
 from idm_env.discovery.free import Stand
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Rows
@@ -53,6 +53,8 @@ class Search:
     base: Model = field(default_factory=Model)
     stood: tuple[Stand, Solution] | None = None
     """The model that was weighed last, and how it stands in free simulation."""
+    calibrations: dict[tuple[int, bytes, bytes | None], Calibrated] = field(default_factory=dict)
+    """What ``calibrated`` has said, by model (held here, so that its id stays its), φ and log θ to begin with."""
     squares: dict[Solution, np.ndarray] = field(default_factory=dict)
     """What ``free_run_squares`` has said."""
     unplaced: dict[str, str] = field(default_factory=dict)
@@ -78,10 +80,17 @@ class Search:
         In windows its drivers stay as they are. The weight of the prior becomes that of the task.
         """
         if self.stood is None or self.stood[1] is not now:
-            found = calibrate(self.task.rows.records, now.model, now.values, now.theta)
+            found = self.calibrated(now.model, now.values, now.theta)
             self.task = replace(self.task, prior=replace(self.task.prior, alike_s=found.prior.alike_s))
             self.stood = found.stand, replace(now, prior=found.prior)
         return self.stood
+
+    def calibrated(self, model: Model, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
+        """Return a model calibrated on the runs that may choose (``calibrate``), done once for the same beginning."""
+        key = (id(model), values.tobytes(), None if start is None else start.tobytes())
+        if key not in self.calibrations:
+            self.calibrations[key] = calibrate.calibrate(self.task.rows.records, model, values, start)
+        return self.calibrations[key]
 
     def free_run_squares(self, now: Solution) -> np.ndarray:
         """Return every unit's squared gap errors (m²) of free simulation of the runs that may choose."""
