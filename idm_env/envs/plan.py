@@ -462,7 +462,7 @@ def _record(moves: Moves, world: World, kind: tuple[bool, bool], draws: tuple[st
     slots: dict[str, str] = {}
 
     def early(**leaves: Tensor) -> dict[str, Tensor]:
-        world_now = _world(leaves, world)
+        world_now = world_of(leaves, world)
         asked, passed, inputs = moves.commanded(world_now, leaves.get("action"), normals or None, leaves.get("live"))
         seen.update(inputs)
         out = {} if asked is None or passed is None else {"command": asked, "given": passed}
@@ -480,8 +480,8 @@ def _record(moves: Moves, world: World, kind: tuple[bool, bool], draws: tuple[st
         raise Untraceable(kernel)
 
     def late(**leaves: Tensor) -> dict[str, Tensor]:
-        then = _world({n: x for n, x in leaves.items() if not n.startswith("later_")}, world)
-        now, asked = _world(leaves, world, "later_"), leaves.get("command")
+        then = world_of({n: x for n, x in leaves.items() if not n.startswith("later_")}, world)
+        now, asked = world_of(leaves, world, "later_"), leaves.get("command")
         said = now.state.speed.new_zeros(len(now.state.speed), count) if asked is None else asked
         return moves.told(then, said, leaves.get("given"), now, asked is not None)
 
@@ -553,7 +553,8 @@ def named(world: World) -> dict[str, Tensor]:
     return found | {f"episode_{n}": x for n, x in world.episode.items()}
 
 
-def _world(leaves: Mapping[str, Tensor], like: World, prefix: str = "") -> World:
+def world_of(leaves: Mapping[str, Tensor], like: World, prefix: str = "") -> World:
+    """Return a world of the leaves that ``named`` gives, memories as in ``like``."""
     own = {n.removeprefix(prefix): x for n, x in leaves.items() if n.startswith(prefix)}
     fields = {n.removeprefix("state_"): x for n, x in own.items() if n.startswith("state_")}
     episode = {n.removeprefix("episode_"): x for n, x in own.items() if n.startswith("episode_")}

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import Past
-from idm_env.envs.plan import Array, Bound, Layout, Moment, Plan, named
+from idm_env.envs.plan import Array, Bound, Layout, Moment, Plan, named, world_of
 from idm_env.history import PAST
 from idm_env.kernels.lanes import past_tensor
 from idm_env.scalar.record import Untraceable
@@ -212,7 +212,7 @@ class _Step(torch.autograd.Function):
         ctx.plan, ctx.moment = plan, moment
         ctx.save_for_backward(blocks, later, action, token, *wanted)
         ctx.set_materialize_grads(False)
-        past = None if token is None else _like(token)
+        past = None if token is None else token_like(token)
         return (later, past, *(told[n] for n in plan.recorded.flowing))
 
     @staticmethod
@@ -274,18 +274,16 @@ def _again(
 
 def _world(like: World, layout: Layout, blocks: Tensor, clock: Array, past: Tensor | None) -> World:
     """Return worlds as tensors that share the memory given."""
-    state = like.state
     leaves = dict(zip(layout.blocks, blocks, strict=True))
     for name, x in named(like).items():
         if name not in leaves:
             array = clock if name == "state_step" else layout.still[name]
             leaves[name] = torch.from_numpy(array).view(x.shape)
-    memory = {name: leaves.get(f"memory_{name}", x) for name, x in state.memory.items()}
+    memory = {name: leaves.get(f"memory_{name}", x) for name, x in like.state.memory.items()}
     if past is not None:
         memory[PAST] = past
-    fields: Any = {n.removeprefix("state_"): x for n, x in leaves.items() if n.startswith("state_")}
-    episode = {n.removeprefix("episode_"): x for n, x in leaves.items() if n.startswith("episode_")}
-    return World(state._replace(**fields, memory=memory), episode)
+    made = world_of(leaves, like)
+    return made._replace(state=made.state._replace(memory=memory))
 
 
 def _block(world: World, names: Sequence[str]) -> Tensor:
@@ -312,7 +310,7 @@ def _as_rows(past: Tensor, shape: tuple[int, ...]) -> Tensor:
     return full.reshape(full.shape[0] * full.shape[1], -1)
 
 
-def _like(token: Tensor) -> Tensor:
+def token_like(token: Tensor) -> Tensor:
     """Return a token of the same shape: nobody reads it, so it has one number."""
     return token.new_zeros(1).expand(token.shape)
 
@@ -349,7 +347,7 @@ class _Forget(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, token: Tensor, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         ctx.rows, ctx.vehicles = rows, shape[-1]
-        return _like(token)
+        return token_like(token)
 
     @staticmethod
     def backward(ctx: Any, on_token: Tensor) -> Any:  # type: ignore[override]

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from idm_env.envs.plan import Array, Bound, Plan, address
+from idm_env.envs.values import token_like
 from idm_env.kernels.policy_rows import PolicyRows
 from idm_env.kernels.rows import RowFunction, adjoint
 from idm_env.kernels.window_loop import window, window_back
@@ -277,7 +278,7 @@ class _Window(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         shaped = (steps, rows, -1)
         return (
-            values.blocks.clone(), None if token is None else token.new_zeros(1).expand(token.shape),
+            values.blocks.clone(), None if token is None else token_like(token),
             torch.from_numpy(tape.seen).view(steps + 1, rows, -1), torch.from_numpy(tape.action).view(shaped),
             torch.from_numpy(tape.tell("whole_reward")).view(steps, rows), torch.from_numpy(tape.final).view(shaped),
         )  # fmt: skip
