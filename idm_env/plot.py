@@ -21,16 +21,12 @@ def edie(drawn: Sequence[Panel], *, seconds: float = 60.0, metres: float = 100.0
     flow: list[np.ndarray] = []
     for panel in drawn:
         ring = panel.ring_length
-        ends = [(line.time[1:], line.position[1:] % ring if ring else line.position[1:]) for line in panel.lines]
-        spent = [np.where(line.whole(ring), np.diff(line.time), 0.0) for line in panel.lines]
-        time, place, step, speed = (
-            np.concatenate(x)
-            for x in zip(
-                *((*e, s, line.speed[1:]) for e, s, line in zip(ends, spent, panel.lines, strict=True)), strict=True
-            )
-        )
-        if ring:  # the end of a lap is no hole
-            step = np.concatenate([np.diff(line.time) for line in panel.lines])
+        lines = panel.lines
+        time, speed = (np.concatenate([getattr(line, name)[1:] for line in lines]) for name in ("time", "speed"))
+        place = np.concatenate([line.position[1:] % ring if ring else line.position[1:] for line in lines])
+        step = np.concatenate([np.diff(line.time) for line in lines])
+        if not ring:  # the end of a lap would be a hole
+            step = np.where(np.concatenate([line.whole(None) for line in lines]), step, 0.0)
         low = 0.0 if ring else float(place.min())
         wide = ring or metres
         times = np.arange(time.min(), time.max() + 1e-6, seconds)
