@@ -94,7 +94,7 @@ def ray_at_home() -> Iterator[None]:
 
     Why: Ray binds to all interfaces unless a node's address is 127.0.0.1, and turns that address, where it is asked for
     one, into that of the network. Only its switch for systems without clusters keeps it, which is read when ray is
-    imported. Tried: Ray 2.52.0 and 2.60.0.
+    imported. Tried: Ray 2.60.0.
     """
     given = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
     if "ray" not in sys.modules:  # later only those processes would hear of it that are begun now
