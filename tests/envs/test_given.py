@@ -88,7 +88,7 @@ SHAPES = [
     (lambda s: s._replace(accel=s.accel.tolist()), "accel is a list, and a"),
     (lambda s: s._replace(step=s.step.double()), "step is a torch.Tensor of torch.float64"),
     (lambda s: s._replace(length=None), "length is missing"),
-    (lambda s: s._replace(memory={"lag": s.speed}), r"memory.\w+ is (no part|missing)"),
+    (lambda s: s._replace(memory={"lag": s.speed}), r"memory\.(lag is no part|(past|gap_acceptance) is missing)"),
 ]  # fmt: skip
 LINKS = [
     *((put("links", lane, "lane"), f"links.lane = {lane} is outside") for lane in (100_000, 50, -3)),
