@@ -5,6 +5,8 @@ from __future__ import annotations
 from idm_env.extras import needed
 
 with needed("filtering or reconstruction"):
-    from idm_env.kernels.compiler import compiler
+    import numba  # noqa: F401
+
+from idm_env.kernels.compiler import compiler
 
 compiled = compiler(fastmath={"contract"})

@@ -26,7 +26,7 @@ def test_filter_and_its_ablation(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert {p.name for p in (tmp_path / "out").iterdir()} == OUTPUT
     assert "3/3" in done.stderr + done.stdout  # the progress at its end
-    assert "Data: repaired: length assumed 3." in done.stderr.splitlines()
+    assert "Data: repaired: length assumed 3, leaders derived 2." in done.stderr.splitlines()
     named = methods(tmp_path / "out")
     assert named[0] == "simulator, imagined leader" and {"linear", "Savitzky–Golay", "bounded spline"} <= set(named)
     assert "Driver parameters" in (tmp_path / "out" / "report.html").read_text()
@@ -68,9 +68,9 @@ def test_predict_does_the_whole_records_of_a_truncated_file(tmp_path: Path) -> N
     ("arguments", "words"),
     [
         (("filter", "missing.csv"), "missing.csv does not exist"),
-        (("filter", "lane.csv", "--recipe", "papers"), "recipe = 'papers' is unknown; use 'default' or 'paper'"),
+        (("filter", "lane.csv", "--recipe", "papers"), "--recipe = 'papers' is unknown. Did you mean 'paper'?"),
         (("reconstruct", "lane.csv", "--dt", "9"), "--dt = 9 s is outside [0.01, 2] s"),
-        (("predict", "broken.json"), "no scenario can be used: broken.json cannot be read"),
+        (("predict", "broken.json"), "broken.json cannot be read (Expecting property name"),
     ],
 )
 def test_what_is_wrong_is_one_line(tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
