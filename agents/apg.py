@@ -22,8 +22,8 @@ from torch import Tensor
 from agents import common, environments
 from agents.monitor import Monitor
 from agents.policy import Driving, Past
-from idm_env.checks import finite, shown
 from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.validation import finite, shown
 
 
 @dataclass

@@ -24,7 +24,7 @@ from agents.common import load_agent, one_line
 from agents.environments import task_of
 from agents.evaluate import as_judged, evaluate_ring
 from agents.rollout import FRESH, LENGTHS, Act, ring_start, uniform_speed
-from idm_env import trust
+from idm_env.jobs import trust
 from idm_env.tasks import Task
 
 

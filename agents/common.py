@@ -20,10 +20,10 @@ from torch import Tensor, nn
 import idm_env
 from agents.environments import first_seed, human_driving, task_of
 from agents.policy import Policy
-from idm_env import keep, trust
-from idm_env.checks import finite, nearest, shown
-from idm_env.config import check_places, load_environment, number, read_yaml
+from idm_env.jobs import storage, trust
+from idm_env.model_file import check_places, load_environment, number, read_yaml
 from idm_env.tasks import Task
+from idm_env.validation import finite, nearest, shown
 
 SCHEMA = 2
 """Version of the layout of checkpoints."""
@@ -113,7 +113,9 @@ def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
     text += "--trust runs Python code that YAML files and checkpoints name, such as my_file.py:MyEffect."
     found = tyro.cli(kind, default=default, args=rest, description=text)
     for path in (found.out / name for name in KEPT):
-        keep.not_an_input(path, (known.config, *(getattr(found, name, None) for name in ("data", "start", "teacher"))))
+        storage.not_an_input(
+            path, (known.config, *(getattr(found, name, None) for name in ("data", "start", "teacher")))
+        )
         if path.suffix == ".pt" and path.exists() and not found.resume and _content(path) is None:
             raise ValueError(
                 f"{path} is not a checkpoint of an agent, or is broken. Move or delete it, or give another --out."
@@ -126,7 +128,7 @@ def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Seque
     torch.set_num_threads(1)
     with one_line():
         found = parse(kind, agent, argv)
-        with keep.alone(found.out):
+        with storage.alone(found.out):
             return train(found)
 
 
@@ -212,7 +214,7 @@ def save(path: Path, policy: Policy, agent: str, environment: Mapping[str, Any],
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = io.BytesIO()
     torch.save(content, kept)
-    keep.write(path, lambda beside: beside.write_bytes(kept.getvalue()))
+    storage.write(path, lambda beside: beside.write_bytes(kept.getvalue()))
 
 
 def load(path: str | Path, task: str | None = None, agent: str | None = None) -> tuple[Policy, dict[str, Any]]:

@@ -35,8 +35,10 @@ from agents.rollout import (
     ring_start,
     uniform_speed,
 )
-from idm_env import metrics, population, trust
+from idm_env import metrics
 from idm_env.envs.gym import DiffIDMEnv
+from idm_env.jobs import trust
+from idm_env.multilane import demand
 from idm_env.tasks.ring import RingTask
 
 STEPS = 3000
@@ -261,7 +263,7 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
     columns = {
         "speed": way / inside,
         "outflow": (gone - left) * 3600.0 / (judged * task.simulator.dt),
-        "queued": population.counts(task.simulator, state).queued.double(),
+        "queued": demand.counts(task.simulator, state).queued.double(),
         "reward": reward / judged,
     }
     parts = {name: x.view(policies, -1) for name, x in columns.items()}
@@ -327,7 +329,7 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, human: int,
     """Write one episode as a GIF, from 20 s before the policy takes over: a picture a second, ten of them a second."""
     from PIL import Image
 
-    from idm_env.render import COLOURS_DRAWN, colour
+    from idm_env.envs.render import COLOURS_DRAWN, colour
 
     frames, every = [], round(1.0 / task_of(environment).simulator.dt)
     first = max(human - 20 * every, 0)
@@ -350,7 +352,7 @@ def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: i
 
     Roads of several lanes get a panel for each.
     """
-    from idm_env.diagrams import lane_panels, rollout_panel, space_time
+    from idm_env.reports.diagrams import lane_panels, rollout_panel, space_time
 
     states = []
     for env in shown(environment, policy, human, steps, seed):

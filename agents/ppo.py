@@ -30,10 +30,10 @@ from agents import common, environments
 from agents.common import DivergedError
 from agents.monitor import Monitor
 from agents.policy import ACTIVATIONS, Policy
-from idm_env import keep
-from idm_env.checks import nearest
 from idm_env.envs.sb3 import SB3VecEnv
 from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.jobs import storage
+from idm_env.validation import nearest
 
 
 @dataclass
@@ -289,7 +289,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
     file, model = arguments.out / "learner.pt", make_model(arguments, env, policy)
     if saved:
-        keep.read(file, lambda path: goes_on(model, env, torch.load(path, weights_only=True)), keep.AFRESH)
+        storage.read(file, lambda path: goes_on(model, env, torch.load(path, weights_only=True)), storage.AFRESH)
     elif arguments.clone:
         for mine, other in layers(model, policy):
             other.load_state_dict(mine.state_dict())
@@ -302,7 +302,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     vector.seed(environments.first_seed(arguments.seed, arguments.count * (done + 1)))
 
     def store() -> None:
-        keep.write(file, lambda path: torch.save(learned(model, env), path))
+        storage.write(file, lambda path: torch.save(learned(model, env), path))
 
     with Monitor(name, arguments, began, saved) as monitor:
         if not saved:

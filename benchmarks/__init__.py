@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
-    from idm_env.executor import Executor, Work
+    from idm_env.jobs.executor import Executor, Work
 
 P = TypeVar("P")
 
 
 def add_executor(parser: argparse.ArgumentParser, usual: str = "serial") -> None:
     """Add ``--executor``, ``--jobs`` and ``--ray-address``."""
-    from idm_env.executor import KINDS
+    from idm_env.jobs.executor import KINDS
 
     parser.add_argument("--executor", choices=KINDS, default=usual, help="where parts run; no result depends on it")
     parser.add_argument("--jobs", type=int, help="parts that run at a time; default: one per processor")
@@ -37,7 +37,7 @@ def kept_rows(out: Path, column: str) -> dict[Any, dict[str, Any]]:
 
 def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
     """Give the executor that the arguments name."""
-    from idm_env.executor import opened
+    from idm_env.jobs.executor import opened
 
     return opened(arguments.executor, arguments.jobs, arguments.ray_address)
 

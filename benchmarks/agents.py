@@ -76,10 +76,10 @@ from agents.reference import (  # noqa: E402
 )  # fmt: skip
 from agents.rollout import FRESH, LENGTHS, Act  # noqa: E402
 from benchmarks import add_executor, executor_of  # noqa: E402
-from idm_env.config import read_yaml  # noqa: E402
-from idm_env.executor import Executor, Serial  # noqa: E402
-from idm_env.keep import write_text  # noqa: E402
-from idm_env.progress import OnProgress  # noqa: E402
+from idm_env.jobs.executor import Executor, Serial  # noqa: E402
+from idm_env.jobs.progress import OnProgress  # noqa: E402
+from idm_env.jobs.storage import write_text  # noqa: E402
+from idm_env.model_file import read_yaml  # noqa: E402
 
 LIMIT = 150.0
 """CPU seconds after which a training ends that has updates left."""

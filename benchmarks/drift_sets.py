@@ -37,7 +37,7 @@ from idm_env.drift.kinds import behind_a_record, tell  # noqa: E402
 from idm_env.effects import DRIFTS, AccelNoise, Effect, PerceptionNoise, Wander  # noqa: E402
 from idm_env.fitting.batch import Batch  # noqa: E402
 from idm_env.fitting.problem import IDM_NAMES  # noqa: E402
-from idm_env.progress import OnProgress, silent  # noqa: E402
+from idm_env.jobs.progress import OnProgress, silent  # noqa: E402
 from idm_env.types import Record  # noqa: E402
 
 DT, SECONDS, DRIVERS = 0.2, 90.0, 20

@@ -37,10 +37,11 @@ from torch import Tensor
 
 import idm_env  # noqa: F401  (registers the environments)
 from benchmarks import add_executor, named_rows
-from idm_env import keep, population, progress
-from idm_env import report as page
 from idm_env.effects import IDM, Brakes, LaneCommand, MandatoryChange, Mobil
-from idm_env.progress import OnProgress
+from idm_env.jobs import progress, storage
+from idm_env.jobs.progress import OnProgress
+from idm_env.multilane import demand
+from idm_env.reports import page
 from idm_env.roads import Lanes, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator
 from idm_env.tasks import BottleneckTask, MergeTask
@@ -367,7 +368,7 @@ def picture(found: Rows, path: Path) -> None:
     for axis in axes[0]:
         axis.grid(alpha=0.25)
     path.parent.mkdir(parents=True, exist_ok=True)
-    keep.write(path, lambda beside: figure.savefig(beside, dpi=110))
+    storage.write(path, lambda beside: figure.savefig(beside, dpi=110))
 
 
 def flow(arguments: argparse.Namespace, path: Path = Path("out/lanes-flow.png")) -> None:
@@ -428,10 +429,10 @@ def world(kind: str, seed: int, rows: int, each: int, dtype: torch.dtype) -> tup
         pace = torch.full_like(place, 6.0)
         return simulator, simulator.state(place.to(dtype), pace, params, lane=index % count, length=4.0), params
     flows = {k: 300.0 + 2200.0 * float(torch.rand((), generator=draw)) for k in range(count - (kind == "ramps"))}
-    given = population.trips(flows, 3600.0, speed=20.0, slots=each // 3, dtype=dtype)  # fewer find room there
+    given = demand.trips(flows, 3600.0, speed=20.0, slots=each // 3, dtype=dtype)  # fewer find room there
     n = len(given.departs)  # lanes share the slots, rounded down
     params["idm"] = {name: x[..., :n] if x.dim() else x for name, x in params["idm"].items()}
-    return simulator, population.waiting(simulator, population.spread(given, (rows, n)), params), params
+    return simulator, demand.waiting(simulator, demand.spread(given, (rows, n)), params), params
 
 
 def broken(simulator: Simulator, before: State, after: State, kept: Any, params: Params) -> Counts:
@@ -454,7 +455,7 @@ def broken(simulator: Simulator, before: State, after: State, kept: Any, params:
     stays = there if before.present is None else there & (before.present > 0)
     if after.trips is not None and before.trips is not None:
         stays = stays & (after.trips.entered == before.trips.entered)
-        due, inside, left, queued = population.counts(simulator, after)
+        due, inside, left, queued = demand.counts(simulator, after)
         gone = (after.trips.entered - after.trips.left).sum(-1) != inside
         found["vehicles lost"] = int(((due != inside + left + queued) | (queued < 0) | gone).sum())
         found["entered"] = int((after.trips.entered - before.trips.entered).sum())
@@ -564,9 +565,9 @@ def standing() -> None:
     print("| | drivers | longest stand in each of 8 × 600 s (s) | from lane 0, vehicles/h | out, vehicles/h "
           "| hard brakings, s | touched, s |")  # fmt: skip
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    for name, (kind, demand) in DEMANDS.items():
+    for name, (kind, given) in DEMANDS.items():
         for drivers, changed in zip(("without", "as they come"), BEFORE, strict=True):
-            found = stood(kind(parameters=changed, **demand))
+            found = stood(kind(parameters=changed, **given))
             each = ", ".join(f"{x:.0f}" for x in found.longest)
             print(f"| {name} | {drivers} | {each} | {found.merged:.0f} | {found.out:.0f} "
                   f"| {found.hard:.0f} | {found.touched:.0f} |")  # fmt: skip

@@ -16,9 +16,9 @@ import time
 from pathlib import Path
 
 from idm_env.data import synthetic
-from idm_env.executor import KINDS, opened
 from idm_env.fitting.job import fit_file
 from idm_env.fitting.options import Options, Source
+from idm_env.jobs.executor import KINDS, opened
 
 FOLLOWERS, RUNS = 10, 200
 SECONDS = 15.0

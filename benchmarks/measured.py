@@ -25,7 +25,7 @@ import polars as pl  # noqa: E402
 from benchmarks import add_executor, kept_rows, rows_of  # noqa: E402
 from idm_env.data import load  # noqa: E402
 from idm_env.discovery import Discovery, discover  # noqa: E402
-from idm_env.progress import OnProgress, silent  # noqa: E402
+from idm_env.jobs.progress import OnProgress, silent  # noqa: E402
 
 FEWEST_RUNS = 7
 

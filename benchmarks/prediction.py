@@ -18,12 +18,12 @@ from pathlib import Path
 from benchmarks import add_executor, executor_of
 from idm_env.data.scenario import Scenario
 from idm_env.data.womd import scenarios
+from idm_env.jobs.progress import OnProgress, silent
 from idm_env.prediction.files import OURS, case_of
 from idm_env.prediction.metrics import Score, score, summary
 from idm_env.prediction.predict import METHODS, Mixture, Prediction, chosen, mixture
 from idm_env.prediction.scene import Scene
 from idm_env.prediction.shares import SHARES, Seen, Shares, fit_shares, seen
-from idm_env.progress import OnProgress, silent
 
 STRAIGHT = "constant velocity"
 LEAST_S = 3

@@ -25,10 +25,10 @@ import torch
 from benchmarks import add_executor, executor_of
 from idm_env.data import synthetic
 from idm_env.data.scenario import Agent, Control, Lane, Scenario
+from idm_env.jobs.progress import OnProgress, silent
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import predict
 from idm_env.prediction.scene import Scene
-from idm_env.progress import OnProgress, silent
 from idm_env.trajectories import baselines, paper
 from idm_env.trajectories.noise import SPARSE_WHITE_M, fit_noise
 from idm_env.trajectories.recipe import clock_of, overlaps, recipe

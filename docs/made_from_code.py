@@ -358,7 +358,7 @@ def commands() -> str:
     import click
     from typer.main import get_command
 
-    from idm_env.cli import app
+    from idm_env.cli.commands import app
 
     group: Any = get_command(app)
     lines = [

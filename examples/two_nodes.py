@@ -9,9 +9,9 @@ import tempfile
 from pathlib import Path
 
 from idm_env.data import synthetic
-from idm_env.executor import opened
 from idm_env.fitting.job import fit_file
 from idm_env.fitting.options import Options, Source
+from idm_env.jobs.executor import opened
 
 FILES = ("parameters.parquet", "drivers.csv", "model.yaml")
 

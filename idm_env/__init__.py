@@ -12,10 +12,12 @@ import importlib
 import os
 import signal
 import sys
+import warnings
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from idm_env import instead
+from idm_env import backends
 
 __version__ = "0.1.0"
 
@@ -35,6 +37,12 @@ _LAZY = {
     "Control": "idm_env.effects",
     "Replay": "idm_env.effects",
 }
+
+_MOVED = {
+    "config": "model_file", "diagrams": "reports.diagrams", "executor": "jobs.executor", "plot": "reports.plot",
+    "population": "multilane.demand", "trust": "jobs.trust",
+}  # fmt: skip
+"""Modules that documents of 0.1 named, and where they are now; the old names work for one version."""
 
 _TASKS = (
     "follow", "platoon", "replay", "ring", "highway", "open_highway", "merge", "bottleneck", "replay_lanes",
@@ -65,6 +73,18 @@ if TYPE_CHECKING:
     from idm_env.roads import Lane, Lanes, Ring
     from idm_env.simulator import Simulator, Trajectory
     from idm_env.types import Command, Record, State
+
+
+class _Moved(ModuleType):
+    """A module under the name that it had: what is taken from it comes with a warning from where it is now."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # asked by importlib and inspect
+            raise AttributeError(name)
+        now = f"idm_env.{_MOVED[self.__name__.rpartition('.')[2]]}"
+        found = getattr(importlib.import_module(now), name)
+        warnings.warn(f"{self.__name__} has moved. Import {name} from {now}.", DeprecationWarning, stacklevel=2)
+        return found
 
 
 def _end(number: int, frame: object) -> None:
@@ -112,12 +132,15 @@ def _register() -> None:
 
 _end_quietly()
 _register()
-instead.enter("idm_env.kernels.dispatch:rollout")
+sys.modules.update({name: _Moved(name) for name in (f"idm_env.{old}" for old in _MOVED)})
+backends.enter("idm_env.kernels.dispatch:rollout")
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return getattr(importlib.import_module(_LAZY[name]), name)
+    if name in _MOVED:
+        return sys.modules[f"idm_env.{name}"]
     raise AttributeError(f"module 'idm_env' has no attribute '{name}'")
 
 

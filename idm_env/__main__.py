@@ -8,7 +8,7 @@ import sys
 def main() -> None:
     """Run the command line; without its extra, say in one line what to install."""
     try:
-        from idm_env.cli import run
+        from idm_env.cli.commands import run
     except ImportError as error:
         sys.exit(f"error: {error}")
     run()

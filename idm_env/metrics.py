@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from idm_env.checks import one_of
+from idm_env.validation import one_of
 
 _CRUISE = (0.1569, 2.450e-2, -7.415e-4, 5.975e-5)
 _ACCELERATION = (0.07224, 9.681e-2, 1.075e-3)

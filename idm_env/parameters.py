@@ -18,9 +18,9 @@ from torch import Tensor
 from torch.distributions import biject_to, constraints
 from torch.distributions.transforms import Transform
 
-from idm_env.checks import nearest as nearest
-from idm_env.checks import shown
 from idm_env.types import Params
+from idm_env.validation import nearest as nearest
+from idm_env.validation import shown
 
 Role = Literal["strength", "shape", "threshold", "place"]
 

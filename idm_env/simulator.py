@@ -1,4 +1,4 @@
-"""A simulator: one pure step (``step.py``), and that step repeated, or what may run instead of it (``instead.py``)."""
+"""A simulator: one pure step (``step.py``), and that step repeated, or what may run instead of it (``backends.py``)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from idm_env import compat, instead, parameters
+from idm_env import backends, compat, parameters
 from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead, normals
 from idm_env.types import Inputs, Params, State, mapped
 
@@ -92,7 +92,7 @@ class Simulator(Stepping):
 
         ``keep`` None keeps nothing, and None is returned in its place. Where a compiled kernel knows this simulator it
         runs instead of ``step`` (``kernels.dispatch`` says when). Second derivatives of a
-        kernel's rollout are recomputed on the torch path; inside ``instead.off()`` everything is.
+        kernel's rollout are recomputed on the torch path; inside ``backends.off()`` everything is.
 
         ``inputs`` carry a leading time dimension of at least ``steps``. ``checkpoint_every`` k > 0 saves the graph's
         tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps
@@ -104,7 +104,7 @@ class Simulator(Stepping):
         if steps > 0 and keep in (_kept, None):
             self._covered(inputs, steps)
             self.tried(state, inputs, params)
-            fast = instead.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)
+            fast = backends.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)
             # NaN that an effect of one's own has made is told by the step itself.
             if fast is not None and not (self.own and bool(fast[0].speed.isnan().any())):
                 last, kept_of_all = fast

@@ -16,12 +16,13 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from idm_env import changes, parameters
-from idm_env.decisions import decided
+from idm_env import parameters
+from idm_env.delay_buffer import PAST, History
 from idm_env.effects.base import HOOKS, CarFollowing, Effect, Hook
 from idm_env.effects.limits import unspoken
-from idm_env.history import PAST, History
-from idm_env.population import turnover
+from idm_env.multilane import incentives
+from idm_env.multilane.demand import turnover
+from idm_env.multilane.lane_change import decided
 from idm_env.roads.base import Road
 from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
 
@@ -34,7 +35,7 @@ class Stepping:
     """A road, a tuple of effects and a time step (s): all of a simulator that is one step.
 
     One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps. Where vehicles
-    enter or lanes are changed, that comes first (``population.py``, ``changes.py``).
+    enter or lanes are changed, that comes first (``multilane/``).
 
     ``integration`` is ``"ballistic"`` (``x += v Δt + a Δt²/2``, and a car that would reverse stops inside the step) or
     ``"euler"`` (the paper's: ``x += v Δt`` with the old speed). ``"midpoint"`` is ballistic with speeds and gaps of the
@@ -250,7 +251,7 @@ class Stepping:
                 memory[effect.name] = normals(f"{effect.name} at the start", seed or 0, held) if drawn else held
         if self.looks_back:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
-        return {**memory, **changes.nobody(state.speed)} if self.sees_mergers else memory
+        return {**memory, **incentives.nobody(state.speed)} if self.sees_mergers else memory
 
     def scene(self, state: State, inputs: Inputs) -> Scene:
         """Return what this step looks like to every vehicle."""
@@ -272,7 +273,7 @@ class Stepping:
             inputs=inputs,
             memory=state.memory,
             history=self._history(state),
-            merger=changes.merger(state.memory, state.speed) if self.sees_mergers else None,
+            merger=incentives.merger(state.memory, state.speed) if self.sees_mergers else None,
         )
         return half_ahead(scene) if self.integration == "midpoint" else scene
 
@@ -344,7 +345,7 @@ class Stepping:
         }
         if scene.history is not None:
             memory[PAST] = scene.history.pushed(scene)
-        memory |= changes.driven_on(state.memory, motion.displacement, self.dt)
+        memory |= incentives.driven_on(state.memory, motion.displacement, self.dt)
         gap, links = self._gaps(state, motion), state.links
         if motion.lane is not None:
             gap, links = self.road.view(state).placed(state, motion, gap)

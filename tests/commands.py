@@ -7,7 +7,7 @@ import io
 import subprocess
 import sys
 
-from idm_env import cli
+from idm_env.cli import commands as cli
 
 Done = subprocess.CompletedProcess[str]
 

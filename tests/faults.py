@@ -20,9 +20,10 @@ from typing import Any
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 CHANGES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate"}
 MODULES = (
-    "idm_env.cli", "idm_env.fitting.job", "idm_env.fitting.lane_changes", "idm_env.discovery.sets",
-    "idm_env.drift.job", "idm_env.trajectories.files", "idm_env.prediction.files", "idm_env.diagrams", "idm_env.fonts",
-    "idm_env.kernels.dispatch", "idm_env.kernels.drivers", "idm_env.kernels.descent", "idm_env.config",
+    "idm_env.cli.commands", "idm_env.fitting.job", "idm_env.fitting.lane_changes", "idm_env.discovery.sets",
+    "idm_env.drift.job", "idm_env.trajectories.files", "idm_env.prediction.files",
+    "idm_env.reports.diagrams", "idm_env.reports.fonts",
+    "idm_env.kernels.dispatch", "idm_env.kernels.drivers", "idm_env.kernels.descent", "idm_env.model_file",
 )  # fmt: skip
 
 
@@ -90,7 +91,7 @@ def _in(path: Any, folder: str) -> bool:
 
 
 def _child(asked: dict[str, Any], folder: str, answer: int) -> None:
-    from idm_env.cli import run
+    from idm_env.cli.commands import run
 
     told = os.open(os.path.join(os.path.dirname(folder), "told.txt"), os.O_RDWR | os.O_CREAT | os.O_TRUNC)
     os.dup2(os.open(os.devnull, os.O_RDWR), 1)
@@ -119,11 +120,11 @@ def main(folder: str) -> None:
         importlib.import_module(name)
     import torch
 
-    from idm_env import keep
+    from idm_env.jobs import storage
 
     torch.set_num_threads(1)
     time.perf_counter = time.process_time = float  # reports tell how long their methods took
-    keep.LOCK_SECONDS = 0.0
+    storage.LOCK_SECONDS = 0.0
     os.chdir(folder)
     for line in sys.stdin:
         read, write = os.pipe()

@@ -21,11 +21,12 @@ from hypothesis import strategies as st
 import idm_env  # noqa: F401
 from agents import apg, common
 from agents.policy import Policy
-from idm_env import checks, cli
-from idm_env.config import load_environment, load_model
+from idm_env import validation
+from idm_env.cli import commands as cli
 from idm_env.data import synthetic
 from idm_env.effects import ALL
 from idm_env.envs.pettingzoo import parallel_env
+from idm_env.model_file import load_environment, load_model
 from tests.commands import refused, typed
 
 QUICK = settings(max_examples=60)
@@ -191,7 +192,7 @@ def test_a_picture_has_a_file_that_is_no_input(data: Path, tmp_path: Path) -> No
 
 @given(st.recursive(st.integers() | st.floats() | st.text() | st.binary() | st.none(), st.lists, max_leaves=200))
 def test_a_value_in_an_error_text_is_short(value: Any) -> None:
-    assert len(checks.shown(value)) < 700 and "\n" not in checks.shown(value)
+    assert len(validation.shown(value)) < 700 and "\n" not in validation.shown(value)
 
 
 def test_a_value_in_an_error_text_is_short_however_it_grows() -> None:
@@ -199,7 +200,7 @@ def test_a_value_in_an_error_text_is_short_however_it_grows() -> None:
     for _ in range(30):
         laughs = [laughs] * 9
     for value in (laughs, 10**5000, "x" * 10**7, {"a": laughs}):
-        assert len(checks.shown(value)) < 700
+        assert len(validation.shown(value)) < 700
 
 
 # -- environments ----------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import lanes, named_rows
-from idm_env.progress import OnProgress
+from idm_env.jobs.progress import OnProgress
 
 COMMANDS = sorted(p.stem for p in (Path(__file__).parents[1] / "benchmarks").glob("*.py") if p.stem != "__init__")
 

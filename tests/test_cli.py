@@ -15,8 +15,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from idm_env import keep
 from idm_env.data import synthetic
+from idm_env.jobs import storage
 from tests.commands import spawned, typed
 
 
@@ -143,7 +143,7 @@ def test_killed_and_resumed_gives_the_same_result(tmp_path: Path) -> None:
             [sys.executable, "-m", "idm_env", "fit", str(path), *options, str(out)], stderr=subprocess.PIPE, text=True
         )
         deadline = time.monotonic() + 120
-        kept = out / keep.UNFINISHED / "fit" / "adam.kept"
+        kept = out / storage.UNFINISHED / "fit" / "adam.kept"
         while not kept.exists() and running.poll() is None and time.monotonic() < deadline:
             time.sleep(0.01)
         os.kill(running.pid, number)

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 import typer
 
-from idm_env import cli
+from idm_env.cli import commands as cli
 from idm_env.data import Trajectories
 from idm_env.trajectories import files
 from idm_env.trajectories.spool import Spool

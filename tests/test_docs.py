@@ -21,9 +21,9 @@ import pytest
 import torch
 
 from idm_env import IDM, Brakes, Lane, Replay, Simulator
-from idm_env.config import Model, save_model
 from idm_env.data import synthetic
 from idm_env.effects import ALL
+from idm_env.model_file import Model, save_model
 from idm_env.types import Record
 from tests.prediction import scenes
 

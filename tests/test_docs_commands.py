@@ -62,7 +62,7 @@ def read_as_typed(words: list[str]) -> None:
     """Let the command line read a command of ``idm-env`` without running it; an error if it cannot."""
     from typer.main import get_command
 
-    from idm_env.cli import app
+    from idm_env.cli.commands import app
 
     group: Any = get_command(app)
     command = group.get_command(None, words[1])
@@ -91,7 +91,7 @@ def test_every_command_is_one(path: Path, folder: Path) -> None:
 @pytest.mark.slow
 def test_the_commands_of_the_readme_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One after the other, in a folder that has the files they read, as somebody would type them."""
-    from idm_env.cli import app
+    from idm_env.cli.commands import app
 
     usual = signal.getsignal(signal.SIGINT)
     my_csv(folder)

@@ -11,10 +11,10 @@ import pytest
 import yaml
 
 import idm_env
-from idm_env import doctor
-from idm_env.cli import citations
-from idm_env.config import Model, save_model
+from idm_env.cli import doctor
+from idm_env.cli.commands import citations
 from idm_env.effects import ALL, IDM, Brakes, Delay
+from idm_env.model_file import Model, save_model
 
 ROOT = Path(__file__).resolve().parents[1]
 

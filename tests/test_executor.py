@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from idm_env import executor
-from idm_env.progress import OnProgress
+from idm_env.jobs import executor
+from idm_env.jobs.progress import OnProgress
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from idm_env import keep
-from idm_env.cli import app
+from idm_env.cli.commands import app
 from idm_env.data import synthetic
+from idm_env.jobs import storage
 from tests.faults import Disturbed
 from tests.prediction.test_womd import write_json
 
@@ -72,7 +72,7 @@ def content(folder: Path) -> dict[str, bytes]:
             found[str(path.relative_to(folder))] = (
                 told if path.suffix == ".parquet" else told.replace(b" --resume", b"")
             )
-    return {k: re.sub(rb"[0-9a-f]{64}", b"", v) if k.endswith(keep.MARK) else v for k, v in found.items()}
+    return {k: re.sub(rb"[0-9a-f]{64}", b"", v) if k.endswith(storage.MARK) else v for k, v in found.items()}
 
 
 def test_all_commands_that_write_are_here() -> None:
@@ -99,8 +99,8 @@ def test_the_next_run_ends_as_if_nothing_had_been(disturbed: Disturbed, name: st
 
     killed(moments // 2)
     if name != "plot":
-        killed(f"{OUT}/{keep.LOCK}")  # nothing is missing but that the lock is taken away
-        assert content(out) | {keep.LOCK: b""} == undisturbed | {keep.LOCK: b""}
+        killed(f"{OUT}/{storage.LOCK}")  # nothing is missing but that the lock is taken away
+        assert content(out) | {storage.LOCK: b""} == undisturbed | {storage.LOCK: b""}
     killed(moments // 2)
     resumed = ("--resume",) if name in RESUMED else ()
     killed(3, *resumed)
@@ -119,7 +119,7 @@ def test_a_folder_that_cannot_be_used_is_one_line(disturbed: Disturbed, name: st
     loop, held = disturbed.folder / "loop", disturbed.folder / "held"
     if not loop.is_symlink():
         loop.symlink_to(loop)
-    with keep.alone(held):
+    with storage.alone(held):
         for out, rule in (("loop/under", "loop"), ("held", "held is being written to by process")):
             if name == "plot" and out == "held":
                 continue

@@ -9,8 +9,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from idm_env import fonts, report
-from idm_env.diagrams import space_time
+from idm_env.reports import fonts, page
+from idm_env.reports.diagrams import space_time
 
 NAMES = ["東京/車両一", "Москва", "도로", "ถนน", "सड़क", "شارع", "plain", "\U0001f697"]
 
@@ -22,16 +22,16 @@ def glyphs_are_not_missing() -> object:
         yield
 
 
-def drawn(names: list[str]) -> report.Block:
+def drawn(names: list[str]) -> page.Block:
     """Names in a title, a legend, an annotation and as labels of ticks: all that our pictures have."""
-    figure, axes = report.figure(2, 1)
+    figure, axes = page.figure(2, 1)
     for i, name in enumerate(names):
         axes[0, 0].plot([0, 1], [i, i], label=name)
     axes[0, 0].legend()
     axes[0, 0].set_title(f"best: {names[0]}\nRMSE 1.00 m")
     axes[1, 0].annotate(names[0], (0.0, 0.0))
     axes[1, 0].set_xticks(np.arange(len(names)), [name[:14] for name in names], rotation=90)
-    return report.picture(figure, "Names.")
+    return page.picture(figure, "Names.")
 
 
 def test_names_of_any_script_are_drawn_without_a_warning() -> None:
@@ -47,7 +47,7 @@ def test_a_name_that_no_font_has_becomes_a_number(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(fonts, "_families", lambda lacking: ([], set(lacking)))
     caption = drawn(["東京/車両一", "車両二"]).text
     assert all(f": {word}" in caption for word in ("東京", "車両一", "車両二")) and caption.count("#") == 3
-    figure, axes = report.figure()
+    figure, axes = page.figure()
     axes[0, 0].set_title("東京: 車両一")
     axes[0, 0].set_xticks([0, 1], ["車両一", "b"])
     said = fonts.legible(figure)
@@ -63,10 +63,10 @@ def test_a_name_has_one_number_in_the_wide_and_the_narrow_picture(monkeypatch: p
     monkeypatch.setattr(fonts, "_families", lambda lacking: ([], set(lacking)))
     titles = []
     for title in ("東京 車両一", "車両二 東京"):
-        figure, axes = report.figure()
+        figure, axes = page.figure()
         axes[0, 0].set_title(title)
         titles.append((figure, axes[0, 0]))
-    caption = report.picture(titles[0][0], "Names.", titles[1][0]).text
+    caption = page.picture(titles[0][0], "Names.", titles[1][0]).text
     said = dict(part.split(": ") for part in caption.removeprefix("Names. ").removesuffix(".").split(", "))
     assert [" ".join(said[n] for n in axes.get_title().split()) for _, axes in titles] == ["東京 車両一", "車両二 東京"]
 
@@ -81,7 +81,7 @@ def test_space_time_diagrams_have_titles_of_any_script() -> None:
 
 def test_a_figure_in_the_default_font_is_left_as_it_is() -> None:
     """No other font, no number."""
-    figure, axes = report.figure()
+    figure, axes = page.figure()
     axes[0, 0].set_title("gap (m), Δv, θ")
     assert fonts.legible(figure) == {}
     assert axes[0, 0].title.get_fontfamily() == ["sans-serif"]

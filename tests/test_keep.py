@@ -13,14 +13,14 @@ import polars as pl
 import pytest
 import torch
 
-from idm_env import keep
-from idm_env.cli import EXPLAINED
+from idm_env.cli.commands import EXPLAINED
 from idm_env.data import synthetic
 from idm_env.discovery import write
 from idm_env.fitting import job
 from idm_env.fitting.job import fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
-from idm_env.parts import Parts
+from idm_env.jobs import storage
+from idm_env.jobs.shards import Parts
 from idm_env.prediction.files import predict_files
 from idm_env.trajectories import files
 from tests.commands import refused
@@ -50,7 +50,7 @@ def test_a_file_is_replaced_only_by_a_whole_one(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        keep.write(path, half)
+        storage.write(path, half)
     assert content(tmp_path) == {"a.json": b"old"}
 
 
@@ -61,15 +61,15 @@ def test_a_full_disk_is_told_as_such_and_leaves_nothing_half(tmp_path: Path, err
         raise error
 
     with pytest.raises(OSError, match=r"a\.json cannot be written: No space left on device\. Free space"):
-        keep.write(tmp_path / "a.json", full)
+        storage.write(tmp_path / "a.json", full)
     assert not any(tmp_path.iterdir())
 
 
 def run(out: Path, text: str = "1", inputs: tuple[Path, ...] = ()) -> None:
     """Write both results."""
-    with keep.results(out, NAMES, inputs) as folder:
+    with storage.results(out, NAMES, inputs) as folder:
         for name in NAMES:
-            keep.write_text(folder / name, text)
+            storage.write_text(folder / name, text)
 
 
 def test_results_of_ours_are_replaced_and_those_of_others_kept(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_results_of_ours_are_replaced_and_those_of_others_kept(tmp_path: Path) -
     assert (tmp_path / "mine.json").read_text() == "my remarks" and (tmp_path / "report.json").read_text() == "3"
 
 
-@pytest.mark.parametrize("name", [*NAMES, keep.MARK])
+@pytest.mark.parametrize("name", [*NAMES, storage.MARK])
 def test_a_file_that_is_not_ours_is_never_replaced(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("mine")
     with pytest.raises(ValueError, match=rf"{name}.* (was not written by|is not one of) idm-env"):
@@ -95,10 +95,10 @@ def test_a_file_that_is_not_ours_is_never_replaced(tmp_path: Path, name: str) ->
 
 
 def test_a_killed_run_may_be_done_again_and_a_failed_one_leaves_no_mark(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), keep.results(tmp_path, NAMES):
+    with pytest.raises(ZeroDivisionError), storage.results(tmp_path, NAMES):
         raise ZeroDivisionError
     assert not any(tmp_path.iterdir())
-    killed = keep.results(tmp_path, NAMES)
+    killed = storage.results(tmp_path, NAMES)
     folder = killed.__enter__()
     (folder / NAMES[0]).write_text("of a run that was killed")
     left = content(folder)
@@ -140,7 +140,7 @@ def test_fit_and_simulate_refuse_to_overwrite_what_they_read(data: Path, tmp_pat
     fit_file(Source(data), Options(by="all", starts=1, substeps=1), out)
     simulate_file(Source(data), out / "model.yaml", out)
     before = content(out)
-    assert set(before) == {*job.FITTED, *job.SIMULATED, keep.MARK}
+    assert set(before) == {*job.FITTED, *job.SIMULATED, storage.MARK}
     for given in (
         lambda: fit_file(Source(data), Options(by="all", model=str(out / "model.yaml")), out),
         lambda: fit_file(Source(out / "parameters.parquet"), Options(), out),
@@ -154,9 +154,9 @@ def test_fit_and_simulate_refuse_to_overwrite_what_they_read(data: Path, tmp_pat
 HOLD = """
 import os, signal, sys
 from pathlib import Path
-from idm_env import keep
+from idm_env.jobs import storage
 
-with keep.results(sys.argv[1], ["report.json"]):
+with storage.results(sys.argv[1], ["report.json"]):
     print("held", flush=True)
     if sys.stdin.readline().strip() == "die":
         os.kill(os.getpid(), signal.SIGKILL)
@@ -165,7 +165,7 @@ with keep.results(sys.argv[1], ["report.json"]):
 
 def test_one_job_at_a_time_writes_to_a_folder_and_a_dead_one_is_not_in_the_way(tmp_path: Path, monkeypatch) -> None:
     pytest.importorskip("fcntl")
-    monkeypatch.setattr(keep, "LOCK_SECONDS", 0.2)
+    monkeypatch.setattr(storage, "LOCK_SECONDS", 0.2)
     for end in ("end", "die"):
         other = subprocess.Popen(
             [sys.executable, "-c", HOLD, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -175,9 +175,9 @@ def test_one_job_at_a_time_writes_to_a_folder_and_a_dead_one_is_not_in_the_way(t
             with pytest.raises(ValueError, match=rf"is being written to by process {other.pid} on .*, since .* Wait"):
                 run(tmp_path)
             other.stdin.write(f"{end}\n")
-        assert (keep.LOCK in content(tmp_path)) == (end == "die")
+        assert (storage.LOCK in content(tmp_path)) == (end == "die")
         run(tmp_path)
-        assert set(content(tmp_path)) == {*NAMES, keep.MARK}
+        assert set(content(tmp_path)) == {*NAMES, storage.MARK}
         shutil.rmtree(tmp_path)
         tmp_path.mkdir()
 
@@ -186,18 +186,18 @@ def test_a_lock_is_held_once_per_job_and_not_by_another_thread(tmp_path: Path, m
     from concurrent.futures import ThreadPoolExecutor
 
     pytest.importorskip("fcntl")
-    monkeypatch.setattr(keep, "LOCK_SECONDS", 0.2)
-    with keep.results(tmp_path, NAMES):
+    monkeypatch.setattr(storage, "LOCK_SECONDS", 0.2)
+    with storage.results(tmp_path, NAMES):
         run(tmp_path)  # explain writes its report so
         with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match=f"written to by process {os.getpid()} on"):
             pool.submit(run, tmp_path).result()
-        assert keep.LOCK in content(tmp_path)
-    assert keep.LOCK not in content(tmp_path)
+        assert storage.LOCK in content(tmp_path)
+    assert storage.LOCK not in content(tmp_path)
 
 
 def test_a_lock_follows_no_link(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("years of work")
-    (tmp_path / keep.LOCK).symlink_to(tmp_path / "thesis.txt")
+    (tmp_path / storage.LOCK).symlink_to(tmp_path / "thesis.txt")
     with pytest.raises(OSError, match="idm-env-lock"):
         run(tmp_path)
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
@@ -217,7 +217,7 @@ def test_formulas_are_escaped_and_numbers_stay_numbers(tmp_path: Path) -> None:
     table = pl.DataFrame({"x": [*formulas, *harmless], "=y": [-1.5] * 14}).with_columns(
         k=pl.col("x").cast(pl.Categorical)
     )
-    keep.write_csv(tmp_path / "a.csv", table.lazy())
+    storage.write_csv(tmp_path / "a.csv", table.lazy())
     with (tmp_path / "a.csv").open(newline="") as file:
         found = list(csv.DictReader(file))
     wanted = [f"'{text}" for text in formulas] + [text or "" for text in harmless]
@@ -229,49 +229,49 @@ def test_formulas_are_escaped_and_numbers_stay_numbers(tmp_path: Path) -> None:
 
 
 def test_a_store_keeps_and_is_removed(tmp_path: Path) -> None:
-    folder = tmp_path / keep.UNFINISHED / "fit"
-    store = keep.Store(folder, "a", False)
+    folder = tmp_path / storage.UNFINISHED / "fit"
+    store = storage.Store(folder, "a", False)
     kept = {"x": torch.arange(3.0), "n": [1, {"deep": True}]}
     store.put("round 1/delay", kept)
-    again = keep.Store(folder, "a", True)
+    again = storage.Store(folder, "a", True)
     found = again.get("round 1/delay")
     assert torch.equal(found["x"], kept["x"]) and found["n"] == kept["n"] and again.get("other") is None
     with pytest.raises(ValueError, match="other data or options"):
-        keep.Store(folder, "b", True)
-    assert keep.Store(folder, "b", False).get("round 1/delay") is None
+        storage.Store(folder, "b", True)
+    assert storage.Store(folder, "b", False).get("round 1/delay") is None
     again.remove()
     assert not any(tmp_path.iterdir())
 
 
 def test_a_folder_that_is_not_ours_is_never_emptied(tmp_path: Path) -> None:
-    folder = tmp_path / keep.UNFINISHED / "filter"
+    folder = tmp_path / storage.UNFINISHED / "filter"
     folder.mkdir(parents=True)
     (folder / "thesis.txt").write_text("years of work")
     for mark in (None, "", "{", "{}", '{"written_by": "somebody"}', "[" * 100_000):
         if mark is not None:
-            (folder / keep.MARK).write_text(mark)
+            (folder / storage.MARK).write_text(mark)
         for resume in (False, True):
             with pytest.raises(ValueError, match=r"run\.json is broken or missing.* Delete .* to start afresh") as told:
-                keep.Store(folder, "a", resume)
+                storage.Store(folder, "a", resume)
             assert "\n" not in str(told.value)
     assert (folder / "thesis.txt").read_text() == "years of work"
 
 
 def test_a_store_that_is_killed_while_it_is_made_or_removed_is_still_ours(tmp_path: Path, monkeypatch) -> None:
-    folder = tmp_path / keep.UNFINISHED / "fit"
+    folder = tmp_path / storage.UNFINISHED / "fit"
     folder.mkdir(parents=True)
     (folder / ".run.idm-env-part.json").write_text("{")
-    store = keep.Store(folder, "a", True)
+    store = storage.Store(folder, "a", True)
     store.put_json("x", 1)
 
     def killed(*given: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(keep.shutil, "rmtree", killed)
+    monkeypatch.setattr(storage.shutil, "rmtree", killed)
     with pytest.raises(KeyboardInterrupt):
         store.remove()
     monkeypatch.undo()
-    assert keep.Store(folder, "b", False).kept() == []
+    assert storage.Store(folder, "b", False).kept() == []
 
 
 def damaged(path: Path) -> dict[str, bytes]:
@@ -286,7 +286,7 @@ def damaged(path: Path) -> dict[str, bytes]:
 
 
 def test_every_broken_file_of_a_store_is_one_line(tmp_path: Path) -> None:
-    store = keep.Store(tmp_path / "fit", "a", False)
+    store = storage.Store(tmp_path / "fit", "a", False)
     store.put("tensors", {"x": torch.zeros(5)})
     store.put_json("plain", {"x": [1, 2, 3]})
     for key, get in (("tensors", store.get), ("plain", store.get_json)):
@@ -317,11 +317,14 @@ def test_a_broken_table_of_a_finished_part_is_one_line(tmp_path: Path) -> None:
 def test_what_determines_a_run_is_in_its_fingerprint(tmp_path: Path) -> None:
     file = tmp_path / "model.yaml"
     file.write_text("a")
-    first = keep.fingerprint(file, torch.zeros(2), "x")
-    assert keep.fingerprint(file, torch.zeros(2), "x") == first
-    assert keep.fingerprint(file, torch.ones(2), "x") != first and keep.fingerprint(file, torch.zeros(2), "y") != first
+    first = storage.fingerprint(file, torch.zeros(2), "x")
+    assert storage.fingerprint(file, torch.zeros(2), "x") == first
+    assert (
+        storage.fingerprint(file, torch.ones(2), "x") != first
+        and storage.fingerprint(file, torch.zeros(2), "y") != first
+    )
     file.write_text("b")
-    assert keep.fingerprint(file, torch.zeros(2), "x") != first
+    assert storage.fingerprint(file, torch.zeros(2), "x") != first
 
 
 # -- commands --------------------------------------------------------------------------------------------------------
@@ -333,17 +336,17 @@ def test_filter_keeps_a_user_s_parts_and_refuses_its_own_output_as_input(data: P
     (out / "parts").mkdir(parents=True)
     (out / "parts" / "thesis.txt").write_text("years of work")
     files.filter_file(data, out, baselines=False)
-    assert (out / "parts" / "thesis.txt").read_text() == "years of work" and not (out / keep.UNFINISHED).exists()
+    assert (out / "parts" / "thesis.txt").read_text() == "years of work" and not (out / storage.UNFINISHED).exists()
     before = content(out)
     with pytest.raises(ValueError, match=r"trajectories\.parquet is an input, and"):
         files.filter_file(out / "trajectories.parquet", out, baselines=False)
     with pytest.raises(ValueError, match=r"report\.json is an input, and"):
         predict_files([out / "report.json"], out)
     assert content(out) == before
-    (out / keep.UNFINISHED).mkdir()
-    shutil.copy(data, out / keep.UNFINISHED / "mine.csv")
+    (out / storage.UNFINISHED).mkdir()
+    shutil.copy(data, out / storage.UNFINISHED / "mine.csv")
     with pytest.raises(ValueError, match=r"mine\.csv belongs to an interrupted run"):
-        files.filter_file(out / keep.UNFINISHED / "mine.csv", out)
+        files.filter_file(out / storage.UNFINISHED / "mine.csv", out)
 
 
 def test_predict_that_refuses_deletes_nothing(tmp_path: Path) -> None:
@@ -379,18 +382,18 @@ def test_a_broken_checkpoint_is_one_line_and_without_resume_a_fit_starts_afresh(
 
     with pytest.raises(KeyboardInterrupt):
         fit_file(Source(data), Options(by="all", starts=1, substeps=1), out, on_progress=stop)
-    folder = out / keep.UNFINISHED / "fit"
+    folder = out / storage.UNFINISHED / "fit"
     (kept,) = folder.glob("*.kept")
     options = ("--by", "all", "--starts", 1, "--substeps", 1, "--out", out)
     for broken in (b"", b"garbage", kept.read_bytes()[:-5]):
         kept.write_bytes(broken)
         line = refused("fit", data, *options, "--resume")
         assert f"{kept.name} is broken" in line and "Leave out --resume to start afresh" in line
-    (folder / keep.MARK).write_text("")
+    (folder / storage.MARK).write_text("")
     assert "Delete" in refused("fit", data, *options, "--resume")
-    keep._sign(folder, fingerprint="")
+    storage._sign(folder, fingerprint="")
     fit_file(Source(data), Options(by="all", starts=1, substeps=1), out)
-    assert not (out / keep.UNFINISHED).exists()
+    assert not (out / storage.UNFINISHED).exists()
 
 
 def test_explain_and_fit_refuse_inputs_among_their_outputs(data: Path, tmp_path: Path) -> None:

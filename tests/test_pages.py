@@ -10,11 +10,11 @@ import numpy as np
 import polars as pl
 import pytest
 
-from idm_env import diagrams, report
 from idm_env.data import synthetic
 from idm_env.effects import ALL
 from idm_env.fitting.job import fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
+from idm_env.reports import diagrams, page
 from idm_env.tasks import TASKS, make_task
 from idm_env.trajectories.files import filter_file, reconstruct_file
 from tests.browser import after, check, chromium
@@ -66,14 +66,14 @@ def test_reports_are_well(chromium: None, tmp_path: Path) -> None:
     panels, _ = diagrams.panels(made), np.zeros(1)
     diagrams.write_html(tmp_path / "diagram.html", panels, "diagram")
     rows = [{f"column {i} of a table that is wide": f"{i}" * 12 for i in range(14)} for _ in range(3)]
-    report.write_page(tmp_path / "wide.html", "wide", [report.lead("x"), report.table(rows)])
+    page.write_page(tmp_path / "wide.html", "wide", [page.lead("x"), page.table(rows)])
     assert check.wrong([*pages, tmp_path / "diagram.html", tmp_path / "wide.html"]) == []
 
 
 def test_a_click_on_a_heading_sorts(chromium: None, tmp_path: Path) -> None:
     """By number, not by text, what is not there last; a second click turns the order round."""
     rows = [{"name": name, "gap": gap} for name, gap in (("b", 10.0), ("c", float("nan")), ("a", 9.0), ("d", -1.0))]
-    report.write_page(tmp_path / "page.html", "page", [report.table(rows)])
+    page.write_page(tmp_path / "page.html", "page", [page.table(rows)])
     order = "[...document.querySelectorAll('tbody tr')].map(r => r.cells[0].textContent.trim()).join('')"
     for clicks, wanted in (((), "bcad"), ((1,), "dabc"), ((1, 1), "badc"), ((1, 0), "abcd")):
         script = "".join(f"document.querySelectorAll('th')[{i}].click();" for i in clicks)
@@ -125,12 +125,12 @@ def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
     """What a task's observation means, how to use one's own csv, what an effect's equation is."""
     near = links(site, "index.html")
     near |= {link for first in near for link in links(site, first)}
-    for page, words in (
+    for place, words in (
         *((f"generated/tasks/{name}.html", make_task(name).features.names[-1]) for name in TASKS),
         ("jobs/files.html", "position_m"),
         ("generated/effects.html", "speed-dependent gap"),
     ):
-        assert page in near and words in (site / page).read_text(encoding="utf-8")
+        assert place in near and words in (site / page).read_text(encoding="utf-8")
 
 
 def links(site: Path, page: str) -> set[str]:

@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 
 import idm_env
-from idm_env import cli, progress
+from idm_env.cli import commands as cli
+from idm_env.jobs import progress
 
 
 def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
@@ -69,7 +70,7 @@ def test_there_is_one_protocol() -> None:
 
     for long in (fit, fit_file, simulate_file, discover, filter_file, reconstruct_file, predict_files, bench.run):
         assert inspect.signature(long).parameters["on_progress"].annotation == "OnProgress | None", long
-    package = Path(progress.__file__).parent
+    package = Path(idm_env.__file__).parent
     assert [p.name for p in package.rglob("*.py") if "\nOnProgress =" in p.read_text()] == ["progress.py"]
 
 

@@ -17,11 +17,11 @@ from typing import Any
 import polars as pl
 import pytest
 
-from idm_env import executor, keep
 from idm_env.data import synthetic
 from idm_env.fitting.job import fit_file
 from idm_env.fitting.options import Options, Source
-from idm_env.progress import OnProgress
+from idm_env.jobs import executor, storage
+from idm_env.jobs.progress import OnProgress
 from tests.test_executor import Part, square
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -162,7 +162,7 @@ def test_whoever_asked_may_be_killed_and_goes_on_with_another_executor(
         "fitted(Path(sys.argv[1]), Path(sys.argv[2]), 'ray', sys.argv[3])"
     )
     out = tmp_path / "out"
-    kept = out / keep.UNFINISHED / "fit-parts"
+    kept = out / storage.UNFINISHED / "fit-parts"
     asked = subprocess.Popen(
         [sys.executable, "-c", code, str(folder), str(out), cluster.address],
         env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,

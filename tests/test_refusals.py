@@ -11,11 +11,12 @@ from typing import Any, get_args
 import pytest
 import typer
 
-from idm_env import cli, refusals
+from idm_env.cli import commands as cli
+from idm_env.cli import refusals
 from idm_env.effects import BASES
-from idm_env.executor import KINDS
 from idm_env.fitting.fit import Method
 from idm_env.fitting.problem import Loss, Objective
+from idm_env.jobs.executor import KINDS
 from idm_env.step import INTEGRATORS
 from idm_env.tasks.replay_lanes import FIRST_LANES
 from idm_env.trajectories.chunks import Recipe
@@ -73,7 +74,7 @@ def refused(name: str, command: Any, folder: Path) -> dict[str, list[str]]:
 
 RUN = """
 import json, os, sys
-from idm_env import cli
+from idm_env.cli import commands as cli
 told = []
 for words in json.loads(sys.stdin.read()):
     sys.argv = ["idm-env", *words]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from idm_env import report as page
+from idm_env.reports import page
 
 ROWS = [
     {"driver": "b", "a (m/s²)": 10.0, "share": page.Cell("10 (5 %)", 10), "mark": page.Cell("3 ⊣", 3.0, True)},

@@ -18,12 +18,13 @@ import torch
 import yaml
 
 from agents import apg, classical, common, distil, evaluate, shac
-from idm_env import cli, executor, trust
-from idm_env.config import load_environment, load_model
+from idm_env.cli import commands as cli
 from idm_env.data import synthetic
 from idm_env.effects import ALL
 from idm_env.envs.pettingzoo import parallel_env
-from idm_env.progress import OnProgress
+from idm_env.jobs import executor, trust
+from idm_env.jobs.progress import OnProgress
+from idm_env.model_file import load_environment, load_model
 from idm_env.tasks import make_task
 from tests.commands import run
 
@@ -310,12 +311,12 @@ def test_every_command_that_reads_a_model_can_be_told_to_trust_and_is_in_the_law
 
 
 READERS = {
-    "yaml.load": {"config.py"},
-    "yaml.parse": {"config.py"},
-    "torch.load": {"keep.py", "agents/common.py", "agents/ppo.py"},
-    "pickle.loads": {"executor.py", "compat.py"},
-    "import_module": {"data/__init__.py", "__init__.py", "instead.py", "effects/registry.py", "cli.py"},
-    "spec_from_file_location": {"modules.py"},
+    "yaml.load": {"model_file.py"},
+    "yaml.parse": {"model_file.py"},
+    "torch.load": {"jobs/storage.py", "agents/common.py", "agents/ppo.py"},
+    "pickle.loads": {"jobs/executor.py", "compat.py"},
+    "import_module": {"data/__init__.py", "__init__.py", "backends.py", "effects/registry.py", "cli/commands.py"},
+    "spec_from_file_location": {"jobs/import_file.py"},
     "exec": {"kernels/staged.py"},
 }
 """What may run or build whatever a file says, and where: executors pickle for their own workers, caches are sealed."""

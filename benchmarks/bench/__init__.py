@@ -15,10 +15,10 @@ import torch
 
 from benchmarks.bench import fits, memory, peers, tables, traffic
 from benchmarks.bench.measure import Case, machine, measure
-from idm_env import keep, kernels
+from idm_env import kernels
+from idm_env.jobs import storage
+from idm_env.jobs.progress import OnProgress, silent
 from idm_env.kernels import dispatch
-from idm_env.progress import OnProgress, silent
-from idm_env.report import write_json
 
 OUTPUT = ("performance.json", "performance.png", "report.html")
 SIZES = (2_000, 20_000, 200_000, 2_000_000)
@@ -46,7 +46,7 @@ def run(
         if size <= 0 or size % traffic.LANE:
             raise ValueError(f"size {size} is no multiple of {traffic.LANE}, the length of a lane. Take {SIZES}.")
     if out is not None:
-        with keep.results(out, OUTPUT):  # what is in the way is told before anything is measured
+        with storage.results(out, OUTPUT):  # what is in the way is told before anything is measured
             pass
     say = say or print
     threads = torch.get_num_threads()
@@ -93,8 +93,8 @@ def run(
     if out is not None:
         from benchmarks.bench.picture import draw
 
-        with keep.results(out, OUTPUT) as folder:
-            write_json(folder / "performance.json", result)
+        with storage.results(out, OUTPUT) as folder:
+            storage.write_json(folder / "performance.json", result)
             tables.write(folder, result, draw(result, folder / "performance.png"))
     return result
 

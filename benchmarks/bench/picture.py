@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from idm_env import keep
-from idm_env import report as page
+from idm_env.jobs import storage
+from idm_env.reports import page
 
 
 def draw(result: dict[str, Any], path: Path) -> page.Block:
@@ -33,5 +33,5 @@ def draw(result: dict[str, Any], path: Path) -> page.Block:
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("ns per vehicle-step")
     panels[1].legend()
-    keep.write(path, lambda beside: figure.savefig(beside, dpi=120))
+    storage.write(path, lambda beside: figure.savefig(beside, dpi=120))
     return page.picture(figure, "Time of one core per vehicle-step over the number of vehicles; lower is faster.")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from idm_env import report as page
+from idm_env.reports import page
 
 Rows = list[dict[str, Any]]
 RINGS = {

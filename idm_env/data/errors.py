@@ -33,7 +33,7 @@ class Repair:
 
 
 def by_kind(repairs: Iterable[Repair]) -> list[tuple[str, int]]:
-    """Return the kind and the number of each, as ``report.account`` takes them."""
+    """Return the kind and the number of each, as ``reports.page.account`` takes them."""
     return [(repair.kind, repair.count) for repair in repairs]
 
 

@@ -11,9 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from idm_env import keep
-from idm_env.checks import nearest
-from idm_env.config import Model as SavedModel
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
 from idm_env.discovery import bases, calibrate, ceilings, free, judge, places, records, search, shared, summary, words
@@ -38,7 +35,10 @@ from idm_env.effects import (
     named,
     register,
 )  # fmt: skip
-from idm_env.progress import OnProgress, silent
+from idm_env.jobs import storage
+from idm_env.jobs.progress import OnProgress, silent
+from idm_env.model_file import Model as SavedModel
+from idm_env.validation import nearest
 
 
 @dataclass(eq=False)
@@ -95,7 +95,7 @@ def discover(
         place: Column with the coordinate of places, if not that of ``trajectories``; a lap's wraps are noticed.
         out: Folder in which an interrupted search keeps what is done, or None.
         resume: Go on from there.
-        on_progress: Called with phase, done, total and the candidate; see ``idm_env.progress``.
+        on_progress: Called with phase, done, total and the candidate; see ``idm_env.jobs.progress``.
         seed: Of the draw of the lockbox and of sign flips.
         located: Whether effects without a name are looked for too.
         lockbox: Share of the runs that neither fit nor choose.
@@ -118,8 +118,8 @@ def discover(
     fit_runs, kept_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
     options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
-    mark = keep.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
-    saved = keep.Store(None if out is None else out / keep.UNFINISHED / "explain", mark, resume)
+    mark = storage.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
+    saved = storage.Store(None if out is None else out / storage.UNFINISHED / "explain", mark, resume)
     task = Task(rows, search.first_noise(rows), calibrate.first_prior(law))
     told = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from idm_env import delay_buffer
 from idm_env import effects as known
-from idm_env import history
 from idm_env.discovery import march_loops
 from idm_env.discovery.slots import SETS, TARGETS, Push
 from idm_env.discovery.slots import Slot as Changed
@@ -212,7 +212,7 @@ def pulsed(catalogue: Catalogue, pulse: np.ndarray, on: np.ndarray, phi: np.ndar
 def back_steps(effects: Sequence[Effect], dt: float) -> int:
     """Return how many steps of the past some effects look back."""
     seconds = max((e.looks_back for e in effects), default=0.0)
-    return history.slots(seconds, dt) + 1 if seconds else 0
+    return delay_buffer.slots(seconds, dt) + 1 if seconds else 0
 
 
 def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from idm_env import report as pages
 from idm_env.discovery import pictures, words
 from idm_env.discovery.decide import LEAST_GAIN, LEAST_SHARE
 from idm_env.discovery.discover import Discovery
@@ -13,7 +12,8 @@ from idm_env.discovery.score import ALPHA, FREE_SHARE
 from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
 from idm_env.discovery.verdict import HOLDS, Verdict
 from idm_env.discovery.words import percent as change
-from idm_env.report import Block
+from idm_env.reports import page as pages
+from idm_env.reports.page import Block
 
 TITLES = {
     Verdict.NAMED: "What IDM lacks here has a name",

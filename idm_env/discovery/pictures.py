@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from idm_env.discovery import march as twin
 from idm_env.discovery import words
-from idm_env.report import Block, picture
+from idm_env.reports.page import Block, picture
 
 if TYPE_CHECKING:
     from idm_env.discovery.decide import Round

@@ -20,8 +20,8 @@ from idm_env.discovery.solve import Linear, Solution, Task, finish, linearise, p
 from idm_env.discovery.units import Units, units
 from idm_env.effects import Effect
 from idm_env.effects.base import Sought
-from idm_env.keep import Store
-from idm_env.progress import OnProgress
+from idm_env.jobs.progress import OnProgress
+from idm_env.jobs.storage import Store
 
 FAINT = 0.002
 """Share of the squared error, at best on the very data, below which a candidate is fitted in one step only."""

@@ -10,14 +10,14 @@ from typing import Any
 
 import polars as pl
 
-from idm_env import keep
-from idm_env import report as page
 from idm_env.data import load
 from idm_env.discovery.discover import discover
 from idm_env.discovery.write import OUTPUT, write_report
-from idm_env.executor import Executor, Serial
-from idm_env.parts import Parts
-from idm_env.progress import OnProgress, silent
+from idm_env.jobs import storage
+from idm_env.jobs.executor import Executor, Serial
+from idm_env.jobs.progress import OnProgress, silent
+from idm_env.jobs.shards import Parts
+from idm_env.reports import page
 
 SETS = ("sets.csv", "report.html")
 """What ``explain_sets`` writes beside the folders of the sets."""
@@ -45,7 +45,7 @@ def explain(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Explain one file, write the results, and return the report and the names of the models compared."""
     progress = on_progress or silent
-    with keep.results(out, OUTPUT, [path]):
+    with storage.results(out, OUTPUT, [path]):
         progress("reading", 0, 0, path.name)
         trajectories = load(
             path,
@@ -96,9 +96,9 @@ def explain_sets(
     """
     progress, out = on_progress or silent, out.absolute()
     names = _names(paths)
-    with keep.results(out, SETS, paths):
+    with storage.results(out, SETS, paths):
         stamps = [(p, p.stat().st_size, p.stat().st_mtime_ns) if p.exists() else p for p in paths]
-        parts = Parts(out / keep.UNFINISHED / "sets", keep.fingerprint(question, stamps), resume)
+        parts = Parts(out / storage.UNFINISHED / "sets", storage.fingerprint(question, stamps), resume)
         sets = [
             _Set(n, path.absolute(), out / name, question, parts, resume)
             for n, (path, name) in enumerate(zip(paths, names, strict=True)) if not parts.done(n)
@@ -108,7 +108,7 @@ def explain_sets(
             done += 1
             progress("sets", done, len(paths), "")
         rows = parts.summaries()
-        keep.write_csv(out / "sets.csv", pl.DataFrame(rows, infer_schema_length=None).select(COLUMNS))
+        storage.write_csv(out / "sets.csv", pl.DataFrame(rows, infer_schema_length=None).select(COLUMNS))
         page.write_page(out / "report.html", f"{len(rows)} data sets", _page(rows))
         parts.remove()
     return rows

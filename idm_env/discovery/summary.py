@@ -21,7 +21,7 @@ from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves, mean_ratio
 from idm_env.effects import ALL
-from idm_env.report import versions
+from idm_env.reports.page import versions
 
 SCHEMA = 3
 

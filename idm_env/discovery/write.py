@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from idm_env.config import save_model
 from idm_env.discovery.discover import Discovery
-from idm_env.keep import results
-from idm_env.report import write_json, write_page
+from idm_env.jobs.storage import results, write_json
+from idm_env.model_file import save_model
+from idm_env.reports.page import write_page
 
 OUTPUT = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
 """Every file that a discovery may write."""

@@ -21,8 +21,8 @@ from scipy.stats import t as student
 from idm_env.drift import filter_loops as loops
 from idm_env.drift.linear import Drivers, Path
 from idm_env.fitting.batch import Batch
+from idm_env.jobs.progress import OnProgress, silent
 from idm_env.parameters import catalogue
-from idm_env.progress import OnProgress, silent
 from idm_env.simulator import Simulator
 
 JITTER = (0.005, 2.0)

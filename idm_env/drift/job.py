@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from idm_env import keep
-from idm_env import report as page
-from idm_env.config import Model, Numbers, nested, save_model
 from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import fitted_on
 from idm_env.drift.estimate import Estimate
 from idm_env.drift.kinds import Told, tell
 from idm_env.effects import DRIFTS, Replay
 from idm_env.fitting.options import Source
-from idm_env.progress import OnProgress, silent
+from idm_env.jobs import storage
+from idm_env.jobs.progress import OnProgress, silent
+from idm_env.model_file import Model, Numbers, nested, save_model
+from idm_env.reports import page
 
 WRITTEN = ("model.yaml", "report.json")
 
@@ -38,7 +38,7 @@ def drift_file(
 
     ``drivers`` are taken at most, evenly spread over the file. DataError and ValueError for what cannot be read.
     """
-    with keep.results(out, WRITTEN, (source.path,)):
+    with storage.results(out, WRITTEN, (source.path,)):
         progress = on_progress or silent
         progress("reading", 0, 0, source.path.name)
         trajectories = source.trajectories()
@@ -63,7 +63,7 @@ def drift_file(
             },
             "versions": page.versions(),
         }  # fmt: skip
-        page.write_json(out / "report.json", result)
+        storage.write_json(out / "report.json", result)
         return result
 
 

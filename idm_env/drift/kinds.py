@@ -10,8 +10,8 @@ from idm_env.drift.estimate import Estimate, estimate, usual
 from idm_env.effects import DRIFTS, IDM, Brakes, Effect, Replay
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.problem import IDM_NAMES
+from idm_env.jobs.progress import OnProgress, silent
 from idm_env.parameters import catalogue
-from idm_env.progress import OnProgress, silent
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 

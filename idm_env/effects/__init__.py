@@ -9,7 +9,6 @@ import sys
 from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from idm_env.checks import nearest, shown
 from idm_env.effects.actions import Control, Replay
 from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
 from idm_env.effects.base import CarFollowing, Effect
@@ -25,6 +24,7 @@ from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
 from idm_env.effects.registry import entered, imported, is_candidate, lives, read
 from idm_env.effects.surroundings import Drag, Grade
 from idm_env.effects.time_gaps import Relaxation, SetPointAsymmetry, SpeedTimeGap
+from idm_env.validation import nearest, shown
 
 ALL: dict[str, type[Effect]] = {
     effect.kind: effect

@@ -8,8 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from idm_env import modules
 from idm_env.effects.base import CarFollowing, Effect
+from idm_env.jobs import import_file
 
 
 def same_class(a: type[Effect], b: type[Effect]) -> bool:
@@ -107,7 +107,7 @@ def _file(effect: type[Effect]) -> str:
 def _module_of(path: Path) -> ModuleType:
     """Run a file once per process and text, and return it as a module."""
     full = path.resolve()
-    return modules.run(full, _name_of(full))
+    return import_file.run(full, _name_of(full))
 
 
 def _name_of(path: Path) -> str:

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.checks import whole
 from idm_env.envs.beginnings import Beginnings
 from idm_env.envs.given import checked
 from idm_env.envs.moves import Moves
@@ -26,6 +25,7 @@ from idm_env.roads import Lanes
 from idm_env.scalar.record import Untraceable
 from idm_env.tasks import Draw, World
 from idm_env.types import Params, State, mapped
+from idm_env.validation import whole
 
 if TYPE_CHECKING:
     from idm_env.envs.values import Values

@@ -13,13 +13,13 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from idm_env import compat
-from idm_env.checks import whole
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.tasks import Task
 from idm_env.types import Params, State, mapped
+from idm_env.validation import whole
 
 if TYPE_CHECKING:
     from idm_env.envs.window import Unrolled
@@ -182,7 +182,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
         if self.render_mode is None:
             gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array' to make.")
             return None
-        from idm_env.render import Viewer
+        from idm_env.envs.render import Viewer
 
         if self._viewer is None:
             self._viewer = Viewer(self.render_mode, self.metadata["render_fps"])

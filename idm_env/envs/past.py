@@ -7,7 +7,7 @@ import math
 import numpy as np
 from torch import Tensor
 
-from idm_env.history import PAST
+from idm_env.delay_buffer import PAST
 from idm_env.kernels.lanes import past_rows, past_tensor
 from idm_env.types import State
 

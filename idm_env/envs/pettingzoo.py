@@ -18,11 +18,11 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from idm_env.checks import shown
 from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.info import ids
 from idm_env.envs.settings import RENDER_MODES, settings
 from idm_env.envs.spaces import action_space, continuous, numpy_dtype, observation_box
+from idm_env.validation import shown
 
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 
@@ -163,7 +163,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         if self.render_mode is None:
             gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array'.")
             return None
-        from idm_env.render import Viewer
+        from idm_env.envs.render import Viewer
 
         if self._viewer is None:
             self._viewer = Viewer(self.render_mode, round(1.0 / self.task.simulator.dt))

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
-from idm_env.history import PAST
 from idm_env.kernels import threads as pool
 from idm_env.kernels import tiles
 from idm_env.kernels.lanes import part_of, static_of

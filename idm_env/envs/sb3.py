@@ -9,9 +9,9 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from idm_env.checks import shown
 from idm_env.envs.info import row
 from idm_env.extras import needed
+from idm_env.validation import shown
 
 with needed("SB3VecEnv"):
     from stable_baselines3.common.vec_env import VecEnv

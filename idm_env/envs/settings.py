@@ -11,10 +11,10 @@ from typing import Any, Literal, cast
 import torch
 from gymnasium.vector import AutoresetMode
 
-from idm_env import trust
-from idm_env.checks import nearest, one_of, shown
-from idm_env.config import load_environment
+from idm_env.jobs import trust
+from idm_env.model_file import load_environment
 from idm_env.tasks import KeywordError, Task, task_with
+from idm_env.validation import nearest, one_of, shown
 
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}

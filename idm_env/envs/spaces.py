@@ -11,9 +11,9 @@ import torch
 from gymnasium.spaces import Box, MultiDiscrete, Space
 from torch import Tensor
 
-from idm_env.checks import shown
 from idm_env.envs.settings import Settings
 from idm_env.tasks import Task
+from idm_env.validation import shown
 
 
 def numpy_dtype(dtype: torch.dtype) -> type[np.floating]:

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.delay_buffer import PAST
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import Past
 from idm_env.envs.plan import Array, Bound, Layout, Moment, Plan, named, world_of
-from idm_env.history import PAST
 from idm_env.kernels.lanes import past_tensor
 from idm_env.scalar.record import Untraceable
 from idm_env.tasks import World

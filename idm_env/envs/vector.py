@@ -13,12 +13,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from idm_env.checks import shown, whole
 from idm_env.envs.batch import Batch, Outcome
 from idm_env.envs.gym import Face
 from idm_env.envs.info import Rows
 from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
+from idm_env.validation import shown, whole
 
 
 class DiffIDMVectorEnv(Face, VectorEnv):
@@ -189,7 +189,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         if self.render_mode is None:
             gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array' to make_vec.")
             return None
-        from idm_env.render import Viewer
+        from idm_env.envs.render import Viewer
 
         shown = self.num_envs if self.render_mode == "rgb_array" else 1
         while len(self._viewers) < shown:

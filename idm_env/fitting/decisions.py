@@ -11,8 +11,8 @@ import polars as pl
 import torch
 from torch import Tensor
 
-from idm_env.changes import beside
 from idm_env.data import DataError, Repair, Trajectories
+from idm_env.multilane.incentives import beside
 from idm_env.roads import End, Lanes
 from idm_env.roads.linked import Linked
 from idm_env.simulator import Simulator

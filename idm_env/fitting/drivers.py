@@ -12,10 +12,10 @@ import polars as pl
 import torch
 from torch import Tensor
 
-from idm_env import report as page
 from idm_env.fitting.evaluate import Errors
 from idm_env.fitting.fit import Fit
 from idm_env.parameters import Parameter, catalogue
+from idm_env.reports import page
 from idm_env.simulator import Simulator
 
 MOST_ROWS = 1000

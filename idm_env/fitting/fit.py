@@ -12,7 +12,6 @@ import torch
 from scipy.stats import qmc
 from torch import Tensor
 
-from idm_env import keep
 from idm_env.data import Episode
 from idm_env.effects import IDM, Brakes, CarFollowing, Replay
 from idm_env.fitting.adam import adam
@@ -21,7 +20,8 @@ from idm_env.fitting.prior import Prior
 from idm_env.fitting.problem import Loss, Objective, Problem, group_of
 from idm_env.fitting.solver import Normal, Progress, minimise, normal
 from idm_env.fitting.uncertainty import Uncertainty, uncertainty
-from idm_env.progress import OnProgress
+from idm_env.jobs import storage
+from idm_env.jobs.progress import OnProgress
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
@@ -87,7 +87,7 @@ def own_names(simulator: Simulator) -> tuple[str, ...]:
 def fingerprint(problem: Problem, *options: object) -> str:
     """Return a digest of everything that determines a fit."""
     prior = problem.prior
-    return keep.fingerprint(
+    return storage.fingerprint(
         (problem.simulator, problem.own, problem.shared, problem.groups, options),
         (problem.objective, problem.relative, problem.loss, problem.skip, sorted(problem.fixed.items())),
         *(() if prior is None else (prior.centre, prior.deviation, prior.noise)),
@@ -143,7 +143,7 @@ def fit(
         simulator, batch, own_names(simulator) if free is None else tuple(free), tuple(shared), group, names,
         objective=objective, relative=relative, loss=loss, skip=skip, fixed=dict(fixed or {}), prior=prior,
     )  # fmt: skip
-    saved = keep.Store(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)
+    saved = storage.Store(checkpoint, fingerprint(problem, method, starts, iterations, seed), resume)
     begin = start or (_defaults(problem, problem.own).expand(len(names), -1), _defaults(problem, problem.shared))
     if method == "adam":
         own, common, converged, count = _adam(problem, *begin, saved, on_progress)
@@ -169,7 +169,7 @@ def _defaults(problem: Problem, names: Sequence[str]) -> Tensor:
 
 
 def _adam(
-    problem: Problem, own: Tensor, shared: Tensor, saved: keep.Store, on_progress: OnProgress | None
+    problem: Problem, own: Tensor, shared: Tensor, saved: storage.Store, on_progress: OnProgress | None
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     steps = 500
 
@@ -187,7 +187,7 @@ def _adam(
 
 
 def _levenberg(
-    problem: Problem, begin: tuple[Tensor, Tensor], starts: int, iterations: int, seed: int, saved: keep.Store,
+    problem: Problem, begin: tuple[Tensor, Tensor], starts: int, iterations: int, seed: int, saved: storage.Store,
     on_progress: OnProgress | None,
 ) -> tuple[Tensor, Tensor, Tensor, int]:  # fmt: skip
     own, shared = begin
@@ -217,7 +217,7 @@ def _spread(problem: Problem, own: Tensor, starts: int, seed: int) -> Tensor:
 
 
 def _phase(
-    name: str, problem: Problem, own: Tensor, shared: Tensor, iterations: int, saved: keep.Store,
+    name: str, problem: Problem, own: Tensor, shared: Tensor, iterations: int, saved: storage.Store,
     on_progress: OnProgress | None,
 ) -> tuple[Progress, Normal]:  # fmt: skip
     found = saved.get(name)

@@ -10,15 +10,11 @@ from typing import Any, NamedTuple
 import polars as pl
 import torch
 
-from idm_env import keep
-from idm_env import report as page
-from idm_env.config import Model, load_model, nested, save_model
 from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories
 from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import marks, seen
 from idm_env.data.folder import Share, shares, stamp
 from idm_env.effects import Brakes, base_named
-from idm_env.executor import Executor, Serial
 from idm_env.fitting import drivers, pictures, pieces
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.drivers import Estimates
@@ -26,8 +22,12 @@ from idm_env.fitting.evaluate import Errors, errors
 from idm_env.fitting.options import Options, Source, behind_records
 from idm_env.fitting.pieces import Joined, Piece
 from idm_env.fitting.problem import Problem, Simulated, group_of
-from idm_env.parts import Parts
-from idm_env.progress import OnProgress, silent
+from idm_env.jobs import storage
+from idm_env.jobs.executor import Executor, Serial
+from idm_env.jobs.progress import OnProgress, silent
+from idm_env.jobs.shards import Parts
+from idm_env.model_file import Model, load_model, nested, save_model
+from idm_env.reports import page
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
@@ -62,7 +62,7 @@ def fit_file(
     fitted; PartsError names parts that failed for another reason, and keeps the others for ``resume``.
     """
     work = _Work(source, options, out.absolute(), resume, part, executor or Serial(), on_progress or silent)
-    with keep.results(out, FITTED, (source.path, options.model)):
+    with storage.results(out, FITTED, (source.path, options.model)):
         return _fit_folder(work) if source.path.is_dir() else _fit_file(work)
 
 
@@ -81,8 +81,8 @@ class _Work(NamedTuple):
         """Return the parts of a fit and where they are kept; one that is alone is kept step by step."""
         inputs = stamp(self.source.path), self.options.model and Path(self.options.model)
         asked = dataclasses.replace(self.source, path=Path()), self.options, by, self.part
-        kept = self.out / keep.UNFINISHED
-        parts = Parts(kept / f"{name}-parts", keep.fingerprint(asked, *inputs), self.resume)
+        kept = self.out / storage.UNFINISHED
+        parts = Parts(kept / f"{name}-parts", storage.fingerprint(asked, *inputs), self.resume)
         alone = kept / name if len(data) == 1 else None
         return tuple(
             Piece(n, len(data), one, self.source, self.options, by, parts, alone, self.resume)
@@ -174,7 +174,7 @@ def _write(
     if len(estimates.groups) <= MOST_DRIVERS:
         model = dataclasses.replace(model, fitted_on={"source": data["source"], "tracks": sorted(set(tracks))})
     save_model(out / "model.yaml", model)
-    page.write_json(out / "report.json", result)
+    storage.write_json(out / "report.json", result)
     title = f"{estimates.simulator.base.title} fitted to {data['source']}"
     page.write_page(out / "report.html", title, _fit_page(result, found, table))
     found.parts.remove()
@@ -315,7 +315,7 @@ def simulate_file(
     """
     if (model_path is None) == (base is None):
         raise ValueError("simulate takes either a model (--model) or a car-following law (--base). Give one of them.")
-    with keep.results(out, SIMULATED, (source.path, model_path)):
+    with storage.results(out, SIMULATED, (source.path, model_path)):
         model = load_model(model_path) if model_path else Model((base_named(base or ""), Brakes()))
         return _simulate_file(source, model, str(model_path or base), out, seed, on_progress or silent)
 
@@ -332,7 +332,7 @@ def _simulate_file(
         error, simulated = errors(problem, values, torch.zeros(0, dtype=values.dtype))
     progress("writing", 0, 0, "the report")
     tables = [_simulated_table(problem, simulated, row) for row in range(len(items))]
-    keep.write(out / "simulated.parquet", pl.concat(tables).write_parquet)
+    storage.write(out / "simulated.parquet", pl.concat(tables).write_parquet)
     result: dict[str, Any] = {
         "schema": 1,
         "command": page.command_line(),
@@ -349,7 +349,7 @@ def _simulate_file(
         "seed": seed,
         "versions": page.versions(),
     }
-    page.write_json(out / "report.json", result)
+    storage.write_json(out / "report.json", result)
     blocks = [
         page.lead(
             f"{len(items)} episodes simulated behind their measured leaders: mean gap RMSE "

@@ -9,9 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from idm_env import keep
-from idm_env import report as page
-from idm_env.config import Model, load_model, save_model
 from idm_env.data import DataError, Trajectories
 from idm_env.data.errors import by_kind
 from idm_env.effects import IDM, Brakes, Mobil, base_named
@@ -29,7 +26,10 @@ from idm_env.fitting.choices import (
 )
 from idm_env.fitting.decisions import Decisions, recorded_decisions
 from idm_env.fitting.options import Source
-from idm_env.progress import OnProgress, silent
+from idm_env.jobs import storage
+from idm_env.jobs.progress import OnProgress, silent
+from idm_env.model_file import Model, load_model, save_model
+from idm_env.reports import page
 from idm_env.roads import Lanes
 from idm_env.types import Command, Params, Record
 
@@ -166,14 +166,14 @@ def fit_lane_changes(
 ) -> dict[str, Any]:
     """Fit the lane changes of a file and return the report; write it, and ``model.yaml``."""
     progress = on_progress or silent
-    with keep.results(out, WRITTEN, (source.path, options.model)):
+    with storage.results(out, WRITTEN, (source.path, options.model)):
         progress("reading", 0, 0, source.path.name)
         trajectories = source.trajectories()
         found = lane_changes(trajectories, options, progress)
         progress("writing", 0, 0, "the report")
         result = _result(found, trajectories, options)
         save_model(out / "model.yaml", found.model)
-        page.write_json(out / "report.json", result)
+        storage.write_json(out / "report.json", result)
         page.write_page(out / "report.html", f"Lane changes of {trajectories.source}", _page(found, result))
         return result
 

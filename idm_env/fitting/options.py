@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from idm_env.config import Model, load_model
 from idm_env.data import LEADER_LOST_GAP_M, Episodes, Trajectories, episodes, load
 from idm_env.data.episode import windows
 from idm_env.data.folder import Share
@@ -14,6 +13,7 @@ from idm_env.data.names import Columns
 from idm_env.effects import Effect, Replay, base_named
 from idm_env.fitting.fit import Method, base_simulator
 from idm_env.fitting.problem import Loss, Objective
+from idm_env.model_file import Model, load_model
 from idm_env.roads import Lane
 from idm_env.simulator import Integration, Simulator
 from idm_env.types import Command, Record

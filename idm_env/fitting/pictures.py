@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from idm_env import diagrams
-from idm_env import report as page
 from idm_env.data import Episode
 from idm_env.fitting.drivers import Estimates
 from idm_env.fitting.evaluate import Errors
 from idm_env.fitting.problem import Problem, Simulated
+from idm_env.reports import diagrams, page
 
 MEASURED, SIMULATED = "#20242c", "#d1495b"
 

@@ -14,19 +14,19 @@ from typing import Any
 import polars as pl
 import torch
 
-from idm_env import report as page
 from idm_env.data import DataError, Episode, Repair, Trajectories
 from idm_env.data.errors import Counted, by_kind
 from idm_env.data.fingerprint import marks
 from idm_env.data.folder import Share
-from idm_env.executor import Executor
 from idm_env.fitting import drivers, pictures
 from idm_env.fitting.evaluate import Errors, errors
 from idm_env.fitting.fit import fit
 from idm_env.fitting.options import Options, Source
 from idm_env.fitting.problem import group_of
-from idm_env.parts import Parts
-from idm_env.progress import OnProgress
+from idm_env.jobs.executor import Executor
+from idm_env.jobs.progress import OnProgress
+from idm_env.jobs.shards import Parts
+from idm_env.reports import page
 
 PART = 2000
 """Drivers of a part, about."""

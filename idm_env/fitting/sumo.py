@@ -8,9 +8,9 @@ from xml.sax.saxutils import quoteattr
 
 import torch
 
-from idm_env.config import Model
 from idm_env.effects import IDM
-from idm_env.keep import write_text
+from idm_env.jobs.storage import write_text
+from idm_env.model_file import Model
 
 _MARK = "<!-- Written by idm-env fit. -->"
 ATTRIBUTES = {

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.changes import seen_merging
-from idm_env.decisions import decided
 from idm_env.kernels import decision_loops, lanes, order_loops
 from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import dense, operand
 from idm_env.kernels.printed import HEADER, printed
 from idm_env.kernels.tiles import ROW, Array
-from idm_env.population import turnover
+from idm_env.multilane.demand import turnover
+from idm_env.multilane.incentives import seen_merging
+from idm_env.multilane.lane_change import decided
 from idm_env.roads import Lanes
 from idm_env.roads.chains import Places
 from idm_env.roads.linked import Linked

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from idm_env.checks import nearest
 from idm_env.kernels import descent_loops, tiles
 from idm_env.kernels.lanes import part_of, starts, static_of
 from idm_env.kernels.memory import addresses
@@ -20,6 +19,7 @@ from idm_env.kernels.tiles import Array
 from idm_env.scalar.record import Form, slot_name
 from idm_env.simulator import Simulator
 from idm_env.types import Inputs, Params, State
+from idm_env.validation import nearest
 
 Bounds = Mapping[str, tuple[float, float]]
 """Lowest and highest value by full name (``idm.time_gap``, ``imagined.gap``); what is not named stays as it is."""

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from idm_env import compat
-from idm_env.history import PAST
-from idm_env.instead import off, switched_off
+from idm_env.backends import off, switched_off
+from idm_env.delay_buffer import PAST
 from idm_env.kernels import available
 from idm_env.roads import Lanes
 from idm_env.scalar.record import Form

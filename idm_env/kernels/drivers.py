@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from idm_env.delay_buffer import PAST
 from idm_env.effects.base import Effect
-from idm_env.history import PAST
 from idm_env.kernels import driver_loops as loops
 from idm_env.kernels import threads as pool
 from idm_env.kernels.printed import HEADER

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.history import PAST
-from idm_env.instead import off
+from idm_env.backends import off
+from idm_env.delay_buffer import PAST
 from idm_env.kernels import lane_adjoint, lane_loops, tiles
 from idm_env.kernels import threads as pool
 from idm_env.kernels.memory import addresses

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.delay_buffer import PAST
 from idm_env.effects.base import Remembering
-from idm_env.history import PAST
 from idm_env.kernels import lanes, tiles
 from idm_env.kernels.deciding import Traffic, decision
 from idm_env.kernels.printed import TileKernel, tile_kernel

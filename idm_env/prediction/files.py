@@ -10,19 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
-from idm_env import keep
-from idm_env import report as page
 from idm_env.data import DataError
 from idm_env.data.scenario import Scenario
 from idm_env.data.womd import count, scenarios
-from idm_env.executor import Executor, Serial
-from idm_env.parts import Parts
+from idm_env.jobs import storage
+from idm_env.jobs.executor import Executor, Serial
+from idm_env.jobs.progress import OnProgress, silent
+from idm_env.jobs.shards import Parts
 from idm_env.prediction import report as written
 from idm_env.prediction.metrics import Case, Score, intervals, score, shape_of, summary
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import METHODS, Prediction, available
 from idm_env.prediction.scene import Scene
-from idm_env.progress import OnProgress, silent
+from idm_env.reports import page
 
 OURS = "drivers on routes"
 OUTPUT = ("predictions.parquet", "parameters.parquet", "report.json", "report.html")
@@ -61,14 +61,14 @@ def predict_files(
         DataError: If no file holds a scenario that can be used, or ``resume`` finds a run on other files or settings.
     """
     files = [Path(path) for path in paths]
-    with keep.results(out, OUTPUT, files) as folder:
+    with storage.results(out, OUTPUT, files) as folder:
         return _predict_files(files, folder.absolute(), baselines, resume, executor or Serial(), on_progress or silent)
 
 
 def _predict_files(
     files: Sequence[Path], out: Path, baselines: bool, resume: bool, executor: Executor, progress: OnProgress
 ) -> dict[str, Any]:
-    parts = Parts(out / keep.UNFINISHED / "predict", _fingerprint(files, baselines), resume)
+    parts = Parts(out / storage.UNFINISHED / "predict", _fingerprint(files, baselines), resume)
     progress("counting", 0, 0, "scenarios")
     counts = [count(path) for path in files]
     names = tuple(name for name in available() if baselines or name == OURS)
@@ -127,7 +127,7 @@ def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
     stats = [
         (path.name, path.stat().st_size, path.stat().st_mtime_ns) if path.exists() else path.name for path in files
     ]
-    return keep.fingerprint(stats, baselines)
+    return storage.fingerprint(stats, baselines)
 
 
 def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scenario: Callable[[int], None]) -> None:

@@ -6,15 +6,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from idm_env import report as page
+from idm_env.jobs import storage
 from idm_env.prediction.metrics import ENOUGH_SCENES, HORIZONS
+from idm_env.reports import page
 
 WHAT = (("minADE", "minADE (m)"), ("minFDE", "minFDE (m)"), ("miss_rate", "miss rate"), ("mAP", "mAP"))
 
 
 def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> None:
     """Write ``report.json`` and ``report.html``."""
-    page.write_json(out / "report.json", report)
+    storage.write_json(out / "report.json", report)
     left_out = report["left_out"]
     scored = f"{report['agents_with_known_future']} of them have a known future and are scored, at 2 Hz."
     blocks = [

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
-from idm_env import modules
+from idm_env.jobs import import_file
 
 Loaded = TypeVar("Loaded")
 _log = logging.getLogger("idm_env")
@@ -145,4 +145,4 @@ def load(name: str, text: str) -> ModuleType:
             _log.warning("%s is damaged (not what was printed): written again.", path)
         if not same:
             _write(path, content)
-    return modules.run(path, module_name, text)
+    return import_file.run(path, module_name, text)

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from idm_env import history
+from idm_env import delay_buffer
 from idm_env.roads.base import Road
 from idm_env.roads.chains import Chains
 from idm_env.roads.ends import Ending
@@ -43,7 +43,7 @@ class Form:
             fields = {"": value} if isinstance(value, Tensor) else value._asdict()
             given = {name: x for name, x in fields.items() if x is not None}
             found.append((effect, tuple(given), tuple(x.dtype == torch.bool for x in given.values())))
-        memories = tuple(sorted(name for name in state.memory if name != history.PAST))
+        memories = tuple(sorted(name for name in state.memory if name != delay_buffer.PAST))
         return cls(tuple(found), memories, state.present is not None)
 
     @property
@@ -145,7 +145,7 @@ class _Past:
 
     def __init__(self, recording: Recording, seconds: float, dt: float) -> None:
         self._recording = recording
-        self._slots, self._dt = TimeStep(history.slots(seconds, dt)), dt
+        self._slots, self._dt = TimeStep(delay_buffer.slots(seconds, dt)), dt
 
     def at(self, scene: Scene, seconds: Any) -> Scene:
         graph = self._recording.graph
@@ -154,13 +154,13 @@ class _Past:
         share = (steps - whole).node
         newer, older = whole.node, graph.add(whole.node, graph.constant(1.0))
         values = []
-        for i, _ in enumerate(history.signals(scene)):
+        for i, _ in enumerate(delay_buffer.signals(scene)):
             a, b = graph.node("past", newer, label=i, level=2), graph.node("past", older, label=i, level=2)
             values.append(Scalar(graph, graph.add(a, graph.mul(share, graph.sub(b, a)))))
-        return history.seeing(scene, values)  # type: ignore[arg-type]
+        return delay_buffer.seeing(scene, values)  # type: ignore[arg-type]
 
     def pushed(self, scene: Scene) -> Any:
-        self._recording.sense = [x.node for x in history.signals(scene)]  # type: ignore[attr-defined]
+        self._recording.sense = [x.node for x in delay_buffer.signals(scene)]  # type: ignore[attr-defined]
         return scene.speed
 
 

@@ -6,8 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from idm_env import trust
-from idm_env.checks import nearest, shown
+from idm_env.jobs import trust
 from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.follow import FollowTask
@@ -18,6 +17,7 @@ from idm_env.tasks.random import Draw
 from idm_env.tasks.replay import ReplayTask
 from idm_env.tasks.replay_lanes import ReplayLanesTask
 from idm_env.tasks.ring import RingTask
+from idm_env.validation import nearest, shown
 
 TASKS: dict[str, type[Task]] = {
     task.name: task

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.checks import one_of, shown
 from idm_env.effects import Control, Effect, Noise
 from idm_env.roads import Road
 from idm_env.simulator import Simulator, stacked
@@ -29,6 +28,7 @@ from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.nouns import Advance, Bounds, Ended, Features, Pay, World
 from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params, State
+from idm_env.validation import one_of, shown
 
 _NORMALS_AT_ONCE = 1 << 16
 _MOST_STEPS = 1_000_000_000

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from idm_env import parameters
-from idm_env.config import Model, load_model, make_effects, nested, number
 from idm_env.effects import CarFollowing, Effect
+from idm_env.model_file import Model, load_model, make_effects, nested, number
 from idm_env.simulator import Integration
 
 

@@ -7,8 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from idm_env.checks import at_least, finite, shown, whole
-from idm_env.config import nested
+from idm_env.model_file import nested
+from idm_env.validation import at_least, finite, shown, whole
 
 __all__ = ["KeywordError", "Range", "agents_of", "at_least", "in_ranges", "limits_of", "ranges", "span", "whole"]
 

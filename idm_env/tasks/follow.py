@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
@@ -22,6 +21,7 @@ from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import Leaders, head, made_up_leader, queue, recorded_leaders, starts
 from idm_env.types import Inputs, Params
+from idm_env.validation import one_of
 
 HORIZON = 1000
 SEEN = Features(("speed", "lead_speed", "gap"), (40.0, 40.0, 100.0), (0.0, 0.0, -10.0), (100.0, 100.0, 1000.0))

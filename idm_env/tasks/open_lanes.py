@@ -12,8 +12,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env import population
 from idm_env.effects import IDM, Brakes, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
+from idm_env.multilane import demand
 from idm_env.roads import Lanes, lane_drop, on_ramp
 from idm_env.tasks.base import World
 from idm_env.tasks.checks import Range, at_least
@@ -32,7 +32,7 @@ class OpenLanesTask(LanesTask):
     """Trips begin evenly in time, lane by lane, and slots make them again and again, so that an episode has no end.
 
     An episode begins with free traffic up to ``filled``, where lanes are still all there; the first slots are in front.
-    Whoever finds no room at his entry waits and is counted (``idm_env.population.counts``). Agents act as ``LanesTask``
+    Whoever finds no room at his entry waits and is counted (``multilane.demand.counts``). Agents act as ``LanesTask``
     says; while an agent's vehicle waits or has left, it stands still, its observation and infos are zeros, and its
     command does and costs nothing: its reward is what the traffic earns.
 
@@ -87,7 +87,7 @@ class OpenLanesTask(LanesTask):
         """Return trips, of which the first ones began before the episode did; each up to a quarter aside in time."""
         flows, total = self.inflows, sum(self.inflows.values())
         counts = {k: max(1, round(self.vehicles * flow / total)) for k, flow in flows.items()}
-        departs, again, lane = population.evenly(flows, counts, first=0)
+        departs, again, lane = demand.evenly(flows, counts, first=0)
         by_time = sorted(range(len(departs)), key=lambda i: departs[i])[: self.vehicles]
         while len(by_time) < self.vehicles:  # shares that are rounded down leave a slot to spare: it never drives
             by_time.append(-1)
@@ -132,14 +132,14 @@ class OpenLanesTask(LanesTask):
 
     def told(self, world: World) -> dict[str, Tensor]:
         """As in ``LanesTask``, and how many wait at the entries: a queue that grows is an inflow beyond capacity."""
-        queued = population.counts(self.simulator, world.state).queued
+        queued = demand.counts(self.simulator, world.state).queued
         return {**super().told(world), "queued": queued.unsqueeze(-1).expand(-1, len(self.agents)).contiguous()}
 
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``V/40 − 0.1 (u/u_max)²``."""
         state = after.state
         assert state.present is not None
-        found = population.counts(self.simulator, state)
+        found = demand.counts(self.simulator, state)
         pace = (state.speed.clamp_max(FASTEST) * state.present).sum(-1) / (found.inside + found.queued).clamp_min(1)
         hardest = max(abs(limit) for limit in self.command_limits)
         return pace.unsqueeze(-1) / FASTEST - 0.1 * (command / hardest).square().clamp_max(1.0)

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.checks import nearest, one_of, shown
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Ended, Features, Pay, Task, World
@@ -23,6 +22,7 @@ from idm_env.tasks.nouns import NOBODY
 from idm_env.tasks.random import Draw
 from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene
 from idm_env.types import Inputs, Params, Record
+from idm_env.validation import nearest, one_of, shown
 
 HORIZON = 300
 REWARDS = ("imitation", "follow")

@@ -10,7 +10,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Control, Effect, LaneCommand, Mobil, Replay
 from idm_env.roads import End, Lanes
 from idm_env.tasks.base import Features, World
@@ -19,6 +18,7 @@ from idm_env.tasks.lane_scenes import LanesScene, made_up_lanes, recorded_lanes
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.replay import ReplayTask
 from idm_env.types import Inputs, State
+from idm_env.validation import one_of
 
 LANE_CHANGES = ("recorded", "drivers")
 FIRST_LANES = ("left", "right")

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.checks import one_of
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Ring, Road
 from idm_env.tasks.base import Features, Pay, Task, World
@@ -20,6 +19,7 @@ from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params
+from idm_env.validation import one_of
 
 STARTS = ("uniform", "wave")
 SCALES = (5.0, 1.0, 10.0)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import polars as pl
 
-from idm_env.parts import Parts
+from idm_env.jobs.shards import Parts
 from idm_env.trajectories import baselines, paper
 from idm_env.trajectories.drivers import parameter_rows
 from idm_env.trajectories.recipe import Filtered, clock_of, nearest, overlaps, recipe

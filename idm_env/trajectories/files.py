@@ -1,7 +1,7 @@
 """Whole files: filtering and reconstruction chunk by chunk, resumable, with tidy output and a report.
 
 Memory holds one chunk of tracks: the file is spooled to disk by vehicles (``spool.py``), every finished chunk is a part
-on disk (``parts.py``), and the parts are joined at the end without being read as a whole.
+on disk (``jobs/shards.py``), and the parts are joined at the end without being read as a whole.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
-from idm_env import keep
 from idm_env.data import DataError
 from idm_env.data.folder import stamp
 from idm_env.data.names import Columns
-from idm_env.executor import Executor, Serial
-from idm_env.parts import Parts
-from idm_env.progress import OnProgress, silent
-from idm_env.report import account, versions
+from idm_env.jobs import storage
+from idm_env.jobs.executor import Executor, Serial
+from idm_env.jobs.progress import OnProgress, silent
+from idm_env.jobs.shards import Parts
+from idm_env.reports.page import account, versions
 from idm_env.trajectories import chunks, left_out, paper, pictures
 from idm_env.trajectories.chunks import CHUNK, OURS, PARAMETERS, TRAJECTORIES, Plan, Recipe, Settings
 from idm_env.trajectories.noise import fit_noise, is_dense
@@ -127,7 +127,7 @@ def run(
     progress = on_progress or silent
     progress("compiling", 0, 0, "the loops")
     _compile()
-    with keep.results(out, OUTPUT, (path, settings.model)) as folder:
+    with storage.results(out, OUTPUT, (path, settings.model)) as folder:
         return _run(Path(path), folder.absolute(), settings, how, resume, executor or Serial(), progress)
 
 
@@ -136,7 +136,9 @@ def _run(
 ) -> dict[str, Any]:  # fmt: skip
     progress("reading", 0, 0, path.name)
     model = None if settings.model is None else Path(settings.model)
-    parts = Parts(out / keep.UNFINISHED / settings.task, keep.fingerprint(settings, how, stamp(path), model), resume)
+    parts = Parts(
+        out / storage.UNFINISHED / settings.task, storage.fingerprint(settings, how, stamp(path), model), resume
+    )
     try:
         spool = Spool(path, parts.folder / "spool", how.layout, settings.chunk, how.ring_length, how.columns)
         bridge = 2.0 if settings.task == "filter" else None

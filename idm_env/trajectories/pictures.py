@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from idm_env import diagrams
-from idm_env import report as page
+from idm_env.reports import diagrams, page
 from idm_env.trajectories.spool import Spool
 from idm_env.trajectories.tracks import Pieces, Track
 

@@ -10,8 +10,9 @@ import numpy as np
 import polars as pl
 from matplotlib.figure import Figure
 
-from idm_env import report as page
 from idm_env.effects import IDM
+from idm_env.jobs import storage
+from idm_env.reports import page
 from idm_env.trajectories.scores import Motion
 from idm_env.trajectories.tracks import Track
 
@@ -36,7 +37,7 @@ def write_report(
 
     Numbers that are not finite become null in JSON, which knows none.
     """
-    page.write_json(out / "report.json", report)
+    storage.write_json(out / "report.json", report)
     how = "filtered" if report["settings"]["task"] == "filter" else "reconstructed"
     blocks = [page.lead(_lead(report))]
     if report["noise"]:

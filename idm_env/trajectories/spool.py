@@ -15,11 +15,11 @@ from tempfile import TemporaryDirectory
 
 import polars as pl
 
-from idm_env import keep
 from idm_env.data import Repair, clean, clock, directions, leaders, prepare, units
 from idm_env.data.errors import Counted
 from idm_env.data.load import batches
 from idm_env.data.names import Columns
+from idm_env.jobs import storage
 from idm_env.trajectories.tracks import Table
 
 KEPT = ("run_id", "vehicle_id", "time_s", "position_m", "leader_id", "lane", "length_m", "ring_length_m", "gap_m")
@@ -131,13 +131,13 @@ class Spool:
             sample += [kept] if sum(some.height for some in sample) < BUCKET_ROWS else []
             files.append(self.folder / f"raw-{len(files):05d}.parquet")
             kept = kept.select(pl.col(name) for name in KEPT if name in kept.columns)
-            keep.write(files[-1], kept.write_parquet)
+            storage.write(files[-1], kept.write_parquet)
             parts.append(_indexed(kept))
         filled.check(self.source)
         index = _merged(parts)
         vehicles = directions.against(index.filter(~pl.col("ring")), self.source)
         for file in files if vehicles.height else []:
-            keep.write(file, directions.mirrored(pl.read_parquet(file, glob=False), vehicles).write_parquet)
+            storage.write(file, directions.mirrored(pl.read_parquet(file, glob=False), vehicles).write_parquet)
         self._counted.add(directions.repairs(vehicles))
         self._sample = directions.mirrored(pl.concat(sample, how="diagonal_relaxed"), vehicles)
         index = directions.renamed(index, vehicles)
@@ -159,7 +159,7 @@ class Spool:
             self._counted.add(repairs)
             paces.append(clock.paces(frame))
             twice.append(moved)
-            keep.write(self.shelf.path(chunk), frame.drop("chunk").write_parquet)
+            storage.write(self.shelf.path(chunk), frame.drop("chunk").write_parquet)
         if unsorted:
             text = f"Time runs backward at {unsorted} rows; the rows were sorted by time."
             self._counted.add([Repair("time not increasing", unsorted, text)])
@@ -182,7 +182,7 @@ class Spool:
                 named.append(counts)
             ticks, _ = clock.regularise(frame, steps, starts, BRIDGED_S)
             files.append(self.folder / f"ticks-{chunk:05d}.parquet")
-            keep.write(files[-1], ticks.with_columns(pl.lit(chunk).alias("chunk")).write_parquet)
+            storage.write(files[-1], ticks.with_columns(pl.lit(chunk).alias("chunk")).write_parquet)
         if named:
             self._counted.add(
                 leaders.named(pl.concat(named).group_by("leader_id", "state").agg(pl.col("len").sum()), self.source)
@@ -199,7 +199,7 @@ class Spool:
             if not files:
                 leaders.headways(frame, self.source)  # refuses what is the wrong way round
             files.append(self.folder / f"led-{bucket:05d}.parquet")
-            keep.write(files[-1], frame.select(*KEY, "chunk", "step", "leader_id").write_parquet)
+            storage.write(files[-1], frame.select(*KEY, "chunk", "step", "leader_id").write_parquet)
             _remove(parts)
         found = self._partition(files, "led", pl.col("chunk"))
         followers = 0
@@ -209,7 +209,7 @@ class Spool:
             self._counted.add(repairs)
             followers += ticks.filter(pl.col("leader_id").is_not_null()).select(KEY).n_unique()
             frame = pl.read_parquet(self.shelf.path(chunk), glob=False).drop("leader_id", "gap_m", strict=False)
-            keep.write(self.shelf.path(chunk), _joined(frame, ticks, steps, starts).write_parquet)
+            storage.write(self.shelf.path(chunk), _joined(frame, ticks, steps, starts).write_parquet)
             _remove(parts)
         if not named and followers:
             self._counted.add([leaders.derived(followers, any(laned.values()))])
@@ -226,7 +226,7 @@ class Spool:
             frame = frame.with_columns(bucket.cast(pl.Int64).alias("bucket"))
             for (key,), part in frame.partition_by("bucket", as_dict=True, include_key=False).items():
                 target = self.folder / f"{name}-{key:05d}-{n:05d}.parquet"
-                keep.write(target, part.write_parquet)
+                storage.write(target, part.write_parquet)
                 found.setdefault(key, []).append(target)
             path.unlink()
         return found

@@ -164,8 +164,8 @@ class ParameterFitting:
         owner.params = params
 
     def model(self, group: int = 0) -> Any:
-        """Return the values of one group as an ``idm_env.config.Model``, for ``save_model`` and ``effects=``."""
-        from idm_env.config import Model, numbers
+        """Return the values of one group as an ``idm_env.model_file.Model``, for ``save_model`` and ``effects=``."""
+        from idm_env.model_file import Model, numbers
 
         found = {name: float(value[group].detach()) for name, value in self.values().items()}
         simulator = self.problem.simulator

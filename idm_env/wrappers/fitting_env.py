@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 
-from idm_env.checks import shown
+from idm_env.validation import shown
 from idm_env.wrappers.fitting import ParameterFitting
 
 

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from idm_env.progress import silent
+from idm_env.jobs.progress import silent
 
 ROOT = Path(__file__).resolve().parents[2]
 

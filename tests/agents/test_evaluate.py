@@ -262,7 +262,7 @@ def test_a_saved_policy_is_evaluated_and_filmed(tmp_path, capsys, monkeypatch):
 
 
 def test_a_road_of_several_lanes_is_drawn_with_a_panel_for_each(tmp_path, monkeypatch):
-    from idm_env import diagrams
+    from idm_env.reports import diagrams
 
     drawn = []
     space_time = diagrams.space_time

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from idm_env.config import load_model
 from idm_env.data import synthetic
 from idm_env.discovery import discover, write_report
 from idm_env.discovery.calibrate import first_prior
@@ -19,6 +18,7 @@ from idm_env.discovery.solve import Task
 from idm_env.effects import BASES, Brakes, Replay, base_named
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.problem import Problem
+from idm_env.model_file import load_model
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from idm_env.config import load_model
 from idm_env.data import Trajectories, synthetic
 from idm_env.discovery import Discovery, discover, write_report
-from idm_env.keep import UNFINISHED
+from idm_env.jobs.storage import UNFINISHED
+from idm_env.model_file import load_model
 from idm_env.roads import Lane
 
 FEW = ("lag", "leader_acceleration", "drag", "grade", "speed_zone", "regime_shift")

@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from idm_env import effects as catalogue
-from idm_env.config import load_model, save_model
 from idm_env.data import Trajectories, synthetic
 from idm_env.discovery import discover, march, places
 from idm_env.discovery import model as terms
@@ -21,6 +20,7 @@ from idm_env.discovery.model import Model, simple
 from idm_env.discovery.records import Records
 from idm_env.effects import Effect
 from idm_env.effects.registry import is_candidate
+from idm_env.model_file import load_model, save_model
 from idm_env.parameters import Parameter
 from tests.discovery.test_march import agrees
 

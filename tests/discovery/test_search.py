@@ -15,7 +15,7 @@ from idm_env.discovery.model import Model
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.search import Search
 from idm_env.discovery.solve import Solution, Task, _Nested, linearise
-from idm_env.keep import Store
+from idm_env.jobs.storage import Store
 
 
 def begun(records: Records, *names: str) -> tuple[Search, Solution]:

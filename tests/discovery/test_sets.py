@@ -11,7 +11,7 @@ import pytest
 from idm_env.data import DataError
 from idm_env.data.load import files_of
 from idm_env.discovery import sets
-from idm_env.executor import opened
+from idm_env.jobs.executor import opened
 
 
 def drives(folder: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from idm_env.discovery.records import gather, windows
 from idm_env.discovery.score import interval_of
 from idm_env.discovery.search import Search
 from idm_env.discovery.solve import Task, solve
-from idm_env.keep import Store
+from idm_env.jobs.storage import Store
 
 
 @pytest.fixture(scope="module")

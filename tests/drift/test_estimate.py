@@ -11,7 +11,6 @@ import torch
 
 pytest.importorskip("numba")
 
-from idm_env.config import load_model
 from idm_env.data import Episode, Trajectories, episodes
 from idm_env.drift import forecast
 from idm_env.drift.estimate import Estimate, estimate, usual
@@ -21,6 +20,7 @@ from idm_env.effects import IDM, AccelNoise, Brakes, Delay, Effect, Replay, Wand
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.options import Source
 from idm_env.fitting.problem import IDM_NAMES
+from idm_env.model_file import load_model
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 from idm_env.types import Record

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401
-from idm_env import IDM, Brakes, Lane, Simulator, instead
+from idm_env import IDM, Brakes, Lane, Simulator, backends
 from idm_env.effects import Control
 from idm_env.types import Command
 
@@ -45,7 +45,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_an_absent_agent_sees_gets_and_changes_nothing(case: str, output: str, record: str) -> None:
     """Two episodes, in which it commands otherwise while it is absent, are the same, and all that is its own is 0."""
     choices = ROADS[case] | ({"data": record} if "record" in case else {})
-    with instead.off():
+    with backends.off():
         pair = [gym.make("DiffIDM-v0", output=output, dtype="float64", **choices).unwrapped for _ in range(2)]
         for env in pair:
             env.reset(seed=2)
@@ -88,7 +88,7 @@ def test_who_is_not_there_stands_still_whatever_he_is_commanded() -> None:
         torch.full((50, 1, 1), 2.0, dtype=torch.float64), torch.tensor([[[False, False, True, False]]]).expand(50, 1, 4)
     )
     fast = simulator.rollout(start, {"control": command}, params, 50)[0]
-    with instead.off():
+    with backends.off():
         slow = simulator.rollout(start, {"control": command}, params, 50)[0]
     for end in (fast, slow):
         assert end.position[0, 2] == 30.0 and end.speed[0, 2] == 0.0 and end.accel[0, 2] == 0.0

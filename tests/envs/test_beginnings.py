@@ -6,11 +6,11 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401
+from idm_env.delay_buffer import PAST
 from idm_env.envs.batch import Batch
 from idm_env.envs.beginnings import Beginnings
 from idm_env.envs.past import Past
 from idm_env.envs.settings import settings
-from idm_env.history import PAST
 
 RING = {"warmup": 4, "effects": ["delay"], "dtype": "float64", "noise": 0.3}
 

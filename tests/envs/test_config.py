@@ -9,11 +9,11 @@ import torch
 import yaml
 
 import idm_env  # noqa: F401
-from idm_env.config import Model, load_environment, load_model, save_model
 from idm_env.effects import IDM, Brakes, Curve, Delay
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.envs.settings import settings
 from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.model_file import Model, load_environment, load_model, save_model
 from idm_env.tasks import TASKS, make_task
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401 (registers the environments)
-from idm_env.config import Model, save_model
 from idm_env.effects import IDM, AccelNoise, Brakes, PerceptionNoise, Wander
 from idm_env.kernels import dispatch
+from idm_env.model_file import Model, save_model
 
 UNSTEADY = (IDM(), Wander(), PerceptionNoise(signal="closing_speed"), AccelNoise(), Brakes())
 SMALL = {"task": "ring", "vehicles": 6, "length": 120.0, "warmup": 20}

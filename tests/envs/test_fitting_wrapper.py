@@ -8,9 +8,9 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
-from idm_env.config import load_model, save_model
 from idm_env.data import Trajectories
 from idm_env.effects import IDM, Brakes, Replay
+from idm_env.model_file import load_model, save_model
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 from idm_env.tasks.recorded import head, made_up_leader

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401
-from idm_env import instead
+from idm_env import backends
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.tasks import TASKS
 from idm_env.types import Moving, State, mapped
@@ -36,7 +36,7 @@ def begun(name: str, face: str = "single") -> tuple[Any, State]:
 @pytest.fixture(autouse=True)
 def uncompiled():
     """What is checked does not depend on what steps."""
-    with instead.off():
+    with backends.off():
         yield
 
 

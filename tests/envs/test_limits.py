@@ -96,7 +96,8 @@ def test_the_cost_of_a_crash_knows_the_episodes_length():
 
 def test_a_picture_is_as_long_as_it_was_asked_for(tmp_path, monkeypatch):
     # The usual 3000 steps are no limit of it: plot's ring is drawn over 400 s.
-    from idm_env import cli, progress
+    from idm_env.cli import commands as cli
+    from idm_env.jobs import progress
 
     monkeypatch.setattr(cli, "_work_begins", lambda: None)
     path = tmp_path / "ring.yaml"

@@ -13,7 +13,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
-from idm_env import instead
+from idm_env import backends
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.tasks import TASKS
 
@@ -88,7 +88,7 @@ def same(one: Any, other: Any) -> bool:
 
 def printed(name: str) -> Any:
     """Compiled loops own what they write to in every task alike: one of them is enough, and the others are cheap."""
-    return contextlib.nullcontext() if name == "ring" else instead.off()
+    return contextlib.nullcontext() if name == "ring" else backends.off()
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -11,8 +11,8 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
-from idm_env.diagrams import lane_panels, panels, write_html
-from idm_env.render import colour, space_time
+from idm_env.envs.render import colour, space_time
+from idm_env.reports.diagrams import lane_panels, panels, write_html
 from idm_env.simulator import Trajectory
 
 QUICK = {"warmup": 5}

@@ -9,7 +9,7 @@ from torchrl.envs import GymEnv, GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 import idm_env  # noqa: F401
-from idm_env import instead
+from idm_env import backends
 from idm_env.tasks import TASKS
 
 LIMIT, COUNT = 4, 3
@@ -82,7 +82,7 @@ def test_a_vector_is_collected_over_ends_as_gymnasiums_is(mode, output):
 @pytest.mark.parametrize("name", TASKS)
 def test_a_vector_of_every_task_is_collected_over_ends_with_all_that_infos_tell(name, output):
     quick = {"warmup": 2} if name == "ring" else {}
-    with instead.off():
+    with backends.off():
         ours = gym.make_vec("DiffIDM-v0", num_envs=2, task=name, output=output, max_episode_steps=3, **quick)
         told, ids = set(ours.reset(seed=0)[1]) | set(ours.step(None)[-1]), ours.unwrapped.task.vehicle_ids
         seen = GymWrapper(ours).rollout(8, break_when_any_done=False)

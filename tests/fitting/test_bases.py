@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from idm_env.config import Model, load_model
 from idm_env.data import Episode, episodes, synthetic
 from idm_env.effects import Brakes, base_named
 from idm_env.fitting.evaluate import errors
 from idm_env.fitting.fit import base_simulator, fit, own_names
 from idm_env.fitting.job import fit_file, problem_of, simulate_file
 from idm_env.fitting.options import Options, Source
+from idm_env.model_file import Model, load_model
 
 
 def driven_by(name: str, count: int) -> list[Episode]:

@@ -9,11 +9,11 @@ from typing import Any
 import polars as pl
 import pytest
 
-from idm_env.config import load_model
 from idm_env.data import synthetic
 from idm_env.fitting.drivers import over_fitting
 from idm_env.fitting.job import FITTED, fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
+from idm_env.model_file import load_model
 
 
 @pytest.fixture(scope="module")

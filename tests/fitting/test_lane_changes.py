@@ -9,14 +9,14 @@ import polars as pl
 import pytest
 import torch
 
-from idm_env.config import load_model
 from idm_env.data import DataError, Trajectories
 from idm_env.effects import IDM, Brakes, Mobil
 from idm_env.fitting.choices import ConstantRate, GapAcceptance, Wishes, fit_choice
 from idm_env.fitting.decisions import LEFT, RIGHT, Decisions, recorded_decisions
 from idm_env.fitting.lane_changes import ChangeOptions, fit_lane_changes, lane_changes
 from idm_env.fitting.options import Source
-from idm_env.report import plain
+from idm_env.jobs.storage import plain
+from idm_env.model_file import load_model
 from idm_env.roads import Lanes
 from idm_env.simulator import Simulator
 

@@ -12,13 +12,13 @@ import polars as pl
 import pytest
 import torch
 
-from idm_env import keep
-from idm_env import report as page
 from idm_env.data import DataError, synthetic
-from idm_env.executor import PartsError, opened
 from idm_env.fitting import pictures, pieces
 from idm_env.fitting.job import fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
+from idm_env.jobs import storage
+from idm_env.jobs.executor import PartsError, opened
+from idm_env.reports import page
 
 FILES = ("parameters.parquet", "drivers.csv", "model.yaml")
 """What no executor may change a byte of; the reports have the command in them."""
@@ -117,7 +117,7 @@ def test_a_part_that_raises_is_named_and_the_run_goes_on_from_the_others(
     told = r"1 of 3 parts failed \(runs 3 to 4: ZeroDivisionError: driver 3/3\)"
     with pytest.raises(PartsError, match=told):
         fitted(folder, tmp_path)
-    assert done == ["1", "3", "5"] and (tmp_path / keep.UNFINISHED / "fit-parts").exists()
+    assert done == ["1", "3", "5"] and (tmp_path / storage.UNFINISHED / "fit-parts").exists()
     assert fitted(folder, tmp_path, resume=True) == whole
     assert done == ["1", "3", "5", "3"]
 

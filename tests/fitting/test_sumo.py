@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from benchmarks.bench.peers import straight_lane
-from idm_env.config import Model, save_model
 from idm_env.effects import IDM, Brakes, Gipps
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.fitting import sumo
+from idm_env.model_file import Model, save_model
 
 NUMBERS = {"max_accel": 1.1, "comfort_decel": 1.7, "time_gap": 1.3, "min_gap": 2.5, "desired_speed": 30.0}
 OTHER = {"max_accel": 2.0, "time_gap": 0.9}

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from idm_env import population
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
 from idm_env.kernels import dispatch
+from idm_env.multilane import demand
 from idm_env.roads import Lanes, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator, Trajectory
 from idm_env.types import State
@@ -167,10 +167,10 @@ def test_vehicles_come_and_go_in_compiled_rollouts(again: int | None, steps: tup
     road = Lanes(3, length=700.0, ends=(on_ramp(0, 150.0, 400.0, entry=50.0), off_ramp(2, 200.0, 400.0, leaves=500.0)))
     simulator = Simulator(road, (IDM(), make("second_leader"), make("memory"), Mobil(), MandatoryChange(), Brakes()))
     params = simulator.defaults(dtype=torch.float64)
-    trips = population.trips({0: 900.0, 1: 1500.0, 2: 1500.0}, 60.0, slots=again, dtype=torch.float64)
+    trips = demand.trips({0: 900.0, 1: 1500.0, 2: 1500.0}, 60.0, slots=again, dtype=torch.float64)
     n = len(trips.departs)
     desired = 15.0 + 20.0 * torch.rand((2, n), generator=torch.Generator().manual_seed(1)).double()
-    begin = population.waiting(simulator, population.spread(trips, (2, n)), params)
+    begin = demand.waiting(simulator, demand.spread(trips, (2, n)), params)
     begin = begin._replace(step=torch.tensor(steps) if steps[1] else begin.step)
 
     def run() -> tuple[State, Trajectory, Tensor]:

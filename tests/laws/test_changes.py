@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from idm_env import population
-from idm_env.changes import beside
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
+from idm_env.multilane import demand
+from idm_env.multilane.incentives import beside
 from idm_env.roads import Lane, Lanes, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator
 from idm_env.types import State
@@ -409,11 +409,11 @@ def test_timed_changes_on_mirrored_roads_and_with_trips() -> None:
     simulator = Simulator(road, (IDM(), Mobil(), MandatoryChange(), Brakes()))
     params = simulator.defaults(dtype=DTYPE)
     params["idm"]["desired_speed"] = 12.0 + 20.0 * torch.rand(16, generator=torch.Generator().manual_seed(1)).double()
-    given = population.trips({0: 900.0, 1: 900.0}, 3600.0, slots=16, dtype=DTYPE)
-    state = population.waiting(simulator, given, params)
+    given = demand.trips({0: 900.0, 1: 900.0}, 3600.0, slots=16, dtype=DTYPE)
+    state = demand.waiting(simulator, given, params)
     for _ in range(600):
         state = simulator.step(state, {}, params)
-        found = population.counts(simulator, state)
+        found = demand.counts(simulator, state)
         assert found.due == found.inside + found.left + found.queued and state.present is not None
         if state.moving is not None:
             there = state.present > 0

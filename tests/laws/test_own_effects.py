@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401  (registers the environments)
-from idm_env import instead
+from idm_env import backends
 from idm_env.effects import IDM, Brakes, CarFollowing, Effect, Mobil
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane, Lanes
@@ -28,7 +28,7 @@ LATE = 1.05
 """When effects begin to do what they must not (s): not at the first step, which is tried."""
 
 
-PATHS = {"compiled": contextlib.nullcontext, "torch": instead.off, "lanes": contextlib.nullcontext}
+PATHS = {"compiled": contextlib.nullcontext, "torch": backends.off, "lanes": contextlib.nullcontext}
 
 
 def own(hook: str, method: Callable[..., Any], back: float = 0.0) -> Effect:

@@ -10,8 +10,8 @@ from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from idm_env import population
 from idm_env.effects import IDM, Brakes, MandatoryChange, Mobil, make
+from idm_env.multilane import demand
 from idm_env.roads import Lane, Lanes, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator
 from idm_env.types import State
@@ -35,11 +35,11 @@ def begun(
     changing = (Mobil(), MandatoryChange()) if road.count > 1 else ()
     simulator = Simulator(road, (IDM(), *changing, Brakes()))
     params = simulator.defaults(dtype=DTYPE)
-    trips = population.trips(per_hour, seconds, slots=slots, dtype=DTYPE)
+    trips = demand.trips(per_hour, seconds, slots=slots, dtype=DTYPE)
     generator = torch.Generator().manual_seed(seed)
     n = len(trips.departs)
     params["idm"]["desired_speed"] = 15.0 + 20.0 * torch.rand(n, generator=generator, dtype=DTYPE)
-    return simulator, population.waiting(simulator, trips, params), params
+    return simulator, demand.waiting(simulator, trips, params), params
 
 
 @settings(max_examples=5, phases=(Phase.explicit, Phase.generate))
@@ -56,7 +56,7 @@ def test_entered_is_inside_and_left_and_the_rest_is_queued(road: str, flow: int,
     own = torch.arange(state.speed.shape[-1])
     for _ in range(400):
         before, state = state, simulator.step(state, {}, params)
-        due, inside, left, queued = (int(x) for x in population.counts(simulator, state))
+        due, inside, left, queued = (int(x) for x in demand.counts(simulator, state))
         assert due == inside + left + queued and queued >= 0
         assert state.trips is not None and state.present is not None and before.present is not None
         assert inside == int((state.trips.entered - state.trips.left).sum())
@@ -77,8 +77,8 @@ def test_trips_enter_at_their_time_with_the_gap_that_they_need() -> None:
     """One after the other on an empty road; then as soon as s0 + vT and braking allow, neither before nor later."""
     simulator = Simulator(Lanes(1), (IDM(), Brakes()))
     params = simulator.defaults(dtype=DTYPE)
-    trips = population.trips({0: 3600.0}, 10.0, speed=20.0, dtype=DTYPE)
-    state = population.waiting(simulator, trips, params)
+    trips = demand.trips({0: 3600.0}, 10.0, speed=20.0, dtype=DTYPE)
+    state = demand.waiting(simulator, trips, params)
     at: dict[int, float] = {}
     for k in range(600):
         before, state = state, simulator.step(state, {}, params)
@@ -100,7 +100,7 @@ def test_an_inflow_beyond_capacity_is_queued_and_counted() -> None:
     queues = []
     for _ in range(4):
         state, _ = simulator.rollout(state, {}, params, 400)
-        queues.append(int(population.counts(simulator, state).queued))
+        queues.append(int(demand.counts(simulator, state).queued))
     assert queues[0] < queues[1] < queues[2] < queues[3] and queues[3] > 30
 
 
@@ -108,29 +108,29 @@ def test_slots_that_make_trips_again_keep_up_an_inflow_for_ever() -> None:
     """Far more trips than slots; parameters stay with their slot; too few slots are counted as a queue."""
     simulator, state, params = begun(Lanes(2, length=500.0), {0: 600.0, 1: 600.0}, 60.0, slots=20)
     state, _ = simulator.rollout(state, {}, params, 4000)
-    due, inside, left, queued = (int(x) for x in population.counts(simulator, state))
+    due, inside, left, queued = (int(x) for x in demand.counts(simulator, state))
     assert due == inside + left + queued and 130 <= due <= 134 and left >= 110 and queued <= 2
     few, state, params = begun(Lanes(2, length=500.0), {0: 600.0, 1: 600.0}, 60.0, slots=4)
     state, _ = few.rollout(state, {}, params, 3000)
-    assert population.counts(few, state).queued > 10
+    assert demand.counts(few, state).queued > 10
 
 
 def test_drivers_begin_with_fresh_memories_and_rows_do_not_see_each_other() -> None:
     """What a driver remembers begins when he does, not when the simulation did."""
     simulator = Simulator(Lanes(1, length=2000.0), (IDM(), make("memory"), make("delay"), Brakes()))
     params = simulator.defaults(dtype=DTYPE)
-    late = population.trips({0: 60.0}, 60.0, dtype=DTYPE)
-    state = population.waiting(simulator, late, params)
+    late = demand.trips({0: 60.0}, 60.0, dtype=DTYPE)
+    state = demand.waiting(simulator, late, params)
     for _ in range(601):
         before, state = state, simulator.step(state, {}, params)
     assert before.present is not None and state.present is not None
     assert before.present[0] == 0 and state.present[0] == 1
-    early = population.waiting(simulator, late._replace(departs=late.departs - 60.0), params)
+    early = demand.waiting(simulator, late._replace(departs=late.departs - 60.0), params)
     early = simulator.step(early, {}, params)
     for name, held in state.memory.items():
         torch.testing.assert_close(held, early.memory[name])
     both = late._replace(departs=torch.tensor([[60.0], [0.0]], dtype=DTYPE))
-    rows = population.waiting(simulator, population.spread(both, (2, 1)), params)
+    rows = demand.waiting(simulator, demand.spread(both, (2, 1)), params)
     rows = simulator.step(rows, {}, params)
     assert rows.present is not None and rows.present.flatten().tolist() == [0.0, 1.0]
 
@@ -155,19 +155,19 @@ def test_gradients_flow_through_entries() -> None:
 def test_bad_input_is_refused_in_one_line() -> None:
     """With the value, the rule and the cure."""
     with pytest.raises(ValueError, match="must give every lane that is entered vehicles an hour above 0"):
-        population.trips({0: -5.0}, 60.0)
+        demand.trips({0: -5.0}, 60.0)
     with pytest.raises(ValueError, match="no slot for lane 0: 10 vehicles an hour"):
-        population.trips({0: 10.0}, 60.0)
+        demand.trips({0: 10.0}, 60.0)
     simulator = Simulator(Lanes(2, ring=500.0), (IDM(), Brakes()))
     params = simulator.defaults(dtype=DTYPE)
-    trips = population.trips({0: 600.0}, 60.0, dtype=DTYPE)
+    trips = demand.trips({0: 600.0}, 60.0, dtype=DTYPE)
     with pytest.raises(ValueError, match="trips need a road that begins somewhere"):
-        population.waiting(simulator, trips, params)
+        demand.waiting(simulator, trips, params)
     with pytest.raises(ValueError, match="trips need a road that begins somewhere"):
-        population.waiting(Simulator(Lane(), (IDM(), Brakes())), trips, params)
+        demand.waiting(Simulator(Lane(), (IDM(), Brakes())), trips, params)
     with pytest.raises(ValueError, match="lane 2 does not exist"):
-        population.waiting(
+        demand.waiting(
             Simulator(Lanes(2), (IDM(), Brakes())), trips._replace(lane=torch.full_like(trips.lane, 2)), params
         )
     with pytest.raises(ValueError, match="has no trips"):
-        population.counts(simulator, simulator.state(torch.zeros(1), torch.zeros(1), params, lane=0))
+        demand.counts(simulator, simulator.state(torch.zeros(1), torch.zeros(1), params, lane=0))

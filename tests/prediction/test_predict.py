@@ -13,7 +13,7 @@ from benchmarks import prediction as benchmark
 from idm_env.data import DataError
 from idm_env.data.scenario import Control, Scenario
 from idm_env.data.womd import read_json, scenarios
-from idm_env.keep import UNFINISHED
+from idm_env.jobs.storage import UNFINISHED
 from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
 from idm_env.prediction.files import OURS, case_of, predict_files
 from idm_env.prediction.lanes import LaneGraph, Route

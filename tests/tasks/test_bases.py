@@ -11,9 +11,9 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401 (registers the environments)
-from idm_env import instead
-from idm_env.config import Model, save_model
+from idm_env import backends
 from idm_env.effects import BASES, Brakes, Mobil, base_named
+from idm_env.model_file import Model, save_model
 from idm_env.tasks import TASKS
 from idm_env.tasks.lanes import LanesTask
 
@@ -38,7 +38,7 @@ def test_every_task_takes_every_law(name: str, how: str, drivers: Path) -> None:
     choices: dict[str, Any] = {"task": name, "dtype": "float64", **({"warmup": 0} if name == "ring" else {})}
     for law in BASES:
         given = [law] if how == "effects" else str(drivers / f"{law}-{many}.yaml")
-        with instead.off():
+        with backends.off():
             env = gymnasium.make("DiffIDM-v0", **choices, **{how: given})
             env.reset(seed=3)
             for _ in range(12):
@@ -52,7 +52,7 @@ def test_every_task_takes_every_law(name: str, how: str, drivers: Path) -> None:
 @pytest.mark.parametrize("law", BASES)
 def test_lane_changes_are_judged_by_the_law_that_is_there(law: str) -> None:
     """Where only one lane is free ahead, a driver of each law wants it for what this law gains there."""
-    from idm_env.changes import beside, wished
+    from idm_env.multilane.incentives import beside, wished
     from idm_env.roads import Lanes
     from idm_env.simulator import Simulator
 

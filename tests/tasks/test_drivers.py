@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import idm_env  # noqa: F401 (registers the environments)
-from idm_env.config import Model, save_model
 from idm_env.effects import IDM, Brakes
+from idm_env.model_file import Model, save_model
 from idm_env.tasks import Draw, make_task
 
 GAPS = (0.9, 1.3, 1.7)

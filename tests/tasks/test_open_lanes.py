@@ -9,9 +9,10 @@ import torch
 
 import idm_env  # noqa: F401
 from benchmarks import lanes
-from idm_env import instead, population
+from idm_env import backends
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.kernels import dispatch
+from idm_env.multilane import demand
 from idm_env.tasks import BottleneckTask, Draw, MergeTask, make_task
 
 OPEN = ("merge", "bottleneck", "open_highway")
@@ -30,7 +31,7 @@ def test_whoever_is_due_is_inside_left_or_queued_for_a_minute(name: str) -> None
         for _ in range(600):
             push = 0.5 * torch.rand((2, 3), generator=generator, dtype=torch.float64) - 0.25
             world = task.step(world, task.command(push), None, params)
-            found = population.counts(task.simulator, world.state)
+            found = demand.counts(task.simulator, world.state)
             assert torch.equal(found.due, found.inside + found.left + found.queued) and (found.queued >= 0).all()
             assert not task.crashed(world).any()
             seen, there = task.observe(world), task.pick(world.state.present)
@@ -144,8 +145,8 @@ def test_bad_choices_are_one_line() -> None:
 def test_nobody_stands_for_ever_where_a_lane_ends(name: str, least: float) -> None:
     """No vehicle stands for more than a minute, and the ramp gets in, in eight episodes of ten minutes."""
     pytest.importorskip("numba")
-    kind, demand = lanes.DEMANDS[name]
-    found = lanes.stood(kind(**demand))
+    kind, given = lanes.DEMANDS[name]
+    found = lanes.stood(kind(**given))
     assert max(found.longest) <= 60.0 and found.merged >= least and found.touched == 0.0
 
 
@@ -157,7 +158,7 @@ def test_without_them_drivers_are_as_they_were() -> None:
     full = task.simulator.without("control")
     bare = full.without("gap_acceptance", "courtesy")
     state, memory = world.state, {n: x for n, x in world.state.memory.items() if n in bare.by_name}
-    with instead.off():
+    with backends.off():
         one, kept = full.rollout(state, {}, params, 300)
         other, told = bare.rollout(state._replace(memory=memory), {}, params, 300)
     assert one.links is not None and other.links is not None and int(one.links.changed.sum()) > 10
@@ -176,7 +177,7 @@ def test_compiled_decisions_accept_the_gaps_that_the_step_does() -> None:
     state, _ = simulator.rollout(state, {}, params, 900, keep=None)
     assert float(state.memory["gap_acceptance"].max()) > 0.5
     compiled, kept = simulator.rollout(state, {}, params, 200)
-    with instead.off():
+    with backends.off():
         plain, told = simulator.rollout(state, {}, params, 200)
     assert compiled.links is not None and plain.links is not None and state.links is not None
     assert int((compiled.links.changed - state.links.changed).sum()) > 3

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import polars as pl
 
-from idm_env.config import Model, save_model
 from idm_env.data import synthetic
 from idm_env.effects import IDM, Brakes, make
+from idm_env.model_file import Model, save_model
 from idm_env.trajectories.files import filter_file
 
 

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from idm_env.data import DataError
-from idm_env.keep import UNFINISHED
+from idm_env.jobs.storage import UNFINISHED
 from idm_env.trajectories import files
 from tests.trajectories.test_recipe import correlated
 from tests.trajectories.tracks import swinging

@@ -7,7 +7,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from idm_env.executor import opened
+from idm_env.jobs.executor import opened
 from idm_env.trajectories import files
 from idm_env.trajectories.spool import Spool, _borders
 from tests.trajectories.test_files import lane

@@ -18,7 +18,7 @@ sys.modules["numba"] = None
 real = u.find_spec
 u.find_spec = lambda name, *more: None if name == "numba" else real(name, *more)
 sys.argv = ["idm-env", *sys.argv[1:]]
-from idm_env.cli import run
+from idm_env.cli.commands import run
 run()
 """
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from idm_env import keep
 from idm_env.extras import needed
-from idm_env.report import plain
+from idm_env.jobs import storage
 
 with needed("a part of a folder"):
     import polars as pl
@@ -22,7 +21,7 @@ class Parts:
     """
 
     def __init__(self, folder: Path, fingerprint: str, resume: bool) -> None:
-        self.store = keep.Store(folder, fingerprint, resume)
+        self.store = storage.Store(folder, fingerprint, resume)
         self.folder = folder
 
     def path(self, number: int, name: str) -> Path:
@@ -31,7 +30,7 @@ class Parts:
 
     def write(self, number: int, name: str, table: pl.DataFrame) -> None:
         """Write a table of a part."""
-        keep.write(self.path(number, name), table.write_parquet, shared=True)
+        storage.write(self.path(number, name), table.write_parquet, shared=True)
 
     def done(self, number: int) -> bool:
         """Tell whether a part is finished, with its tables as they were written."""
@@ -40,14 +39,14 @@ class Parts:
             return False
         for name, digest in found["tables"].items():
             path = self.folder / name
-            if not path.is_file() or keep.fingerprint(path) != digest:
-                raise ValueError(f"{path} is broken (not what was written). {keep.AFRESH}")
+            if not path.is_file() or storage.fingerprint(path) != digest:
+                raise ValueError(f"{path} is broken (not what was written). {storage.AFRESH}")
         return True
 
     def finish(self, number: int, summary: dict[str, Any]) -> None:
         """Mark a part as done, with what is to be remembered of it; its tables must have been written before."""
-        tables = {p.name: keep.fingerprint(p) for p in self.folder.glob(f"{number:06d}.*.parquet")}
-        self.store.put_json(f"{number:06d}", {"summary": plain(summary), "tables": tables})
+        tables = {p.name: storage.fingerprint(p) for p in self.folder.glob(f"{number:06d}.*.parquet")}
+        self.store.put_json(f"{number:06d}", {"summary": storage.plain(summary), "tables": tables})
 
     def summaries(self) -> list[dict[str, Any]]:
         """Return what is remembered of all parts, in their order."""
@@ -61,9 +60,9 @@ class Parts:
         """Write the tables of all parts as one, holding one of them at a time: parquet, or csv with four digits."""
         whole = pl.scan_parquet(self.tables(name), glob=False, missing_columns="insert", extra_columns="ignore")
         if target.suffix == ".csv":
-            keep.write_csv(target, whole.with_columns(pl.selectors.float().round_sig_figs(4)))
+            storage.write_csv(target, whole.with_columns(pl.selectors.float().round_sig_figs(4)))
         else:
-            keep.write(target, whole.sink_parquet)
+            storage.write(target, whole.sink_parquet)
 
     def remove(self) -> None:
         """Remove the folder: the run has ended."""

@@ -19,7 +19,7 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -78,6 +78,22 @@ def full(error: BaseException) -> str | None:
 def write_text(path: Path, content: str) -> None:
     """Write a text file in one piece."""
     write(path, lambda beside: beside.write_text(content, encoding="utf-8"))
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON; NaN and infinities, which JSON does not have, become null."""
+    write_text(path, json.dumps(plain(content), indent=1, ensure_ascii=False) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: NaN and infinities are null."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        return None
+    return value
 
 
 def write_csv(path: Path, table: pl.DataFrame | pl.LazyFrame) -> None:

@@ -1,4 +1,4 @@
-"""Pictures: a live view of rings and lanes with pygame; space-time diagrams are in ``diagrams.py``."""
+"""Pictures: a live view of rings and lanes with pygame; space-time diagrams are in ``reports/diagrams.py``."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from idm_env.diagrams import COLOURS, space_time
 from idm_env.extras import needed
+from idm_env.reports.diagrams import COLOURS, space_time
 from idm_env.roads import Lanes
 from idm_env.types import State
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from idm_env.checks import one_of
+from idm_env.validation import one_of
 
 CHOICES = {
     "base": ("idm", "idm_plus", "iidm", "fvdm", "gipps", "constant_time_gap"),

@@ -19,9 +19,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, Protocol, TypeVar
 
-from idm_env import compat, trust
+from idm_env import compat
 from idm_env.extras import needed
-from idm_env.progress import OnProgress, silent
+from idm_env.jobs import trust
+from idm_env.jobs.progress import OnProgress, silent
 
 KINDS = ("serial", "processes", "ray")
 PER_WORKER = 2

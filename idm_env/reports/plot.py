@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from idm_env.diagrams import COLOURS, Panel, panels, place_label, rollout_panel
 from idm_env.extras import needed
+from idm_env.reports.diagrams import COLOURS, Panel, panels, place_label, rollout_panel
 
 
 def edie(drawn: Sequence[Panel], *, seconds: float = 60.0, metres: float = 100.0) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +49,7 @@ def fundamental_diagram(
     """Return a matplotlib figure of flow (vehicles/h) over density (vehicles/km), a point per cell.
 
     Args:
-        data: As in ``idm_env.diagrams.space_time``; or a list of panels, as one ring for each density.
+        data: As in ``idm_env.reports.diagrams.space_time``; or a list of panels, as one ring for each density.
         dt: Time step of a rollout (s).
         ring_length: Circumference of a rollout's ring (m).
         seconds: Duration of a cell (s).
@@ -77,7 +77,7 @@ def animate(data: Any, *, dt: float = 0.1, ring_length: float | None = None, eve
     Vehicles are dots, red at standstill and green at full speed, on a circle where there is a ring.
 
     Args:
-        data: As in ``idm_env.diagrams.space_time``, or a list of panels.
+        data: As in ``idm_env.reports.diagrams.space_time``, or a list of panels.
         dt: Time step of a rollout (s).
         ring_length: Circumference of a rollout's ring (m).
         every: Time of the traffic between two pictures (s).

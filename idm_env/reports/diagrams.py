@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.extras import needed
-from idm_env.fonts import legible
+from idm_env.reports.fonts import legible
 
 COLOURS = np.array([(178, 24, 43), (239, 138, 98), (253, 219, 120), (120, 190, 110), (26, 120, 80)], float)
 """Red at standstill, over yellow, to green at full speed; RGB in 0–255."""
@@ -226,7 +226,7 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
 
 def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     """Write an interactive page: choose a panel, look closer, point at a vehicle. It needs nothing from elsewhere."""
-    from idm_env import report
+    from idm_env.reports import page
 
     stride, fastest = _stride(drawn, MOST_POINTS), _fastest(drawn)
     content = {
@@ -240,7 +240,7 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     several = f" {len(drawn)} panels, one per run and lane, the largest first." if len(drawn) > 1 else ""
     words = f"One line per vehicle, coloured by speed.{several}"
     thinned = f" Every {stride}th sample is drawn." if stride > 1 else ""
-    report.write_page(path, title, [report.note(words + thinned), report.html(fragment)])
+    page.write_page(path, title, [page.note(words + thinned), page.html(fragment)])
 
 
 def place_label(ring_length: float | None) -> str:

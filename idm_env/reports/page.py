@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 import platform
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from idm_env.extras import needed
-from idm_env.keep import write_text
+from idm_env.jobs.storage import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -145,7 +144,7 @@ def picture(figure: Figure, caption: str, narrow: Figure | None = None) -> Block
 
     ``narrow`` is shown instead where the screen is less than 600 pixels wide.
     """
-    from idm_env.fonts import legible
+    from idm_env.reports.fonts import legible
 
     numbers = legible(figure)
     if narrow is not None:
@@ -181,22 +180,6 @@ def write_page(path: Path, title: str, blocks: Iterable[Block]) -> None:
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     page = Environment(autoescape=True).from_string(template).render(title=title, blocks=list(blocks))
     write_text(path, page)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON; NaN and infinities, which JSON does not have, become null."""
-    write_text(path, json.dumps(plain(content), indent=1, ensure_ascii=False) + "\n")
-
-
-def plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: NaN and infinities are null."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, float) and not abs(value) < float("inf"):
-        return None
-    return value
 
 
 def account(

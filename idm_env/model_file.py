@@ -10,7 +10,7 @@
 
 An effect that the package has never seen is written as the place of its class, ``my_file.py:MyEffect`` or
 ``my_package.my_module:MyEffect``. That is code of whoever wrote the YAML file. It is free where this process has
-imported it already. Otherwise it is run only if ``trusted``, inside ``idm_env.trust.trusting()``, or with
+imported it already. Otherwise it is run only if ``trusted``, inside ``idm_env.jobs.trust.trusting()``, or with
 IDM_ENV_TRUST=1.
 
 ``by`` says what the keys of ``drivers`` are, as in ``fit``: ``driver`` (run/vehicle), ``run_id``, ``vehicle_id`` or a
@@ -35,13 +35,14 @@ import torch
 from torch import Tensor
 
 from idm_env import effects as catalogue
-from idm_env import parameters, trust
-from idm_env.checks import nearest, one_of, shown, whole
+from idm_env import parameters
 from idm_env.effects import CarFollowing, Effect
 from idm_env.extras import needed
-from idm_env.keep import write_text
+from idm_env.jobs import trust
+from idm_env.jobs.storage import write_text
 from idm_env.roads import Lanes, Road
 from idm_env.simulator import INTEGRATORS, Integration, Simulator
+from idm_env.validation import nearest, one_of, shown, whole
 
 SCHEMA = 1
 """Version of the layout of ``model.yaml``."""

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import idm_env
-from idm_env import checks, keep, refusals, trust
+from idm_env import validation
+from idm_env.cli import refusals
 from idm_env.extras import needed
-from idm_env.progress import OnProgress, shown
+from idm_env.jobs import storage, trust
+from idm_env.jobs.progress import OnProgress, shown
 
 with needed("the command line"):
     import typer
@@ -48,7 +50,7 @@ console = Console(stderr=True, **PLAIN)
 EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
 """What ``explain`` writes."""
 PICTURES = (".png", ".svg", ".pdf")
-CHECKOUT = Path(__file__).resolve().parents[1]
+CHECKOUT = Path(__file__).resolve().parents[2]
 """Where this package lies: a checkout, or the libraries of an installation."""
 
 
@@ -72,7 +74,7 @@ def _ranged(*names: str, help: str, low: float, high: float, unit: str = "") -> 
 
     def check(param: typer.CallbackParam, value: float | None) -> float | None:
         if value is not None:
-            checks.within(param.opts[0], value, low, high, unit)
+            validation.within(param.opts[0], value, low, high, unit)
         return value
 
     return typer.Option(*names, help=help, callback=check)
@@ -154,7 +156,7 @@ def _stop(number: int, frame: object) -> NoReturn:
 
 
 def _show(title: str, rows: list[dict[str, Any]]) -> None:
-    from idm_env.report import number
+    from idm_env.reports.page import number
 
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
@@ -228,16 +230,16 @@ def fit(
     share: str | float | None = held_out
     if held_out is not None and "=" not in held_out:
         share = _number("--held-out", held_out, 'neither "column=value" nor a share such as 0.25')
-        checks.within("--held-out", share, 0.001, 0.999)
+        validation.within("--held-out", share, 0.001, 0.999)
     with shown(console) as report:
-        from idm_env.config import load_model
-        from idm_env.executor import opened
         from idm_env.fitting import sumo as vtypes
         from idm_env.fitting.job import fit_file
         from idm_env.fitting.options import Options, Source
+        from idm_env.jobs.executor import opened
+        from idm_env.model_file import load_model
 
         if sumo is not None:
-            keep.not_an_input(sumo, [data])
+            storage.not_an_input(sumo, [data])
             vtypes.refuse(sumo, base or "idm")
         _work_begins()
         source = Source(
@@ -324,7 +326,7 @@ def explain(
         from idm_env.data.load import files_of
         from idm_env.discovery.sets import Question, explain_sets
         from idm_env.discovery.sets import explain as explain_one
-        from idm_env.executor import opened
+        from idm_env.jobs.executor import opened
 
         files = files_of(data)
         asked = Question(
@@ -349,7 +351,7 @@ def explain(
 
 def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
     from idm_env.discovery.words import ERRORS, ceilings, laws, weight
-    from idm_env.report import account
+    from idm_env.reports.page import account
 
     console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
     console.print(result["sentence"], highlight=False)
@@ -395,7 +397,9 @@ def _error_row(
 def _names(option: str, text: str | None) -> tuple[str, ...] | None:
     found = None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
     if found == ():
-        raise ValueError(f"{option} = {checks.shown(text)} names nothing. Give names by comma, or leave {option} out.")
+        raise ValueError(
+            f"{option} = {validation.shown(text)} names nothing. Give names by comma, or leave {option} out."
+        )
     return found
 
 
@@ -413,7 +417,7 @@ def demo(
     The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
     """
     names = (*EXPLAINED, *(("platoon.csv",) if data is None else ()))
-    with keep.results(out, names, [data]) as folder, shown(console) as report:
+    with storage.results(out, names, [data]) as folder, shown(console) as report:
         from idm_env.data import synthetic
         from idm_env.discovery.sets import Question
         from idm_env.discovery.sets import explain as explain_one
@@ -425,7 +429,7 @@ def demo(
             path = folder / "platoon.csv"
             made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
             told = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
-            keep.write_csv(path, made.table.select(told))
+            storage.write_csv(path, made.table.select(told))
             console.print(f"Ten runs of a leader and three followers: {path}", soft_wrap=True)
         result, models = explain_one(path, out, Question(columns=columns if data else None), on_progress=report)
     _explained(result, models, out)
@@ -508,7 +512,7 @@ def effects(
     from idm_env.parameters import table
 
     if model is not None:
-        from idm_env.config import load_model
+        from idm_env.model_file import load_model
 
         chosen = {effect.name: effect for effect in load_model(model).effects}
     else:
@@ -543,7 +547,7 @@ def citations(effects: dict[str, Any]) -> list[str]:
 @app.command()
 def doctor() -> None:
     """Say what works on this machine and what does not, with the cure. Ends with code 1 if something is broken."""
-    from idm_env.doctor import findings
+    from idm_env.cli.doctor import findings
 
     found = findings()
     _show("This machine", [{"what": f.what, "state": f.state, "found": f.told, "cure": f.cure} for f in found])
@@ -579,19 +583,19 @@ def plot(
     One panel per run and lane, of a rollout the left lane first; controlled vehicles (of a rollout, or a column
     "controlled") are underlined in blue.
     """
-    from idm_env.report import account
+    from idm_env.reports.page import account
 
     if out.is_dir() or out.suffix.lower() not in PICTURES:
         told = "is a folder" if out.is_dir() else "names no kind of picture"
         raise ValueError(f"--out = {out} {told}. Give a file that ends in {', '.join(PICTURES)}.")
     written = [out, *([out.with_suffix(".html")] if html else [])]
     for path in written:
-        keep.not_an_input(path, [source])
+        storage.not_an_input(path, [source])
     if html and written[1].exists() and 'id="diagram"' not in written[1].read_text(errors="replace"):
         raise ValueError(f"{written[1]} was not written by idm-env plot. Move it, or give --out another name.")
     repairs: tuple[Any, ...] = ()
     with shown(console) as report:
-        from idm_env import diagrams, fonts
+        from idm_env.reports import diagrams, fonts
 
         if source.suffix in (".yaml", ".yml"):
             drawn = _rollout_panels(source, seconds, seed, report)
@@ -611,7 +615,7 @@ def plot(
         out.parent.mkdir(parents=True, exist_ok=True)
         figure = diagrams.figure_of(kept, title)
         numbers = fonts.legible(figure)
-        keep.write(out, figure.savefig)
+        storage.write(out, figure.savefig)
         if html:
             diagrams.write_html(out.with_suffix(".html"), kept, title)
     if more:
@@ -629,9 +633,9 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
     """Return the panel of a rollout, or one for each of several lanes."""
     import torch
 
-    from idm_env.config import load_environment
-    from idm_env.diagrams import lane_panels, rollout_panel
     from idm_env.envs.gym import DiffIDMEnv
+    from idm_env.model_file import load_environment
+    from idm_env.reports.diagrams import lane_panels, rollout_panel
     from idm_env.roads import Lanes, Ring
     from idm_env.simulator import Trajectory
 
@@ -684,7 +688,7 @@ def filter_(
 ) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
     with shown(console) as report:
-        from idm_env.executor import opened
+        from idm_env.jobs.executor import opened
         from idm_env.trajectories.files import filter_file
 
         _work_begins()
@@ -727,7 +731,7 @@ def reconstruct(
 ) -> None:
     """Reconstruct dense trajectories from sparse ones, a second or more between points."""
     with shown(console) as report:
-        from idm_env.executor import opened
+        from idm_env.jobs.executor import opened
         from idm_env.trajectories.files import reconstruct_file
 
         _work_begins()
@@ -751,7 +755,7 @@ def predict(
 ) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
     with shown(console) as report:
-        from idm_env.executor import opened
+        from idm_env.jobs.executor import opened
         from idm_env.prediction.files import predict_files
 
         _work_begins()
@@ -796,9 +800,9 @@ def bench(
 
 def _number(option: str, text: str, wrong: str) -> float:
     try:
-        return checks.finite(option, float(text))
+        return validation.finite(option, float(text))
     except ValueError:
-        raise ValueError(f"{option} = {checks.shown(text)} is {wrong}.") from None
+        raise ValueError(f"{option} = {validation.shown(text)} is {wrong}.") from None
 
 
 def _told(word: str, path: Path) -> None:
@@ -823,7 +827,7 @@ def run() -> None:
         cause = error.__cause__ if isinstance(error, typer.Abort) else error
         if _stopped or not isinstance(cause, Exception):
             _interrupted()
-        if isinstance(cause, (ValueError, ImportError, OSError, EOFError, MemoryError)) or keep.full(cause):
+        if isinstance(cause, (ValueError, ImportError, OSError, EOFError, MemoryError)) or storage.full(cause):
             _failed(cause)
         if not hasattr(error, "show"):
             raise
@@ -843,7 +847,7 @@ def run() -> None:
 
 def _failed(error: Exception) -> NoReturn:
     """End with one line that says what is wrong, never longer than a terminal can take."""
-    text = " ".join((keep.full(error) or str(error) or type(error).__name__).split())
+    text = " ".join((storage.full(error) or str(error) or type(error).__name__).split())
     print(f"error: {text if len(text) <= 1000 else text[:1000] + ' …'}", file=sys.stderr)
     sys.exit(1)
 

@@ -1,0 +1,1 @@
+"""The command line: commands, what they refuse before anything slow is imported, and what works on this machine."""
