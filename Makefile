@@ -44,7 +44,7 @@ test-lowest: setup
 	  pytest pytest-xdist pytest-timeout hypothesis packaging 'setuptools>=77'
 	$(LOWEST)/bin/python -m pytest -n 2 --ignore tests/envs/test_torchrl.py -k 'not supersuit and not record_video' \
 	  tests/envs tests/tasks tests/data tests/fitting tests/prediction tests/trajectories/test_files.py \
-	  tests/test_cli.py tests/test_keep.py tests/test_executor.py tests/test_report.py tests/test_wheel.py
+	  tests/test_cli.py tests/test_storage.py tests/test_executor.py tests/test_report.py tests/test_wheel.py
 
 # RLlib's example, in the environment that RLlib wants (2 GB).
 RLLIB := build/rllib

@@ -2,7 +2,7 @@
 
     python -m benchmarks.prediction FILE… [--shares] [--executor processes]
 
-Shares of the ways in which agents go on (``idm_env.prediction.shares``) are fitted to all scenes but the one that is
+Shares of the ways in which agents go on (``idm_env.prediction.mixture``) are fitted to all scenes but the one that is
 predicted, so every figure is held out. ``--shares`` prints those fitted to all scenes, which the package ships.
 """
 
@@ -21,9 +21,9 @@ from idm_env.data.womd import scenarios
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.prediction.files import OURS, case_of
 from idm_env.prediction.metrics import Score, score, summary
+from idm_env.prediction.mixture import SHARES, Seen, Shares, fit_shares, seen
 from idm_env.prediction.predict import METHODS, Mixture, Prediction, chosen, mixture
 from idm_env.prediction.scene import Scene
-from idm_env.prediction.shares import SHARES, Seen, Shares, fit_shares, seen
 
 STRAIGHT = "constant velocity"
 LEAST_S = 3

@@ -16,10 +16,10 @@ from idm_env.data.fingerprint import fitted_on
 from idm_env.discovery import bases, calibrate, ceilings, free, judge, places, records, search, shared, summary, words
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
-from idm_env.discovery.decide import Decided, Round, decide
 from idm_env.discovery.model import Model, Term
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
+from idm_env.discovery.selection import Decided, Round, decide
 from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.verdict import Reason, Refusal, Verdict
 from idm_env.effects import (

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from idm_env.discovery import pictures, words
-from idm_env.discovery.decide import LEAST_GAIN, LEAST_SHARE
 from idm_env.discovery.discover import Discovery
 from idm_env.discovery.score import ALPHA, FREE_SHARE
+from idm_env.discovery.selection import LEAST_GAIN, LEAST_SHARE
 from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
 from idm_env.discovery.verdict import HOLDS, Verdict
 from idm_env.discovery.words import percent as change

@@ -16,9 +16,9 @@ from idm_env.discovery import words
 from idm_env.reports.page import Block, picture
 
 if TYPE_CHECKING:
-    from idm_env.discovery.decide import Round
     from idm_env.discovery.discover import Discovery
     from idm_env.discovery.judge import Judged
+    from idm_env.discovery.selection import Round
 
 BEFORE, AFTER, TRUTH, GREY = "#c0392b", "#1f6fb2", "#222222", "#9aa5b1"
 plt.rcParams.update(

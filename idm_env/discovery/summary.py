@@ -11,11 +11,11 @@ import numpy as np
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import bases, judge, words
 from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
-from idm_env.discovery.decide import LEAST_GAIN, Round
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Bar, Strength, powerful, strength_of
 from idm_env.discovery.records import Records
 from idm_env.discovery.score import FREE_SHARE, interval_of, level
+from idm_env.discovery.selection import LEAST_GAIN, Round
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units

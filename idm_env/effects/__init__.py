@@ -13,9 +13,9 @@ from idm_env.effects.actions import Control, Replay
 from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
 from idm_env.effects.base import CarFollowing, Effect
 from idm_env.effects.bases import FVDM, IIDM, ConstantTimeGap, Gipps, IDMPlus
-from idm_env.effects.changes import GapAcceptance, LaneCommand, MandatoryChange, Mobil
 from idm_env.effects.free import Curve, DriverCurve
 from idm_env.effects.idm import IDM
+from idm_env.effects.lane_changes import GapAcceptance, LaneCommand, MandatoryChange, Mobil
 from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
 from idm_env.effects.neighbours import BrakeLight, Courtesy, Follower, Lateral, LeaderAcceleration, SecondLeader
 from idm_env.effects.noise import DRIFTS, AccelNoise, Noise, PerceptionNoise, Wander

@@ -12,7 +12,7 @@ import torch
 from idm_env.data import DataError, Trajectories
 from idm_env.data.errors import by_kind
 from idm_env.effects import IDM, Brakes, Mobil, base_named
-from idm_env.fitting.choices import (
+from idm_env.fitting.discrete_choice import (
     Choice,
     Chosen,
     ConstantRate,
@@ -24,7 +24,7 @@ from idm_env.fitting.choices import (
     held_out,
     per_vehicle,
 )
-from idm_env.fitting.decisions import Decisions, recorded_decisions
+from idm_env.fitting.lane_decisions import Decisions, recorded_decisions
 from idm_env.fitting.options import Source
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, silent

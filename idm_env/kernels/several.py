@@ -18,7 +18,7 @@ from torch import Tensor
 from idm_env.delay_buffer import PAST
 from idm_env.effects.base import Remembering
 from idm_env.kernels import lanes, tiles
-from idm_env.kernels.deciding import Traffic, decision
+from idm_env.kernels.lane_changes import Traffic, decision
 from idm_env.kernels.printed import TileKernel, tile_kernel
 from idm_env.roads import Lanes
 from idm_env.roads.chains import Chains, Places

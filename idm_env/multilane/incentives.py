@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from idm_env.roads.beside import Side, Sideways
+from idm_env.roads.adjacent import Side, Sideways
 from idm_env.types import FAR, Beside, Inputs, Memory, Neighbour, Params, Scene, State, Wish
 
 if TYPE_CHECKING:

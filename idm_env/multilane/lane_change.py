@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from idm_env.multilane.incentives import beside, seen_merging, wished
-from idm_env.roads.beside import preferred
+from idm_env.roads.adjacent import preferred
 from idm_env.roads.linked import Linked, still_changing, without_absent
 from idm_env.types import Inputs, Params, State
 

@@ -22,8 +22,8 @@ from idm_env.fitting.fit import fit
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.solver import normal
 from idm_env.prediction.lanes import Route
+from idm_env.prediction.mixture import STANDING_MPS
 from idm_env.prediction.rollout import DT, Ahead, Drivers, bend_speed
-from idm_env.prediction.shares import STANDING_MPS
 from idm_env.prediction.stops import Stop
 
 URBAN_LIMIT = 13.4

@@ -11,10 +11,10 @@ from idm_env.effects import IDM
 from idm_env.prediction.drivers import posterior
 from idm_env.prediction.free import constant_velocity, free_futures, kept_velocity
 from idm_env.prediction.lanes import Route
+from idm_env.prediction.mixture import SHARES, Shares, share_of
 from idm_env.prediction.rollout import DT, Course, Drivers, roll
 from idm_env.prediction.scene import STEPS, Scene
 from idm_env.prediction.select import select
-from idm_env.prediction.shares import SHARES, Shares, share_of
 
 LATERAL_S = 4.0
 """Time in which a vehicle returns to the middle of its lane (s)."""

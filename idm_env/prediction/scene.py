@@ -11,8 +11,8 @@ from idm_env.data.scenario import Agent, Scenario
 from idm_env.prediction.drivers import Second, middle, passing
 from idm_env.prediction.free import motion_now
 from idm_env.prediction.lanes import LaneGraph, Route, turn
+from idm_env.prediction.mixture import STANDING_MPS
 from idm_env.prediction.rollout import DT, Ahead, Course, nobody, roll
-from idm_env.prediction.shares import STANDING_MPS
 from idm_env.prediction.stops import StopLines
 
 SECONDS = 8

@@ -12,8 +12,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from idm_env.roads.adjacent import within
 from idm_env.roads.base import Road
-from idm_env.roads.beside import within
 from idm_env.roads.linked import Linked
 from idm_env.roads.order import Order
 from idm_env.types import Links, State

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from idm_env.roads.beside import Preference, Side, Sideways
+from idm_env.roads.adjacent import Preference, Side, Sideways
 from idm_env.roads.order import Order, laps
 from idm_env.types import FAR, Links, Motion, Moving, Neighbour, State
 

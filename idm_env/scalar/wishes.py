@@ -1,6 +1,6 @@
 """Records a decision about lanes on scalars, and prints it: what drivers would want beside, and which side is better.
 
-``beside``, every effect's ``change`` and ``roads.beside.preferred`` run once, on names. A name of another lane
+``beside``, every effect's ``change`` and ``roads.adjacent.preferred`` run once, on names. A name of another lane
 is ``left speed`` or ``right speed``; there 0 is the follower that a driver would have, 1 the leader, and so on up and
 down that lane. On the driver's own lane 0 is himself, as in every recording.
 """
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 
 from idm_env.multilane.incentives import beside, wished
-from idm_env.roads.beside import Preference, Side, Sideways, preferred, within
+from idm_env.roads.adjacent import Preference, Side, Sideways, preferred, within
 from idm_env.roads.chains import Chains
 from idm_env.roads.lanes import Lanes
 from idm_env.scalar.graph import Graph, Node, Slot, inputs_of

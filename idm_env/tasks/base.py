@@ -25,8 +25,8 @@ from idm_env.tasks.behaviour import Behaviour, behaviour
 from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges, ranges_of, whole
 from idm_env.tasks.crash import contact, lawful_cost
 from idm_env.tasks.failsafe import safe_accel
-from idm_env.tasks.nouns import Advance, Bounds, Ended, Features, Pay, World
 from idm_env.tasks.random import Draw
+from idm_env.tasks.types import Advance, Bounds, Ended, Features, Pay, World
 from idm_env.types import Command, Inputs, Params, State
 from idm_env.validation import one_of, shown
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from idm_env.tasks.nouns import NOBODY, Pay
+from idm_env.tasks.types import NOBODY, Pay
 
 
 def lawful_cost(pay: Pay, steps: int) -> float:

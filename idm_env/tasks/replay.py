@@ -18,9 +18,9 @@ from idm_env.tasks.base import Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import count_of, in_ranges
 from idm_env.tasks.crash import floored
 from idm_env.tasks.follow import HIGHEST, KNEE, LOWEST, SEEN, headway_penalty
-from idm_env.tasks.nouns import NOBODY
 from idm_env.tasks.random import Draw
 from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene
+from idm_env.tasks.types import NOBODY
 from idm_env.types import Inputs, Params, Record
 from idm_env.validation import nearest, one_of, shown
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from idm_env.tasks.nouns import NOBODY
+from idm_env.tasks.types import NOBODY
 
 
 class Scene(NamedTuple):

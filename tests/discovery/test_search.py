@@ -10,10 +10,10 @@ from idm_env.data import episodes, synthetic
 from idm_env.discovery import model as terms
 from idm_env.discovery import search
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.decide import _same_class
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.search import Search
+from idm_env.discovery.selection import _same_class
 from idm_env.discovery.solve import Solution, Task, _Nested, linearise
 from idm_env.jobs.storage import Store
 

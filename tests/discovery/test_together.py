@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import decide, free, search, together
+from idm_env.discovery import free, search, selection, together
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Model
@@ -60,8 +60,8 @@ def test_a_term_of_windows_whose_interval_contains_its_null_is_taken_back_whatev
     both = solve(task, model, np.tile(task.prior.centre, (task.groups, 1)), np.array([-0.3, 1e-4]))
     intervals = interval_of(both, task)
     assert intervals[0, 2] < 0.0 and intervals[1, 1] < 0.0 < intervals[1, 2]
-    monkeypatch.setattr(decide, "log_gain", lambda *_: np.ones(1))  # the loss of no term is small
-    assert [t.label for t in decide._delete(searching, both, 0).model.terms] == ["speed_time_gap"]
+    monkeypatch.setattr(selection, "log_gain", lambda *_: np.ones(1))  # the loss of no term is small
+    assert [t.label for t in selection._delete(searching, both, 0).model.terms] == ["speed_time_gap"]
 
 
 def test_what_windows_found_is_fitted_in_free_simulation_once_more(searching: Search, start: free.Stand) -> None:

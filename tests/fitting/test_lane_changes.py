@@ -11,9 +11,9 @@ import torch
 
 from idm_env.data import DataError, Trajectories
 from idm_env.effects import IDM, Brakes, Mobil
-from idm_env.fitting.choices import ConstantRate, GapAcceptance, Wishes, fit_choice
-from idm_env.fitting.decisions import LEFT, RIGHT, Decisions, recorded_decisions
+from idm_env.fitting.discrete_choice import ConstantRate, GapAcceptance, Wishes, fit_choice
 from idm_env.fitting.lane_changes import ChangeOptions, fit_lane_changes, lane_changes
+from idm_env.fitting.lane_decisions import LEFT, RIGHT, Decisions, recorded_decisions
 from idm_env.fitting.options import Source
 from idm_env.jobs.storage import plain
 from idm_env.model_file import load_model

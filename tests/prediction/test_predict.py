@@ -18,6 +18,7 @@ from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
 from idm_env.prediction.files import OURS, case_of, predict_files
 from idm_env.prediction.lanes import LaneGraph, Route
 from idm_env.prediction.metrics import score, summary
+from idm_env.prediction.mixture import SHARES, fit_shares
 from idm_env.prediction.predict import (
     METHODS,
     along_lane,
@@ -29,7 +30,6 @@ from idm_env.prediction.predict import (
 from idm_env.prediction.rollout import Ahead, Course, Drivers, nobody, roll
 from idm_env.prediction.scene import STEPS, Scene
 from idm_env.prediction.select import chances, select
-from idm_env.prediction.shares import SHARES, fit_shares
 from idm_env.prediction.stops import Stop, StopLines
 from tests.prediction import scenes
 from tests.prediction.test_womd import write_json

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from idm_env.prediction.metrics import Case
-from idm_env.prediction.shares import PRIOR_AGENTS, Seen, fit_shares, pace_of, seen, share_of
+from idm_env.prediction.mixture import PRIOR_AGENTS, Seen, fit_shares, pace_of, seen, share_of
 
 STEPS = 80
 

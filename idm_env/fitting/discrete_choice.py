@@ -25,7 +25,7 @@ from scipy import optimize
 from torch import Tensor
 
 from idm_env.data import DataError
-from idm_env.fitting.decisions import Decisions
+from idm_env.fitting.lane_decisions import Decisions
 from idm_env.multilane.incentives import wished
 from idm_env.parameters import Parameter
 from idm_env.simulator import Simulator

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.kernels import decision_loops, lanes, order_loops
+from idm_env.kernels import lane_change_loops, lanes, order_loops
 from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import dense, operand
 from idm_env.kernels.printed import HEADER, printed
@@ -149,7 +149,7 @@ class Traffic:
         merger = np.tile(np.arange(self.n), self.rows if sees else 0)
         order, begin = np.empty(self.rows * self.n, np.int64), np.empty(self.rows * (self.road.count + 1), np.int64)
         tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], kind)
-        done = decision_loops.decide(
+        done = lane_change_loops.decide(
             self._links, dense(state.position, self.shape), *self._present(state), self.rows, self.n,
             self.road.count, self._ring, self.road.handed == "left", tables, plan, places, phase, constants,
             len(found.slots), fresh, merger, turns, order, begin,
@@ -183,7 +183,7 @@ class Traffic:
         more = []
         for i, name in moving:
             array, _, _ = self._operand(name, state, inputs, params)
-            plan[i, decision_loops.ADDRESS] = addresses([array])[0]
+            plan[i, lane_change_loops.ADDRESS] = addresses([array])[0]
             more.append(array)
         return plan, places, [*held, *more]
 
@@ -197,7 +197,7 @@ class Traffic:
                 continue
             array, by_row, by_vehicle = self._operand(name, state, inputs, params)
             place = places.setdefault((side, slot.shift), len(places)) if by_vehicle else 0
-            rows.append((decision_loops.ARRAY, side, place, int(addresses([array])[0]), by_row, by_vehicle))
+            rows.append((lane_change_loops.ARRAY, side, place, int(addresses([array])[0]), by_row, by_vehicle))
             held.append(array)
             if not self._lasts(name):
                 moving.append((i, name))
@@ -231,7 +231,7 @@ class Traffic:
 
 KINDS = {
     **{name: i + 1 for i, name in enumerate(SEARCHED)},
-    HERE[0]: decision_loops.OPENS, HERE[1]: decision_loops.CLOSES, HERE[2]: decision_loops.STOPS,
+    HERE[0]: lane_change_loops.OPENS, HERE[1]: lane_change_loops.CLOSES, HERE[2]: lane_change_loops.STOPS,
 }  # fmt: skip
 """Rows that are searched for instead of read from an array."""
 

@@ -18,7 +18,7 @@ CHUNK = 256
 """Vehicles for which the printed phase is called at once: its rows stay in the second-level cache."""
 
 RESULTS = 5
-"""Rows that the phase fills: what ``roads.beside.Preference`` holds."""
+"""Rows that the phase fills: what ``roads.adjacent.Preference`` holds."""
 
 ARRAY, LANE, AHEAD, BEHIND, LAPS_AHEAD, LAPS_BEHIND, OPENS, CLOSES, STOPS = range(9)
 """What a row of the phase is filled with: an array's numbers, or what ``search`` finds."""

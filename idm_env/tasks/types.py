@@ -1,4 +1,4 @@
-"""The nouns of tasks: what a step carries over, how episodes end, what agents see, and who advances a state."""
+"""Words of tasks: what a step carries over, how episodes end, what agents see, and who advances a state."""
 
 from __future__ import annotations
 
