@@ -6,12 +6,15 @@ Sums may be made in any order (``reassoc``), so results are those of torch to ro
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from idm_env.kernels.dense import PITCH, ROWS
 from idm_env.kernels.row_text import UNARY, loops
 from idm_env.kernels.rows import Place, RowFunction, index, storage
 from idm_env.scalar.record import Untraceable
@@ -71,13 +74,20 @@ _SIMPLER: dict[Any, Callable[..., Any]] = {
 class PolicyRows(RowFunction):
     """``function(**inputs)``, of which those named in ``shared`` are the same for all rows.
 
-    An output that is a sum over rows lies in one of ``sums``, arrays that are added to: ``summed`` says for each such
-    output in which, and shape, strides and offset there.
+    Numbers of a block of rows lie side by side, so every loop over rows is one over vectors. An output that is a sum
+    over rows lies in one of ``sums``, arrays that are added to: ``summed`` says for each such output in which, and
+    shape, strides and offset there.
     """
 
     options = ', fastmath={"contract", "reassoc"}'
     imports = (
+        "from idm_env.kernels.dense import dense, outer\n"
         "from idm_env.kernels.functions import exp_{kind} as exp, sigmoid_{kind} as sigmoid, tanh_{kind} as tanh\n"
+    )
+    around = (
+        f"    for first in range(begin, end, {PITCH}):\n"
+        f"        count = min({PITCH}, end - first)\n"
+        f"        m = (count + {ROWS - 1}) // {ROWS} * {ROWS}\n"
     )
     unary = {**UNARY, "exp": "exp({0})", "sigmoid": "sigmoid({0})", "tanh": "tanh({0})"}  # noqa: RUF012
     simpler = _SIMPLER
@@ -88,16 +98,60 @@ class PolicyRows(RowFunction):
     ) -> None:  # fmt: skip
         self._shared = set(shared)
         self._whole: set[int] = set()
+        self._read: dict[str, tuple[Tensor, Place]] = {}
+        self._used: set[int] = set()
         self.sums: dict[str, int] = {}
         self.summed: dict[str, tuple[str, tuple[int, ...], tuple[int, ...], int]] = {}
         super().__init__(function, inputs, rows, apart=True)
 
+    # -- where tensors lie -----------------------------------------------------------------------------------------
+
     def _given(self, name: str, x: Tensor) -> None:
-        if name not in self._shared:
-            super()._given(name, x)
-            return
-        self._stores[storage(x)] = (f"in_{name}", "0", 0)
-        self._whole.add(storage(x))
+        if name in self._shared:
+            self._stores[storage(x)] = (f"in_{name}", "0", 0)
+            self._whole.add(storage(x))
+        else:
+            self._read[name] = (x, self._fresh(x))
+
+    def _fresh(self, x: Tensor) -> Place:
+        kind, width = self._kind(x), x.untyped_storage().nbytes() // x.element_size() // self._rows
+        self._keep(x, kind, f"{self._room[kind]} + r", width, kind)
+        self._room[kind] += width * PITCH
+        return self._places[id(x)]
+
+    def _first(self, lines: Sequence[str]) -> list[str]:
+        """Print how blocks of inputs are read, rows last; what lies beyond the last row is 0."""
+        made: list[str] = []
+        for name, (x, place) in self._read.items():
+            if storage(x) in self._used:
+                to, width = f"{place.array}[U({place.start} + j * {PITCH})]", x.numel() // self._rows
+                made += [
+                    f"for j in range({width}):", "    for r in range(count):",
+                    f"        {to} = in_{name}[U((first + r) * {width} + j)]",
+                    "    for r in range(count, m):", f"        {to} = 0",
+                ]  # fmt: skip
+        return made
+
+    def _tell(self, name: str, x: Tensor, kind: str) -> list[str]:
+        strides = tuple(math.prod(x.shape[k + 1 :]) for k in range(1, x.dim()))
+        to = Place(f"out_{name}", f"(first + r) * {math.prod(x.shape[1:])}", 0, strides, kind)
+        return self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at)}", "count")
+
+    def _loops(self, shape: Sequence[int], line: Callable[[list[str]], str | list[str]], many: str = "m") -> list[str]:
+        """Return loops over a shape and the rows of a block; what is the same for all rows is read before them."""
+
+        def inner(at: list[str]) -> list[str]:
+            made = line(at)
+            lines, held = [made] if isinstance(made, str) else made, dict[str, str]()
+            for i, each in enumerate(lines):
+                for same in _SHARED.findall(each):
+                    held.setdefault(same, f"h{len(held)}")
+                    each = each.replace(same, held[same])
+                lines[i] = each
+            first = [f"{name} = {same}" for same, name in held.items()]
+            return [*first, f"for r in range({many}):", *("    " + each for each in lines)]
+
+        return loops(shape, inner)
 
     def _by_row(self, name: str, x: Tensor) -> bool:
         if storage(x) not in self._whole:
@@ -117,9 +171,19 @@ class PolicyRows(RowFunction):
             self._places[id(x)] = Place(array, start, int(x.storage_offset()), tuple(x.stride()), kind)
             return
         super()._view(x, kind)
+        place = self._places[id(x)]
+        strides = tuple(s * PITCH for s in place.strides)
+        self._places[id(x)] = place._replace(offset=place.offset * PITCH, strides=strides)
+
+    def _number(self, value: float | int | bool, kind: str) -> str:
+        # As it stands: a table of constants would be read anew for every row.
+        return f"F({float(value)!r})" if kind == "f" and math.isfinite(value) else super()._number(value, kind)
 
     def _at(self, x: Any, at: Sequence[str], kind: str | None = None) -> str:
-        if not isinstance(x, Tensor) or storage(x) not in self._whole:
+        if not isinstance(x, Tensor):
+            return super()._at(x, at, kind)
+        self._used.add(storage(x))
+        if storage(x) not in self._whole:
             return super()._at(x, at, kind)
         shape = tuple(x.shape)
         while len(shape) > len(at) and shape[0] == 1:
@@ -128,6 +192,8 @@ class PolicyRows(RowFunction):
             raise Untraceable("an operation mixes rows")
         lined = ["0" if n == 1 else i for n, i in zip(shape, at[len(at) - len(shape) :], strict=True)]
         return index(self._place(x), lined)
+
+    # -- operations ------------------------------------------------------------------------------------------------
 
     def _print(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> None:
         if name in ("t", "transpose") and self._turned(out):
@@ -139,13 +205,37 @@ class PolicyRows(RowFunction):
             to = self._sum(out)
             if out.dim() > 1:
                 to = to._replace(strides=to.strides[1:])
-            self._parts.append(
-                loops(source.shape[1:], lambda at: f"{index(to, at)} = {index(to, at)} + {self._at(source, at)}")
-            )
+
+            def line(at: list[str]) -> list[str]:
+                every = f"    s = s + {self._at(source, at)}"
+                return ["s = F(0.0)", "for r in range(m):", every, f"{index(to, at)} += s"]
+
+            self._parts.append(loops(source.shape[1:], line))
         elif name in ("view", "_unsafe_view", "reshape") and storage(out) in self._whole:
             self._place(out)
         else:
             super()._print(name, args, kwargs, out)
+
+    def _reduce(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
+        """Print a sum or a mean over the last dimension, which is added to for all rows at once."""
+        source = args[0]
+        dims = args[1] if len(args) > 1 else kwargs.get("dim")
+        if name not in ("sum", "mean") or [d % source.dim() for d in dims or ()] != [source.dim() - 1]:
+            return super()._reduce(name, args, kwargs, x, to)
+        kept = x.dim() == source.dim()
+        shape = x.shape[1:-1] if kept else x.shape[1:]
+        count = self._number(source.shape[-1] if name == "mean" else 1, "f")
+        own = to._replace(strides=to.strides[:-1]) if kept else to
+
+        def lines(at: list[str]) -> list[str]:
+            there = index(own, at)
+            return [
+                "for r in range(m):", f"    {there} = F(0.0)", f"for k in range({source.shape[-1]}):",
+                "    for r in range(m):", f"        {there} = {there} + {self._at(source, [*at, 'k'])}",
+                "for r in range(m):", f"    {there} = {there} / {count}",
+            ]  # fmt: skip
+
+        return loops(shape, lines)
 
     def _turned(self, x: Tensor) -> bool:
         """Return whether a tensor has its rows last."""
@@ -169,38 +259,30 @@ class PolicyRows(RowFunction):
             raise Untraceable(f"{name} with {', '.join(kwargs)}")
         a, b = args[-2:]
         if self._turned(a):
-            rows, to = a.t(), self._sum(x)
-            self._parts.append(
-                loops(
-                    tuple(x.shape),
-                    lambda at: f"{index(to, at)} = {index(to, at)} + {self._at(rows, at[:1])} * {self._at(b, at[1:])}",
-                )
-            )
+            to, (tall, wide) = self._sum(x), x.shape
+            sides = f"{self._columns(a.t())}, {tall}, {self._columns(b)}, {wide}"
+            self._parts.append([f"outer({to.array}, {to.offset}, {to.strides[0]}, {to.strides[1]}, f, {sides}, m)"])
             return
-        if not self._known(a) or storage(a) in self._whole or self._turned(b):
-            raise Untraceable(f"{name} of other things than rows and weights")
-        to, (inner, width) = self._fresh(x), b.shape
-        by_column = self._known(b) and self._place(b).strides[-1] != 1 and inner > 1
-        at = "j0" if width > 1 else "0"
-        first = self._at(args[0], [at], "f") if name == "addmm" else "F(0.0)"
-        k = "k" if inner > 1 else "0"
-        times = f"{self._at(a, [k])} * {self._weight(b, k, at)}"
-        loop = [f"for {at} in range({width}):"] if width > 1 else []
-        deep = "    " if loop else ""
-        if by_column or width == 1:
-            lines = [*loop, f"{deep}s = {first}"]
-            lines += (
-                [f"{deep}for k in range({inner}):", f"{deep}    s += {times}"] if inner > 1 else [f"{deep}s += {times}"]
-            )
-            self._parts.append([*lines, f"{deep}{index(to, [at])} = s"])
-            return
-        self._parts.append([*loop, f"{deep}{index(to, [at])} = {first}"])
-        outer = [f"for k in range({inner}):"] if inner > 1 else []
-        far = "    " if outer else ""
-        lines = [*outer, f"{far}s = {self._at(a, [k])}", *(far + line for line in loop)]
-        self._parts.append([*lines, f"{far}{deep}{index(to, [at])} += s * {self._weight(b, k, at)}"])
-
-    def _weight(self, b: Tensor, k: str, at: str) -> str:
+        to, (deep, wide) = self._fresh(x), b.shape
         if not self._known(b):
-            return self._at(b, [k, at])
-        return index(self._place(b), [k, at])
+            by = self._table(b, self._plain(b))
+        elif storage(b) in self._whole:
+            by = self._place(b)
+        else:
+            raise Untraceable(f"{name} of other things than rows and weights")
+        first = args[0] if name == "addmm" else 0.0
+        self._parts.append(self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(first, at, 'f')}"))
+        sides = f"{self._columns(x)}, {wide}, {self._columns(a)}, {deep}, {by.array}, {by.offset}"
+        self._parts.append([f"dense(f, {sides}, {by.strides[1]}, {by.strides[0]}, m)"])
+
+    def _columns(self, x: Tensor) -> str:
+        """Return the first place of a matrix of rows, and the distance of its columns."""
+        if not self._known(x) or storage(x) in self._whole or self._turned(x):
+            raise Untraceable("a product of other things than rows")
+        self._used.add(storage(x))
+        place = self._place(x)
+        return f"{int(place.start.removesuffix(' + r')) + place.offset}, {place.strides[0]}"
+
+
+_SHARED = re.compile(r"\b(?:in_\w+|t\d+)\[[^\[\]]*\]")
+"""An element of what is the same for all rows."""

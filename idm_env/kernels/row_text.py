@@ -72,7 +72,7 @@ def loops(shape: Sequence[int], line: Callable[[list[str]], str | list[str]]) ->
     return head + ["    " * depth + text for text in lines]
 
 
-_ELEMENT = re.compile(r"\b(?:[fib]|out_\w+)\[(\d+|r)[^\[\]]*\]")
+_ELEMENT = re.compile(r"\b(?:[fib]|out_\w+)\[U\((\d+|r)[^\[\]]*\]")
 """An element of the workspace or of an output: its text, and where its storage begins."""
 
 

@@ -9,6 +9,7 @@ of views. Whatever does not depend on the inputs is a constant.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -37,7 +38,7 @@ from numba import carray, njit, types
 from idm_env.kernels.compiler import phase
 from idm_env.kernels.memory import located
 
-F = np.{kind}
+F, U = np.{kind}, np.uint64
 SIZE = (1 << 40,)
 inlined = njit(nogil=True, error_model="numpy", forceinline=True)
 {imports}
@@ -56,8 +57,7 @@ def smaller(x, y):
 @phase(types.void(types.int64, types.int64, types.CPointer(types.int64)){options})
 def run(begin, end, at):
 {arguments}    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
-    for r in range(begin, end):
-'''
+{around}'''
 
 
 class Place(NamedTuple):
@@ -101,6 +101,8 @@ class RowFunction:
 
     options, imports, unary = "", "", UNARY
     """How it is compiled, what is imported for that, and operations on single numbers."""
+    around = "    for r in range(begin, end):\n"
+    """The loop over rows."""
     simpler: Mapping[Any, Callable[..., Any]] = {}
     """What stands for an operation, by its name in torch."""
 
@@ -139,16 +141,11 @@ class RowFunction:
         real = np.dtype(np.float32 if self._floats == torch.float32 else np.float64)
         self.types = {name: TYPES.get(kind, real) for name, kind in kinds.items()}
         for name, x in moving.items():
-            strides = tuple(math.prod(x.shape[k + 1 :]) for k in range(1, x.dim()))
-            to = Place(f"out_{name}", f"r * {math.prod(x.shape[1:])}", 0, strides, kinds[name])
-
-            def line(at: Any, to: Place = to, x: Tensor = x) -> str:
-                return f"{index(to, at)} = {self._at(x, at)}"
-
-            self._parts.append(loops(x.shape[1:], line))
+            self._parts.append(self._tell(name, x, kinds[name]))
         lines = fused(self._parts)
+        lines = self._first(lines) + lines
         text = "\n".join(lines)
-        self.needs = [name for name in inputs if f"in_{name}[" in text]
+        self.needs = [name for name in inputs if re.search(rf"\bin_{name}\b", text)]
         self.outs = list(moving)
         typed: list[tuple[str, str]] = [("c", "f")]
         typed += [(f"t{k}", x.dtype.kind) for k, x in enumerate(self._tables)]
@@ -159,7 +156,7 @@ class RowFunction:
             f"    {n} = carray(located(at[{k}], {_TEXT[kind]}), SIZE)\n" for k, (n, kind) in enumerate(typed)
         )
         room = {kind: max(1, size) for kind, size in self._room.items()}
-        said = {"options": self.options, "imports": self.imports.format(kind=real.name)}
+        said = {"options": self.options, "imports": self.imports.format(kind=real.name), "around": self.around}
         header = HEADER.format(kind=real.name, arguments=arguments, **said, **room)
         self._held = [np.array(list(self._constants) or [0.0], real), *self._tables]
         self.fixed = addresses(self._held)
@@ -180,6 +177,19 @@ class RowFunction:
         """Enter an input."""
         width = x.numel() // self._rows
         self._keep(x, f"in_{name}", f"r * {width}", width, self._kind(x))
+
+    def _tell(self, name: str, x: Tensor, kind: str) -> list[str]:
+        """Print how an output is filled."""
+        strides = tuple(math.prod(x.shape[k + 1 :]) for k in range(1, x.dim()))
+        to = Place(f"out_{name}", f"r * {math.prod(x.shape[1:])}", 0, strides, kind)
+        return self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at)}")
+
+    def _first(self, lines: Sequence[str]) -> list[str]:
+        """Return what comes before lines that were printed."""
+        return []
+
+    def _loops(self, shape: Sequence[int], line: Callable[[list[str]], str | list[str]]) -> list[str]:
+        return loops(shape, line)
 
     def _by_row(self, name: str, x: Tensor) -> bool:
         """Return whether an output has a value for every row."""
@@ -310,7 +320,7 @@ class RowFunction:
         if value is None or x.dim() == 0 or x.shape[0] != self._rows:
             raise Untraceable("a constant is written to")
         to = self._fresh(x)
-        self._parts.append(loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._number(value, to.kind)}"))
+        self._parts.append(self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._number(value, to.kind)}"))
 
     def _compute(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], x: Tensor, to: Place) -> list[str]:
         shape = tuple(x.shape[1:])
@@ -322,7 +332,7 @@ class RowFunction:
             name, args = "where", (args[1], args[2], args[0])
         if name in self.unary or name in ("_to_copy", "clone"):
             form = self.unary.get(name, "{0}")
-            return loops(shape, lambda at: f"{index(to, at)} = " + form.format(self._at(args[0], at, to.kind)))
+            return self._loops(shape, lambda at: f"{index(to, at)} = " + form.format(self._at(args[0], at, to.kind)))
         if name in BINARY or name in COMPARE:
             kind = to.kind if name in BINARY else self._common(args)
             form = BINARY.get(name) or COMPARE[name]
@@ -330,10 +340,12 @@ class RowFunction:
                 raise Untraceable(f"{name} with alpha")
             if name == "pow" and args[1] in (2, 3):
                 form = "({0} * {0})" if args[1] == 2 else "({0} * {0} * {0})"
-            return loops(shape, lambda at: f"{index(to, at)} = " + form.format(*(self._at(a, at, kind) for a in args)))
+            return self._loops(
+                shape, lambda at: f"{index(to, at)} = " + form.format(*(self._at(a, at, kind) for a in args))
+            )
         if name == "where":
             c, y, n = args
-            return loops(
+            return self._loops(
                 shape,
                 lambda at: (
                     f"{index(to, at)} = {self._at(y, at, to.kind)} if {self._at(c, at)} else {self._at(n, at, to.kind)}"
@@ -347,7 +359,7 @@ class RowFunction:
             return self._joined(name, args, kwargs, x, to)
         if name == "flip":
             turned = {d % x.dim() - 1 for d in args[1]}
-            return loops(
+            return self._loops(
                 shape,
                 lambda at: (
                     f"{index(to, at)} = "
@@ -380,7 +392,7 @@ class RowFunction:
                 text = BINARY["minimum"].format(text, self._at(high, at, to.kind))
             return f"{index(to, at)} = {text}"
 
-        return loops(shape, line)
+        return self._loops(shape, line)
 
     def _reduce(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
         source = args[0]
@@ -406,7 +418,7 @@ class RowFunction:
             count = self._number(math.prod(source.shape[d] for d in gone), "f")
             return [*lines, f"{index(to, at)} = " + last.format("s", count)]
 
-        return loops(x.shape[1:], line)
+        return self._loops(x.shape[1:], line)
 
     def _joined(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
         dim = (args[1] if len(args) > 1 else kwargs.get("dim", 0)) % x.dim() - 1
@@ -423,7 +435,7 @@ class RowFunction:
                 own = [j for k, j in enumerate(at) if k != dim] if name == "stack" else at
                 return f"{index(to, there)} = {self._at(part, own, to.kind)}"
 
-            lines += loops(shape, line)
+            lines += self._loops(shape, line)
             done += width
         return lines
 
@@ -439,7 +451,7 @@ class RowFunction:
                 f"    s = s + {self._at(args[0], every, to.kind)}", f"    {index(to, every)} = s",
             ]  # fmt: skip
 
-        return loops(x.shape[1:-1], line)
+        return self._loops(x.shape[1:-1], line)
 
     def _spread(self, name: str, args: Sequence[Any], shape: tuple[int, ...], to: Place) -> list[str]:
         """Print zeros with a part of them filled: what falls on the whole from a slice, or from one index."""
@@ -449,7 +461,7 @@ class RowFunction:
             raise Untraceable(f"{name} mixes rows")
         begin, end, step = (rest[0], rest[0] + 1, 1) if name == "select_backward" else rest
         begin, end = (min(x + shape[k] if x < 0 else x, shape[k]) for x in (begin, end))
-        lines = loops(shape, lambda at: f"{index(to, at)} = {self._number(0, to.kind)}")
+        lines = self._loops(shape, lambda at: f"{index(to, at)} = {self._number(0, to.kind)}")
         part = [len(range(begin, end, step)) if j == k else n for j, n in enumerate(shape)]
 
         def line(at: list[str]) -> str:
@@ -457,7 +469,7 @@ class RowFunction:
             own = [i for j, i in enumerate(at) if j != k] if name == "select_backward" else at
             return f"{index(to, there)} = {self._at(source, own, to.kind)}"
 
-        return [*lines, *loops(part, line)]
+        return [*lines, *self._loops(part, line)]
 
     def _added(self, args: Sequence[Any], to: Place) -> list[str]:
         """Print ``x.index_add(dim, index, source)``."""
@@ -470,8 +482,8 @@ class RowFunction:
             there = index(to, [self._at(which, [i]) if j == k else i for j, i in enumerate(at)])
             return f"{there} = {there} + {self._at(source, at, to.kind)}"
 
-        first = loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at, to.kind)}")
-        return [*first, *loops(source.shape[1:], line)]
+        first = self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at, to.kind)}")
+        return [*first, *self._loops(source.shape[1:], line)]
 
     def _picked(self, name: str, args: Sequence[Any], x: Tensor, to: Place) -> list[str]:
         """Print ``source[index, …]``: rows of a table by recorded indices, or columns by constant ones."""
@@ -480,7 +492,7 @@ class RowFunction:
             dim = args[1] % source.dim() - 1
             if dim < 0 or self._known(args[2]):
                 raise Untraceable("index_select of rows")
-            return loops(
+            return self._loops(
                 x.shape[1:],
                 lambda at: (
                     f"{index(to, at)} = "
@@ -492,7 +504,7 @@ class RowFunction:
             raise Untraceable("an index into what changes")
         values = source.detach().cpu().numpy()
         table = self._table(source, values)
-        return loops(
+        return self._loops(
             x.shape[1:], lambda at: f"{index(to, at)} = {index(table, [*(self._at(p, []) for p in parts), *at])}"
         )
 
@@ -548,4 +560,5 @@ def index(place: Place, at: Sequence[str]) -> str:
     if place.start == "":
         return place.array
     terms = [f"{i} * {s}" for i, s in zip(at, place.strides, strict=True) if i != "0" and s]
-    return f"{place.array}[{' + '.join([place.start, *([str(place.offset)] if place.offset else []), *terms])}]"
+    # Without a sign: numba would ask of every other index whether it counts from the end, and nothing would vectorise.
+    return f"{place.array}[U({' + '.join([place.start, *([str(place.offset)] if place.offset else []), *terms])})]"
