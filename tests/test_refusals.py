@@ -105,3 +105,31 @@ def test_a_refusal_imports_neither_torch_nor_numba(name: str, tmp_path: Path) ->
         assert not imported, (why, words, text)
         assert code == 2 or (text.startswith("error: ") and text.count("\n") == 1), (why, words, text)
     assert helped[0] == 0 and not helped[2]
+
+
+@pytest.mark.parametrize(("vehicles", "cure"), [(60, "add --split-runs"), (4, "record 7 runs or more")])
+def test_one_recording_cannot_tell_and_is_told_so_at_once(tmp_path: Path, vehicles: int, cure: str) -> None:
+    """With what would help, a report, no model, and neither torch nor numba."""
+    rows = [
+        f"{v},{v * 8.0 + 0.5 * i},{10.0 * 0.5 * i:.1f},{v - 1 if v else ''}"
+        for v in range(vehicles) for i in range(80)
+    ]  # fmt: skip
+    (tmp_path / "one.csv").write_text("\n".join(["vehicle_id,time_s,position_m,leader_id", *rows]) + "\n")
+    out = tmp_path / "out"
+    script = f"import sys; sys.argv = ['idm-env', 'explain', 'one.csv', '--out', {str(out)!r}]\n" + ONE
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == ["0 []"], done.stdout + done.stderr
+    assert "Verdict: cannot tell" in done.stderr and cure in done.stderr
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert report["verdict"] == "cannot_tell" and cure in report["sentence"] and report["models"] == {}
+    assert 'class="light "' in (out / "report.html").read_text(encoding="utf-8")
+    assert not list(out.glob("*.yaml"))
+
+
+ONE = """
+from idm_env.cli import commands as cli
+try:
+    cli.run()
+except SystemExit as end:
+    print(int(end.code or 0), [name for name in ("torch", "numba") if name in sys.modules])
+"""

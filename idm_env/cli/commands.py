@@ -47,8 +47,6 @@ app = typer.Typer(
 # A path, a column or a sentence may have brackets and colons in it: nothing is markup.
 PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
 console = Console(stderr=True, **PLAIN)
-EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
-"""What ``explain`` writes."""
 PICTURES = (".png", ".svg", ".pdf")
 CHECKOUT = Path(__file__).resolve().parents[2]
 """Where this package lies: a checkout, or the libraries of an installation."""
@@ -313,6 +311,10 @@ def explain(
     layout: Layout = "auto",
     columns: Columns = None,
     where: Where = None,
+    split_runs: Annotated[
+        str | None,
+        typer.Option(help="Cut recordings into runs of so many seconds, 60s; each driver counts in one of them."),
+    ] = None,
     resume: Resume = False,
     executor: Workers = "serial",
     jobs: Jobs = None,
@@ -323,20 +325,33 @@ def explain(
     Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
     """
     with shown(console) as report:
+        from idm_env.data import pieces
         from idm_env.data.load import files_of
+        from idm_env.reports import undecided
+
+        files, seconds = files_of(data), pieces.seconds_of(split_runs)
+        candidates, given = _names("--effects", effects), _names("--known", known) or ()
+        read = None
+        if len(files) == 1:  # what one recording cannot tell is said before anything slow is imported
+            report("reading", 0, 0, files[0].name)
+            read = pieces.recordings(files[0], ring_length=ring_length, place=place, layout=layout, columns=columns,
+                                     where=where, seconds=seconds)  # fmt: skip
+            cure = pieces.cure(read)
+            if cure is not None:
+                _undecided(undecided.write(read, cure, out, files), out)
+                return
         from idm_env.discovery.sets import Question, explain_sets
         from idm_env.discovery.sets import explain as explain_one
         from idm_env.jobs.executor import opened
 
-        files = files_of(data)
         asked = Question(
-            by, _names("--effects", effects), _names("--known", known) or (), seed, ring_length, place, layout,
-            None if where is None else tuple(where), base or "idm", columns,
+            by, candidates, given, seed, ring_length, place, layout, None if where is None else tuple(where),
+            base or "idm", columns, seconds,
         )  # fmt: skip
         _work_begins()
         rows: list[dict[str, Any]] = []
-        if len(files) == 1:
-            result, models = explain_one(files[0], out, asked, resume=resume, on_progress=report)
+        if read is not None:
+            result, models = explain_one(files[0], out, asked, resume=resume, on_progress=report, trajectories=read)
         else:
             with opened(executor, jobs, ray_address) as workers:
                 rows = explain_sets(files, out, asked, resume=resume, executor=workers, on_progress=report)
@@ -349,7 +364,17 @@ def explain(
     _done(out, f"Every set's own report is in {out}/NAME; sets.csv has them all.")
 
 
+def _undecided(result: dict[str, Any], out: Path) -> None:
+    from idm_env.reports.page import account
+
+    console.print(Text.assemble("Verdict: ", ("cannot tell", "bold"), f". {result['sentence']}"), soft_wrap=True)
+    _done(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
+
+
 def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
+    if not result["models"]:
+        _undecided(result, out)
+        return
     from idm_env.discovery.words import ERRORS, ceilings, laws, weight
     from idm_env.reports.page import account
 
@@ -416,6 +441,8 @@ def demo(
 
     The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
     """
+    from idm_env.reports.undecided import EXPLAINED
+
     names = (*EXPLAINED, *(("platoon.csv",) if data is None else ()))
     with storage.results(out, names, [data]) as folder, shown(console) as report:
         from idm_env.data import synthetic

@@ -101,8 +101,9 @@ def blocks(d: Discovery) -> Iterator[Block]:
 
 
 def _lights(r: dict[str, Any], law: str) -> Iterator[Block]:
+    """Return the first screen's cards: how each error changed or, where nothing is compared, what is known instead."""
     if not r["helps"]:
-        yield pages.note(f"No second model came near enough to be compared with {law} on runs kept back.")
+        yield pages.lights((name, "", told) for name, told in known_instead(r, law))
         return
     yield pages.lights(
         (
@@ -113,6 +114,25 @@ def _lights(r: dict[str, Any], law: str) -> Iterator[Block]:
         )
         for key, h in r["helps"].items()
     )
+
+
+def known_instead(r: dict[str, Any], law: str) -> list[tuple[str, str]]:
+    """Return names and words of the cards of a report in which no second model is compared with the law."""
+    cards = [("Runs", f"{r['data']['runs']}, of them {r['data']['runs_to_choose_on']} to choose on")]
+    if r["verdict"] == Verdict.CANNOT_TELL.value:
+        cards.append(("What to do", "record more runs: seven decide, ten are better"))
+    if r["shared"] is not None:
+        at = r["shared"]
+        cards.append(
+            ("Where", f"run {at['run']}, {at['begin_s']:.0f} to {at['end_s']:.0f} s, {at['vehicles']} followers")
+        )
+        cards.append(("How much", f"{number(at['accel_mps2'], 2)} m/s² beside {law}"))
+    before = r["error"]["before"]
+    if before is not None:
+        floor = r["error"]["floor"]["gap_rmse_m"]
+        cards.append((f"Gap in free simulation, {law}", f"{number(before['gap_rmse_m'])} m on runs kept back; "
+                      f"the noise of the sensors alone leaves {number(floor)} m"))  # fmt: skip
+    return cards
 
 
 def _first_picture(d: Discovery) -> Iterator[Block]:

@@ -10,14 +10,16 @@ from typing import Any
 
 import polars as pl
 
-from idm_env.data import load
+from idm_env.data import Trajectories
+from idm_env.data.pieces import cure, recordings
 from idm_env.discovery.discover import discover
-from idm_env.discovery.write import OUTPUT, write_report
+from idm_env.discovery.write import write_report
 from idm_env.jobs import storage
 from idm_env.jobs.executor import Executor, Serial
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.jobs.shards import Parts
-from idm_env.reports import page
+from idm_env.reports import page, undecided
+from idm_env.reports.undecided import EXPLAINED
 
 SETS = ("sets.csv", "report.html")
 """What ``explain_sets`` writes beside the folders of the sets."""
@@ -38,24 +40,28 @@ class Question:
     where: tuple[str, ...] | None = None
     base: str = "idm"
     columns: str | None = None
+    split_s: float | None = None
 
 
 def explain(
-    path: Path, out: Path, question: Question, *, resume: bool = False, on_progress: OnProgress | None = None
-) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Explain one file, write the results, and return the report and the names of the models compared."""
+    path: Path, out: Path, question: Question, *, resume: bool = False, on_progress: OnProgress | None = None,
+    trajectories: Trajectories | None = None,
+) -> tuple[dict[str, Any], tuple[str, ...]]:  # fmt: skip
+    """Explain one file, write the results, and return the report and the names of the models compared.
+
+    ``trajectories`` are those of the file where they have been read before.
+    """
     progress = on_progress or silent
-    with storage.results(out, OUTPUT, [path]):
-        progress("reading", 0, 0, path.name)
-        trajectories = load(
-            path,
-            ring_length=question.ring_length,
-            place=question.place,
-            layout=question.layout,
-            columns=question.columns,
-        )
-        if question.where is not None:
-            trajectories = trajectories.where(question.where)
+    with storage.results(out, EXPLAINED, [path]):
+        if trajectories is None:
+            progress("reading", 0, 0, path.name)
+            trajectories = recordings(
+                path, ring_length=question.ring_length, place=question.place, layout=question.layout,
+                columns=question.columns, where=question.where, seconds=question.split_s,
+            )  # fmt: skip
+        said = cure(trajectories)
+        if said is not None:
+            return undecided.write(trajectories, said, out), ()
         found = discover(
             trajectories, by=question.by, effects=question.effects, known=question.known, out=out, resume=resume,
             seed=question.seed, base=question.base, on_progress=progress,

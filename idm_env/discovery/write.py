@@ -8,9 +8,7 @@ from idm_env.discovery.discover import Discovery
 from idm_env.jobs.storage import results, write_json
 from idm_env.model_file import save_model
 from idm_env.reports.page import write_page
-
-OUTPUT = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
-"""Every file that a discovery may write."""
+from idm_env.reports.undecided import EXPLAINED
 
 
 def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
@@ -21,9 +19,9 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
     """
     from idm_env.discovery import page
 
-    with results(out, OUTPUT) as folder:
+    with results(out, EXPLAINED) as folder:
         paths = {name: folder / name for name in ("report.json", "report.html", *discovery.models)}
-        for name in OUTPUT:  # the other model of an earlier run would be taken for one of this
+        for name in EXPLAINED:  # the other model of an earlier run would be taken for one of this
             if name not in paths:
                 (folder / name).unlink(missing_ok=True)
         write_json(paths["report.json"], discovery.report)

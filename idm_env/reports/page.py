@@ -120,7 +120,7 @@ def shortened(items: Sequence[str], most: int = 100) -> list[str]:
 
 
 def lights(rows: Iterable[tuple[str, str, str]]) -> Block:
-    """Return one light per (name, ``better``, ``same`` or ``worse``, words); the state is a word and a colour."""
+    """Return one card per (name, ``better``, ``same`` or ``worse``, words); the state is a word and a colour, or ""."""
     return Block("lights", rows=tuple(rows))
 
 

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from idm_env.data import Trajectories, episodes, synthetic
-from idm_env.discovery import Discovery, compare, discover, judge, verdict, words, write_report
+from idm_env.discovery import Discovery, compare, discover, judge, page, verdict, words, write_report
 from idm_env.discovery import model as terms
 from idm_env.discovery.bases import Law, best_of
 from idm_env.discovery.calibrate import first_prior
@@ -279,3 +279,18 @@ def test_ceilings_are_told_with_the_smooth_function_and_the_sensors(lag: Discove
         f"predictions of 5 s by {100 * told['smooth_function_gain']:.1f} %" in text
         and "sensors alone leave 0.0" in text
     )
+
+
+def test_what_is_not_compared_has_cards_all_the_same() -> None:
+    """Where it lies and how much it is, or what to do: on the first screen, of every verdict without a second model."""
+    data = {"runs": 4, "runs_to_choose_on": 3}
+    error = {"before": {"gap_rmse_m": 2.0}, "floor": {"gap_rmse_m": 0.5}}
+    shared = {"run": "a", "vehicles": 3, "begin_s": 10.0, "end_s": 20.0, "accel_mps2": -0.4}
+    for told, common, names in (("cannot_tell", None, ["Runs", "What to do"]),
+                                   ("located", shared, ["Runs", "Where", "How much"])):  # fmt: skip
+        cards = page.known_instead(
+            {"verdict": told, "data": data, "shared": common, "error": error, "helps": {}}, "IDM"
+        )
+        assert [name for name, _ in cards] == [*names, "Gap in free simulation, IDM"]
+        assert all(card for _, card in cards) and "2 m on runs kept back" in cards[-1][1]
+    assert cards[1][1] == "run a, 10 to 20 s, 3 followers"

@@ -1,0 +1,44 @@
+"""The report of ``explain`` on one recording, which cannot tell: written before torch and numba are imported."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from idm_env.jobs.storage import results, write_json
+from idm_env.reports import page
+from idm_env.reports.diagrams import space_time
+
+if TYPE_CHECKING:
+    from idm_env.data import Trajectories
+
+EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
+"""What ``explain`` writes."""
+
+
+def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Path] = ()) -> dict[str, Any]:
+    """Write and return what can be said of one recording, of which nothing can be held out, and the ``cure``.
+
+    The report has the keys of every report of ``explain``; there is no model.
+    """
+    sentence = f"{trajectories.source} is one recording, of which no run can be held out for a final check. {cure}"
+    found: dict[str, Any] = {
+        "verdict": "cannot_tell", "reason": "few_runs", "sentence": sentence, "details": [cure], "found": [],
+        "known": [], "helps": {}, "interval": None, "models": {}, "partial": None, "candidates": [], "shared": None,
+        "error": {"held_out_runs": [], "held_out_drivers": [], "before": None, "after": None}, "excluded": [],
+        "parameters": [], "data": trajectories.summary(), "prior": None, "bases": [], "versions": page.versions(),
+    }  # fmt: skip
+    cards = [
+        ("Recordings", "", "1"),
+        ("Drivers behind a leader", "", str(len(trajectories.followers()))),
+        ("What to do", "", cure),
+    ]
+    with results(out, EXPLAINED, inputs) as folder:
+        for name in EXPLAINED:  # a model of an earlier run would be taken for one of this
+            (folder / name).unlink(missing_ok=True)
+        write_json(folder / "report.json", found)
+        drawn = page.picture(space_time(trajectories), "The recording: a line per vehicle, coloured by speed.")
+        blocks = [page.lead(sentence), page.lights(cards), drawn]
+        page.write_page(folder / "report.html", "One recording cannot tell what IDM lacks", blocks)
+    return found
