@@ -29,7 +29,7 @@ from scipy.stats import energy_distance  # noqa: E402
 from idm_env.data import Episode, episodes, load  # noqa: E402
 from idm_env.drift import forecast  # noqa: E402
 from idm_env.drift.estimate import Estimate, estimate, usual  # noqa: E402
-from idm_env.drift.linear import Drivers, Path  # noqa: E402
+from idm_env.drift.linear import MeasuredDrivers, Path  # noqa: E402
 from idm_env.effects import IDM, AccelNoise, Brakes, Effect, Noise, Replay, Wander  # noqa: E402
 from idm_env.fitting.batch import Batch  # noqa: E402
 from idm_env.fitting.fit import fit  # noqa: E402
@@ -212,14 +212,14 @@ def _quantities(gap: np.ndarray, speed: np.ndarray, dt: float) -> tuple[np.ndarr
     return time_gap, accel, np.diff(accel, axis=0) / dt
 
 
-def residuals(drivers: Drivers, theta: np.ndarray) -> np.ndarray:
+def residuals(drivers: MeasuredDrivers, theta: np.ndarray) -> np.ndarray:
     """Return what IDM lacks of the recorded acceleration (m/s²) [T − 1, rows]."""
     batch = drivers.batch
     linear = drivers.linearise(Path.at(drivers, theta))
     return (batch.speed.numpy()[1:] - linear.to[..., 1]) / batch.dt
 
 
-def autoregression(drivers: Drivers, theta: np.ndarray) -> np.ndarray:
+def autoregression(drivers: MeasuredDrivers, theta: np.ndarray) -> np.ndarray:
     """Return the coefficients of AR(k) on residuals of ``RESIDUAL_S`` s, by least squares over all drivers."""
     stride = round(RESIDUAL_S / drivers.batch.dt)
     left, right = [], []
@@ -251,7 +251,7 @@ def going_on(
 
 
 def by_residual(
-    drivers: Drivers, theta: np.ndarray, starts: list[tuple[int, int]], ahead: np.ndarray
+    drivers: MeasuredDrivers, theta: np.ndarray, starts: list[tuple[int, int]], ahead: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the forecasts [steps, 1, starts] of a driver's law with residuals ``ahead`` (m/s²) [steps, starts]."""
     items, dt, steps = drivers.batch.episodes, drivers.batch.dt, len(ahead)
@@ -268,7 +268,7 @@ def by_residual(
 
 
 def persistent(
-    drivers: Drivers, nothing: Estimate, theta: np.ndarray, starts: list[tuple[int, int]], gap: np.ndarray,
+    drivers: MeasuredDrivers, nothing: Estimate, theta: np.ndarray, starts: list[tuple[int, int]], gap: np.ndarray,
     speed: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return IDM's forecasts plus the error of its last forecast over the same time; without one, as they are."""
@@ -286,7 +286,7 @@ def persistent(
     return gap, speed
 
 
-def still_levels(drivers: Drivers) -> tuple[np.ndarray, np.ndarray]:
+def still_levels(drivers: MeasuredDrivers) -> tuple[np.ndarray, np.ndarray]:
     """Return levels of drivers who do not drift, known for sure."""
     k = drivers.levels
     return np.zeros((*drivers.batch.gap.shape, k)), np.zeros((*drivers.batch.gap.shape, k, k))
@@ -314,7 +314,7 @@ def i80(folder: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[
     batch, starts = Batch.of(kept, substeps=1), starts_of(kept)
     training = Batch.of(train, substeps=1)
     rows = Rows(kept, starts)
-    plain = Drivers(simulator(dt), batch, batch, IDM_NAMES)
+    plain = MeasuredDrivers(simulator(dt), batch, batch, IDM_NAMES)
     nothing = estimate(plain.simulator, training, IDM_NAMES, theta, spread=0.0, rounds=1)
     ahead = forecast.drawn(plain, nothing.settings, mine, still_levels(plain), starts, HORIZONS[-1], 1)
     rows.score("IDM", *ahead)
@@ -324,7 +324,7 @@ def i80(folder: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[
                                 for x in (lambda e: e.gap_m, lambda e: e.speed_mps)),
     )  # fmt: skip
     rows.score("IDM + last error", *persistent(plain, nothing, mine, starts, *ahead))
-    trained = Drivers(simulator(dt), training, training, IDM_NAMES)
+    trained = MeasuredDrivers(simulator(dt), training, training, IDM_NAMES)
     past, count = residuals(plain, mine), round(HORIZONS[-1] / dt)
     on = going_on(past, starts, autoregression(trained, theta), dt, count)
     rows.score(f"IDM + AR({ORDER})", *by_residual(plain, mine, starts, on))
@@ -335,7 +335,7 @@ def i80(folder: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[
             estimated = estimate(model, training, IDM_NAMES, usual(IDM_NAMES), noise=noise, rounds=3)
             numbers = (f"{r['name']} {r['estimate']:.3g} ({r['low']:.3g} … {r['high']:.3g})" for r in estimated.table())
             say(f"{label}: {', '.join(numbers)}")
-            drivers = Drivers(model, batch, batch, IDM_NAMES)
+            drivers = MeasuredDrivers(model, batch, batch, IDM_NAMES)
             for known in KNOWN if choose else KNOWN[:1]:
                 settings = dataclasses.replace(estimated.settings, spread=np.full(len(IDM_NAMES), known))
                 levels = forecast.followed(drivers, settings, mine)

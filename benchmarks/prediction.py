@@ -23,7 +23,7 @@ from idm_env.prediction.files import OURS, case_of
 from idm_env.prediction.metrics import Score, score, summary
 from idm_env.prediction.mixture import SHARES, Seen, Shares, fit_shares, seen
 from idm_env.prediction.predict import METHODS, Mixture, Prediction, chosen, mixture
-from idm_env.prediction.scene import Scene
+from idm_env.prediction.scene import MapScene
 
 STRAIGHT = "constant velocity"
 LEAST_S = 3
@@ -34,7 +34,7 @@ LEAST_S = 3
 class Known:
     """An agent whose future is known: what it may do, and how far each way of going on hit the truth."""
 
-    scene: Scene
+    scene: MapScene
     mixture: Mixture
     seen: Seen
 
@@ -50,7 +50,7 @@ class Known:
 
 def known_agents(scenario: Scenario, _: OnProgress = silent) -> list[Known]:
     """Return the agents of a scene that are valid at the present and at ``LEAST_S``."""
-    scene, found = Scene(scenario), []
+    scene, found = MapScene(scenario), []
     for index, agent in enumerate(scenario.agents):
         known = agent.valid[scenario.present] and agent.valid[scenario.present + 10 * LEAST_S]
         if known:
@@ -86,7 +86,7 @@ def show(title: str, rows: dict[str, list[Score]]) -> None:
 def compared(agents: Iterable[tuple[Known, Shares]], methods: Sequence[str]) -> dict[str, list[Score]]:
     """Return scores by method; ours with the shares that are held out."""
     kept = list(agents)
-    single: dict[str, Callable[[Scene, int], Prediction]] = {n: m for n, m in METHODS.items() if n in methods}
+    single: dict[str, Callable[[MapScene, int], Prediction]] = {n: m for n, m in METHODS.items() if n in methods}
     return {OURS: [one.scored(chosen(one.scene, one.mixture, shares)) for one, shares in kept]} | {
         name: [one.scored(method(one.scene, one.mixture.agent)) for one, _ in kept] for name, method in single.items()
     }

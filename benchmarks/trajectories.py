@@ -24,19 +24,19 @@ import torch
 
 from benchmarks import add_executor, executor_of
 from idm_env.data import synthetic
-from idm_env.data.scenario import Agent, Control, Lane, Scenario
+from idm_env.data.scenario import Agent, MapLane, Scenario, TrafficControl
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import predict
-from idm_env.prediction.scene import Scene
+from idm_env.prediction.scene import MapScene
 from idm_env.trajectories import baselines, paper
 from idm_env.trajectories.noise import SPARSE_WHITE_M, fit_noise
 from idm_env.trajectories.recipe import clock_of, overlaps, recipe
 from idm_env.trajectories.report import before_and_after
-from idm_env.trajectories.scores import Motion, Tally
+from idm_env.trajectories.scores import RegularMotion, Tally
 from idm_env.trajectories.smoother import SPARSE
 from idm_env.trajectories.spool import read_table
-from idm_env.trajectories.tracks import Pieces, Track
+from idm_env.trajectories.tracks import Pieces, TrackPiece
 
 RAW, CLEAN = "ngsim_i80_rawlike.csv.gz", "ngsim_i80_lanes.parquet"
 FILES = {
@@ -49,13 +49,13 @@ ENDS_S = (0.0, 0.5, 1.0)
 """Ends of tracks that are not scored (s): the clean tracks speed up as they begin and brake as they end."""
 
 
-def truth_of(frame: pl.DataFrame, with_run: bool) -> Callable[[Track], Motion]:
+def truth_of(frame: pl.DataFrame, with_run: bool) -> Callable[[TrackPiece], RegularMotion]:
     """Return a function from a track to its measured motion at its own samples, NaN where there is none."""
     keys = ["run_id", "vehicle_id"] if with_run else ["vehicle_id"]
     frame = frame.with_columns(pl.col(key).cast(pl.String) for key in keys).sort("time_s")
     parts = dict(iter(frame.group_by(keys)))
 
-    def motion(track: Track) -> Motion:
+    def motion(track: TrackPiece) -> RegularMotion:
         part = parts[(track.run_id, track.vehicle_id) if with_run else (track.vehicle_id,)]
         clock = clock_of(track, 0.1)
         known = part["time_s"].to_numpy()
@@ -65,13 +65,16 @@ def truth_of(frame: pl.DataFrame, with_run: bool) -> Callable[[Track], Motion]:
         if not np.isfinite(accel).any():
             accel = np.gradient(speed, known)  # of Doppler speeds, in files without accelerations
         columns = (column[at] for column in (position, speed, accel))
-        return Motion(clock, *(np.where(there, column, np.nan) for column in columns))
+        return RegularMotion(clock, *(np.where(there, column, np.nan) for column in columns))
 
     return motion
 
 
 def score(
-    tracks: list[Track], motions: list[Motion], truth: Callable[[Track], Motion], ends: float = 0.0
+    tracks: list[TrackPiece],
+    motions: list[RegularMotion],
+    truth: Callable[[TrackPiece], RegularMotion],
+    ends: float = 0.0,
 ) -> dict[str, float | int]:
     """Return the row of a method; the first and last ``ends`` seconds of every track are not compared."""
     tally = Tally()
@@ -81,7 +84,7 @@ def score(
         inside = np.abs(true.time_s - 0.5 * (true.time_s[0] + true.time_s[-1]))
         inside = inside <= 0.5 * (true.time_s[-1] - true.time_s[0]) - ends + 1e-6
         speed, accel = (np.where(inside, x, np.nan) for x in (true.speed_mps, true.accel_mps2))
-        tally.compare(motion, Motion(true.time_s, true.position_m, speed, accel))
+        tally.compare(motion, RegularMotion(true.time_s, true.position_m, speed, accel))
     return tally.row()
 
 
@@ -99,8 +102,8 @@ HEAD = f"  {'method':24s} " + " ".join(f"{title:>8s}" for _, title, _ in SHOWN)
 
 
 def best_of(
-    name: str, tuned: list[Track], scored: list[Track], truth: Callable[[Track], Motion], ends: float = 0.0,
-    given: dict[str, float] | None = None,
+    name: str, tuned: list[TrackPiece], scored: list[TrackPiece], truth: Callable[[TrackPiece], RegularMotion],
+    ends: float = 0.0, given: dict[str, float] | None = None,
 ) -> list[str]:  # fmt: skip
     """Tune a baseline on some tracks, for each figure by itself, and return what it does to the others."""
     rows: list[tuple[dict[str, float], dict[str, float | int]]] = []
@@ -119,11 +122,11 @@ def best_of(
     return lines
 
 
-def _motions(name: str, tracks: list[Track], choice: dict[str, float]) -> list[Motion]:
+def _motions(name: str, tracks: list[TrackPiece], choice: dict[str, float]) -> list[RegularMotion]:
     return [baselines.run(name, t.time_s, t.position_m, clock_of(t, 0.1), **choice) for t in tracks]
 
 
-def halves(tracks: list[Track]) -> tuple[list[Track], list[Track]]:
+def halves(tracks: list[TrackPiece]) -> tuple[list[TrackPiece], list[TrackPiece]]:
     """Return the tracks of every other vehicle, and of the rest."""
     names = sorted({(t.run_id, t.vehicle_id) for t in tracks}, key=lambda name: (name[0], len(name[1]), name[1]))
     first = set(names[::2])
@@ -153,7 +156,7 @@ def filtering(part: tuple[Path, int], _: OnProgress = silent) -> str:
     return "\n".join(lines)
 
 
-def thinned(track: Track, seconds: float) -> Track:
+def thinned(track: TrackPiece, seconds: float) -> TrackPiece:
     kept, following = [], track.time_s[0]
     for i, now in enumerate(track.time_s):
         if now >= following - 1e-6:
@@ -190,11 +193,11 @@ def reconstruction(part: tuple[Path, str, float], _: OnProgress = silent) -> str
     return "\n".join(lines)
 
 
-def _dense(motion: Motion, clock: np.ndarray) -> Motion:
+def _dense(motion: RegularMotion, clock: np.ndarray) -> RegularMotion:
     """Return a coarse motion between its steps: positions and speeds by straight lines, accelerations held."""
     at = np.clip(np.searchsorted(motion.time_s, clock + 1e-9) - 1, 0, len(motion.time_s) - 1)
     position, speed = (np.interp(clock, motion.time_s, x) for x in (motion.position_m, motion.speed_mps))
-    return Motion(clock, position, speed, motion.accel_mps2[at])
+    return RegularMotion(clock, position, speed, motion.accel_mps2[at])
 
 
 def timing(count: int, seconds: float) -> None:
@@ -232,7 +235,7 @@ def timing(count: int, seconds: float) -> None:
     print(f"  ratio                       : {layer / own:8.1f}")
 
 
-def noisy_tracks() -> list[Track]:
+def noisy_tracks() -> list[TrackPiece]:
     """Return generated drivers whose positions carry noise correlated over 0.3 s, white noise, and jumps."""
     made, _ = synthetic.generate(3, runs=2, followers=4, seconds=60.0)
     rng = np.random.default_rng(0)
@@ -254,11 +257,11 @@ def noisy_tracks() -> list[Track]:
 
 def crossing() -> Scenario:
     """Return a crossing with a stop sign, and a vehicle that halts at it and goes on to the left."""
-    east = Lane(1, np.array([[-80.0, 0.0], [-4.0, 0.0]]), exits=(2, 3))
-    across = Lane(2, np.array([[-4.0, 0.0], [60.0, 0.0]]), exits=())
+    east = MapLane(1, np.array([[-80.0, 0.0], [-4.0, 0.0]]), exits=(2, 3))
+    across = MapLane(2, np.array([[-4.0, 0.0], [60.0, 0.0]]), exits=())
     angle = np.linspace(0, np.pi / 2, 12)
     bend = np.stack([-4.0 + 8.0 * np.sin(angle), 8.0 - 8.0 * np.cos(angle)], axis=1)
-    left = Lane(3, np.concatenate([bend, [[4.0, 60.0]]]), exits=())
+    left = MapLane(3, np.concatenate([bend, [[4.0, 60.0]]]), exits=())
     path = np.concatenate([east.line, left.line])
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
     speed = np.interp(np.arange(91), [0, 10, 50, 60, 91], [10.5, 10.0, 0.3, 0.3, 5.0])
@@ -269,7 +272,7 @@ def crossing() -> Scenario:
     velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
     agent = Agent(1, "vehicle", 4.6, 1.9, position, heading, velocity, np.ones(91, bool))
     return Scenario(
-        "a crossing", (agent,), (east, across, left), (0,), controls=(Control("sign", np.array([-6.0, -4.0])),)
+        "a crossing", (agent,), (east, across, left), (0,), controls=(TrafficControl("sign", np.array([-6.0, -4.0])),)
     )
 
 
@@ -278,7 +281,7 @@ def pictures(folder: Path) -> None:
     tracks = noisy_tracks()
     filtered = recipe(tracks, 0.1, fit_noise([(t.time_s, t.position_m) for t in tracks], 0.1))
     before_and_after(filtered[2].track, filtered[2].motion).savefig(folder / "filtering.png", dpi=90)
-    figure, _ = scene_picture(scene := crossing(), predict(Scene(scene), 0))
+    figure, _ = scene_picture(scene := crossing(), predict(MapScene(scene), 0))
     figure.savefig(folder / "prediction.png", dpi=90)
 
 

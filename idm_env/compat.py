@@ -24,7 +24,7 @@ Function = Callable[..., Any]
 Loaded = TypeVar("Loaded")
 
 
-class Store(Protocol):
+class CodeStore(Protocol):
     """Bytes by name: ``load`` reads what was saved, or returns None."""
 
     def load(self, name: str, reader: Callable[[bytes], Loaded]) -> Loaded | None: ...  # noqa: D102
@@ -32,7 +32,7 @@ class Store(Protocol):
 
 
 class _KeptCode:
-    """Machine code of one function in a ``Store``, in place of numba's own cache of it.
+    """Machine code of one function in a ``CodeStore``, in place of numba's own cache of it.
 
     Why: numba reads its index and data files whoever wrote them, fails for ever where one is damaged, gives two
     processes that save at once the code of each other's signatures, notices no change in a file whose functions are
@@ -42,7 +42,7 @@ class _KeptCode:
 
     cache_path = ""
 
-    def __init__(self, name: Callable[[str], str], store: Store) -> None:
+    def __init__(self, name: Callable[[str], str], store: CodeStore) -> None:
         self._name, self._store = name, store
 
     def load_overload(self, signature: Any, context: Any) -> Any:
@@ -64,7 +64,7 @@ class _KeptCode:
         """Nothing: what is stale has another name."""
 
 
-def compiled_loop(function: Function, options: dict[str, Any], name: Callable[[str], str], store: Store) -> Any:
+def compiled_loop(function: Function, options: dict[str, Any], name: Callable[[str], str], store: CodeStore) -> Any:
     """Return a function compiled by ``numba.njit``, whose machine code is kept in a store.
 
     ``name`` makes a name of what tells one compiled version of the function from the others (types, machine).
@@ -77,7 +77,7 @@ def compiled_loop(function: Function, options: dict[str, Any], name: Callable[[s
 
 
 def compiled_callback(
-    function: Function, signature: Any, options: dict[str, Any], name: Callable[[str], str], store: Store
+    function: Function, signature: Any, options: dict[str, Any], name: Callable[[str], str], store: CodeStore
 ) -> Any:
     """Return a function compiled as ``numba.cfunc`` does, with an ``address``; see ``compiled_loop``."""
     from numba.core import ccallback, sigutils

@@ -24,7 +24,7 @@ from idm_env.multilane import incentives
 from idm_env.multilane.demand import turnover
 from idm_env.multilane.lane_change import decided
 from idm_env.roads.base import Road
-from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, Past, Scene, State
+from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, PastScenes, Scene, State
 
 Integration = Literal["ballistic", "euler", "midpoint"]
 S = TypeVar("S", bound="Stepping")
@@ -277,7 +277,7 @@ class Stepping:
         )
         return half_ahead(scene) if self.integration == "midpoint" else scene
 
-    def _history(self, state: State) -> Past | None:
+    def _history(self, state: State) -> PastScenes | None:
         return History(state.memory[PAST], self.dt) if PAST in state.memory else None
 
     def time(self, state: State) -> Tensor:

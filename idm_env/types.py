@@ -177,7 +177,7 @@ class Wish(NamedTuple):
     right_must: Tensor | None = None
 
 
-class Past(Protocol):
+class PastScenes(Protocol):
     """What a simulator keeps of the steps before where an effect looks back."""
 
     def at(self, scene: Scene, seconds: Tensor) -> Scene:
@@ -207,7 +207,7 @@ class Scene(NamedTuple):
     euler: bool
     inputs: Inputs
     memory: Memory
-    history: Past | None = None
+    history: PastScenes | None = None
     here: Beside | None = None
     left: Beside | None = None
     right: Beside | None = None

@@ -7,14 +7,14 @@ import pytest
 from PIL import Image
 
 from idm_env.data import synthetic
-from idm_env.reports.diagrams import Line, Panel
+from idm_env.reports.diagrams import Panel, VehicleLine
 from idm_env.reports.plot import animate, edie, fundamental_diagram
 
 
 def uniform(vehicles: int, speed: float, ring: float | None = 200.0) -> Panel:
     """Vehicles 10 m apart at one speed."""
     time = 0.5 * np.arange(401)
-    lines = [Line(str(i), time, 10.0 * i + speed * time, np.full(401, speed)) for i in range(vehicles)]
+    lines = [VehicleLine(str(i), time, 10.0 * i + speed * time, np.full(401, speed)) for i in range(vehicles)]
     return Panel("", tuple(lines), ring)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from idm_env.extras import needed
@@ -12,9 +13,9 @@ with needed("a trajectory file"):
     from idm_env.data.episodes import episodes
     from idm_env.data.errors import DataError, Repair
     from idm_env.data.load import load
-    from idm_env.data.records import Record
+    from idm_env.data.records import VehicleRecord
     from idm_env.data.schema import LEADER_LOST_GAP_M
-    from idm_env.data.smooth import Motion, noise_sigma, smooth
+    from idm_env.data.smooth import SmoothMotion, noise_sigma, smooth
     from idm_env.data.trajectories import Trajectories
 
 if TYPE_CHECKING:
@@ -25,10 +26,10 @@ __all__ = [
     "DataError",
     "Episode",
     "Episodes",
-    "Motion",
-    "Record",
     "Repair",
+    "SmoothMotion",
     "Trajectories",
+    "VehicleRecord",
     "episodes",
     "load",
     "noise_sigma",
@@ -37,7 +38,16 @@ __all__ = [
 ]
 
 
+_RENAMED = {"Motion": SmoothMotion, "Record": VehicleRecord}
+"""Public classes under the names that they had; these work for one version."""
+
+
 def __getattr__(name: str) -> Any:
+    if name in _RENAMED:
+        now = _RENAMED[name]
+        told = f"idm_env.data.{name} is called {now.__name__}. Import that."
+        warnings.warn(told, DeprecationWarning, stacklevel=2)
+        return now
     if name == "synthetic":  # a second of scipy, which those who read files do not wait for
         return importlib.import_module("idm_env.data.synthetic")
     raise AttributeError(f"module 'idm_env.data' has no attribute '{name}'")

@@ -9,7 +9,7 @@ from typing import Any, overload
 import numpy as np
 
 from idm_env.data.errors import DataError, Repair
-from idm_env.data.records import Record
+from idm_env.data.records import VehicleRecord
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +41,10 @@ class Episode:
     speed_mps: np.ndarray
     gap_m: np.ndarray
     length_m: float
-    leader: Record
-    second_leader: Record
-    behind: Record
-    adjacent: Record
+    leader: VehicleRecord
+    second_leader: VehicleRecord
+    behind: VehicleRecord
+    adjacent: VehicleRecord
     place_m: np.ndarray
     columns: dict[str, np.ndarray]
     labels: dict[str, str]
@@ -58,10 +58,10 @@ class Episode:
         return len(self) * self.dt
 
     @property
-    def driver(self) -> Record:
+    def driver(self) -> VehicleRecord:
         """The driver's own record."""
         accel = np.gradient(self.speed_mps, self.dt)
-        return Record(self.position_m, self.speed_mps, accel, self.length_m, np.ones(len(self), dtype=bool))
+        return VehicleRecord(self.position_m, self.speed_mps, accel, self.length_m, np.ones(len(self), dtype=bool))
 
     def part(self, begin: int, end: int) -> Episode:
         """Return the samples [begin, end), under the same key."""
@@ -69,7 +69,7 @@ class Episode:
         def cut(value: Any) -> Any:
             if isinstance(value, np.ndarray):
                 return value[begin:end]
-            if isinstance(value, Record):
+            if isinstance(value, VehicleRecord):
                 return replace(value, **{f.name: cut(getattr(value, f.name)) for f in fields(value)})
             return value
 

@@ -26,7 +26,7 @@ REACH_M = 25.0
 
 
 @dataclass(frozen=True)
-class Strength:
+class HiddenStrength:
     """An effect's strength: its symbol, and the values that count as middle and as half of it."""
 
     symbol: str
@@ -34,30 +34,30 @@ class Strength:
     half: float
 
 
-EFFECTS: dict[str, Strength] = {
-    "delay": Strength("tau_s", 0.5, 0.25),
-    "lag": Strength("tau_s", 0.5, 0.25),
-    "second_leader": Strength("weight", 0.35, 0.175),
-    "leader_acceleration": Strength("gain", 0.4, 0.2),
-    "brake_light": Strength("gain", 0.6, 0.3),
-    "asymmetry": Strength("k", 0.3, 0.15),
-    "power_limit": Strength("watt_per_kg", 12.0, 18.0),
-    "drag": Strength("per_m", 5e-4, 2.5e-4),
-    "speed_dependent_gap": Strength("s1_m", 5.0, 2.5),
-    "memory": Strength("beta", 0.8, 0.4),
-    "follower": Strength("gain", 0.15, 0.075),
-    "dead_zone": Strength("rad_per_s", 0.002, 0.001),
-    "action_point": Strength("mps2", 0.3, 0.15),
-    "grade": Strength("steepest_slope", 0.04, 0.02),
-    "speed_zone": Strength("factor", 0.6, 0.8),
-    "regime_shift": Strength("k", 0.35, 0.175),
-    "lateral": Strength("per_s", 0.1, 0.05),
-    "gap_bias": Strength("bias_m", 1.5, 0.75),
-    "speed_time_gap": Strength("k", -0.4, -0.2),
-    "set_point_asymmetry": Strength("k", 0.2, 0.1),
-    "relaxation": Strength("beta", 0.7, 0.35),
-    "speed_profile": Strength("depth", 0.6, 0.4),
-    "curve_speed": Strength("mps2", 2.0, 3.0),
+EFFECTS: dict[str, HiddenStrength] = {
+    "delay": HiddenStrength("tau_s", 0.5, 0.25),
+    "lag": HiddenStrength("tau_s", 0.5, 0.25),
+    "second_leader": HiddenStrength("weight", 0.35, 0.175),
+    "leader_acceleration": HiddenStrength("gain", 0.4, 0.2),
+    "brake_light": HiddenStrength("gain", 0.6, 0.3),
+    "asymmetry": HiddenStrength("k", 0.3, 0.15),
+    "power_limit": HiddenStrength("watt_per_kg", 12.0, 18.0),
+    "drag": HiddenStrength("per_m", 5e-4, 2.5e-4),
+    "speed_dependent_gap": HiddenStrength("s1_m", 5.0, 2.5),
+    "memory": HiddenStrength("beta", 0.8, 0.4),
+    "follower": HiddenStrength("gain", 0.15, 0.075),
+    "dead_zone": HiddenStrength("rad_per_s", 0.002, 0.001),
+    "action_point": HiddenStrength("mps2", 0.3, 0.15),
+    "grade": HiddenStrength("steepest_slope", 0.04, 0.02),
+    "speed_zone": HiddenStrength("factor", 0.6, 0.8),
+    "regime_shift": HiddenStrength("k", 0.35, 0.175),
+    "lateral": HiddenStrength("per_s", 0.1, 0.05),
+    "gap_bias": HiddenStrength("bias_m", 1.5, 0.75),
+    "speed_time_gap": HiddenStrength("k", -0.4, -0.2),
+    "set_point_asymmetry": HiddenStrength("k", 0.2, 0.1),
+    "relaxation": HiddenStrength("beta", 0.7, 0.35),
+    "speed_profile": HiddenStrength("depth", 0.6, 0.4),
+    "curve_speed": HiddenStrength("mps2", 2.0, 3.0),
 }
 """Every effect of the catalogue. ``gap_bias`` changes the measured gap, not the motion."""
 

@@ -19,7 +19,7 @@ FAR_M = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class VehicleRecord:
     """One measured vehicle on the clock of an episode; arrays are [T], finite also where ``present`` is False.
 
     Attributes:
@@ -38,7 +38,7 @@ class Record:
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class RecordColumns:
     """The columns of a table as arrays [rows], with the acceleration of every row; cut into records span by span."""
 
     position: np.ndarray
@@ -53,7 +53,7 @@ class Source:
     step: np.ndarray
 
     @classmethod
-    def of(cls, trajectories: Trajectories, table: pl.DataFrame, around: Neighbours) -> Source:
+    def of(cls, trajectories: Trajectories, table: pl.DataFrame, around: Neighbours) -> RecordColumns:
         """Return the arrays of a table with ``step``, smoothing every track once for its acceleration."""
         position, speed = table["position_m"].to_numpy(), table["speed_mps"].to_numpy()
         step = table["run_id"].replace_strict(trajectories.steps, return_dtype=pl.Float64).to_numpy()
@@ -122,7 +122,7 @@ class Source:
         smooth: bool,
         own_speed: np.ndarray,
         elsewhere: np.ndarray | None = None,
-    ) -> Record:
+    ) -> VehicleRecord:
         present = (rows >= 0) & np.isfinite(position)
         length = float(self.length[rows[present][0]]) if present.any() else DEFAULT_LENGTH_M
         # Where one neighbour takes the place of another of other length, its rear end is what a gap is measured to.
@@ -136,7 +136,7 @@ class Source:
             for begin, end in _stretches(rows, present, stride):
                 part = slice(begin, end)
                 place[part], speed[part], accel[part] = fuse(place[part], speed[part], dt)
-        return Record(place, speed, accel, length, present)
+        return VehicleRecord(place, speed, accel, length, present)
 
 
 def _stretches(rows: np.ndarray, present: np.ndarray, stride: int) -> list[tuple[int, int]]:

@@ -27,7 +27,7 @@ class Agent:
 
 
 @dataclass(frozen=True, eq=False)
-class Lane:
+class MapLane:
     """A lane's centre line [M, 2] in the direction of travel.
 
     ``exits`` are identifiers of the lanes that follow, None where the file does not tell them; ``speed_limit`` in m/s,
@@ -42,7 +42,7 @@ class Lane:
 
 
 @dataclass(frozen=True, eq=False)
-class Control:
+class TrafficControl:
     """A stop sign or a signal at ``point`` [2]: what it shows at the present step, and the lanes that it is for.
 
     ``shows`` is ``sign``, or a signal's ``stop``, ``caution``, ``go`` or ``unknown``; a flashing stop is a sign, a
@@ -64,10 +64,10 @@ class Scenario:
 
     id: str
     agents: tuple[Agent, ...]
-    lanes: tuple[Lane, ...]
+    lanes: tuple[MapLane, ...]
     to_predict: tuple[int, ...]
     present: int = PRESENT
-    controls: tuple[Control, ...] = ()
+    controls: tuple[TrafficControl, ...] = ()
     notes: tuple[str, ...] = field(default=())
 
     @property

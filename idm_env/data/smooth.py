@@ -23,7 +23,7 @@ LONGEST_STRIDE_S = 0.3
 _MEDIAN_OF_NORMAL = 0.6745
 
 
-class Motion(NamedTuple):
+class SmoothMotion(NamedTuple):
     """A smooth motion: arrays [T] of position (m), speed (m/s) and acceleration (m/s²), differences of one another."""
 
     position: np.ndarray
@@ -45,7 +45,7 @@ def noise_sigma(values: ArrayLike, stride: int = 1) -> float:
     return max(float(np.median(np.abs(third))) / _MEDIAN_OF_NORMAL / np.sqrt(20.0), SMALLEST_SIGMA)
 
 
-def fuse(position: np.ndarray, speed: np.ndarray, dt: float) -> Motion:
+def fuse(position: np.ndarray, speed: np.ndarray, dt: float) -> SmoothMotion:
     """Return the smooth motion of one unbroken record, with both noises estimated from the record itself.
 
     A position that drifts against the integral of the speed over 1 s (an antenna's, for instance) is as uncertain as
@@ -69,7 +69,7 @@ def smooth(
     sigma_speed: float = 0.1,
     jerk_density: float = JERK_DENSITY,
     robust: int = 0,
-) -> Motion:
+) -> SmoothMotion:
     """Return the motion that fits positions and speeds within their noise with the least jerk.
 
     Args:
@@ -86,7 +86,7 @@ def smooth(
     if length < 4:
         # too short for a jerk: the straight differences
         rate = np.gradient(measured, dt) if length > 1 else np.zeros(length)
-        return Motion(measured.copy(), rate, np.gradient(rate, dt) if length > 1 else np.zeros(length))
+        return SmoothMotion(measured.copy(), rate, np.gradient(rate, dt) if length > 1 else np.zeros(length))
     origin = measured[0]  # keeps the numbers small; the penalty does not see it
     target = measured - origin
     rates = None if speed is None else np.asarray(speed, float)
@@ -102,7 +102,7 @@ def smooth(
         weights = np.maximum(position_weight * np.minimum(1.0, 2.0 / np.maximum(scaled, 1e-9)), lowest)
         estimate = _solve(target, rates, dt, weights, speed_weight, penalty)
     rate = _speed(estimate, dt)
-    return Motion(estimate + origin, rate, _accel(estimate, dt))
+    return SmoothMotion(estimate + origin, rate, _accel(estimate, dt))
 
 
 def _solve(

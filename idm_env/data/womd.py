@@ -16,7 +16,7 @@ import numpy as np
 
 from idm_env.data import womd_record
 from idm_env.data.errors import DataError
-from idm_env.data.scenario import PRESENT, SHOWN, Agent, Control, Lane, Scenario, check_scenario
+from idm_env.data.scenario import PRESENT, SHOWN, Agent, MapLane, Scenario, TrafficControl, check_scenario
 
 _STATES = (
     "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution",
@@ -78,9 +78,9 @@ def _scenario(content: dict[str, Any], source: str) -> Scenario:
         line = _xy(points if isinstance(points, list) else [points])
         if road.get("type") == "lane" and len(line) >= 2:
             bike = road.get("map_element_id") == 3
-            lanes.append(Lane(int(road.get("id", number)), line, bike=bike))
+            lanes.append(MapLane(int(road.get("id", number)), line, bike=bike))
         elif road.get("type") == "stop_sign" and len(line):
-            controls.append(Control("sign", line[0]))
+            controls.append(TrafficControl("sign", line[0]))
     controls += _signals(content.get("tl_states"))
     metadata = content.get("metadata") or {}
     chosen = metadata.get("tracks_to_predict")
@@ -94,7 +94,7 @@ def _scenario(content: dict[str, Any], source: str) -> Scenario:
     return Scenario(name, agents, tuple(lanes), wanted, PRESENT, tuple(controls), tuple(notes))
 
 
-def _signals(lights: Any) -> list[Control]:
+def _signals(lights: Any) -> list[TrafficControl]:
     """Return the signals of ``tl_states``, lane → states over time, as they are at the present and not later."""
     found = []
     for key, light in (lights or {}).items():
@@ -107,7 +107,7 @@ def _signals(lights: Any) -> list[Control]:
         shows = SHOWN[_STATES.index(name)] if name in _STATES else "unknown"
         lane = light.get("lane_id", key)
         lanes = (int(lane),) if str(lane).lstrip("-").isdigit() else ()
-        found.append(Control(shows, np.array([float(light["x"][last]), float(light["y"][last])]), lanes))
+        found.append(TrafficControl(shows, np.array([float(light["x"][last]), float(light["y"][last])]), lanes))
     return found
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.data.errors import DataError
-from idm_env.data.scenario import SHOWN, Agent, Control, Lane, Scenario, check_scenario
+from idm_env.data.scenario import SHOWN, Agent, MapLane, Scenario, TrafficControl, check_scenario
 
 MILE_PER_HOUR = 0.44704
 _KIND = {1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}
@@ -161,16 +161,16 @@ def _scenario(message: Any, source: str) -> Scenario:
             lane = feature.lane
             limit = lane.speed_limit_mph * MILE_PER_HOUR if lane.speed_limit_mph > 0 else float("nan")
             line = np.array([[p.x, p.y] for p in lane.polyline])
-            lanes.append(Lane(int(feature.id), line, tuple(lane.exit_lanes), limit, lane.type == 3))
+            lanes.append(MapLane(int(feature.id), line, tuple(lane.exit_lanes), limit, lane.type == 3))
         elif feature.HasField("stop_sign"):
             sign = feature.stop_sign
-            controls.append(Control("sign", np.array([sign.position.x, sign.position.y]), tuple(sign.lane)))
+            controls.append(TrafficControl("sign", np.array([sign.position.x, sign.position.y]), tuple(sign.lane)))
     wanted = tuple(int(item.track_index) for item in message.tracks_to_predict)
     present = int(message.current_time_index)
     # only the state at the present: later ones are the future
     for light in message.dynamic_map_states[present].lane_states if len(message.dynamic_map_states) > present else ():
         shows = SHOWN[light.state] if light.state < len(SHOWN) else "unknown"
-        controls.append(Control(shows, np.array([light.stop_point.x, light.stop_point.y]), (int(light.lane),)))
+        controls.append(TrafficControl(shows, np.array([light.stop_point.x, light.stop_point.y]), (int(light.lane),)))
     notes: tuple[str, ...] = ()
     if not wanted:
         wanted = tuple(i for i, agent in enumerate(agents) if agent.valid[present])

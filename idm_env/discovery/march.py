@@ -31,9 +31,9 @@ from idm_env.effects.free import FEATURES
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane
 from idm_env.scalar import library
-from idm_env.scalar.graph import Slot, TimeStep
+from idm_env.scalar.graph import Leaf, TimeStep
 from idm_env.scalar.record import Form, Recording, Untraceable, record, slot_name
-from idm_env.scalar.regions import Behind, Regions
+from idm_env.scalar.regions import Flagged, Regions
 from idm_env.scalar.straight import Straight
 from idm_env.step import Stepping
 
@@ -53,15 +53,15 @@ COLUMNS = (
     "beside_present", "position", "speed", "accel", "time", "place",
 )  # fmt: skip
 
-_SEEN: dict[Slot, str] = {
-    Slot("position"): "place", Slot("speed"): "speed", Slot("accel"): "accel", Slot("gap"): "gap",
-    Slot("length"): "own_length", Slot("step"): "(time * per_dt)",
-    Slot("led"): "1.0", Slot("speed", 1): "lead_speed", Slot("accel", 1): "lead_accel",
+_SEEN: dict[Leaf, str] = {
+    Leaf("position"): "place", Leaf("speed"): "speed", Leaf("accel"): "accel", Leaf("gap"): "gap",
+    Leaf("length"): "own_length", Leaf("step"): "(time * per_dt)",
+    Leaf("led"): "1.0", Leaf("speed", 1): "lead_speed", Leaf("accel", 1): "lead_accel",
     # A gap to the second leader is counted from the leader's rear, whose length is then not needed.
-    Slot("led", 1): "signals[i, 6]", Slot("length", 1): "0.0", Slot("gap", 1): "(signals[i, 3] - signals[i, 0])",
-    Slot("speed", 2): "signals[i, 4]", Slot("accel", 2): "signals[i, 5]",
-    Slot("leads"): "signals[i, 10]", Slot("led", -1): "1.0", Slot("gap", -1): "(position - own_length - signals[i, 7])",
-    Slot("speed", -1): "signals[i, 8]", Slot("accel", -1): "signals[i, 9]",
+    Leaf("led", 1): "signals[i, 6]", Leaf("length", 1): "0.0", Leaf("gap", 1): "(signals[i, 3] - signals[i, 0])",
+    Leaf("speed", 2): "signals[i, 4]", Leaf("accel", 2): "signals[i, 5]",
+    Leaf("leads"): "signals[i, 10]", Leaf("led", -1): "1.0", Leaf("gap", -1): "(position - own_length - signals[i, 7])",
+    Leaf("speed", -1): "signals[i, 8]", Leaf("accel", -1): "signals[i, 9]",
 }  # fmt: skip
 """Where the loop has what a step reads."""
 _BESIDE = {"distance": "signals[i, 11]", "speed": "signals[i, 12]", "present": "signals[i, 13]"}
@@ -230,7 +230,7 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     for effect in catalogue.effects:
         inputs |= {slot_name(effect.name, part): text for part, text in _BESIDE.items()}
 
-    def read(slot: Slot) -> str:
+    def read(slot: Leaf) -> str:
         name = slot.name
         if slot in _SEEN:
             return _SEEN[slot]
@@ -277,7 +277,7 @@ def _recorded(catalogue: Catalogue, dt: float, graph: Regions) -> Recording:
     wrapped = []
     for effect in catalogue.flagged:
         table = tables.get(getattr(effect, "label", "") if isinstance(effect, (Changed, Push)) else effect.name)
-        wrapped.append(Behind(effect, graph, f"on {effect.name}", table))
+        wrapped.append(Flagged(effect, graph, f"on {effect.name}", table))
     beside = [e.name for e in catalogue.effects if e.beyond == "vehicle in an adjacent lane"]
     inputs = [(name, tuple(_BESIDE), (False,) * len(_BESIDE)) for name in beside]
     inputs += [(e.name, ("",), (False,)) for e in (_slots(PULSE) if catalogue.located else ())]

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from scipy.stats import t as student
 
 from idm_env.drift import filter_loops as loops
-from idm_env.drift.linear import Drivers, Path
+from idm_env.drift.linear import MeasuredDrivers, Path
 from idm_env.fitting.batch import Batch
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.parameters import catalogue
@@ -59,7 +59,7 @@ SKIPPED = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Settings:
+class DriftSettings:
     """What a filter assumes: σ and τ (s) of every drift [k], noise of gap (m) and speed (m/s) [2].
 
     ``spread`` [p] is the standard deviation of what drivers' own log θ has more than theirs in a path: over drivers, or
@@ -77,7 +77,7 @@ class Settings:
         """Return logarithms of σ, τ, noise and jitter, one after the other."""
         return np.log(np.concatenate((self.sigma, self.memory_time, self.noise, [self.jitter])))
 
-    def unpacked(self, x: np.ndarray) -> Settings:
+    def unpacked(self, x: np.ndarray) -> DriftSettings:
         """Return settings from such logarithms."""
         k, y = len(self.sigma), np.exp(x)
         return replace(
@@ -89,12 +89,12 @@ class Settings:
 class Estimate:
     """Settings as estimated, their log standard errors, the log-likelihood, and what the drivers are made of.
 
-    ``names`` are those of the entries of ``Settings.packed``; intervals are of 95 %, on the logarithm, with what linear
-    steps leave in them.
+    ``names`` are those of the entries of ``DriftSettings.packed``; intervals are of 95 %, on the logarithm, with
+    what linear steps leave in them.
     """
 
-    drivers: Drivers
-    settings: Settings
+    drivers: MeasuredDrivers
+    settings: DriftSettings
     names: tuple[str, ...]
     log_error: np.ndarray
     log_likelihood: float
@@ -125,7 +125,7 @@ def usual(free: Sequence[str]) -> np.ndarray:
 class Likelihood:
     """The marginal likelihood of settings, about a path."""
 
-    def __init__(self, drivers: Drivers, path: Path) -> None:
+    def __init__(self, drivers: MeasuredDrivers, path: Path) -> None:
         self.drivers, self.path = drivers, path
         batch, linear = drivers.measured, drivers.linearise(path)
         steps = (linear.to, linear.by_state, linear.by_level, path.gap, path.speed)
@@ -142,16 +142,16 @@ class Likelihood:
         other.path = replace(self.path, theta=theta, level=level)
         return other
 
-    def _settings(self, s: Settings) -> tuple[np.ndarray | float, ...]:
+    def _settings(self, s: DriftSettings) -> tuple[np.ndarray | float, ...]:
         dt = self.drivers.batch.dt
         decay = np.append(np.ones(len(s.spread)), np.exp(-dt / s.memory_time))
         return self.path.level, decay, np.append(s.spread, s.sigma), s.noise, s.jitter**2 * dt
 
-    def __call__(self, s: Settings) -> float:
+    def __call__(self, s: DriftSettings) -> float:
         """Return the log-likelihood of all records."""
         return float(loops.likelihood(*(*self.given, *self._settings(s), SKIPPED)).sum())
 
-    def filtered(self, s: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def filtered(self, s: DriftSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return filtered means and covariances and smoothed means [T, rows, …] of gap, speed and levels."""
         found: tuple[np.ndarray, np.ndarray, np.ndarray] = loops.smooth(*(*self.given, *self._settings(s)))
         return found
@@ -185,9 +185,9 @@ def estimate(
     Raises:
         ValueError: For a simulator that looks back.
     """
-    drivers = Drivers(simulator, batch, measured or batch, tuple(free))
+    drivers = MeasuredDrivers(simulator, batch, measured or batch, tuple(free))
     known = catalogue(simulator.effects)
-    settings = Settings(
+    settings = DriftSettings(
         np.array([known[f"{n}.sigma"].default for n in drivers.drifts]),
         np.array([known[f"{n}.memory_time"].default for n in drivers.drifts]),
         np.array(noise or (0.1, 0.1)), 0.02, np.broadcast_to(np.asarray(spread, float), len(free)).copy(),
@@ -207,7 +207,7 @@ def estimate(
     return Estimate(drivers, settings, tuple(names), error, around(settings), path)
 
 
-def _limits(drivers: Drivers, noise: tuple[float, float] | None) -> np.ndarray:
+def _limits(drivers: MeasuredDrivers, noise: tuple[float, float] | None) -> np.ndarray:
     known = catalogue(drivers.simulator.effects)
     highest = [known[f"{n}.sigma"].high for n in drivers.drifts]
     found = [(1e-3 * x, x) for x in highest] + [(2.0 * drivers.batch.dt, 300.0)] * len(highest)
@@ -215,7 +215,7 @@ def _limits(drivers: Drivers, noise: tuple[float, float] | None) -> np.ndarray:
     return np.log([*found, *both, JITTER])
 
 
-def _maximised(around: Likelihood, settings: Settings, limits: np.ndarray) -> Settings:
+def _maximised(around: Likelihood, settings: DriftSettings, limits: np.ndarray) -> DriftSettings:
     def cost(x: np.ndarray) -> float:
         value = -around(settings.unpacked(x))
         return value if math.isfinite(value) else 1e12
@@ -225,7 +225,7 @@ def _maximised(around: Likelihood, settings: Settings, limits: np.ndarray) -> Se
     return settings.unpacked(minimize(cost, x0, method="L-BFGS-B", bounds=limits, options=options).x)
 
 
-def _path(around: Likelihood, settings: Settings) -> Path:
+def _path(around: Likelihood, settings: DriftSettings) -> Path:
     """Return where the next steps are linear about: drivers as their whole records tell, the rest as the past tells.
 
     A drift that knows the sample that it is about to explain would be told apart from the driver by nothing: his
@@ -242,7 +242,7 @@ def _path(around: Likelihood, settings: Settings) -> Path:
     return predicted(replace(path, level=level), settings, around.drivers.batch.dt, known, covariance)
 
 
-def predicted(path: Path, settings: Settings, dt: float, mean: np.ndarray, covariance: np.ndarray) -> Path:
+def predicted(path: Path, settings: DriftSettings, dt: float, mean: np.ndarray, covariance: np.ndarray) -> Path:
     """Return a path with gap and speed as filtered, and drifts as foreseen one sample earlier."""
     own = len(settings.spread)
     decay, level, unsure = np.exp(-dt / settings.memory_time), path.level.copy(), np.zeros_like(path.unsure)
@@ -256,7 +256,7 @@ def predicted(path: Path, settings: Settings, dt: float, mean: np.ndarray, covar
     )  # fmt: skip
 
 
-def _errors(around: Likelihood, settings: Settings, limits: np.ndarray) -> np.ndarray:
+def _errors(around: Likelihood, settings: DriftSettings, limits: np.ndarray) -> np.ndarray:
     """Return standard errors of the packed settings, from the curvature; inf for what lies at a limit or is flat."""
     x = settings.packed()
     free = limits[:, 1] > limits[:, 0]

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from idm_env.drift.estimate import Likelihood, Settings, predicted
-from idm_env.drift.linear import Drivers, Path
+from idm_env.drift.estimate import DriftSettings, Likelihood, predicted
+from idm_env.drift.linear import MeasuredDrivers, Path
 from idm_env.fitting.batch import Batch
 
 
-def followed(drivers: Drivers, settings: Settings, theta: np.ndarray, passes: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def followed(
+    drivers: MeasuredDrivers, settings: DriftSettings, theta: np.ndarray, passes: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
     """Return mean [T, rows, p + k] and covariance of a driver's levels, each from the record up to that sample only.
 
     Steps are linear about the record and about the levels that the pass before had found one sample earlier.
@@ -26,8 +28,8 @@ def followed(drivers: Drivers, settings: Settings, theta: np.ndarray, passes: in
 
 
 def drawn(
-    drivers: Drivers,
-    settings: Settings,
+    drivers: MeasuredDrivers,
+    settings: DriftSettings,
     theta: np.ndarray,
     levels: tuple[np.ndarray, np.ndarray],
     starts: list[tuple[int, int]],
@@ -50,7 +52,7 @@ def drawn(
 
 
 def _chunk(
-    drivers: Drivers, settings: Settings, theta: np.ndarray, levels: tuple[np.ndarray, np.ndarray],
+    drivers: MeasuredDrivers, settings: DriftSettings, theta: np.ndarray, levels: tuple[np.ndarray, np.ndarray],
     starts: list[tuple[int, int]], steps: int, count: int, seed: int,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     simulator, d = drivers.simulator, drivers.driver

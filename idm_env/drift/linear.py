@@ -40,7 +40,7 @@ class Path:
     unsure: np.ndarray
 
     @classmethod
-    def at(cls, drivers: Drivers, theta: np.ndarray) -> Path:
+    def at(cls, drivers: MeasuredDrivers, theta: np.ndarray) -> Path:
         """Return the path of drivers on their records who do not drift, known for sure."""
         gap, speed = drivers.batch.gap.numpy(), drivers.batch.speed.numpy()
         k = len(drivers.drifts)
@@ -48,7 +48,7 @@ class Path:
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class LinearSteps:
     """Steps about a path: gap and speed after a step ``to`` [T − 1, rows, 2], and their derivatives.
 
     ``by_state`` [T − 1, rows, 2, 2] by gap and speed, ``by_level`` [T − 1, rows, 2, p + k] by levels of the step.
@@ -60,7 +60,7 @@ class Linear:
     by_level: np.ndarray
 
 
-class Drivers:
+class MeasuredDrivers:
     """Measured drivers as a simulator steps them: one step per sample, everybody else on the record.
 
     ``batch`` are the records, smoothed; ``measured`` the same samples with gap and speed as measured: the noise of a
@@ -94,7 +94,7 @@ class Drivers:
             params[name] = {**params[name], "sigma": one, "memory_time": STILL * one}
         return params
 
-    def linearise(self, path: Path) -> Linear:
+    def linearise(self, path: Path) -> LinearSteps:
         """Return the steps from all samples but the last, linear about the path.
 
         Where a drift is unsure a step is the best line over what it may be, by three points of Gauss and Hermite: a
@@ -123,7 +123,7 @@ class Drivers:
             by_level[..., at] = np.where(
                 off[..., None] > NARROW, (high - low) / (2.0 * np.maximum(off, NARROW))[..., None], by_level[..., at]
             )
-        return Linear(path, to, both(slice(0, 2)), by_level)
+        return LinearSteps(path, to, both(slice(0, 2)), by_level)
 
     def _stepped(self, path: Path, gap: Tensor, speed: Tensor, level: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Return gap and speed after a step from every sample but the last."""

@@ -77,7 +77,7 @@ class Choice(abc.ABC):
 
 
 @dataclass(frozen=True)
-class Wishes(Choice):
+class UtilityLogit(Choice):
     """The logit of what a simulator's effects wish for; ``free`` are full names of parameters of these effects."""
 
     simulator: Simulator
@@ -154,7 +154,7 @@ class ConstantRate(Choice):
 
 
 @dataclass(frozen=True)
-class GapAcceptance(Choice):
+class GapLogit(Choice):
     """A logit of gaps and relative speeds on the lane beside, without a car-following law (as Ahmed 1999, MIT).
 
     ``ln P(side)/P(stay) = c_side + Σ β_k x_k``, x: logarithms of the gaps to the leader and the follower there (at most
@@ -320,6 +320,6 @@ def per_vehicle(decisions: Decisions, value: Tensor) -> Tensor:
 
 
 __all__ = [
-    "TEMPERATURE", "Choice", "Chosen", "ConstantRate", "GapAcceptance", "HeldOut", "Wishes", "fit_choice", "folds",
+    "TEMPERATURE", "Choice", "Chosen", "ConstantRate", "GapLogit", "HeldOut", "UtilityLogit", "fit_choice", "folds",
     "held_out", "per_vehicle",
 ]  # fmt: skip

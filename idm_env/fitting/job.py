@@ -20,7 +20,7 @@ from idm_env.fitting.batch import Batch
 from idm_env.fitting.drivers import Estimates
 from idm_env.fitting.evaluate import Errors, errors
 from idm_env.fitting.options import Options, Source, behind_records
-from idm_env.fitting.pieces import Joined, Piece
+from idm_env.fitting.pieces import JoinedFit, Piece
 from idm_env.fitting.problem import Problem, Simulated, group_of
 from idm_env.jobs import storage
 from idm_env.jobs.executor import Executor, Serial
@@ -89,7 +89,7 @@ class _Work(NamedTuple):
             for n, one in enumerate(data)
         )
 
-    def fit(self, data: Sequence[Sequence[Episode] | Share], by: str, name: str, before: str = "") -> Joined:
+    def fit(self, data: Sequence[Sequence[Episode] | Share], by: str, name: str, before: str = "") -> JoinedFit:
         """Fit all parts and return what they found."""
         cut = self.pieces(data, by, name)
         parts = cut[0].parts
@@ -138,7 +138,7 @@ def _fit_folder(work: _Work) -> dict[str, Any]:
 
 
 def _write(
-    work: _Work, found: Joined, held_out: dict[str, Any] | None, data: dict[str, Any], tracks: Iterable[str]
+    work: _Work, found: JoinedFit, held_out: dict[str, Any] | None, data: dict[str, Any], tracks: Iterable[str]
 ) -> dict[str, Any]:
     """Join the parts to the files that were promised, and return the report."""
     out, options, estimates = work.out, work.options, found.estimates
@@ -227,7 +227,7 @@ def model_of(found: Estimates, by: str = "driver") -> Model:
     )
 
 
-def _fit_page(result: dict[str, Any], joined: Joined, table: list[dict[str, Any]]) -> list[page.Block]:
+def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, Any]]) -> list[page.Block]:
     held, found = result["held_out"], joined.estimates
     lead = (
         f"{result['fit']['episodes']} episodes of {result['fit']['groups']} groups: mean gap RMSE "

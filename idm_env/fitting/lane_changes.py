@@ -16,9 +16,9 @@ from idm_env.fitting.discrete_choice import (
     Choice,
     Chosen,
     ConstantRate,
-    GapAcceptance,
+    GapLogit,
     HeldOut,
-    Wishes,
+    UtilityLogit,
     fit_choice,
     folds,
     held_out,
@@ -119,7 +119,7 @@ def lane_changes(
         first_lane=options.first_lane,
     )  # fmt: skip
     free = options.free or tuple(f"{Mobil.kind}.{p.name}" for p in Mobil.declared)
-    models: list[Choice] = [Wishes(model.simulator(Lanes(2)), free), ConstantRate(), GapAcceptance()]
+    models: list[Choice] = [UtilityLogit(model.simulator(Lanes(2)), free), ConstantRate(), GapLogit()]
     fitted = []
     for k, each in enumerate(models):
         progress("fitting", k, len(models), each.title)

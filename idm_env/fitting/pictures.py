@@ -95,10 +95,10 @@ def space_time(problem: Problem, simulated: Simulated) -> list[page.Block]:
         episode = episodes[row]
         lead = episode.leader.position_m - episode.leader.length_m
         gap, speed = episode.gap_m.copy(), episode.speed_mps.copy()
-        measured.append(diagrams.Line(episode.key, episode.time_s, lead - gap, speed))
+        measured.append(diagrams.VehicleLine(episode.key, episode.time_s, lead - gap, speed))
         gap[1:] = simulated.gap[: len(episode) - 1, row].numpy()
         speed[1:] = simulated.speed[: len(episode) - 1, row].numpy()
-        model.append(diagrams.Line(episode.key, episode.time_s, lead - gap, speed))
+        model.append(diagrams.VehicleLine(episode.key, episode.time_s, lead - gap, speed))
     panels = [diagrams.Panel(title, tuple(lines)) for title, lines in (("measured", measured), ("simulated", model))]
     where = f"run {run}" + (f", lane {lane}" if lane >= 0 else "")
     word = "episode" if len(rows) == 1 else "episodes"

@@ -121,7 +121,7 @@ def _told(trajectories: Trajectories, left_out: Sequence[Repair]) -> dict[str, A
 
 
 @dataclass(frozen=True, eq=False)
-class Joined:
+class JoinedFit:
     """What all pieces of a fit found: estimates, errors of every episode, and what each piece told."""
 
     parts: Parts
@@ -146,7 +146,7 @@ class Joined:
         return [page.Block("figure", **block) for told in self.summaries for block in told["pictures"]]
 
 
-def join(parts: Parts, options: Options) -> Joined:
+def join(parts: Parts, options: Options) -> JoinedFit:
     """Return what the pieces found. DataError if none found anything."""
     told = parts.summaries()
     good = [summary for summary in told if "lost" not in summary]
@@ -160,10 +160,10 @@ def join(parts: Parts, options: Options) -> Joined:
     errors = pl.concat([pl.read_parquet(path, glob=False) for path in parts.tables(ERRORS)])
     estimates = drivers.Estimates.joined(table, simulator, good[0]["dt"], fixed)
     measures = Errors(*(torch.from_numpy(errors[name].to_numpy().copy()) for name in Errors._fields))
-    return Joined(parts, estimates, measures, good, [summary for summary in told if "lost" in summary])
+    return JoinedFit(parts, estimates, measures, good, [summary for summary in told if "lost" in summary])
 
 
-def account_of(found: Joined, source: str) -> dict[str, Any]:
+def account_of(found: JoinedFit, source: str) -> dict[str, Any]:
     """Return what the parts of a folder are together, as ``Trajectories.summary`` says it of a file."""
     data = [told["data"] for told in found.summaries]
     repairs, left_out = Counted(), Counted()

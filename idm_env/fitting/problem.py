@@ -25,7 +25,7 @@ from idm_env.simulator import Simulator
 from idm_env.types import Inputs, State
 
 if TYPE_CHECKING:
-    from idm_env.kernels.drivers import Behind
+    from idm_env.kernels.drivers import BehindRecord
 
 Objective = Literal["spacing", "speed", "both"]
 Loss = Literal["mse", "rmse"]
@@ -193,7 +193,7 @@ class Problem:
         return torch.cat([x for name, x in pair.items() if self.objective in (name, "both")])
 
     @cached_property
-    def _prepared(self) -> Behind | str:
+    def _prepared(self) -> BehindRecord | str:
         """The compiled rollout of these drivers, or why there is none."""
         from idm_env.kernels import drivers
 
@@ -205,7 +205,7 @@ class Problem:
         )  # fmt: skip
 
     @property
-    def _compiled(self) -> Behind | None:
+    def _compiled(self) -> BehindRecord | None:
         """The compiled rollout, where there is one and kernels can run."""
         if not self.kernels or dispatch.surroundings() is not None:
             return None
@@ -252,7 +252,7 @@ class Problem:
         )
 
     def _linear(
-        self, compiled: Behind, own: Tensor, shared: Tensor
+        self, compiled: BehindRecord, own: Tensor, shared: Tensor
     ) -> tuple[State, dict[str, dict[str, Tensor]], tuple[str, ...], Tensor | None]:
         """Return start, parameters, names of the free ones, and the start's derivative by these (for memories)."""
         values = self.rows(own, shared)

@@ -38,7 +38,7 @@ class Observed(NamedTuple):
     weight: Array
 
 
-class Found(NamedTuple):
+class DescentResult(NamedTuple):
     """Values [vehicles] and inputs [steps, vehicles] by full name; motion [steps + 1, vehicles], the start first.
 
     ``accel`` is the acceleration of the step before, as in a state (m/s²).
@@ -54,7 +54,7 @@ class Found(NamedTuple):
 def descend(
     simulator: Simulator, state: State, inputs: Inputs, params: Params, steps: int, observed: Observed, bounds: Bounds,
     *, iterations: int, rates: tuple[float, float],
-) -> Found:  # fmt: skip
+) -> DescentResult:  # fmt: skip
     """Minimise Σ weight · |position − observed| of a state ``(vehicles, 1)`` in float64, by Adam between bounds.
 
     The learning rate falls linearly from the first of ``rates`` to the second. ImportError without numba; ValueError
@@ -92,7 +92,7 @@ def descend(
         count, wide, tiles.tiles(count, 1, wide, 0), iterations, *rates,
     )  # fmt: skip
     first = [dense(x, shape)[None] for x in (state.position, state.speed, state.accel)]
-    return Found(
+    return DescentResult(
         dict(zip(program.parameters, values, strict=True)),
         {slots[n]: x.reshape(steps, count) for n, x in zip(kernel.numbers, given, strict=True) if n in slots},
         *(np.concatenate((x, y)) for x, y in zip(first, kept[:3], strict=True)),

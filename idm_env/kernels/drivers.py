@@ -28,8 +28,8 @@ from idm_env.kernels.workspace import take
 from idm_env.roads import Lane, Road
 from idm_env.scalar import library
 from idm_env.scalar.driver import DriverProgram, shift_of
-from idm_env.scalar.driver_text import ADJOINT, TANGENTS, VALUES, DriverText, Layout
-from idm_env.scalar.graph import Slot, inputs_of
+from idm_env.scalar.driver_text import ADJOINT, TANGENTS, VALUES, DriverText, RowLayout
+from idm_env.scalar.graph import Leaf, inputs_of
 from idm_env.scalar.record import Form, Untraceable, record, slot_name
 from idm_env.step import Integration, Stepping
 from idm_env.types import Inputs, Params, Record, State
@@ -53,7 +53,7 @@ class _Printed:
     known: dict[tuple[str, Sequence[str]], tuple[Array, Array]] = field(default_factory=dict)
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> RowLayout:
         return self.text.layout
 
     def compiled(self, kind: str, names: Sequence[str]) -> tuple[Array, Array]:
@@ -108,7 +108,7 @@ class DriverKernel:
 @lru_cache(maxsize=256)
 def _kernel(
     road: Road, effects: tuple[Effect, ...], dt: float, integration: Integration, form: Form,
-    fixed: tuple[tuple[Slot, float], ...],
+    fixed: tuple[tuple[Leaf, float], ...],
 ) -> DriverKernel | str:  # fmt: skip
     try:
         recording = record(Stepping(road, effects, dt, integration), form)
@@ -122,7 +122,7 @@ def _kernel(
 
 def prepared(
     simulator: Stepping, state: State, records: Mapping[str, Tensor], inputs: Inputs, driver: int
-) -> Behind | str:
+) -> BehindRecord | str:
     """Return the compiled rollouts of these drivers, or why there are none.
 
     ``state`` is a start (its form counts, not its numbers); ``records`` are position (m), speed (m/s), acceleration
@@ -133,25 +133,25 @@ def prepared(
         return f"the road is {type(simulator.road).__name__}; drivers behind records know Lane"
     count = records["speed"].shape[-1]
     form = Form.of(state, inputs)
-    fixed = {Slot(n, s): _of(road_is, driver - s) for n, road_is in _topology(simulator, count) for s in range(-2, 4)}
+    fixed = {Leaf(n, s): _of(road_is, driver - s) for n, road_is in _topology(simulator, count) for s in range(-2, 4)}
     for name in form.flags:
         active = _part(inputs, name)[..., driver]
         if bool(active.any()) != bool(active.all()):
             return f"the input '{name}' of the driver changes under way"
-        fixed[Slot(name)] = float(active.any())
+        fixed[Leaf(name)] = float(active.any())
     for effect, value in inputs.items():
         if isinstance(value, Record):
             if not bool(value.active[..., torch.arange(count) != driver].all()):
                 return "some neighbour is no record"
             if value.present is not None and bool((value.present[..., driver] == 1).all()):
-                fixed |= {Slot("present"): 1.0, Slot(slot_name(effect, "present")): 1.0}
+                fixed |= {Leaf("present"): 1.0, Leaf(slot_name(effect, "present")): 1.0}
     try:
         kernel = _kernel(
             simulator.road, simulator.effects, simulator.dt, simulator.integration, form, tuple(fixed.items())
         )
     except TypeError as error:  # an effect with a choice that cannot be hashed
         return f"an effect cannot be a key: {error}"
-    return kernel if isinstance(kernel, str) else Behind(kernel, records, inputs, driver)
+    return kernel if isinstance(kernel, str) else BehindRecord(kernel, records, inputs, driver)
 
 
 def _topology(simulator: Stepping, count: int) -> list[tuple[str, Tensor]]:
@@ -176,7 +176,7 @@ def _part(inputs: Inputs, name: str) -> Tensor:
 # -- what is run -------------------------------------------------------------------------------------------------
 
 
-class Behind:
+class BehindRecord:
     """Drivers behind their records: everything that stays the same from rollout to rollout.
 
     States passed in have shape ``(…, rows, vehicles)``, parameters broadcast against that; what comes out has
@@ -399,7 +399,9 @@ class _Rollout(torch.autograd.Function):
     """Keeps the states that the adjoint reads, where anybody will ask for it."""
 
     @staticmethod
-    def forward(ctx: Any, behind: Behind, every: int, threads: int | None, *sources: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, behind: BehindRecord, every: int, threads: int | None, *sources: Tensor
+    ) -> tuple[Tensor, Tensor]:
         wanted = any(ctx.needs_input_grad[3:])
         taped = behind.kernel.taped if wanted else np.zeros(0, np.int64)
         gap, speed, tape = behind._forward(sources, every, threads, taped)
@@ -416,4 +418,4 @@ class _Rollout(torch.autograd.Function):
         return None, None, None, *found
 
 
-__all__ = ["Behind", "DriverKernel", "prepared"]
+__all__ = ["BehindRecord", "DriverKernel", "prepared"]

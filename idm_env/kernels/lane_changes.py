@@ -21,7 +21,7 @@ from idm_env.roads import Lanes
 from idm_env.roads.chains import Places
 from idm_env.roads.linked import Linked
 from idm_env.scalar import library
-from idm_env.scalar.graph import Slot
+from idm_env.scalar.graph import Leaf
 from idm_env.scalar.record import Form
 from idm_env.scalar.wishes import HERE, SEARCHED, SIDES, Wishes
 from idm_env.step import Stepping
@@ -236,7 +236,7 @@ KINDS = {
 """Rows that are searched for instead of read from an array."""
 
 
-def _side(slot: Slot) -> tuple[int, str]:
+def _side(slot: Leaf) -> tuple[int, str]:
     """Return the side of a slot, 0 for the own lane, and its name there."""
     first, _, rest = slot.name.partition(" ")
     return (SIDES.index(first) + 1, rest) if first in SIDES else (0, slot.name)

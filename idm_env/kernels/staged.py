@@ -86,23 +86,23 @@ class Number:
     def __abs__(self) -> Number:
         return _called(lambda x: abs(x), self)
 
-    def __lt__(self, other: Any) -> Truth:
+    def __lt__(self, other: Any) -> StagedBool:
         return _compared("<", self, other)
 
-    def __le__(self, other: Any) -> Truth:
+    def __le__(self, other: Any) -> StagedBool:
         return _compared("<=", self, other)
 
-    def __gt__(self, other: Any) -> Truth:
+    def __gt__(self, other: Any) -> StagedBool:
         return _compared(">", self, other)
 
-    def __ge__(self, other: Any) -> Truth:
+    def __ge__(self, other: Any) -> StagedBool:
         return _compared(">=", self, other)
 
-    def __eq__(self, other: Any) -> Truth:  # type: ignore[override]
+    def __eq__(self, other: Any) -> StagedBool:  # type: ignore[override]
         return _compared("==", self, other)
 
-    def __ne__(self, other: Any) -> Truth:  # type: ignore[override]
-        return Truth(_now.get().builder.fcmp_unordered("!=", self.value, _real(other)))
+    def __ne__(self, other: Any) -> StagedBool:  # type: ignore[override]
+        return StagedBool(_now.get().builder.fcmp_unordered("!=", self.value, _real(other)))
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -125,22 +125,22 @@ class Merged(Number):
         _now.get().builder.store(_real(value), self._value)
 
 
-class Truth:
+class StagedBool:
     """A truth value that the compiled code will have."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
 
-    def __and__(self, other: Any) -> Truth:
-        return Truth(_now.get().builder.and_(self.value, _bit(other)))
+    def __and__(self, other: Any) -> StagedBool:
+        return StagedBool(_now.get().builder.and_(self.value, _bit(other)))
 
-    def __or__(self, other: Any) -> Truth:
-        return Truth(_now.get().builder.or_(self.value, _bit(other)))
+    def __or__(self, other: Any) -> StagedBool:
+        return StagedBool(_now.get().builder.or_(self.value, _bit(other)))
 
     __rand__, __ror__ = __and__, __or__
 
-    def __invert__(self) -> Truth:
-        return Truth(_now.get().builder.not_(self.value))
+    def __invert__(self) -> StagedBool:
+        return StagedBool(_now.get().builder.not_(self.value))
 
 
 class Row:
@@ -163,7 +163,7 @@ class Row:
         found = _now.get().builder.load(self._place(at))
         if self.kind.dtype == types.float64:
             return Number(found)
-        return Truth(_now.get().builder.icmp_signed("!=", found, ir.Constant(found.type, 0)))
+        return StagedBool(_now.get().builder.icmp_signed("!=", found, ir.Constant(found.type, 0)))
 
     def __setitem__(self, at: Any, value: Any) -> None:
         _now.get().builder.store(_real(value), self._place(at))
@@ -192,15 +192,15 @@ def _whole(x: Any) -> Any:
 
 
 def _bit(x: Any) -> Any:
-    return x.value if isinstance(x, Truth) else ir.Constant(ir.IntType(1), bool(x))
+    return x.value if isinstance(x, StagedBool) else ir.Constant(ir.IntType(1), bool(x))
 
 
 def _made(instruction: str, a: Any, b: Any) -> Number:
     return Number(getattr(_now.get().builder, instruction)(_real(a), _real(b)))
 
 
-def _compared(how: str, a: Any, b: Any) -> Truth:
-    return Truth(_now.get().builder.fcmp_ordered(how, _real(a), _real(b)))
+def _compared(how: str, a: Any, b: Any) -> StagedBool:
+    return StagedBool(_now.get().builder.fcmp_ordered(how, _real(a), _real(b)))
 
 
 def _called(function: Callable[..., Any], *numbers: Any) -> Number:
@@ -218,7 +218,7 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
 
     A branch, not a selection: what follows need not wait for the one that does not count.
     """
-    if not isinstance(condition, Truth):
+    if not isinstance(condition, StagedBool):
         return a if condition else b
     builder, one, other = _now.get().builder, _real(a), _real(b)
     before = builder.block
@@ -232,11 +232,11 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
 
 def negated(condition: Any) -> Any:
     """Return whether the condition does not hold."""
-    return ~condition if isinstance(condition, Truth) else not condition
+    return ~condition if isinstance(condition, StagedBool) else not condition
 
 
 @contextmanager
-def when(condition: Truth) -> Iterator[None]:
+def when(condition: StagedBool) -> Iterator[None]:
     """Run what stands in it only where the condition holds; it leaves results in ``Merged`` or in arrays."""
     with _now.get().builder.if_then(_bit(condition)):
         yield

@@ -17,13 +17,13 @@ import torch
 from scipy.stats import norm, qmc
 
 from idm_env.data import Episode
-from idm_env.data import Record as Recorded
+from idm_env.data import VehicleRecord as Recorded
 from idm_env.fitting.fit import fit
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.solver import normal
 from idm_env.prediction.lanes import Route
 from idm_env.prediction.mixture import STANDING_MPS
-from idm_env.prediction.rollout import DT, Ahead, Drivers, bend_speed
+from idm_env.prediction.rollout import DT, RouteDrivers, RouteLeader, bend_speed
 from idm_env.prediction.stops import Stop
 
 URBAN_LIMIT = 13.4
@@ -80,7 +80,7 @@ class Second:
 
     route: Route
     speeds: np.ndarray
-    ahead: Ahead
+    ahead: RouteLeader
     front: float
     stop: Stop | None
 
@@ -126,7 +126,7 @@ def hypotheses(second: Second) -> list[Hypothesis]:
     return found
 
 
-def posterior(seconds: Sequence[Second]) -> list[tuple[Drivers, np.ndarray]]:
+def posterior(seconds: Sequence[Second]) -> list[tuple[RouteDrivers, np.ndarray]]:
     """Return, for every route, drivers drawn around the fits of its hypotheses, and the weight of each.
 
     Weights are share × evidence / number drawn, with the evidence by Laplace's method: what the mode costs, and how
@@ -135,10 +135,10 @@ def posterior(seconds: Sequence[Second]) -> list[tuple[Drivers, np.ndarray]]:
     cases = [(second, h) for second in seconds for h in hypotheses(second)]
     log_mode, spread, evidence = _fitted(cases)
     evidence = evidence - evidence.max()
-    drawn: list[tuple[Drivers, np.ndarray]] = []
+    drawn: list[tuple[RouteDrivers, np.ndarray]] = []
     for second in seconds:
         parts = [_draw(h, second, log_mode[i], spread[i], evidence[i]) for i, (s, h) in enumerate(cases) if s is second]
-        drawn.append((Drivers.joined([one for one, _ in parts]), np.concatenate([weight for _, weight in parts])))
+        drawn.append((RouteDrivers.joined([one for one, _ in parts]), np.concatenate([weight for _, weight in parts])))
     return drawn
 
 
@@ -184,7 +184,7 @@ def _episode(number: int, second: Second, h: Hypothesis) -> Episode:
 
 def _draw(
     h: Hypothesis, second: Second, log_mode: np.ndarray, factor: np.ndarray, evidence: float
-) -> tuple[Drivers, np.ndarray]:
+) -> tuple[RouteDrivers, np.ndarray]:
     """Return drivers around one fit, and their weights."""
     count = DRAWS[h.kind]
     u = quantiles(count)
@@ -202,11 +202,11 @@ def _draw(
         opens = LONGEST_RED_S * u[:, 7]
     stop = np.maximum(np.full(count, h.stop) + spread, 0.5)
     a, b, time_gap, min_gap = np.maximum(values[:, :4].T, 0.05)
-    drivers = Drivers(a, b, time_gap, min_gap, wanted, lateral, stop, wait, opens, u[:, 9])
+    drivers = RouteDrivers(a, b, time_gap, min_gap, wanted, lateral, stop, wait, opens, u[:, 9])
     return drivers, np.full(count, h.share / count * np.exp(evidence))
 
 
-def middle(speed: float, limit: float, stop: Stop | None) -> Drivers:
+def middle(speed: float, limit: float, stop: Stop | None) -> RouteDrivers:
     """Return the one driver of the prior's medians who keeps about his speed and stops where he must."""
     known = limit if np.isfinite(limit) else URBAN_LIMIT
     halts = stop.distance + CENTRE["min_gap"] if stop is not None else np.inf
@@ -214,7 +214,7 @@ def middle(speed: float, limit: float, stop: Stop | None) -> Drivers:
     opens = 0.5 * LONGEST_RED_S if stop is not None and stop.kind == "red" else np.inf
     wanted = 0.5 * (max(speed, 1.0) + known)
     values = {**CENTRE, "desired_speed": wanted, "lateral": LATERAL_MPS2, "stop": halts, "wait": wait, "opens": opens}
-    return Drivers(**{name: np.array([value]) for name, value in values.items()}, passing=np.array([0.5]))
+    return RouteDrivers(**{name: np.array([value]) for name, value in values.items()}, passing=np.array([0.5]))
 
 
 def passing(lateral: float) -> float:

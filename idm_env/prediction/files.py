@@ -21,7 +21,7 @@ from idm_env.prediction import report as written
 from idm_env.prediction.metrics import Case, Score, intervals, score, shape_of, summary
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import METHODS, Prediction, available
-from idm_env.prediction.scene import Scene
+from idm_env.prediction.scene import MapScene
 from idm_env.reports import page
 
 OURS = "drivers on routes"
@@ -142,7 +142,7 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scen
     for scenario in _readable(path, left_out):
         on_scenario(found)
         found += 1
-        scene = Scene(scenario)
+        scene = MapScene(scenario)
         notes += [{"scenario": scenario.id, "note": note} for note in _notes(scenario)]
         for index in scenario.to_predict:
             done = _agent(scene, index, methods, left_out)
@@ -187,7 +187,7 @@ def _notes(scenario: Scenario) -> list[str]:
 
 
 def _agent(
-    scene: Scene, index: int, methods: Sequence[str], left_out: list[dict[str, str]]
+    scene: MapScene, index: int, methods: Sequence[str], left_out: list[dict[str, str]]
 ) -> dict[str, Prediction] | None:  # fmt: skip
     """Predict one agent by every method; None, and counted, where it cannot be."""
     try:

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from idm_env.data.scenario import Lane
+from idm_env.data.scenario import MapLane
 
 JOIN_M = 1.5
 """A lane that begins this near to another's end follows it, where the file does not say what follows (m)."""
@@ -81,7 +81,7 @@ def arc_length(line: np.ndarray) -> np.ndarray:
 class LaneGraph:
     """The lanes of a scene and what follows each: by the file, or by ends that meet in one direction."""
 
-    def __init__(self, lanes: Sequence[Lane]) -> None:
+    def __init__(self, lanes: Sequence[MapLane]) -> None:
         self.lanes = {lane.id: lane for lane in lanes if arc_length(lane.line)[-1] > 0.1}
         self.lengths = {key: arc_length(lane.line) for key, lane in self.lanes.items()}
         self.exits = {
@@ -89,7 +89,7 @@ class LaneGraph:
             for key, lane in self.lanes.items()
         }
 
-    def _meeting(self, lane: Lane) -> tuple[int, ...]:
+    def _meeting(self, lane: MapLane) -> tuple[int, ...]:
         end, along = lane.line[-1], lane.line[-1] - lane.line[-2]
         found = []
         for other in self.lanes.values():

@@ -12,8 +12,8 @@ from idm_env.prediction.drivers import posterior
 from idm_env.prediction.free import constant_velocity, free_futures, kept_velocity
 from idm_env.prediction.lanes import Route
 from idm_env.prediction.mixture import SHARES, Shares, share_of
-from idm_env.prediction.rollout import DT, Course, Drivers, roll
-from idm_env.prediction.scene import STEPS, Scene
+from idm_env.prediction.rollout import DT, Course, RouteDrivers, roll
+from idm_env.prediction.scene import STEPS, MapScene
 from idm_env.prediction.select import select
 
 LATERAL_S = 4.0
@@ -47,7 +47,7 @@ class Mixture:
     parameters: dict[str, tuple[float, float]]
 
 
-def mixture(scene: Scene, index: int) -> Mixture:
+def mixture(scene: MapScene, index: int) -> Mixture:
     """Return the futures of an agent by all ways. ValueError if it is not valid at the present.
 
     Everybody may keep the velocity (``kept_velocity``) or the motion, loosely (``free_futures``: driveways, parking,
@@ -75,7 +75,7 @@ def mixture(scene: Scene, index: int) -> Mixture:
     return Mixture(index, tuple(futures), tuple(weights), parameters)
 
 
-def chosen(scene: Scene, found: Mixture, shares: Shares = SHARES) -> Prediction:
+def chosen(scene: MapScene, found: Mixture, shares: Shares = SHARES) -> Prediction:
     """Return up to six futures of an agent's mixture, and their confidences, with these shares of the ways.
 
     Constant velocity is always one of them, so that no agent is predicted worse than by it.
@@ -88,14 +88,14 @@ def chosen(scene: Scene, found: Mixture, shares: Shares = SHARES) -> Prediction:
     return Prediction(found.agent, futures, confidence, "lane" if on_lane else "free", found.parameters)
 
 
-def predict(scene: Scene, index: int) -> Prediction:
+def predict(scene: MapScene, index: int) -> Prediction:
     """Return up to six futures of an agent. ValueError if it is not valid at the present."""
     return chosen(scene, mixture(scene, index))
 
 
-def _moments(name: str, drawn: list[Drivers], shares: np.ndarray) -> tuple[float, float]:
+def _moments(name: str, drawn: list[RouteDrivers], shares: np.ndarray) -> tuple[float, float]:
     """Return mean and deviation of one parameter over weighted drivers."""
-    values = getattr(Drivers.joined(drawn), name)
+    values = getattr(RouteDrivers.joined(drawn), name)
     mean = float((shares * values).sum())
     return mean, float(np.sqrt((shares * (values - mean) ** 2).sum()))
 
@@ -106,13 +106,13 @@ def lifted(route: Route, along: np.ndarray) -> np.ndarray:
     return route.lift(along, np.broadcast_to(route.lateral * np.exp(-time / LATERAL_S), along.shape))
 
 
-def straight_on(scene: Scene, index: int) -> Prediction:
+def straight_on(scene: MapScene, index: int) -> Prediction:
     """Return the one future at constant velocity."""
     agent = scene.valid(index)
     return Prediction(index, constant_velocity(agent, scene.present, STEPS), np.ones(1), "constant velocity")
 
 
-def along_lane(scene: Scene, index: int) -> Prediction:
+def along_lane(scene: MapScene, index: int) -> Prediction:
     """Return the one future at constant speed along the likeliest route; constant velocity off the lanes."""
     agent = scene.valid(index)
     routes = scene.routes(agent)
@@ -122,7 +122,7 @@ def along_lane(scene: Scene, index: int) -> Prediction:
     return Prediction(index, lifted(routes[0], along[None]), np.ones(1), "lane, constant speed")
 
 
-def as_published(scene: Scene, index: int) -> Prediction:
+def as_published(scene: MapScene, index: int) -> Prediction:
     """Return the paper's one future: five IDM values by its recipe from one second, on the current lane, straight on.
 
     ``trajectories.paper`` optimises and drives, behind the real leader, which drives by its own fit; stop lines,
@@ -136,7 +136,7 @@ def as_published(scene: Scene, index: int) -> Prediction:
     return Prediction(index, lifted(routes[0], along[None]), np.ones(1), "the paper's recipe")
 
 
-def published_distance(scene: Scene, index: int, known: dict[int, np.ndarray]) -> np.ndarray:
+def published_distance(scene: MapScene, index: int, known: dict[int, np.ndarray]) -> np.ndarray:
     """Return how far an agent goes by the paper's recipe at every step [S] (m); ``known`` holds those worked out."""
     from idm_env.trajectories import paper
 

@@ -27,7 +27,7 @@ AT_LINE_M = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class Drivers:
+class RouteDrivers:
     """Drivers [N]: IDM's five, lateral acceleration accepted in bends (m/s²), distance to a stop (m, inf for none).
 
     A stop ends ``wait`` seconds after the driver has halted at it, or ``opens`` seconds from now (inf for never).
@@ -46,13 +46,13 @@ class Drivers:
     passing: np.ndarray
 
     @classmethod
-    def joined(cls, parts: Sequence[Drivers]) -> Drivers:
+    def joined(cls, parts: Sequence[RouteDrivers]) -> RouteDrivers:
         """Return the drivers of several groups as one."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
 @dataclass(frozen=True, eq=False)
-class Ahead:
+class RouteLeader:
     """The vehicle ahead on a route: rear bumper (m of arc length) and speed (m/s) per step [S + 1].
 
     ``passed`` is the share of drivers who go around it, which only standing vehicles are.
@@ -68,14 +68,14 @@ class Course:
     """Drivers on a route behind what is ahead, from arc length ``begin`` (m, centre) on."""
 
     route: Route
-    drivers: Drivers
-    ahead: Ahead
+    drivers: RouteDrivers
+    ahead: RouteLeader
     begin: float
 
 
-def nobody(steps: int) -> Ahead:
+def nobody(steps: int) -> RouteLeader:
     """Return what stands for an empty road ahead: something that is far away and keeps away."""
-    return Ahead(np.full(steps + 1, AWAY_M), np.full(steps + 1, 30.0))
+    return RouteLeader(np.full(steps + 1, AWAY_M), np.full(steps + 1, 30.0))
 
 
 def bend_speed(route: Route, lateral: np.ndarray, comfort: np.ndarray) -> np.ndarray:
@@ -94,7 +94,7 @@ def roll(courses: Sequence[Course], speed: float, steps: int, front: float) -> l
     ``front`` (m) is from the centre to the front bumper. Speeds wanted fall before bends; the leader, or a stop line
     if it is nearer, is replayed. An overlap at the start is taken as bumper to bumper.
     """
-    drivers = Drivers.joined([c.drivers for c in courses])
+    drivers = RouteDrivers.joined([c.drivers for c in courses])
     sizes = [len(c.drivers.stop) for c in courses]
     rows = np.repeat(np.arange(len(courses)), sizes)
     begin = np.array([c.begin for c in courses])[rows]
@@ -139,7 +139,7 @@ def roll(courses: Sequence[Course], speed: float, steps: int, front: float) -> l
 class _StopLine:
     """The stop line [N] of every driver (m of arc length), which goes away once its stop has ended."""
 
-    def __init__(self, drivers: Drivers, front: np.ndarray) -> None:
+    def __init__(self, drivers: RouteDrivers, front: np.ndarray) -> None:
         self.line = torch.as_tensor(np.minimum(front + drivers.stop, AWAY_M))
         self._wait, self._opens = torch.as_tensor(drivers.wait), torch.as_tensor(drivers.opens)
         self._halted = torch.zeros_like(self.line)

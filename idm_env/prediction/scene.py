@@ -12,7 +12,7 @@ from idm_env.prediction.drivers import Second, middle, passing
 from idm_env.prediction.free import motion_now
 from idm_env.prediction.lanes import LaneGraph, Route, turn
 from idm_env.prediction.mixture import STANDING_MPS
-from idm_env.prediction.rollout import DT, Ahead, Course, nobody, roll
+from idm_env.prediction.rollout import DT, Course, RouteLeader, nobody, roll
 from idm_env.prediction.stops import StopLines
 
 SECONDS = 8
@@ -32,7 +32,7 @@ def _turning_alike(route: Route, speed: float, turning: float) -> float:
     return float(np.exp(-0.5 * ((turning - wanted) / YAW_SIGMA) ** 2))
 
 
-class Scene:
+class MapScene:
     """A scenario with its lane graph, and the motions of leaders once they have been worked out."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -97,7 +97,7 @@ class Scene:
                 best = other, along, lateral
         return best
 
-    def ahead(self, index: int, route: Route, depth: int = 0) -> tuple[Ahead, Ahead]:
+    def ahead(self, index: int, route: Route, depth: int = 0) -> tuple[RouteLeader, RouteLeader]:
         """Return the vehicle ahead over the last second and over the future, by its own predicted motion."""
         found = self.leader(index, route)
         if found is None:
@@ -108,14 +108,14 @@ class Scene:
         speed = np.gradient(np.concatenate([[0.0], travelled]), DT)
         past = self.past(agent, along - 0.5 * agent.length)
         share = passing(lateral) if past.speed[-1] < STANDING_MPS else 0.0
-        future = Ahead(past.rear[-1] + np.concatenate([[0.0], travelled]), np.maximum(speed, 0.0), share)
-        return Ahead(past.rear, past.speed, share), future
+        future = RouteLeader(past.rear[-1] + np.concatenate([[0.0], travelled]), np.maximum(speed, 0.0), share)
+        return RouteLeader(past.rear, past.speed, share), future
 
-    def past(self, agent: Agent, rear: float) -> Ahead:
+    def past(self, agent: Agent, rear: float) -> RouteLeader:
         """Return where an agent's rear has been that is at arc length ``rear`` (m) now."""
         speed = self.speeds(agent)
         back = np.concatenate([np.cumsum(speed[::-1])[::-1][1:] * DT, [0.0]])
-        return Ahead(rear - back, speed)
+        return RouteLeader(rear - back, speed)
 
     def speeds(self, agent: Agent) -> np.ndarray:
         """Return speeds from the first step to the present; what is not valid takes the nearest that is."""
@@ -123,7 +123,7 @@ class Scene:
         known = np.flatnonzero(agent.valid[: self.present + 1])
         return np.asarray(np.interp(np.arange(self.present + 1), known, speed[known]))
 
-    def second(self, agent: Agent, route: Route, past: Ahead) -> Second:
+    def second(self, agent: Agent, route: Route, past: RouteLeader) -> Second:
         """Return the last second of an agent on a route, from where it has been valid without a break."""
         known = agent.valid[max(self.present - 10, 0) : self.present + 1]
         broken = np.flatnonzero(~known)
@@ -131,8 +131,12 @@ class Scene:
         front = 0.5 * agent.length
         stop = self.lines.ahead(route, front, self.speed(agent))
         return Second(
-            route, self.speeds(agent)[first:], Ahead(past.rear[first:], past.speed[first:], past.passed), front, stop
-        )  # fmt: skip
+            route,
+            self.speeds(agent)[first:],
+            RouteLeader(past.rear[first:], past.speed[first:], past.passed),
+            front,
+            stop,
+        )
 
     def travelled(self, index: int, depth: int) -> np.ndarray:
         """Return how far an agent will have gone at every step [S] (m): the middle driver on its likeliest route."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from idm_env.data.scenario import Control
+from idm_env.data.scenario import TrafficControl
 from idm_env.prediction.lanes import LaneGraph, Route
 
 POST_RIGHT_M = (1.2, 8.0)
@@ -33,7 +33,7 @@ class Stop:
 class StopLines:
     """The stop lines of a scene: for each lane, what is shown there and where."""
 
-    def __init__(self, graph: LaneGraph, controls: Sequence[Control]) -> None:
+    def __init__(self, graph: LaneGraph, controls: Sequence[TrafficControl]) -> None:
         self._by_lane: dict[int, list[tuple[str, np.ndarray]]] = {}
         self._loose: list[tuple[str, np.ndarray]] = []
         for control in controls:

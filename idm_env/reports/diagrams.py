@@ -24,7 +24,7 @@ MOST_DRAWN = 60_000
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class VehicleLine:
     """One vehicle: time (s), position (m) and speed (m/s), each [T], by rising time; ``marked`` where controlled."""
 
     name: str
@@ -47,7 +47,7 @@ class Panel:
     """The vehicles of one run and lane."""
 
     title: str
-    lines: tuple[Line, ...]
+    lines: tuple[VehicleLine, ...]
     ring_length: float | None = None
 
     @property
@@ -77,11 +77,11 @@ def panels(data: Any, *, ring_length: float | None = None) -> list[Panel]:
     rings = np.asarray(table["ring_length_m"], float) if "ring_length_m" in table.columns else np.full(count, np.nan)
     order = np.lexsort((time, vehicles, lanes, runs))
     edges = np.flatnonzero(_changes(runs[order]) | _changes(lanes[order]) | _changes(vehicles[order]))
-    found: dict[tuple[str, str], list[Line]] = {}
+    found: dict[tuple[str, str], list[VehicleLine]] = {}
     lengths: dict[tuple[str, str], float | None] = {}
     for at in np.split(order, edges[1:]):
         key = str(runs[at[0]]), str(lanes[at[0]])
-        line = Line(str(vehicles[at[0]]), time[at], position[at], speed[at], bool(marked[at].any()))
+        line = VehicleLine(str(vehicles[at[0]]), time[at], position[at], speed[at], bool(marked[at].any()))
         found.setdefault(key, []).append(line)
         known = rings[at][np.isfinite(rings[at])]
         lengths[key] = ring_length or (float(known[0]) if len(known) else None)
@@ -103,7 +103,7 @@ def rollout_panel(
         index = row if position.ndim == 3 else 0
         position, speed = position[:, index], speed[:, index]
     time = dt * np.arange(1, len(position) + 1)
-    lines = [Line(str(i), time, position[:, i], speed[:, i], i in marked) for i in range(position.shape[1])]
+    lines = [VehicleLine(str(i), time, position[:, i], speed[:, i], i in marked) for i in range(position.shape[1])]
     return Panel(f"{len(lines)} vehicles", tuple(lines), ring_length)
 
 
@@ -118,7 +118,7 @@ def lane_panels(
     position, speed = (np.asarray(x.detach().cpu(), float) for x in (data.position, data.speed))
     lanes, there = np.asarray(lane.detach().cpu()), np.asarray(present.detach().cpu()) > 0
     time = dt * np.arange(1, len(position) + 1)
-    found: dict[int, list[Line]] = {}
+    found: dict[int, list[VehicleLine]] = {}
     for i in range(position.shape[1]):
         # A piece ends where the lane changes, where nobody is there, and where a slot begins anew.
         back = np.diff(position[:, i], prepend=position[:1, i]) < -1.0
@@ -128,7 +128,7 @@ def lane_panels(
                 # One sample more, so that a change leaves no hole.
                 more = at if at[-1] + 1 == len(time) or back[at[-1] + 1] else np.append(at, at[-1] + 1)
                 more = more[there[more, i]]
-                line = Line(str(i), time[more], position[more, i], speed[more, i], i in marked)
+                line = VehicleLine(str(i), time[more], position[more, i], speed[more, i], i in marked)
                 found.setdefault(int(lanes[at[0], i]), []).append(line)
     made = []
     for k in sorted(found, reverse=True):
@@ -285,11 +285,11 @@ def _stride(drawn: Sequence[Panel], most: int) -> int:
     return max(1, -(-sum(panel.points for panel in drawn) // most))
 
 
-def _thinned(line: Line, stride: int) -> Line:
+def _thinned(line: VehicleLine, stride: int) -> VehicleLine:
     if stride == 1 or len(line.time) < 3:
         return line
     at = np.unique(np.append(np.arange(0, len(line.time), stride), len(line.time) - 1))
-    return Line(line.name, line.time[at], line.position[at], line.speed[at], line.marked)
+    return VehicleLine(line.name, line.time[at], line.position[at], line.speed[at], line.marked)
 
 
 def _changes(values: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from idm_env.scalar.derive import adjoint
-from idm_env.scalar.graph import CONSTANT, DYNAMIC, STATIC, Node, Slot, hoisted, inputs_of, ordered, replaced
+from idm_env.scalar.graph import CONSTANT, DYNAMIC, STATIC, Leaf, Node, hoisted, inputs_of, ordered, replaced
 from idm_env.scalar.record import Recording, Untraceable
 
 OWN = ("gap", "speed", "position", "accel")
@@ -56,7 +56,7 @@ class DriverProgram:
     ``Untraceable`` for an effect that looks back by a time that changes under way.
     """
 
-    def __init__(self, recording: Recording, fixed: Mapping[Slot, float]) -> None:
+    def __init__(self, recording: Recording, fixed: Mapping[Leaf, float]) -> None:
         self.graph = graph = recording.graph
         self._recording = recording
         names = list(recording.respond)
@@ -94,7 +94,7 @@ class DriverProgram:
                 wanted += [s.name for s in inputs_of(nodes) if self._is_state(s)]
         return after
 
-    def _is_state(self, slot: Slot) -> bool:
+    def _is_state(self, slot: Leaf) -> bool:
         name = slot.name
         return not slot.shift and (name in OWN or name == "step" or name.startswith(("memory of ", "gap of ")))
 
@@ -121,9 +121,9 @@ class DriverProgram:
         moved: dict[Node, Node] = self._known | self._gaps([close])
         for slot in inputs_of([close]):
             node = graph.input(*slot)
-            if slot == Slot("displacement"):
+            if slot == Leaf("displacement"):
                 moved[node] = self._respond["displacement"]
-            elif slot == Slot("position after"):
+            elif slot == Leaf("position after"):
                 moved[node] = self._respond["position"]
             elif slot.name == "displacement":
                 moved[node] = graph.sub(graph.input("position after", slot.shift), graph.input("position", slot.shift))
@@ -158,7 +158,7 @@ class DriverProgram:
         return tuple(n for n in self.states if n != "step" and not n.endswith(" ahead"))
 
     @cached_property
-    def slots(self) -> list[Slot]:
+    def slots(self) -> list[Leaf]:
         """Everything that is read."""
         return inputs_of([*self._after, *self._sense, *self.agos])
 
@@ -168,12 +168,12 @@ class DriverProgram:
         return tuple(s.name for s in self.slots if "." in s.name)
 
     @cached_property
-    def constants(self) -> tuple[Slot, ...]:
+    def constants(self) -> tuple[Leaf, ...]:
         """What holds for a whole rollout and is no parameter."""
         return tuple(s for s in self.slots if s.name in FIXED_IN_TIME)
 
     @cached_property
-    def records(self) -> tuple[Slot, ...]:
+    def records(self) -> tuple[Leaf, ...]:
         """What a record or an input gives at every step."""
         others = [s for s in self.slots if not self._is_state(s) and s not in self.constants]
         return tuple(s for s in others if "." not in s.name and not s.name.startswith("past "))
@@ -191,7 +191,7 @@ class DriverProgram:
     def _adjoint(self, nodes: Mapping[str, Node]) -> dict[str, Node]:
         seeds = [self.graph.input(f"on {name}", level=DYNAMIC) for name in nodes]
         found = adjoint(self.graph, list(nodes.values()), seeds)
-        return {leaf.label.name: g for leaf, g in found.items() if isinstance(leaf.label, Slot) and not leaf.label.shift
+        return {leaf.label.name: g for leaf, g in found.items() if isinstance(leaf.label, Leaf) and not leaf.label.shift
                 and self._flows(leaf.label.name)}  # fmt: skip
 
     def respond_back(self) -> dict[str, Node]:
@@ -206,7 +206,7 @@ class DriverProgram:
         """Return what falls on the parameters from the hoisted rows."""
         seeds = [self.graph.input(f"on {name}", level=STATIC) for name in self.constants_of_time]
         found = adjoint(self.graph, self.hoist, seeds)
-        return {leaf.label.name: g for leaf, g in found.items() if isinstance(leaf.label, Slot)}
+        return {leaf.label.name: g for leaf, g in found.items() if isinstance(leaf.label, Leaf)}
 
     # -- forwards ------------------------------------------------------------------------------------------------
 
@@ -267,7 +267,7 @@ class _Carrying:
         source = False
         for leaf, slope in zip(leaves, slopes, strict=True):
             slot = leaf.label
-            assert isinstance(slot, Slot)
+            assert isinstance(slot, Leaf)
             if slot.shift or (slope.op == "constant" and slope.label == 0.0):
                 continue
             if slot.name in self.names:

@@ -1,6 +1,6 @@
 """One driver behind a record, printed: rows of a workspace, and phases that run over them.
 
-The loops are ``kernels/driver_loops.py``, which contain no equation; a ``Layout`` tells them where everything is.
+The loops are ``kernels/driver_loops.py``, which contain no equation; a ``RowLayout`` tells them where everything is.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from idm_env.scalar.driver import DriverProgram, Tangents
-from idm_env.scalar.graph import Node, Slot
+from idm_env.scalar.graph import Leaf, Node
 from idm_env.scalar.source import Constants, Write, assignments, body, function, row
 
 VALUES = ("hoist", "sense", "respond")
@@ -22,7 +22,7 @@ ADJOINT = ("hoist_back", "sense_back", "respond_back")
 """Adjoints of a step's phases."""
 
 
-class Layout(NamedTuple):
+class RowLayout(NamedTuple):
     """Where a loop finds everything: first indices of groups of rows in the workspace, and how many rows they have.
 
     A direction's tangents are a block of rows of its own: of states (gap and speed first), signals and the past.
@@ -58,7 +58,7 @@ class Layout(NamedTuple):
 
 
 def _named(name: str) -> str:
-    return row(Slot(name))
+    return row(Leaf(name))
 
 
 class DriverText:
@@ -111,7 +111,7 @@ class DriverText:
         self._rows += names
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> RowLayout:
         """Return where everything is."""
         at = {name: begin * self._distance for name, (begin, _) in self._groups.items()}
         count = {f"n_{name}": many for name, (_, many) in self._groups.items()}
@@ -125,7 +125,7 @@ class DriverText:
             "n_moving_signals": len(self.made.sense),
             "tangent_past": (len(self.program.moving) + self.made.targets + len(self.made.sense)) * distance,
         }  # fmt: skip
-        return Layout(*(known.get(name, 0) for name in Layout._fields))
+        return RowLayout(*(known.get(name, 0) for name in RowLayout._fields))
 
     @cached_property
     def phases(self) -> tuple[str, ...]:
@@ -195,7 +195,7 @@ class DriverText:
             "hoist_back": ("Adjoint of hoist.", _added(p.hoist_back()), "swift"),
         }
 
-    def _read(self, slot: Slot) -> str:
+    def _read(self, slot: Leaf) -> str:
         name = row(slot)
         return f"h[OF_{name} + j]" if name in self._block else f"w[{name} + j]"
 
@@ -208,4 +208,4 @@ def _added(found: dict[str, Node]) -> list[Write]:
     return [Write(f"w[{_named(f'on {name}')} + j]", node, adds=True) for name, node in found.items()]
 
 
-__all__ = ["ADJOINT", "TANGENTS", "VALUES", "DriverText", "Layout"]
+__all__ = ["ADJOINT", "TANGENTS", "VALUES", "DriverText", "RowLayout"]

@@ -38,7 +38,7 @@ class TimeStep(float):
     __neg__, __pow__ = map(_kept, ("__neg__", "__pow__"))
 
 
-class Slot(NamedTuple):
+class Leaf(NamedTuple):
     """A number that a step reads: its name, and whose it is: 0 one's own, 1 the leader's, 2 his leader's, −1 behind."""
 
     name: str
@@ -47,11 +47,11 @@ class Slot(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One operation; ``label`` is an input's ``Slot`` or a constant's value, ``note`` the effect that asked for it."""
+    """One operation; ``label`` is an input's ``Leaf`` or a constant's value, ``note`` the effect that asked for it."""
 
     op: str
     args: tuple[Node, ...]
-    label: Slot | float | int | None
+    label: Leaf | float | int | None
     level: int
     note: str
 
@@ -70,7 +70,7 @@ class Graph:
     """What effects of the user's own have made, which may be NaN."""
     _known: dict[tuple[object, ...], Node] = field(default_factory=dict)
 
-    def node(self, op: str, *args: Node, label: Slot | float | int | None = None, level: int | None = None) -> Node:
+    def node(self, op: str, *args: Node, label: Leaf | float | int | None = None, level: int | None = None) -> Node:
         """Return the node of this operation on these nodes."""
         key = (op, *(id(a) for a in args), label, type(label))
         found = self._known.get(key)
@@ -85,7 +85,7 @@ class Graph:
 
     def input(self, name: str, shift: int = 0, level: int = DYNAMIC) -> Node:
         """Return what is read under a name."""
-        return self.node("input", label=Slot(name, shift), level=level)
+        return self.node("input", label=Leaf(name, shift), level=level)
 
     # -- arithmetic ----------------------------------------------------------------------------------------------
 
@@ -171,14 +171,14 @@ class Graph:
 
     def shifted(self, node: Node, by: int) -> Node:
         """Return the same expression of the vehicle ``by`` places ahead (negative: behind)."""
-        return self.renamed(node, lambda slot: Slot(slot.name, slot.shift + by))
+        return self.renamed(node, lambda slot: Leaf(slot.name, slot.shift + by))
 
-    def renamed(self, node: Node, change: Callable[[Slot], Slot]) -> Node:
+    def renamed(self, node: Node, change: Callable[[Leaf], Leaf]) -> Node:
         """Return the same expression with other slots read."""
         done: dict[Node, Node] = {}
         for each in ordered([node]):
             if each.op == "input":
-                assert isinstance(each.label, Slot)
+                assert isinstance(each.label, Leaf)
                 done[each] = self.input(*change(each.label), each.level)
             elif each.args:
                 done[each] = self.node(each.op, *(done[a] for a in each.args), label=each.label)
@@ -217,10 +217,10 @@ def ordered(outputs: Iterable[Node]) -> list[Node]:
     return order
 
 
-def inputs_of(outputs: Sequence[Node]) -> list[Slot]:
+def inputs_of(outputs: Sequence[Node]) -> list[Leaf]:
     """Return the slots that the outputs read, in order."""
     found = [node.label for node in ordered(outputs) if node.op == "input"]
-    return sorted({slot for slot in found if isinstance(slot, Slot)})
+    return sorted({slot for slot in found if isinstance(slot, Leaf)})
 
 
 def hoisted(graph: Graph, outputs: Sequence[Node], name: str = "hoisted") -> tuple[list[Node], list[Node]]:

@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from idm_env.scalar.derive import adjoint
-from idm_env.scalar.graph import STATIC, Graph, Node, Slot, hoisted, inputs_of, ordered, replaced
+from idm_env.scalar.graph import STATIC, Graph, Leaf, Node, hoisted, inputs_of, ordered, replaced
 from idm_env.scalar.record import Recording
 
 STATICS = ("led", "leads", "ends", "length", "present")
@@ -27,7 +27,7 @@ PHASES = ("sense", "recall", "respond", "close")
 class Recall(NamedTuple):
     """A signal of the past: its slot, which of the ``ago`` it is looked up at, and the number of the signal."""
 
-    slot: Slot
+    slot: Leaf
     ago: int
     signal: int
 
@@ -36,9 +36,9 @@ class Recall(NamedTuple):
 class Backward:
     """The adjoint of one phase: what is assigned, what is added, and what goes to neighbours, by slot."""
 
-    assigned: dict[Slot, Node]
-    added: dict[Slot, Node]
-    sent: dict[Slot, Node]
+    assigned: dict[Leaf, Node]
+    added: dict[Leaf, Node]
+    sent: dict[Leaf, Node]
 
     @property
     def nodes(self) -> list[Node]:
@@ -53,7 +53,7 @@ class Program:
         self.graph = graph = recording.graph
         respond, close = dict(recording.respond), dict(recording.close)
         everything = [*recording.sense, *respond.values(), *close.values()]
-        if Slot("step") in inputs_of(everything):
+        if Leaf("step") in inputs_of(everything):
             respond["step"] = graph.add(graph.input("step"), graph.constant(1.0))
         names = [f"{phase} {name}" for phase, made in (("respond", respond), ("close", close)) for name in made]
         nodes = [*recording.sense, *respond.values(), *close.values()]
@@ -84,7 +84,7 @@ class Program:
         return tuple(name for name in self.states if name not in ("present", "step"))
 
     @cached_property
-    def slots(self) -> list[Slot]:
+    def slots(self) -> list[Leaf]:
         """Everything that some phase reads."""
         return inputs_of([*self.hoist, *(node for phase in PHASES for node in self.outputs(phase))])
 
@@ -121,7 +121,7 @@ class Program:
             "close": self.close,
         }[phase]
 
-    def neighbours(self, nodes: Sequence[Node]) -> list[Slot]:
+    def neighbours(self, nodes: Sequence[Node]) -> list[Leaf]:
         """Return the slots of other vehicles that some nodes read, nearest first."""
         return sorted((s for s in inputs_of(nodes) if s.shift), key=lambda s: (abs(s.shift), s))
 
@@ -139,12 +139,12 @@ class Program:
         made = {name: node for name, node in self.named(phase).items() if self._flows(name)}
         seeds = [self.graph.input(f"on {name}") for name in made]
         found = adjoint(self.graph, list(made.values()), seeds)
-        assigned: dict[Slot, Node] = {Slot(name): self.graph.constant(0.0) for name in made if name in self.moving}
-        added: dict[Slot, Node] = {}
-        sent: dict[Slot, Node] = {}
+        assigned: dict[Leaf, Node] = {Leaf(name): self.graph.constant(0.0) for name in made if name in self.moving}
+        added: dict[Leaf, Node] = {}
+        sent: dict[Leaf, Node] = {}
         for node, g in found.items():
             slot = node.label
-            assert isinstance(slot, Slot)
+            assert isinstance(slot, Leaf)
             if not self._flows(slot.name):
                 continue
             if slot.shift:
@@ -155,11 +155,11 @@ class Program:
                 added[slot] = g
         return Backward(assigned, added, sent)
 
-    def hoist_backward(self) -> dict[Slot, Node]:
+    def hoist_backward(self) -> dict[Leaf, Node]:
         """Return what falls on the parameters from the hoisted rows."""
         seeds = [self.graph.input(f"on {name}", level=STATIC) for name in self.constants_of_time]
         found = adjoint(self.graph, self.hoist, seeds)
-        return {node.label: g for node, g in found.items() if isinstance(node.label, Slot)}
+        return {node.label: g for node, g in found.items() if isinstance(node.label, Leaf)}
 
     def _flows(self, name: str) -> bool:
         """Whether derivatives are carried to what has this name."""
@@ -200,7 +200,7 @@ def _recalled(graph: Graph, nodes: list[Node]) -> tuple[list[Node], list[Recall]
             if node.args[0] not in times:
                 times.append(node.args[0])
             ago = times.index(node.args[0])
-            slot = Slot(f"recalled {node.label} of {ago}")
+            slot = Leaf(f"recalled {node.label} of {ago}")
             places[node] = graph.input(slot.name)
             recalls.append(Recall(slot, ago, node.label))
     return replaced(graph, nodes, places), recalls, times

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from idm_env.effects.base import Effect
-from idm_env.scalar.graph import CONSTANT, DYNAMIC, STATIC, Graph, Node, Slot
+from idm_env.scalar.graph import CONSTANT, DYNAMIC, STATIC, Graph, Leaf, Node
 from idm_env.scalar.scalar import Scalar, value_of
 
 
@@ -26,7 +26,7 @@ class Regions(Graph):
     guards: list[Node] = field(default_factory=list)
     _scopes: list[dict[tuple[object, ...], Node]] = field(default_factory=lambda: [{}])
 
-    def node(self, op: str, *args: Node, label: Slot | float | int | None = None, level: int | None = None) -> Node:
+    def node(self, op: str, *args: Node, label: Leaf | float | int | None = None, level: int | None = None) -> Node:
         """Return the node of this operation on these nodes."""
         key = (op, *(id(a) for a in args), label, type(label))
         for scope in self._scopes:
@@ -74,7 +74,7 @@ class _Tabled(dict[str, Any]):
         return Scalar(self._graph, self._graph.node("table", at, label=self._number, level=DYNAMIC))
 
 
-class Behind:
+class Flagged:
     """An effect behind a flag: a duck with the effect's name, hooks and needs."""
 
     def __init__(self, effect: Effect, graph: Regions, flag: str, table: int | None) -> None:

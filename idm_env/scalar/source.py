@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from idm_env.scalar.graph import Node, Slot, ordered
+from idm_env.scalar.graph import Leaf, Node, ordered
 
 
 class Write(NamedTuple):
@@ -38,7 +38,7 @@ class Constants:
         return len(self.values) - 1
 
 
-def word(slot: Slot) -> str:
+def word(slot: Leaf) -> str:
     """Return a slot as a Python name: ``speed``, ``speed_ahead``, ``speed_behind``, ``idm_time_gap``."""
     name = re.sub(r"\W+", "_", slot.name)
     where = {0: "", 1: "_ahead", -1: "_behind"}.get(slot.shift)
@@ -47,7 +47,7 @@ def word(slot: Slot) -> str:
     )
 
 
-def row(slot: Slot) -> str:
+def row(slot: Leaf) -> str:
     """Return the name of a slot's row."""
     return word(slot).upper()
 
@@ -66,7 +66,7 @@ _FORMS: dict[str, str] = {
 }  # fmt: skip
 """Operation → Python text; every argument is a name, save truth values, which stand where they are used."""
 
-Read = Callable[[Slot], str]
+Read = Callable[[Leaf], str]
 """How a slot is read inside the loop."""
 
 
@@ -96,7 +96,7 @@ def body(writes: Sequence[Write], read: Read, constants: Constants) -> Body:
             assert isinstance(node.label, float)
             names[node] = constant(node.label)
         elif node.op == "input":
-            assert isinstance(node.label, Slot)
+            assert isinstance(node.label, Leaf)
             names[node] = word(node.label)
             loads.append(f"{names[node]} = {read(node.label)}")
         elif node.boolean:

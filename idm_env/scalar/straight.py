@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from idm_env.scalar.graph import DYNAMIC, Node, Slot, TimeStep
+from idm_env.scalar.graph import DYNAMIC, Leaf, Node, TimeStep
 from idm_env.scalar.regions import Regions
 from idm_env.scalar.source import _FORMS, Constants
 
@@ -21,7 +21,7 @@ _STAGED = _FORMS | {
 }  # fmt: skip
 """Operation → text for ``kernels.staged``: functions where Python itself would ask for truth."""
 
-Read = Callable[[Slot], str]
+Read = Callable[[Leaf], str]
 """How an input is read: an expression."""
 
 
@@ -120,7 +120,7 @@ class Straight:
                 return f"k[{self.varying.index(node.label)}]"
             return constant_text(node.label)
         if node.op == "input":
-            assert isinstance(node.label, Slot)
+            assert isinstance(node.label, Leaf)
             return self._read(node.label)
         assert node.boolean, node
         return f"({self._text(node, names)})"

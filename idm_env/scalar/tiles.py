@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import cached_property
 
-from idm_env.scalar.graph import Node, Slot, inputs_of
+from idm_env.scalar.graph import Leaf, Node, inputs_of
 from idm_env.scalar.program import PHASES, Program
 from idm_env.scalar.source import Constants, Write, assignments, body, function, row
 
@@ -24,23 +24,23 @@ class TileText:
         p = program
         self._back = {phase: p.backward(phase) for phase in PHASES}
         self.signals = len(p.sense)
-        self._begin("STATE", [row(Slot(n)) for n in p.states])
-        self._begin("ON", [f"ON_{row(Slot(n))}" for n in p.moving])
-        self._begin("STATIC", [row(Slot(n)) for n in (*p.statics, *p.parameters)])
-        self._begin("HOISTED", [row(Slot(n)) for n in p.constants_of_time])
-        self._begin("GRADIENT", [f"ON_{row(Slot(n))}" for n in p.parameters])
-        self._begin("ON_HOISTED", [f"ON_{row(Slot(n))}" for n in p.constants_of_time])
+        self._begin("STATE", [row(Leaf(n)) for n in p.states])
+        self._begin("ON", [f"ON_{row(Leaf(n))}" for n in p.moving])
+        self._begin("STATIC", [row(Leaf(n)) for n in (*p.statics, *p.parameters)])
+        self._begin("HOISTED", [row(Leaf(n)) for n in p.constants_of_time])
+        self._begin("GRADIENT", [f"ON_{row(Leaf(n))}" for n in p.parameters])
+        self._begin("ON_HOISTED", [f"ON_{row(Leaf(n))}" for n in p.constants_of_time])
         self.numbers = tuple(n for n in p.inputs if n not in flags)
         self.flags = tuple(n for n in p.inputs if n in flags)
-        self._begin("INPUT", [row(Slot(n)) for n in (*self.numbers, *self.flags)])
-        self._begin("ON_INPUT", [f"ON_{row(Slot(n))}" for n in self.numbers])
+        self._begin("INPUT", [row(Leaf(n)) for n in (*self.numbers, *self.flags)])
+        self._begin("ON_INPUT", [f"ON_{row(Leaf(n))}" for n in self.numbers])
         neighbours = {s for phase in PHASES for s in p.neighbours(self._read(phase))}
         self._neighbours = sorted(self._chain(neighbours), key=lambda s: (abs(s.shift), s))
-        self._begin("SIGNAL", [row(Slot(f"signal {i}")) for i in range(self.signals)])
-        self._begin("ON_SIGNAL", [f"ON_{row(Slot(f'signal {i}'))}" for i in range(self.signals)])
+        self._begin("SIGNAL", [row(Leaf(f"signal {i}")) for i in range(self.signals)])
+        self._begin("ON_SIGNAL", [f"ON_{row(Leaf(f'signal {i}'))}" for i in range(self.signals)])
         self._begin("RECALLED", [row(r.slot) for r in p.recalls])
         self._begin("ON_RECALLED", [f"ON_{row(r.slot)}" for r in p.recalls])
-        self._begin("AGO", [row(Slot(f"ago {i}")) for i in range(len(p.recall))])
+        self._begin("AGO", [row(Leaf(f"ago {i}")) for i in range(len(p.recall))])
         self._begin(
             "OTHER", ["DISPLACEMENT", "ON_DISPLACEMENT", "SCRATCH", "SCRATCH_TOO", *(row(s) for s in self._neighbours)]
         )
@@ -56,12 +56,12 @@ class TileText:
         return [*self.program.outputs(phase), *back.nodes]
 
     @staticmethod
-    def _chain(slots: set[Slot]) -> set[Slot]:
+    def _chain(slots: set[Leaf]) -> set[Leaf]:
         """Add the nearer vehicles over which a number is handed on to those further away."""
         found = set()
         for s in slots:
             sign = 1 if s.shift > 0 else -1
-            found |= {Slot(s.name, sign * k) for k in range(1, abs(s.shift) + 1)}
+            found |= {Leaf(s.name, sign * k) for k in range(1, abs(s.shift) + 1)}
         return found
 
     # -- where things are ----------------------------------------------------------------------------------------
@@ -102,24 +102,24 @@ class TileText:
             made[phase] = self._looks(near)
         return made
 
-    def _looks(self, slots: list[Slot]) -> list[tuple[int, int, int]]:
+    def _looks(self, slots: list[Leaf]) -> list[tuple[int, int, int]]:
         found = []
         for s in slots:
             step = 1 if s.shift > 0 else -1
-            found.append((step, self.at(self._row(s)), self.at(self._row(Slot(s.name, s.shift - step)))))
+            found.append((step, self.at(self._row(s)), self.at(self._row(Leaf(s.name, s.shift - step)))))
         return found
 
     def sends(self) -> dict[str, list[tuple[int, int, int]]]:
         """Return, by phase, the adjoints to send after it: (shift, row that is sent, row of the adjoint it adds to)."""
         return {
             phase: [
-                (s.shift, self.at(f"SENT_{row(s)}"), self.at(f"ON_{self._row(Slot(s.name))}"))
+                (s.shift, self.at(f"SENT_{row(s)}"), self.at(f"ON_{self._row(Leaf(s.name))}"))
                 for s in self._back[phase].sent
             ]
             for phase in PHASES
         }
 
-    def _chain_of(self, phase: str) -> list[Slot]:
+    def _chain_of(self, phase: str) -> list[Leaf]:
         slots = self._chain(set(self.program.neighbours(self._read(phase))))
         return [s for s in self._neighbours if s in slots]
 
@@ -144,7 +144,7 @@ class TileText:
         p = self.program
         hoist = dict(zip(p.constants_of_time, p.hoist, strict=True))
         return {
-            name: (doc, [Write(f"w[{row(Slot(n))} + j]", node) for n, node in named.items()])
+            name: (doc, [Write(f"w[{row(Leaf(n))} + j]", node) for n, node in named.items()])
             for name, doc, named in (
                 ("hoist", "What depends on parameters alone.", hoist),
                 ("sense", "Signals that the past keeps.", p.named("sense")),
@@ -167,11 +167,11 @@ class TileText:
             made[f"{phase}_back"] = (f"Adjoint of {phase}.", writes)
         return made
 
-    def _row(self, slot: Slot) -> str:
+    def _row(self, slot: Leaf) -> str:
         # By the time that gaps are closed, positions are those after the step.
-        return row(Slot("position") if slot == Slot("position after") else slot)
+        return row(Leaf("position") if slot == Leaf("position after") else slot)
 
-    def _read_slot(self, slot: Slot) -> str:
+    def _read_slot(self, slot: Leaf) -> str:
         if slot.name.startswith("on "):
-            return f"w[ON_{row(Slot(slot.name[3:]))} + j]"
+            return f"w[ON_{row(Leaf(slot.name[3:]))} + j]"
         return f"w[{self._row(slot)} + j]"

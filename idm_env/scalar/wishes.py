@@ -17,7 +17,7 @@ from idm_env.multilane.incentives import beside, wished
 from idm_env.roads.adjacent import Preference, Side, Sideways, preferred, within
 from idm_env.roads.chains import Chains
 from idm_env.roads.lanes import Lanes
-from idm_env.scalar.graph import Graph, Node, Slot, inputs_of
+from idm_env.scalar.graph import Graph, Leaf, Node, inputs_of
 from idm_env.scalar.record import Form, Parameters, SeenRoad, inputs_of_form, state_of
 from idm_env.scalar.scalar import Scalar, Untraceable, value_of
 from idm_env.scalar.source import Constants, Write, body, function, row
@@ -44,9 +44,9 @@ class _Sides(SeenRoad, Sideways):
     """A road on which places in lanes stand for slots."""
 
     def at(self, x: Any, slot: Where) -> Any:
-        def moved(read: Slot) -> Slot:
+        def moved(read: Leaf) -> Leaf:
             name = f"{slot.side} {read.name}".strip()
-            return read if read.name == "step" else Slot(name, read.shift + slot.up)
+            return read if read.name == "step" else Leaf(name, read.shift + slot.up)
 
         if not isinstance(x, Scalar):
             return x
@@ -110,7 +110,7 @@ class Wishes:
             raise Untraceable(
                 f"effect '{graph.note}' does what cannot be recorded: {' '.join(str(error).split())}"
             ) from error
-        self.slots: tuple[Slot, ...] = tuple(inputs_of(self.outputs))
+        self.slots: tuple[Leaf, ...] = tuple(inputs_of(self.outputs))
         self.rows = len(self.slots) + len(self.outputs)
         self.constants = Constants()
 

@@ -15,7 +15,7 @@ from scipy.interpolate import BSpline
 from scipy.optimize import nnls
 from scipy.signal import lfilter, savgol_filter
 
-from idm_env.trajectories.scores import Motion, from_positions
+from idm_env.trajectories.scores import RegularMotion, from_positions
 
 LONGEST_BLOCK_S = 120.0
 """Longer tracks are fitted by bounded splines block by block (s): the cost grows with the cube of the knots."""
@@ -24,12 +24,12 @@ OVERLAP_S = 10.0
 TINY = 1e-9
 
 
-def linear(time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray) -> Motion:
+def linear(time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray) -> RegularMotion:
     """Return straight lines between samples."""
     return from_positions(clock, np.interp(clock, time_s, position_m))
 
 
-def moving_average(time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, window: int = 9) -> Motion:
+def moving_average(time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, window: int = 9) -> RegularMotion:
     """Return means over ``window`` samples (odd)."""
     x, pad = _extended(np.interp(clock, time_s, position_m), window // 2, window // 2)
     total = np.concatenate([[0.0], np.cumsum(x - x[0])])
@@ -37,7 +37,7 @@ def moving_average(time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray
     return from_positions(clock, x[0] + (total[width:] - total[:-width]) / width)
 
 
-def exponential(time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, width: float = 5.0) -> Motion:
+def exponential(time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, width: float = 5.0) -> RegularMotion:
     """Return exponential moving averages of factor exp(−1/width), forward and backward so that nothing lags.
 
     The symmetric exponential smoothing of Thiemann, Treiber and Kesting (2008), by two recursions.
@@ -70,19 +70,19 @@ def _extended(x: np.ndarray, pad: int, near: int) -> tuple[np.ndarray, int]:
 
 def savitzky_golay(
     time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, window: int = 61, order: int = 3
-) -> Motion:
+) -> RegularMotion:
     """Return local polynomials of ``order`` over ``window`` samples, and their own derivatives (scipy)."""
     x = np.interp(clock, time_s, position_m)
     dt = (clock[-1] - clock[0]) / (len(clock) - 1)
     width = min(window, len(x) - 1 + len(x) % 2)
     if width <= order:
         return from_positions(clock, x)
-    return Motion(clock, *(savgol_filter(x, width, order, deriv=d, delta=dt) for d in range(3)))
+    return RegularMotion(clock, *(savgol_filter(x, width, order, deriv=d, delta=dt) for d in range(3)))
 
 
 def bounded_spline(
     time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, spacing: float = 1.5, bound: float = 10.0
-) -> Motion:
+) -> RegularMotion:
     """Return the cubic B-spline of least squares with speed ≥ 0 and |acceleration| ≤ ``bound`` (m/s²) everywhere.
 
     Knots are ``spacing`` seconds apart. A B-spline lies within the hull of its control points, so bounds on those of
@@ -102,12 +102,12 @@ def bounded_spline(
         weight = np.clip(np.minimum(clock[at] - begin, end - clock[at]) / OVERLAP_S, 1e-3, 1.0)
         for total, values in zip(sums, (1.0, part.position_m, part.speed_mps, part.accel_mps2), strict=True):
             total[at] += weight * values
-    return Motion(clock, *(total / sums[0] for total in sums[1:]))
+    return RegularMotion(clock, *(total / sums[0] for total in sums[1:]))
 
 
 def _bounded_block(
     time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, spacing: float, bound: float
-) -> Motion:
+) -> RegularMotion:
     begin, end = min(time_s[0], clock[0]), max(time_s[-1], clock[-1])
     pieces = max(1, round((end - begin) / spacing))
     knots = np.concatenate([[begin] * 3, np.linspace(begin, end, pieces + 1), [end] * 3])
@@ -125,7 +125,7 @@ def _bounded_block(
     limit = np.concatenate([np.zeros(len(speed)), np.full(2 * len(accel), -bound * (1 - 1e-6))])
     coefficients = _least_squares(matrix, target, inequality, limit)
     spline = BSpline(knots, coefficients, 3)
-    return Motion(clock, spline(clock) + position_m[0], spline(clock, 1), spline(clock, 2))
+    return RegularMotion(clock, spline(clock) + position_m[0], spline(clock, 1), spline(clock, 2))
 
 
 def _least_squares(matrix: np.ndarray, target: np.ndarray, inequality: np.ndarray, limit: np.ndarray) -> np.ndarray:
@@ -147,7 +147,7 @@ def _least_squares(matrix: np.ndarray, target: np.ndarray, inequality: np.ndarra
 
 def kalman(
     time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, density: float = 0.1, sigma: float = 0.3
-) -> Motion:
+) -> RegularMotion:
     """Return the Rauch–Tung–Striebel smoother of a constant-acceleration model with white noise (statsmodels).
 
     ``density`` is the spectral density of the jerk (m²/s⁵) and ``sigma`` the noise of positions (m). Samples are taken
@@ -174,10 +174,10 @@ def kalman(
     model.initialize_known(np.array([0.0, (position_m[-1] - position_m[0]) / duration, 0.0]), np.diag([25.0, 100, 10]))
     model.bind(values[:, None])
     state = model.smooth().smoothed_state
-    return Motion(clock, state[0] + position_m[0], state[1], state[2])
+    return RegularMotion(clock, state[0] + position_m[0], state[1], state[2])
 
 
-Smoother = Callable[..., Motion]
+Smoother = Callable[..., RegularMotion]
 Choice = Mapping[str, float]
 
 BASELINES: dict[str, tuple[Smoother, tuple[Choice, ...]]] = {
@@ -198,7 +198,7 @@ def available() -> list[str]:
     return [name for name in BASELINES if name != "Kalman/RTS" or find_spec("statsmodels") is not None]
 
 
-def run(name: str, time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, **choice: float) -> Motion:
+def run(name: str, time_s: np.ndarray, position_m: np.ndarray, clock: np.ndarray, **choice: float) -> RegularMotion:
     """Apply a baseline by name; ``choice`` replaces the defaults of its free numbers."""
     whole = {key: int(value) if key in ("window", "order") else value for key, value in choice.items()}
     return BASELINES[name][0](time_s, position_m, clock, **whole)

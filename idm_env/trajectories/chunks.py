@@ -14,9 +14,9 @@ from idm_env.jobs.shards import Parts
 from idm_env.trajectories import baselines, paper
 from idm_env.trajectories.drivers import parameter_rows
 from idm_env.trajectories.recipe import Filtered, clock_of, nearest, overlaps, recipe
-from idm_env.trajectories.scores import Motion, Tally
-from idm_env.trajectories.smoother import SPARSE, Choices, Noise
-from idm_env.trajectories.tracks import Track
+from idm_env.trajectories.scores import RegularMotion, Tally
+from idm_env.trajectories.smoother import SPARSE, Choices, PositionNoise
+from idm_env.trajectories.tracks import TrackPiece
 
 Recipe = Literal["default", "paper"]
 CHUNK = 200
@@ -37,7 +37,7 @@ PARAMETER_SCHEMA: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Settings:
+class FilterSettings:
     """What determines a run: task, step (s; None takes the file's), recipe, ablation, baselines, vehicles per chunk.
 
     ``model`` is a model.yaml whose effects are behind the drivers' own parameters; None is IDM.
@@ -53,11 +53,11 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Plan:
+class FilePlan:
     """What is decided for the whole file: step (s), noise, and whether samples are dense; ``seconds`` it took."""
 
     dt: float
-    noise: Noise | None
+    noise: PositionNoise | None
     dense: bool
     seconds: float
 
@@ -68,8 +68,9 @@ class Plan:
 
 
 def done(
-    parts: Parts, number: int, tracks: list[Track], settings: Settings, plan: Plan, recent: Sequence[Filtered],
-    told: dict[str, Any], on_stage: Callable[[float, str], None] = lambda share, words: None,
+    parts: Parts, number: int, tracks: list[TrackPiece], settings: FilterSettings, plan: FilePlan,
+    recent: Sequence[Filtered], told: dict[str, Any],
+    on_stage: Callable[[float, str], None] = lambda share, words: None,
 ) -> list[Filtered]:  # fmt: skip
     """Do one chunk and write its part: the table, the parameters, and last the tallies, which mark it done.
 
@@ -113,14 +114,14 @@ def done(
     return filtered
 
 
-def _tally(motions: Sequence[Motion], tracks: Sequence[Track], seconds: float) -> Tally:
+def _tally(motions: Sequence[RegularMotion], tracks: Sequence[TrackPiece], seconds: float) -> Tally:
     tally = Tally(seconds=seconds)
     for motion, track in zip(motions, tracks, strict=True):
         tally.add(motion, track.time_s, track.position_m)
     return tally
 
 
-def _imitated(tracks: Sequence[Track], dt: float, fixed: bool) -> tuple[list[Filtered], list[dict[str, Any]]]:
+def _imitated(tracks: Sequence[TrackPiece], dt: float, fixed: bool) -> tuple[list[Filtered], list[dict[str, Any]]]:
     filtered, rows = [], []
     for track, found in zip(tracks, paper.imitate(tracks, dt, fixed_parameters=fixed), strict=True):
         clock = found.motion.time_s
@@ -156,7 +157,7 @@ def _table(filtered: Sequence[Filtered]) -> pl.DataFrame:
     )
 
 
-def restored(parts: Parts, number: int, tracks: Sequence[Track]) -> list[Filtered]:
+def restored(parts: Parts, number: int, tracks: Sequence[TrackPiece]) -> list[Filtered]:
     """Return the filtered tracks of a finished part, so that the next chunk meets the same neighbours."""
     table = pl.read_parquet(parts.path(number, TRAJECTORIES), glob=False)
     by_key = dict(iter(table.group_by(["run_id", "vehicle_id", "piece"], maintain_order=True)))
@@ -164,7 +165,7 @@ def restored(parts: Parts, number: int, tracks: Sequence[Track]) -> list[Filtere
     for track in tracks:
         rows = by_key[(track.run_id, track.vehicle_id, track.piece)]
         names = ("time_s", "position_m", "speed_mps", "accel_mps2")
-        motion = Motion(*(rows[name].to_numpy() for name in names))
+        motion = RegularMotion(*(rows[name].to_numpy() for name in names))
         sigma = rows.select("position_sigma_m", "speed_sigma_mps", "accel_sigma_mps2").to_numpy()
         filtered.append(
             Filtered(

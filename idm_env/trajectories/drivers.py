@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from idm_env.data import Episode, Record
+from idm_env.data import Episode, VehicleRecord
 from idm_env.data.records import FAR_M
 from idm_env.effects import IDM
 from idm_env.fitting.fit import Fit, fit
@@ -40,7 +40,7 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
     time = clock[part]
     position, speed = filtered.motion.position_m[part], filtered.motion.speed_mps[part]
     length = lead.track.length_m
-    ahead = Record(
+    ahead = VehicleRecord(
         position + filtered.gap[part] + length,
         np.interp(time, lead.motion.time_s, lead.motion.speed_mps),
         np.interp(time, lead.motion.time_s, lead.motion.accel_mps2),
@@ -48,7 +48,7 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
         np.ones(end - begin, bool),
     )
     nobody = np.zeros(end - begin, bool)
-    far = [Record(position + away, speed, np.zeros(end - begin), 4.5, nobody) for away in (FAR_M, -FAR_M, FAR_M)]
+    far = [VehicleRecord(position + away, speed, np.zeros(end - begin), 4.5, nobody) for away in (FAR_M, -FAR_M, FAR_M)]
     track = filtered.track
     return Episode(
         track.run_id, track.vehicle_id, str(filtered.leader[begin]), track.key, dt, time, position, speed,

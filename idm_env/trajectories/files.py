@@ -26,14 +26,14 @@ from idm_env.jobs.progress import OnProgress, silent
 from idm_env.jobs.shards import Parts
 from idm_env.reports.page import account, versions
 from idm_env.trajectories import chunks, left_out, paper, pictures
-from idm_env.trajectories.chunks import CHUNK, OURS, PARAMETERS, TRAJECTORIES, Plan, Recipe, Settings
+from idm_env.trajectories.chunks import CHUNK, OURS, PARAMETERS, TRAJECTORIES, FilePlan, FilterSettings, Recipe
 from idm_env.trajectories.noise import fit_noise, is_dense
 from idm_env.trajectories.recipe import Filtered, recipe
 from idm_env.trajectories.report import write_report
-from idm_env.trajectories.scores import Motion, Tally
-from idm_env.trajectories.smoother import Noise
+from idm_env.trajectories.scores import RegularMotion, Tally
+from idm_env.trajectories.smoother import PositionNoise
 from idm_env.trajectories.spool import Shelf, Spool
-from idm_env.trajectories.tracks import Pieces, Track
+from idm_env.trajectories.tracks import Pieces, TrackPiece
 
 OUTPUT = ("trajectories.parquet", "parameters.parquet", "report.json", "report.html")
 SAMPLED = 64
@@ -78,7 +78,7 @@ def filter_file(
     Raises:
         DataError: If the file as a whole cannot be used, or ``resume`` finds a run with other data or settings.
     """
-    settings = Settings("filter", None, recipe, fixed_parameters, baselines, chunk, model)
+    settings = FilterSettings("filter", None, recipe, fixed_parameters, baselines, chunk, model)
     how = Reading(layout, columns, ring_length)
     return run(path, out, settings, how, resume=resume, executor=executor, on_progress=on_progress)
 
@@ -106,7 +106,7 @@ def reconstruct_file(
     """
     if not 0.01 <= dt <= 2.0:
         raise DataError(f"dt = {dt:g} s is outside [0.01, 2] s; 0.1 s suits vehicles.")
-    settings = Settings("reconstruct", dt, recipe, fixed_parameters, baselines, chunk, model)
+    settings = FilterSettings("reconstruct", dt, recipe, fixed_parameters, baselines, chunk, model)
     how = Reading(layout, columns, ring_length)
     return run(path, out, settings, how, resume=resume, executor=executor, on_progress=on_progress)
 
@@ -114,7 +114,7 @@ def reconstruct_file(
 def run(
     path: str | Path,
     out: str | Path,
-    settings: Settings,
+    settings: FilterSettings,
     how: Reading,
     *,
     resume: bool = False,
@@ -132,8 +132,14 @@ def run(
 
 
 def _run(
-    path: Path, out: Path, settings: Settings, how: Reading, resume: bool, executor: Executor, progress: OnProgress
-) -> dict[str, Any]:  # fmt: skip
+    path: Path,
+    out: Path,
+    settings: FilterSettings,
+    how: Reading,
+    resume: bool,
+    executor: Executor,
+    progress: OnProgress,
+) -> dict[str, Any]:
     progress("reading", 0, 0, path.name)
     model = None if settings.model is None else Path(settings.model)
     parts = Parts(
@@ -171,8 +177,8 @@ class _Strand:
     numbers: tuple[int, ...]
     shelf: Shelf
     parts: Parts
-    settings: Settings
-    plan: Plan
+    settings: FilterSettings
+    plan: FilePlan
     bridge: float | None
 
     def __str__(self) -> str:
@@ -185,7 +191,7 @@ class _Strand:
 
 
 def _chunks(
-    spool: Spool, parts: Parts, settings: Settings, plan: Plan, bridge: float | None, executor: Executor,
+    spool: Spool, parts: Parts, settings: FilterSettings, plan: FilePlan, bridge: float | None, executor: Executor,
     progress: OnProgress,
 ) -> None:  # fmt: skip
     """Do all chunks that are not done yet, a strand wherever the executor has room for it."""
@@ -228,12 +234,12 @@ def _compile() -> None:
     """Run every loop once, so that compiling or loading them does not count as a trajectory's time."""
     time_s = 0.1 * np.arange(12)
     nobody = np.full(len(time_s), "")
-    track = Track("", "", 0, time_s, 10.0 * time_s, 4.5, nobody, np.full(len(time_s), -1))
+    track = TrackPiece("", "", 0, time_s, 10.0 * time_s, 4.5, nobody, np.full(len(time_s), -1))
     recipe([track], 0.1, fit_noise([(time_s, track.position_m)], 0.1, evaluations=2))
     paper.imitate([track], iterations=1)
 
 
-def _plan(spool: Spool, settings: Settings, bridge: float | None) -> Plan:
+def _plan(spool: Spool, settings: FilterSettings, bridge: float | None) -> FilePlan:
     """Decide by some vehicles, evenly chosen. DataError if no vehicle of the file has a track."""
     count = len(spool.vehicles)
     some = np.unique(np.linspace(0, count - 1, SAMPLED).round().astype(int)).tolist()
@@ -248,8 +254,8 @@ def _plan(spool: Spool, settings: Settings, bridge: float | None) -> Plan:
     dense = is_dense([time for time, _ in tracks])
     begin = time.perf_counter()
     enough = any(len(t) >= 3 for t, _ in tracks)
-    noise = (fit_noise(tracks, dt) if enough else Noise()) if settings.recipe == "default" else None
-    return Plan(dt, noise, dense, time.perf_counter() - begin)
+    noise = (fit_noise(tracks, dt) if enough else PositionNoise()) if settings.recipe == "default" else None
+    return FilePlan(dt, noise, dense, time.perf_counter() - begin)
 
 
 def _any_track(spool: Spool, bridge: float | None) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -265,7 +271,7 @@ def _any_track(spool: Spool, bridge: float | None) -> list[tuple[np.ndarray, np.
     raise DataError(f"{spool.source}: no track can be used ({len(lost)} left out; {name}: {why}).")
 
 
-def _reaches(filtered: Filtered, tracks: Sequence[Track]) -> bool:
+def _reaches(filtered: Filtered, tracks: Sequence[TrackPiece]) -> bool:
     """Tell whether an earlier track is still there when some of these begin."""
     return any(
         filtered.track.run_id == t.run_id and filtered.motion.time_s[-1] >= t.time_s[0] for t in tracks
@@ -273,7 +279,7 @@ def _reaches(filtered: Filtered, tracks: Sequence[Track]) -> bool:
 
 
 def _report(
-    spool: Spool, parts: Sequence[dict[str, Any]], settings: Settings, plan: Plan
+    spool: Spool, parts: Sequence[dict[str, Any]], settings: FilterSettings, plan: FilePlan
 ) -> dict[str, Any]:  # fmt: skip
     """Return the report of all parts."""
     tallies: dict[str, Tally] = {}
@@ -311,7 +317,7 @@ def _report(
     }
 
 
-def _shown(out: Path, spool: Spool, bridge: float | None) -> list[tuple[Track, Motion]]:
+def _shown(out: Path, spool: Spool, bridge: float | None) -> list[tuple[TrackPiece, RegularMotion]]:
     """Return some tracks for pictures, evenly chosen, as they were written."""
     some = np.unique(np.linspace(0, len(spool.vehicles) - 1, 4 * SHOWN).round().astype(int)).tolist()
     tracks = [track for table in spool.picked(some) for track in Pieces(table, bridge)]
@@ -323,5 +329,5 @@ def _shown(out: Path, spool: Spool, bridge: float | None) -> list[tuple[Track, M
         mine = (pl.col("run_id") == track.run_id) & (pl.col("vehicle_id") == track.vehicle_id)
         rows = written.filter(mine & (pl.col("piece") == track.piece)).collect()
         names = ("time_s", "position_m", "speed_mps", "accel_mps2")
-        pairs.append((track, Motion(*(rows[name].to_numpy() for name in names))))
+        pairs.append((track, RegularMotion(*(rows[name].to_numpy() for name in names))))
     return pairs

@@ -7,24 +7,24 @@ from typing import Any
 import numpy as np
 
 from idm_env.trajectories import baselines, paper
-from idm_env.trajectories.chunks import OURS, Plan, Settings
+from idm_env.trajectories.chunks import OURS, FilePlan, FilterSettings
 from idm_env.trajectories.recipe import clock_of, recipe
-from idm_env.trajectories.scores import Motion
+from idm_env.trajectories.scores import RegularMotion
 from idm_env.trajectories.spool import Spool
-from idm_env.trajectories.tracks import Pieces, Track
+from idm_env.trajectories.tracks import Pieces, TrackPiece
 
 VEHICLES = 120
 """Vehicles that are scored, at most, in blocks that follow one another so that leaders are among them."""
 BLOCKS = 4
 
 
-def thinned(track: Track) -> tuple[Track, np.ndarray]:
+def thinned(track: TrackPiece) -> tuple[TrackPiece, np.ndarray]:
     """Return a track without every second point, and the indices of the points left out; both ends stay."""
     out = np.arange(1, len(track) - 1, 2)
     return track.part(np.setdiff1d(np.arange(len(track)), out)), out
 
 
-def score(spool: Spool, plan: Plan, settings: Settings) -> list[dict[str, Any]]:
+def score(spool: Spool, plan: FilePlan, settings: FilterSettings) -> list[dict[str, Any]]:
     """Return one row per method, ours first: errors (m) at every second point of some tracks, left out.
 
     Tracks of fewer than five points are not scored; no row if there is no other.
@@ -53,7 +53,7 @@ def _chosen(count: int) -> list[int]:
 
 
 def _row(
-    name: str, motions: list[Motion], tracks: list[Track], out: tuple[np.ndarray, ...], spacing: float
+    name: str, motions: list[RegularMotion], tracks: list[TrackPiece], out: tuple[np.ndarray, ...], spacing: float
 ) -> dict[str, Any]:
     apart = np.concatenate([
         motion.at(track.time_s[at]) - track.position_m[at]

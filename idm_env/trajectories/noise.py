@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.signal import savgol_filter
 
-from idm_env.trajectories.smoother import Noise, Observed, log_likelihood
+from idm_env.trajectories.smoother import PositionNoise, TrackObservations, log_likelihood
 
 MOST_TRACKS = 32
 MOST_SAMPLES = 400
@@ -62,8 +62,11 @@ def outlying(position: np.ndarray) -> np.ndarray:
 
 
 def fit_noise(
-    tracks: Sequence[tuple[np.ndarray, np.ndarray]], dt: float, start: Noise | None = None, evaluations: int = 110
-) -> Noise:
+    tracks: Sequence[tuple[np.ndarray, np.ndarray]],
+    dt: float,
+    start: PositionNoise | None = None,
+    evaluations: int = 110,
+) -> PositionNoise:
     """Return the noise model under which the tracks (times, positions) are most likely.
 
     Four numbers for dense data (white, correlated, its time, jerk), by a simplex search over their logarithms; jerk and
@@ -75,34 +78,34 @@ def fit_noise(
         raise ValueError("no track has three samples to fit the noise to. Give noise=Noise(…).")
     usual = interval([time for time, _ in parts])
     dense = usual <= DENSE_S
-    observed = [Observed.of(time, position, dt) for time, position in parts]
+    observed = [TrackObservations.of(time, position, dt) for time, position in parts]
     inflated = [outlying(position) if dense else np.zeros(len(position)) for _, position in parts]
     search = _Search(observed, inflated, evaluations)
     if dense:
-        return search.best(start or Noise(0.1, 0.2, 0.3, 0.5), ("white", "sigma", "time", "jerk"))[0]
-    clean, cost = search.best(start or Noise(SPARSE_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("jerk", "accel_time"))
+        return search.best(start or PositionNoise(0.1, 0.2, 0.3, 0.5), ("white", "sigma", "time", "jerk"))[0]
+    clean, cost = search.best(start or PositionNoise(SPARSE_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("jerk", "accel_time"))
     if usual > TELLING_S:
         return clean
-    noisy, less = search.best(Noise(NOISY_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("white", "jerk", "accel_time"))
+    noisy, less = search.best(PositionNoise(NOISY_WHITE_M, 0.0, 0.3, 0.5, 5.0), ("white", "jerk", "accel_time"))
     if less < cost - DECISIVE * sum(len(o.at) for o in observed):
         return noisy
     # between clean samples so near to each other accelerations hardly fade
-    return search.best(Noise(SPARSE_WHITE_M, 0.0, 0.3, 0.5), ("jerk",))[0]
+    return search.best(PositionNoise(SPARSE_WHITE_M, 0.0, 0.3, 0.5), ("jerk",))[0]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Search:
     """Maximum likelihood of some tracks, with extra variances of their samples."""
 
-    observed: Sequence[Observed]
+    observed: Sequence[TrackObservations]
     inflated: Sequence[np.ndarray]
     evaluations: int
 
-    def best(self, begin: Noise, names: tuple[str, ...]) -> tuple[Noise, float]:
+    def best(self, begin: PositionNoise, names: tuple[str, ...]) -> tuple[PositionNoise, float]:
         """Return the likeliest noise that differs from ``begin`` in some of its numbers, and −log-likelihood."""
         low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
 
-        def noise(point: np.ndarray) -> Noise:
+        def noise(point: np.ndarray) -> PositionNoise:
             values = np.exp(np.clip(point, low, high)).tolist()
             return dataclasses.replace(begin, **dict(zip(names, values, strict=True)))
 

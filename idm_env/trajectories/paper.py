@@ -23,12 +23,12 @@ from idm_env.effects.base import Effect, P
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 from idm_env.trajectories.recipe import clock_of
-from idm_env.trajectories.scores import Motion
-from idm_env.trajectories.tracks import Track
+from idm_env.trajectories.scores import RegularMotion
+from idm_env.trajectories.tracks import TrackPiece
 from idm_env.types import Imagined, Neighbour, Scene
 
 if TYPE_CHECKING:
-    from idm_env.kernels.descent import Bounds, Found
+    from idm_env.kernels.descent import Bounds, DescentResult
 
 NAMES = ("max_accel", "comfort_decel", "time_gap", "min_gap", "desired_speed")
 START = np.array([10.0, 2.0, 1.0, 5.0, 50.0])
@@ -73,7 +73,7 @@ class RealLeader(Effect):
 class Imitated:
     """Result for one track: motion [K], the five values, imagined gap (m) and closing speed (m/s) [K], final loss."""
 
-    motion: Motion
+    motion: RegularMotion
     values: np.ndarray
     gap: np.ndarray
     closing_speed: np.ndarray
@@ -81,7 +81,11 @@ class Imitated:
 
 
 def imitate(
-    tracks: Sequence[Track], dt: float = FILTER_STEP_S, *, iterations: int = ITERATIONS, fixed_parameters: bool = False
+    tracks: Sequence[TrackPiece],
+    dt: float = FILTER_STEP_S,
+    *,
+    iterations: int = ITERATIONS,
+    fixed_parameters: bool = False,
 ) -> list[Imitated]:
     """Fit each track by the published recipe; a data point is compared at the simulation step nearest in time.
 
@@ -100,7 +104,7 @@ def imitate(
 
 
 def _imitated(
-    tracks: Sequence[Track], clocks: Sequence[np.ndarray], dt: float, iterations: int, fixed: bool
+    tracks: Sequence[TrackPiece], clocks: Sequence[np.ndarray], dt: float, iterations: int, fixed: bool
 ) -> list[Imitated]:
     targets = [track.position_m - track.position_m[0] for track in tracks]
     at = [
@@ -122,7 +126,9 @@ def _imitated(
         position, speed, accel = driven.position[own, i], driven.speed[own, i], driven.accel[1:][own, i]
         imagined = driven.inputs["imagined.gap"][own, i], driven.inputs["imagined.closing_speed"][own, i]
         loss = float(np.abs(position[at[i]] - targets[i]).mean())
-        found.append(Imitated(Motion(clock, position + track.position_m[0], speed, accel), values[i], *imagined, loss))
+        found.append(
+            Imitated(RegularMotion(clock, position + track.position_m[0], speed, accel), values[i], *imagined, loss)
+        )
     return found
 
 
@@ -155,7 +161,7 @@ def _ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:
 def _descended(
     leader: Effect, ahead: Imagined | Ahead, values: np.ndarray, speed0: Sequence[float], dt: float,
     at: Sequence[np.ndarray], targets: Sequence[np.ndarray], bounds: Bounds, iterations: int,
-) -> Found:  # fmt: skip
+) -> DescentResult:  # fmt: skip
     """Fit rows of ``values`` [N, 5] and of the input ``ahead`` (steps, N, 1) to distances at the steps ``at`` [N]."""
     from idm_env.kernels.descent import Observed, descend
 

@@ -9,7 +9,7 @@ import polars as pl
 
 from idm_env.reports import diagrams, page
 from idm_env.trajectories.spool import Spool
-from idm_env.trajectories.tracks import Pieces, Track
+from idm_env.trajectories.tracks import Pieces, TrackPiece
 
 MOST_VEHICLES = 150
 
@@ -30,7 +30,7 @@ def space_time(written: Path, spool: Spool, bridge: float | None) -> list[page.B
     mine = after.filter(pl.col("vehicle_id").is_in(sorted(names)))
     for (vehicle, piece), rows in mine.group_by("vehicle_id", "piece", maintain_order=True):
         time, position, speed = (rows[name].to_numpy() for name in ("time_s", "position_m", "speed_mps"))
-        lines.append(diagrams.Line(f"{vehicle}/{piece}", time, position, speed))
+        lines.append(diagrams.VehicleLine(f"{vehicle}/{piece}", time, position, speed))
     fastest = 1.05 * max(float(line.speed.max()) for line in lines) or 1.0
     both = [diagrams.Panel("the data", tuple(before)), diagrams.Panel("ours", tuple(lines))]
     words = f"run {run}" + (f", lane {lane}" if lane is not None else "")
@@ -42,9 +42,9 @@ def space_time(written: Path, spool: Spool, bridge: float | None) -> list[page.B
     return [page.picture(diagrams.figure_of(both, fastest=fastest, columns=2), f"{caption[0].upper()}{caption[1:]}")]
 
 
-def _measured(track: Track, lane: int | None) -> diagrams.Line:
+def _measured(track: TrackPiece, lane: int | None) -> diagrams.VehicleLine:
     """Return a track as it was measured, its speeds differences of positions; elsewhere than in the lane left out."""
     speed = np.diff(track.position_m) / np.diff(track.time_s)
     speed = np.append(speed, speed[-1])
     inside = np.full(len(track), True) if lane is None else track.lane == lane
-    return diagrams.Line(track.key, track.time_s[inside], track.position_m[inside], speed[inside])
+    return diagrams.VehicleLine(track.key, track.time_s[inside], track.position_m[inside], speed[inside])

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from idm_env.trajectories.imagined import Driven, drive
-from idm_env.trajectories.scores import Motion
-from idm_env.trajectories.smoother import Choices, Noise, Observed, Smoothed, smooth
-from idm_env.trajectories.tracks import Track
+from idm_env.trajectories.scores import RegularMotion
+from idm_env.trajectories.smoother import Choices, PositionNoise, Smoothed, TrackObservations, smooth
+from idm_env.trajectories.tracks import TrackPiece
 
 SMALLEST_GAP_M = 0.1
 """Where two vehicles would overlap that did not before, they are held this far apart (m)."""
@@ -33,8 +33,8 @@ class Filtered:
         gap: Bumper-to-bumper gap to the leader's filtered position (m), NaN where there is none.
     """
 
-    track: Track
-    motion: Motion
+    track: TrackPiece
+    motion: RegularMotion
     imagined_gap: np.ndarray
     sigma: np.ndarray
     leader: np.ndarray
@@ -51,13 +51,13 @@ class Meeting:
     steps: np.ndarray
 
 
-def clock_of(track: Track, dt: float) -> np.ndarray:
+def clock_of(track: TrackPiece, dt: float) -> np.ndarray:
     """Return the regular clock of a track: from its first sample on, the last one included."""
     steps = int(np.ceil((track.time_s[-1] - track.time_s[0]) / dt - 1e-6)) + 1
     return track.time_s[0] + dt * np.arange(steps)
 
 
-def nearest(track: Track, clock: np.ndarray) -> np.ndarray:
+def nearest(track: TrackPiece, clock: np.ndarray) -> np.ndarray:
     """Return the index of the sample nearest in time to every tick."""
     after = np.clip(np.searchsorted(track.time_s, clock), 1, len(track) - 1)
     earlier = clock - track.time_s[after - 1] <= track.time_s[after] - clock
@@ -67,7 +67,7 @@ def nearest(track: Track, clock: np.ndarray) -> np.ndarray:
 class Neighbourhood:
     """Who follows whom among tracks, old ones (already written) included; all by index."""
 
-    def __init__(self, tracks: Sequence[Track], clocks: Sequence[np.ndarray]) -> None:
+    def __init__(self, tracks: Sequence[TrackPiece], clocks: Sequence[np.ndarray]) -> None:
         self.clocks = clocks
         self.tracks = tracks
         self.leaders = [track.leader[nearest(track, clock)] for track, clock in zip(tracks, clocks, strict=True)]
@@ -88,9 +88,9 @@ class Neighbourhood:
 
 
 def recipe(
-    tracks: Sequence[Track],
+    tracks: Sequence[TrackPiece],
     dt: float,
-    noise: Noise,
+    noise: PositionNoise,
     choices: Choices = Choices(),  # noqa: B008
     before: Sequence[Filtered] = (),
 ) -> list[Filtered]:
@@ -101,7 +101,8 @@ def recipe(
     """
     clocks = [clock_of(track, dt) for track in tracks]
     observed = [
-        Observed.of(track.time_s, track.position_m, dt, len(clock)) for track, clock in zip(tracks, clocks, strict=True)
+        TrackObservations.of(track.time_s, track.position_m, dt, len(clock))
+        for track, clock in zip(tracks, clocks, strict=True)
     ]
     smoothed = _smoothed(observed, noise, choices)
     around = Neighbourhood(
@@ -129,14 +130,14 @@ def recipe(
         gaps[m.follower][m.steps] = _gap(m, around, positions)
     return [
         Filtered(
-            track, Motion(clock, d.position, d.speed, d.accel), d.gap, s.sigma, around.leaders[i],
+            track, RegularMotion(clock, d.position, d.speed, d.accel), d.gap, s.sigma, around.leaders[i],
             track.lane[nearest(track, clock)], gaps[i],
         )
         for i, (track, clock, d, s) in enumerate(zip(tracks, clocks, driven, smoothed, strict=True))
     ]  # fmt: skip
 
 
-def _smoothed(observed: Sequence[Observed], noise: Noise, choices: Choices) -> list[Smoothed]:
+def _smoothed(observed: Sequence[TrackObservations], noise: PositionNoise, choices: Choices) -> list[Smoothed]:
     """Fit every track, on as many threads as torch has; the compiled loops release the interpreter lock."""
     threads = min(torch.get_num_threads(), len(observed))
     if threads < 2:

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from idm_env.effects import IDM
 from idm_env.jobs import storage
 from idm_env.reports import page
-from idm_env.trajectories.scores import Motion
-from idm_env.trajectories.tracks import Track
+from idm_env.trajectories.scores import RegularMotion
+from idm_env.trajectories.tracks import TrackPiece
 
 BEFORE, AFTER = "#b8b8b8", "#0b5fa5"
 COLUMNS = (
@@ -28,7 +28,7 @@ MOST_LISTED = 100
 
 
 def write_report(
-    out: Path, report: dict[str, Any], shown: Sequence[tuple[Track, Motion]], parameters: pl.DataFrame,
+    out: Path, report: dict[str, Any], shown: Sequence[tuple[TrackPiece, RegularMotion]], parameters: pl.DataFrame,
     drawn: Sequence[page.Block] = (),
 ) -> None:  # fmt: skip
     """Write ``report.json`` and ``report.html`` with the table of methods, pictures before and after, and histograms.
@@ -128,7 +128,7 @@ def methods(rows: Sequence[dict[str, Any]]) -> page.Block:
     return page.table(table, digits={title: digits for _, title, digits in COLUMNS}, first=True)
 
 
-def before_and_after(track: Track, motion: Motion) -> Figure:
+def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
     """Return position against the data, speed and acceleration over time: grey differences of the data, blue ours."""
     figure = Figure(figsize=(10, 5.6), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(2, 3, 3))

@@ -11,7 +11,7 @@ IMPLAUSIBLE_MPS2 = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class RegularMotion:
     """A trajectory on a regular clock: arrays [K] of time (s), position (m), speed (m/s) and acceleration (m/s²)."""
 
     time_s: np.ndarray
@@ -24,15 +24,15 @@ class Motion:
         return np.interp(time_s, self.time_s, self.position_m)
 
 
-def from_positions(time_s: np.ndarray, position_m: np.ndarray) -> Motion:
+def from_positions(time_s: np.ndarray, position_m: np.ndarray) -> RegularMotion:
     """Return the motion of positions on a regular clock: speed and acceleration are central differences."""
     if len(time_s) < 2:
         raise ValueError(f"{len(time_s)} position has no speed. Give at least two.")
     speed = np.gradient(position_m, time_s)
-    return Motion(time_s, position_m, speed, np.gradient(speed, time_s))
+    return RegularMotion(time_s, position_m, speed, np.gradient(speed, time_s))
 
 
-def position_error_rate(motion: Motion, time_s: np.ndarray, position_m: np.ndarray) -> float:
+def position_error_rate(motion: RegularMotion, time_s: np.ndarray, position_m: np.ndarray) -> float:
     """Return the paper's average positional error rate: mean |p − data| over the trajectory's length (1).
 
     NaN for a track that does not move.
@@ -42,7 +42,7 @@ def position_error_rate(motion: Motion, time_s: np.ndarray, position_m: np.ndarr
     return error / length if length > 0 else float("nan")
 
 
-def implausible(motion: Motion) -> bool:
+def implausible(motion: RegularMotion) -> bool:
     """Tell whether any |acceleration| exceeds 10 m/s²."""
     return bool((np.abs(motion.accel_mps2) > IMPLAUSIBLE_MPS2).any())
 
@@ -64,7 +64,7 @@ class Tally:
     speed_square: float = 0.0
     accel_error_square: float = 0.0
 
-    def add(self, motion: Motion, time_s: np.ndarray, position_m: np.ndarray) -> None:
+    def add(self, motion: RegularMotion, time_s: np.ndarray, position_m: np.ndarray) -> None:
         """Count one trajectory against its data."""
         rate = position_error_rate(motion, time_s, position_m)
         self.tracks += 1
@@ -77,7 +77,7 @@ class Tally:
         self.accel_square += float((size * size).sum())
         self.implausible += implausible(motion)
 
-    def compare(self, motion: Motion, truth: Motion) -> None:
+    def compare(self, motion: RegularMotion, truth: RegularMotion) -> None:
         """Count errors against a truth on the same clock; samples whose true value is NaN do not count."""
         known = np.isfinite(truth.speed_mps) & np.isfinite(truth.accel_mps2) & np.isfinite(truth.position_m)
         self.compared += int(known.sum())

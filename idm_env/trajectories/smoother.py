@@ -22,7 +22,7 @@ TIGHT = 1e-8
 
 
 @dataclass(frozen=True)
-class Noise:
+class PositionNoise:
     """How positions are wrong, and how lively the driving is.
 
     Attributes:
@@ -69,7 +69,7 @@ SPARSE = Choices(rounds=1, degrees=None, jerk_degrees=None)
 
 
 @dataclass(eq=False)
-class Observed:
+class TrackObservations:
     """Observations of a track on the clock of its steps, positions relative to ``origin`` (m).
 
     Step of each, the row that looks at the state, value and whether it is measured (else it is a bound).
@@ -84,7 +84,7 @@ class Observed:
     measured: np.ndarray
 
     @classmethod
-    def of(cls, time_s: np.ndarray, position_m: np.ndarray, dt: float, steps: int | None = None) -> Observed:
+    def of(cls, time_s: np.ndarray, position_m: np.ndarray, dt: float, steps: int | None = None) -> TrackObservations:
         """Put samples on the clock ``time_s[0] + k dt``; a sample between ticks is seen from the tick before it."""
         since = (time_s - time_s[0]) / dt
         at = np.floor(since + 1e-6).astype(np.int64)
@@ -102,7 +102,7 @@ class Observed:
         mean = np.array([self.value[0], (self.value[span] - self.value[0]) / seconds, 0.0, 0.0])
         return mean, np.diag([25.0, 100.0, 4.0, 0.0])
 
-    def bounded(self, at: np.ndarray, which: int, value: np.ndarray) -> Observed:
+    def bounded(self, at: np.ndarray, which: int, value: np.ndarray) -> TrackObservations:
         """Return these observations and bounds: state ``which`` (0 position, 1 speed, 2 acceleration) at steps."""
         look = np.zeros((len(at), N))
         look[:, which] = 1.0
@@ -111,7 +111,7 @@ class Observed:
         measured = np.concatenate([self.measured, np.zeros(len(at), bool)])
         values = np.concatenate([self.value, value - (self.origin if which == 0 else 0.0)])
         looks = np.concatenate([self.look, look])
-        return Observed(
+        return TrackObservations(
             self.steps, self.dt, self.origin, every[order], looks[order], values[order], measured[order]
         )  # fmt: skip
 
@@ -127,7 +127,7 @@ class Smoothed:
     likelihood: float
 
 
-def log_likelihood(observed: Observed, noise: Noise, inflated: np.ndarray | None = None) -> float:
+def log_likelihood(observed: TrackObservations, noise: PositionNoise, inflated: np.ndarray | None = None) -> float:
     """Return the log-likelihood of a track, with ``inflated`` white variances of single samples where given."""
     start, spread = observed.start()
     spread[3, 3] = noise.sigma**2
@@ -141,7 +141,7 @@ def log_likelihood(observed: Observed, noise: Noise, inflated: np.ndarray | None
     )  # fmt: skip
 
 
-def smooth(observed: Observed, noise: Noise, choices: Choices = Choices()) -> Smoothed:
+def smooth(observed: TrackObservations, noise: PositionNoise, choices: Choices = Choices()) -> Smoothed:
     """Return the most likely motion of a track, reweighted for outliers and bursts, within its bounds.
 
     Bounds (no reverse, accelerations between ``lowest`` and ``highest``) enter as an active set: where the motion
@@ -171,7 +171,7 @@ def _broken(mean: np.ndarray, choices: Choices) -> list[tuple[np.ndarray, int, f
 
 
 def _fitted(
-    observed: Observed, noise: Noise, choices: Choices, push: np.ndarray | None
+    observed: TrackObservations, noise: PositionNoise, choices: Choices, push: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean [K, 4], covariance [K, 4, 4] and the variances of the jerk, fitted unless they are given."""
     start, spread = observed.start()

@@ -22,7 +22,7 @@ REVERSED_M = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class TrackPiece:
     """One unbroken stretch of one vehicle; arrays are [N], times rising strictly.
 
     Attributes:
@@ -52,9 +52,9 @@ class Track:
         """``run/vehicle/piece``."""
         return f"{self.run_id}/{self.vehicle_id}/{self.piece}"
 
-    def part(self, at: slice | np.ndarray, piece: int | None = None) -> Track:
+    def part(self, at: slice | np.ndarray, piece: int | None = None) -> TrackPiece:
         """Return some of the samples."""
-        return Track(
+        return TrackPiece(
             self.run_id, self.vehicle_id, self.piece if piece is None else piece, self.time_s[at], self.position_m[at],
             self.length_m, self.leader[at], self.lane[at],
         )  # fmt: skip
@@ -95,20 +95,20 @@ class Pieces:
         self._length = frame["length_m"].to_numpy()
         self.vehicles = table.vehicles()
 
-    def of(self, vehicles: list[tuple[str, str, int, int]]) -> Iterator[Track]:
+    def of(self, vehicles: list[tuple[str, str, int, int]]) -> Iterator[TrackPiece]:
         """Yield the tracks of some vehicles, as ``vehicles`` lists them."""
         for run, vehicle, first, count in vehicles:
             at = slice(first, first + count)
-            whole = Track(
+            whole = TrackPiece(
                 run, vehicle, 0, self._columns["time_s"][at], self._columns["position_m"][at],
                 float(self._length[first]), self._leader[at], self._lane[at],
             )  # fmt: skip
             yield from self._usable(whole)
 
-    def __iter__(self) -> Iterator[Track]:
+    def __iter__(self) -> Iterator[TrackPiece]:
         return self.of(self.vehicles)
 
-    def _usable(self, whole: Track) -> Iterator[Track]:
+    def _usable(self, whole: TrackPiece) -> Iterator[TrackPiece]:
         name = f"{whole.run_id}/{whole.vehicle_id}"
         if len(whole) < 2:
             self.left_out.append((name, "a single point has no motion"))
@@ -128,7 +128,7 @@ class Pieces:
         if number > 1:
             self.notes.append((name, f"divided into {number} tracks at holes or jumps"))
 
-    def _spans(self, whole: Track) -> list[tuple[int, int]]:
+    def _spans(self, whole: TrackPiece) -> list[tuple[int, int]]:
         """Return [begin, end) of stretches without a long hole or a lasting jump."""
         steps = np.diff(whole.time_s)
         usual = float(np.median(steps))
@@ -153,7 +153,7 @@ def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     return away
 
 
-def reversing(track: Track) -> float:
+def reversing(track: TrackPiece) -> float:
     """Return by how much (m) the position, as a running median over 5 samples, falls below what it had reached."""
     x = track.position_m
     if len(x) >= 5:

@@ -11,7 +11,7 @@ import torch
 
 from idm_env.data import DataError, Trajectories
 from idm_env.effects import IDM, Brakes, Mobil
-from idm_env.fitting.discrete_choice import ConstantRate, GapAcceptance, Wishes, fit_choice
+from idm_env.fitting.discrete_choice import ConstantRate, GapLogit, UtilityLogit, fit_choice
 from idm_env.fitting.lane_changes import ChangeOptions, fit_lane_changes, lane_changes
 from idm_env.fitting.lane_decisions import LEFT, RIGHT, Decisions, recorded_decisions
 from idm_env.fitting.options import Source
@@ -91,14 +91,14 @@ def decisions() -> Decisions:
 
 def test_drawn_decisions_give_their_parameters_back(decisions: Decisions) -> None:
     """All seven within three standard errors, which are small against the bounds; others explain less."""
-    found = fit_choice(Wishes(simulator(Lanes(3)), FREE), decisions)
+    found = fit_choice(UtilityLogit(simulator(Lanes(3)), FREE), decisions)
     rows = {str(row["parameter"]): row for row in found.table()}
     assert list(rows) == list(TRUTH)
     for name, truth in TRUTH.items():
         row = rows[name]
         assert abs(row["estimate"] - truth) < 3.0 * row["standard_error"], (name, row)
         assert row["identified"] and row["standard_error"] < 0.3 * max(1.0, truth), (name, row)
-    for other in (ConstantRate(), GapAcceptance()):
+    for other in (ConstantRate(), GapLogit()):
         assert fit_choice(other, decisions).log_likelihood < found.log_likelihood - 100.0
 
 
@@ -139,7 +139,7 @@ def test_the_simulators_own_changes_are_seen_when_they_were_decided() -> None:
     """Of recorded MOBIL drivers nearly every decision is told from the state before it: none is a second late."""
     each = [{**PARAMS, "idm": {**PARAMS["idm"], "desired_speed": v}} for v in DESIRED]
     seen = recorded_decisions(driven(), simulator, lambda vehicle: each[int(vehicle.removeprefix("a/"))])
-    model = Wishes(simulator(Lanes(3)), FREE)
+    model = UtilityLogit(simulator(Lanes(3)), FREE)
     # The defaults of MOBIL, hardly any temperature, full attention, and a lapse for what other claims win.
     theta = torch.tensor([0.2, 0.1, 4.0, 0.0, 0.01, 1.0, 1e-3], dtype=DTYPE)
     likely = model.each(theta, seen)

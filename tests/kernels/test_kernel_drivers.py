@@ -103,7 +103,7 @@ class Measured:
         )  # fmt: skip
 
     @property
-    def behind(self) -> drivers.Behind:
+    def behind(self) -> drivers.BehindRecord:
         made = drivers.prepared(self.simulator, self.start, self.records, self.inputs, self.driver)
         assert not isinstance(made, str), made
         return made

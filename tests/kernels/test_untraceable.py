@@ -55,7 +55,7 @@ class Unknown(Effect):
 
 
 @dataclass(frozen=True)
-class Reading(Effect):
+class Leaf(Effect):
     """The value of a tensor."""
 
     kind: ClassVar[str] = "reading"
@@ -91,7 +91,7 @@ CASES = [
     (Branching(), "Tensor.any"),
     (Deciding(), "Python `if`"),
     (Unknown(), "torch.erf"),
-    (Reading(), "the value of a tensor"),
+    (Leaf(), "the value of a tensor"),
     (Averaging(), "Tensor.mean"),
     (Profiled(), ""),
 ]

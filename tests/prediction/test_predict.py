@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import prediction as benchmark
 from idm_env.data import DataError
-from idm_env.data.scenario import Control, Scenario
+from idm_env.data.scenario import Scenario, TrafficControl
 from idm_env.data.womd import read_json, scenarios
 from idm_env.jobs.storage import UNFINISHED
 from idm_env.prediction.drivers import Second, hypotheses, middle, posterior
@@ -27,8 +27,8 @@ from idm_env.prediction.predict import (
     published_distance,
     straight_on,
 )  # fmt: skip
-from idm_env.prediction.rollout import Ahead, Course, Drivers, nobody, roll
-from idm_env.prediction.scene import STEPS, Scene
+from idm_env.prediction.rollout import Course, RouteDrivers, RouteLeader, nobody, roll
+from idm_env.prediction.scene import STEPS, MapScene
 from idm_env.prediction.select import chances, select
 from idm_env.prediction.stops import Stop, StopLines
 from tests.prediction import scenes
@@ -59,12 +59,12 @@ def test_routes_follow_every_branch_and_lift_back(fork: Scenario) -> None:
     assert LaneGraph(fork.lanes).routes(np.array([-40.0, 9.0]), 0.0, 100.0) == []  # beside the road
 
 
-def second_of(route: Route, speeds: np.ndarray, ahead: Ahead | None = None, stop: Stop | None = None) -> Second:
+def second_of(route: Route, speeds: np.ndarray, ahead: RouteLeader | None = None, stop: Stop | None = None) -> Second:
     """A last second at these speeds (m/s), 11 samples, behind nobody unless told."""
     return Second(route, speeds, ahead or nobody(len(speeds) - 1), 2.25, stop)
 
 
-def drawn_at(route: Route, speed: float) -> Drivers:
+def drawn_at(route: Route, speed: float) -> RouteDrivers:
     return posterior([second_of(route, np.full(11, speed))])[0][0]
 
 
@@ -89,12 +89,12 @@ def test_courses_rolled_together_are_those_rolled_alone(fork: Scenario) -> None:
 def test_nobody_drives_into_a_standing_leader_or_past_his_own_stop(fork: Scenario) -> None:
     (route, *_) = LaneGraph(fork.lanes).routes(np.array([-40.0, 0.0]), 0.0, 100.0)
     drawn = drawn_at(route, 12.0)
-    wall = Ahead(np.full(STEPS + 1, route.begin + 60.0), np.zeros(STEPS + 1))
+    wall = RouteLeader(np.full(STEPS + 1, route.begin + 60.0), np.zeros(STEPS + 1))
     ((along, speed),) = roll([Course(route, drawn, wall, route.begin)], 12.0, STEPS, 2.25)
     assert (along + 2.25 <= route.begin + 60.0).all()
     assert (along - route.begin <= drawn.stop + 1e-6).all()
     assert (speed >= 0).all() and (np.diff(along, axis=0) >= -1e-9).all()
-    passed = Ahead(wall.rear, wall.speed, passed=1.0)
+    passed = RouteLeader(wall.rear, wall.speed, passed=1.0)
     free = roll([Course(route, drawn, passed, route.begin)], 12.0, STEPS, 2.25)[0][0]
     assert (free[-1][~np.isfinite(drawn.stop)] > route.begin + 60.0).mean() > 0.8
 
@@ -105,18 +105,26 @@ def test_stop_signs_are_for_the_lane_at_whose_end_they_stand_and_lights_for_thei
     (route, *_) = graph.routes(np.array([-40.0, 0.0]), 0.0, 100.0)
     away = float(end[0] + 40.0 - 2.25)
 
-    def stop(*controls: Control) -> Stop | None:
+    def stop(*controls: TrafficControl) -> Stop | None:
         return StopLines(graph, controls).ahead(route, 2.25, 10.0)
 
-    assert stop(Control("sign", end + np.array([-3.0, -4.0]))) == Stop(pytest.approx(away, abs=0.2), "sign")
-    assert stop(Control("sign", end + np.array([-3.0, 4.0]))) is None  # on the left: for those who come towards us
-    assert stop(Control("sign", end + np.array([-40.0, -4.0]))) is None  # not at a junction
-    assert stop(Control("sign", end + np.array([5.0, 30.0]), lanes=(1,))) == Stop(pytest.approx(away, abs=0.2), "sign")
-    assert stop(Control("stop", end, lanes=(route.chain[1],))) == Stop(pytest.approx(away, abs=0.2), "red")
-    assert stop(Control("stop", end, lanes=(99,))) is None and stop(Control("go", end, lanes=(1,))) is None
-    assert stop(Control("caution", end, lanes=(1,))) is not None
+    assert stop(TrafficControl("sign", end + np.array([-3.0, -4.0]))) == Stop(pytest.approx(away, abs=0.2), "sign")
+    assert (
+        stop(TrafficControl("sign", end + np.array([-3.0, 4.0]))) is None
+    )  # on the left: for those who come towards us
+    assert stop(TrafficControl("sign", end + np.array([-40.0, -4.0]))) is None  # not at a junction
+    assert stop(TrafficControl("sign", end + np.array([5.0, 30.0]), lanes=(1,))) == Stop(
+        pytest.approx(away, abs=0.2), "sign"
+    )
+    assert stop(TrafficControl("stop", end, lanes=(route.chain[1],))) == Stop(pytest.approx(away, abs=0.2), "red")
+    assert (
+        stop(TrafficControl("stop", end, lanes=(99,))) is None and stop(TrafficControl("go", end, lanes=(1,))) is None
+    )
+    assert stop(TrafficControl("caution", end, lanes=(1,))) is not None
     near = graph.routes(np.array([-12.0, 0.0]), 0.0, 100.0)[0]
-    assert StopLines(graph, [Control("caution", end, lanes=(1,))]).ahead(near, 2.25, 12.0) is None  # too late to brake
+    assert (
+        StopLines(graph, [TrafficControl("caution", end, lanes=(1,))]).ahead(near, 2.25, 12.0) is None
+    )  # too late to brake
 
 
 def test_a_sign_is_stopped_at_and_left_and_a_red_light_is_waited_for(fork: Scenario) -> None:
@@ -171,7 +179,7 @@ def test_one_second_of_braking_shifts_the_weight_to_those_who_stop(fork: Scenari
         changed = agent.__class__(
             agent.id, agent.kind, agent.length, agent.width, agent.position, agent.heading, velocity, agent.valid
         )
-        scene = Scene(Scenario("s", (changed,), fork.lanes, (0,)))
+        scene = MapScene(Scenario("s", (changed,), fork.lanes, (0,)))
         found = predict(scene, 0)
         near = found.futures[:, -1, 0] < -5.0
         shares.append(found.confidence[near].sum() / found.confidence.sum())
@@ -180,7 +188,7 @@ def test_one_second_of_braking_shifts_the_weight_to_those_who_stop(fork: Scenari
 
 def test_nobody_is_predicted_worse_than_by_constant_velocity(fork: Scenario) -> None:
     """It is one of the six, to the last bit, for every kind, on and off the lanes."""
-    scene = Scene(fork)
+    scene = MapScene(fork)
     for index in range(4):
         straight = straight_on(scene, index).futures[0]
         assert np.abs(predict(scene, index).futures - straight).max(axis=(1, 2)).min() == 0.0
@@ -193,13 +201,13 @@ def test_who_stands_may_stay(fork: Scenario) -> None:
         agent.id, agent.kind, agent.length, agent.width, np.broadcast_to(agent.position[0], agent.position.shape),
         agent.heading, still, agent.valid,
     )  # fmt: skip
-    found = predict(Scene(Scenario("s", (parked,), fork.lanes, (0,))), 0)
+    found = predict(MapScene(Scenario("s", (parked,), fork.lanes, (0,))), 0)
     moved = np.hypot(*(found.futures[:, -1] - agent.position[0]).T)
     assert found.confidence[moved < 2.0].sum() > 0.3 and (moved > 20.0).any()
 
 
 def test_each_kind_gets_its_method_and_six_futures(fork: Scenario) -> None:
-    scene = Scene(fork)
+    scene = MapScene(fork)
     found = [predict(scene, index) for index in range(4)]
     assert [prediction.source for prediction in found] == ["lane", "free", "lane", "free"]
     for prediction in found:
@@ -212,7 +220,7 @@ def test_each_kind_gets_its_method_and_six_futures(fork: Scenario) -> None:
 
 
 def test_the_leader_is_who_is_next_on_the_route(fork: Scenario) -> None:
-    scene = Scene(fork)
+    scene = MapScene(fork)
     cyclist = fork.agents[2]
     (route, *_) = scene.routes(cyclist)
     found = scene.leader(2, route)
@@ -245,7 +253,7 @@ def test_confidence_is_the_chance_to_hit_what_the_others_miss() -> None:
 
 def test_a_fit_by_the_paper_s_recipe_drives_the_paper_s_row(fork: Scenario) -> None:
     """Its bounds ask for 5 m/s² and 20 m/s at least, so that a free road is taken at once; leaders are yielded to."""
-    scene = Scene(fork)
+    scene = MapScene(fork)
     alone = as_published(scene, 0).futures[0]
     assert alone.shape == (STEPS, 2) and abs(alone[-1, 1]) < 0.1  # straight on
     assert alone[-1, 0] > straight_on(scene, 0).futures[0, -1, 0] + 20.0
@@ -255,7 +263,7 @@ def test_a_fit_by_the_paper_s_recipe_drives_the_paper_s_row(fork: Scenario) -> N
 
 
 def test_baselines_are_what_they_say(fork: Scenario) -> None:
-    scene = Scene(fork)
+    scene = MapScene(fork)
     still = straight_on(scene, 0).futures[0]
     assert np.allclose(still[-1], [40.0, 0.3])
     lane = along_lane(scene, 0).futures[0]
@@ -322,7 +330,7 @@ def test_better_than_all_three_single_futures_on_measured_scenes(measured) -> No
     cases = {name: [] for name in METHODS}
     for path in sorted(folder.glob("*.json.gz")):
         for scenario in scenarios(path):
-            scene = Scene(scenario)
+            scene = MapScene(scenario)
             for index in scenario.to_predict:
                 for name, method in METHODS.items():
                     cases[name].append(score(case_of(scenario, method(scene, index))))

@@ -10,7 +10,7 @@ from diffidm import IDMLayer
 
 from idm_env.trajectories import paper
 from idm_env.trajectories.recipe import clock_of
-from idm_env.trajectories.tracks import Track
+from idm_env.trajectories.tracks import TrackPiece
 
 FLOOR = torch.tensor(-paper.MAX_DECEL, dtype=torch.float64)
 Inputs = Callable[[int, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
@@ -59,7 +59,7 @@ def limits(bounds: tuple[float, float]) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.tensor(bounds[0], dtype=torch.float64), torch.tensor(bounds[1], dtype=torch.float64)
 
 
-def direct(tracks: list[Track], dt: float, iterations: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def direct(tracks: list[TrackPiece], dt: float, iterations: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return positions [K, N] relative to the first point, values [N, 5] and imagined gaps [K, N] of equal tracks."""
     clock = clock_of(tracks[0], dt)
     count, steps = len(tracks), len(clock)

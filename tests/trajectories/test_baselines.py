@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from idm_env.trajectories import baselines
-from idm_env.trajectories.scores import Motion, Tally, from_positions, implausible, position_error_rate
+from idm_env.trajectories.scores import RegularMotion, Tally, from_positions, implausible, position_error_rate
 
 CLOCK = np.arange(0, 60.05, 0.1)
 
 
-def wave(clock: np.ndarray) -> Motion:
+def wave(clock: np.ndarray) -> RegularMotion:
     """A speed that swings by 3 m/s about 12 m/s, once in 25 s."""
     w = 2 * np.pi / 25
-    return Motion(clock, 12 * clock - 3 / w * np.cos(w * clock), 12 + 3 * np.sin(w * clock), 3 * w * np.cos(w * clock))
+    return RegularMotion(
+        clock, 12 * clock - 3 / w * np.cos(w * clock), 12 + 3 * np.sin(w * clock), 3 * w * np.cos(w * clock)
+    )
 
 
 @pytest.mark.parametrize("name", baselines.available())
@@ -90,7 +92,7 @@ def test_the_paper_s_metrics() -> None:
     assert position_error_rate(motion, clock, 10.0 * clock + 0.5) == pytest.approx(0.005)
     assert np.isnan(position_error_rate(motion, clock, np.zeros_like(clock)))
     assert not implausible(motion)
-    hard = Motion(clock, motion.position_m, motion.speed_mps, np.where(clock == 5.0, -10.5, 0.0))
+    hard = RegularMotion(clock, motion.position_m, motion.speed_mps, np.where(clock == 5.0, -10.5, 0.0))
     assert implausible(hard)
     first, second = Tally(), Tally()
     first.add(motion, clock, 10.0 * clock + 0.5)

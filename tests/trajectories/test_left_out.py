@@ -11,13 +11,13 @@ import pytest
 
 from idm_env.trajectories import files
 from idm_env.trajectories.left_out import thinned
-from idm_env.trajectories.tracks import Track
+from idm_env.trajectories.tracks import TrackPiece
 from tests.trajectories.test_files import lane
 
 
 def test_every_second_inner_point_is_left_out_and_the_ends_stay() -> None:
     time, nobody = np.arange(8.0), np.full(8, "")
-    track = Track("", "", 0, time, 10 * time, 4.5, nobody, np.full(8, -1))
+    track = TrackPiece("", "", 0, time, 10 * time, 4.5, nobody, np.full(8, -1))
     given, out = thinned(track)
     assert given.time_s.tolist() == [0, 2, 4, 6, 7] and out.tolist() == [1, 3, 5]
 

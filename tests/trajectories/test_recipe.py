@@ -13,10 +13,10 @@ from idm_env.trajectories.drivers import parameter_rows
 from idm_env.trajectories.imagined import CAPABLE, drive
 from idm_env.trajectories.noise import fit_noise
 from idm_env.trajectories.recipe import Filtered, clock_of, overlaps, recipe
-from idm_env.trajectories.scores import Motion, Tally
-from idm_env.trajectories.smoother import SPARSE, Choices, Noise, Observed, log_likelihood, smooth
+from idm_env.trajectories.scores import RegularMotion, Tally
+from idm_env.trajectories.smoother import SPARSE, Choices, PositionNoise, TrackObservations, log_likelihood, smooth
 from idm_env.trajectories.spool import read_table
-from idm_env.trajectories.tracks import Pieces, Track
+from idm_env.trajectories.tracks import Pieces, TrackPiece
 from idm_env.types import Driver
 from tests.trajectories.tracks import swinging, track_of
 
@@ -35,10 +35,10 @@ def correlated(rng: np.random.Generator, count: int, sigma: float = 0.28, time: 
 
 def test_without_reweighting_it_is_the_exact_posterior() -> None:
     """Against dense Gaussian algebra on the same model, irregular times and a hole included."""
-    noise, dt = Noise(white=0.1, sigma=0.3, time=0.4, jerk=0.5), 0.1
+    noise, dt = PositionNoise(white=0.1, sigma=0.3, time=0.4, jerk=0.5), 0.1
     time = np.array([0.0, 0.1, 0.23, 0.3, 0.4, 0.9, 1.0, 1.15, 1.2])
     data = 10 * time + np.sin(5 * time)
-    observed = Observed.of(time, data, dt)
+    observed = TrackObservations.of(time, data, dt)
     steps, n = observed.steps, 4
     keep, fade, push, drift = noise.step(dt)
     step = np.array([[1, dt, dt * dt / 2, 0], [0, 1, dt, 0], [0, 0, keep, 0], [0, 0, 0, fade]])
@@ -127,7 +127,7 @@ def test_distance_that_a_bound_took_is_made_up() -> None:
 def test_bounds_are_exact_whatever_the_data_say() -> None:
     time = np.arange(0, 20.0, 0.1)
     brutal = np.where(time < 10, 30 * time, 300.0)  # from 30 m/s to standstill at once
-    (found,) = recipe([track_of(Motion(time, brutal, brutal, brutal))], 0.1, Noise(0.05, 0, 0.3, 300.0))
+    (found,) = recipe([track_of(RegularMotion(time, brutal, brutal, brutal))], 0.1, PositionNoise(0.05, 0, 0.3, 300.0))
     motion = found.motion
     assert motion.accel_mps2.min() >= -8.0 - 1e-9 and motion.accel_mps2.max() <= 5.0
     assert motion.speed_mps.min() >= 0.0
@@ -139,7 +139,7 @@ def test_bounds_are_exact_whatever_the_data_say() -> None:
 @pytest.mark.parametrize("seconds", [0.1, 0.2, 0.5])
 def test_two_three_and_a_few_points(seconds: float) -> None:
     track = track_of(swinging(seconds))
-    (found,) = recipe([track], 0.1, Noise(0.05, 0.1, 0.3, 0.3))
+    (found,) = recipe([track], 0.1, PositionNoise(0.05, 0.1, 0.3, 0.3))
     assert np.allclose(found.motion.speed_mps, 12.0, atol=1.0)
 
 
@@ -147,7 +147,7 @@ def test_a_parked_vehicle_stays_parked() -> None:
     time = np.arange(0, 30.0, 0.1)
     rng = np.random.default_rng(0)
     parked = 50.0 + correlated(rng, len(time))
-    (found,) = recipe([track_of(Motion(time, parked, parked, parked))], 0.1, Noise(0.1, 0.28, 0.28, 0.3))
+    (found,) = recipe([track_of(RegularMotion(time, parked, parked, parked))], 0.1, PositionNoise(0.1, 0.28, 0.28, 0.3))
     assert found.motion.speed_mps.min() >= 0.0
     assert found.motion.position_m[-1] - found.motion.position_m[0] < 1.0
     assert found.motion.speed_mps.mean() < 0.1
@@ -160,22 +160,23 @@ def test_outliers_do_not_move_it() -> None:
     spikes = noise.copy()
     spikes[[100, 250, 251, 400]] += [4.0, -30.0, -30.0, 100.0]
     speeds = [
-        recipe([track_of(motion, n)], 0.1, Noise(0.1, 0.28, 0.28, 0.3))[0].motion.speed_mps for n in (noise, spikes)
+        recipe([track_of(motion, n)], 0.1, PositionNoise(0.1, 0.28, 0.28, 0.3))[0].motion.speed_mps
+        for n in (noise, spikes)
     ]
     assert np.abs(speeds[0] - speeds[1]).max() < 0.5
 
 
-def platoon(rng: np.random.Generator, spacing: float) -> list[Track]:
+def platoon(rng: np.random.Generator, spacing: float) -> list[TrackPiece]:
     """A follower that comes up at 5 m/s and then is ``spacing`` (m) behind from one sample to the next."""
     motion = swinging(60.0)
     front = track_of(motion, correlated(rng, 601), "front")
     gap = spacing + np.maximum(0.0, 5.0 * (30.0 - motion.time_s))
     back = front.position_m - 4.5 - gap
-    return [front, Track("0", "back", 0, motion.time_s, back, 4.5, np.full(601, "front"), np.full(601, 1))]
+    return [front, TrackPiece("0", "back", 0, motion.time_s, back, 4.5, np.full(601, "front"), np.full(601, 1))]
 
 
 def test_vehicles_do_not_overlap_that_did_not_before() -> None:
-    noise = Noise(0.1, 0.28, 0.28, 0.3)
+    noise = PositionNoise(0.1, 0.28, 0.28, 0.3)
     touching = platoon(np.random.default_rng(1), 0.01)
     alone = [recipe([track], 0.1, noise)[0] for track in touching]
     assert overlaps(alone)[1] > 0  # each by itself they do
@@ -190,13 +191,13 @@ def test_vehicles_do_not_overlap_that_did_not_before() -> None:
 
 def test_drivers_are_calibrated_behind_real_leaders_only() -> None:
     rng = np.random.default_rng(2)
-    found = recipe(platoon(rng, 15.0), 0.1, Noise(0.1, 0.28, 0.28, 0.3))
+    found = recipe(platoon(rng, 15.0), 0.1, PositionNoise(0.1, 0.28, 0.28, 0.3))
     rows = {row["vehicle_id"]: row for row in parameter_rows(found)}
     assert rows["front"]["source"] == "none" and rows["front"]["time_gap"] is None
     assert rows["back"]["source"] == "leader" and 0.1 <= rows["back"]["time_gap"] <= 5.0
 
 
-def halves(path: object) -> tuple[list[Track], list[Track]]:
+def halves(path: object) -> tuple[list[TrackPiece], list[TrackPiece]]:
     tracks = list(Pieces(read_table(path)))  # type: ignore[arg-type]
     names = sorted({t.vehicle_id for t in tracks}, key=int)
     tuned = set(names[::2])
@@ -208,12 +209,12 @@ def truths(path: object) -> dict[str, pl.DataFrame]:
     return {str(vehicle): part.sort("k") for (vehicle,), part in clean.group_by(["vehicle_id"])}
 
 
-def truth_of(track: Track, clean: dict[str, pl.DataFrame]) -> Motion:
+def truth_of(track: TrackPiece, clean: dict[str, pl.DataFrame]) -> RegularMotion:
     clock = clock_of(track, 0.1)
     rows = pl.DataFrame({"k": np.round(clock * 10).astype(np.int64)}).join(
         clean[track.vehicle_id], on="k", how="left", maintain_order="left"
     )
-    return Motion(clock, *(rows[name].to_numpy() for name in ("position_m", "speed_mps", "accel_mps2")))
+    return RegularMotion(clock, *(rows[name].to_numpy() for name in ("position_m", "speed_mps", "accel_mps2")))
 
 
 def test_it_beats_every_tuned_baseline_on_measured_vehicles(measured) -> None:  # type: ignore[no-untyped-def]
@@ -221,7 +222,7 @@ def test_it_beats_every_tuned_baseline_on_measured_vehicles(measured) -> None:  
     clean = truths(measured("ngsim_i80_lanes.parquet"))
     first, second = halves(measured("ngsim_i80_rawlike.csv.gz"))
 
-    def score(tracks: list[Track], motions: list[Motion]) -> dict[str, float]:
+    def score(tracks: list[TrackPiece], motions: list[RegularMotion]) -> dict[str, float]:
         tally = Tally()
         for track, motion in zip(tracks, motions, strict=True):
             tally.add(motion, track.time_s, track.position_m)
