@@ -134,10 +134,8 @@ def base_named(kind: str) -> CarFollowing:
     """
     made = make(kind) if ":" in kind or kind in ALL else None
     if not isinstance(made, CarFollowing):
-        laws = {name: None for name, effect in ALL.items() if issubclass(effect, CarFollowing)}
-        raise ValueError(
-            f"base {shown(kind)} is no car-following law.{nearest(kind, laws)} There are: {', '.join(laws)}."
-        )
+        laws = [name for name, effect in ALL.items() if issubclass(effect, CarFollowing)]
+        raise ValueError(f"base {shown(kind)} is no car-following law. There are: {', '.join(laws)}.")
     return made
 
 
