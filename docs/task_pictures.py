@@ -12,7 +12,7 @@ import idm_env  # noqa: F401 (registers DiffIDM-v0)
 from idm_env.tasks import TASKS
 
 FOLDER = Path(__file__).resolve().parent / "tasks"
-SECONDS, WIDTH = 40.0, 300
+SECONDS, WIDTH = 40.0, 600
 
 
 def pictures(folder: Path = FOLDER) -> list[Path]:
@@ -28,7 +28,8 @@ def pictures(folder: Path = FOLDER) -> list[Path]:
             if terminated or truncated:
                 break
         picture = Image.fromarray(env.render())
-        picture = picture.resize((WIDTH, round(picture.height * WIDTH / picture.width)), Image.Resampling.LANCZOS)
+        width = WIDTH // 2 if picture.width == picture.height else WIDTH
+        picture = picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
         written.append(folder / f"{name}.png")
         picture.save(written[-1], optimize=True)
     return written

@@ -379,7 +379,7 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
     from idm_env.reports.page import account
 
     console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
-    console.print(result["sentence"], highlight=False)
+    console.print(result["sentence"], soft_wrap=True, highlight=False)
     before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
     if before is not None:
         _show("Errors on runs that neither fitted nor chose anything", [

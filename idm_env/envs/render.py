@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,16 +20,22 @@ if TYPE_CHECKING:
 
 __all__ = ["SIZE", "Viewer", "colour", "space_time"]
 
-SIZE = 600
-"""Width, and on a ring also height, of a picture (pixels)."""
-_LANE_HEIGHT = 200
-_NEAR = 150.0
-"""How far from the agent one sees on a ring of several lanes, and on an endless road (m)."""
+SIZE, WIDE = 600, 1000
+"""Width and height of a ring's picture, and width of a road's (pixels)."""
+LANE_M, VEHICLE_M = 3.5, 1.9
+"""Widths of a lane and of a vehicle (m)."""
+_NEAR = 85.0
+"""How far from the agent one sees on a ring of several lanes and on an endless road (m): so much is drawn to scale."""
+_TOP, _EDGE = 64, 15
+"""Height of what is written above a road, and the ground on both sides of what is shown (pixels)."""
+_LANE_PIXELS = 12.0, 20.0
+"""A lane's width at least and at most; where the least is more than to scale, the picture says how much."""
+_TICKS_M = 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0
 _MOST_LANES = 8
 """Lanes beyond these are drawn over the first ones again."""
 _ASPHALT, _GROUND, _INK, _MARK = (70, 74, 82), (244, 243, 238), (30, 32, 36), (30, 90, 220)
-_CHANGE = (208, 60, 150)
-COLOURS_DRAWN = (_ASPHALT, _GROUND, _INK, _MARK, _CHANGE)
+_CHANGE, _CRASH, _PAINT = (208, 60, 150), (255, 210, 0), (226, 226, 220)
+COLOURS_DRAWN = (_ASPHALT, _GROUND, _INK, _MARK, _CHANGE, _CRASH, _PAINT)
 """Colours of a picture besides those of speeds (red, green, blue)."""
 _CHANGE_SHOWN = 1.0
 """How long an arrow shows that a vehicle has changed lanes (s)."""
@@ -59,8 +66,64 @@ def _around(task: Task, values: dict[str, np.ndarray], ring: float | None) -> No
     values["present"] = values["present"] * (np.abs(away) <= _NEAR)
 
 
+def _crashed(values: dict[str, np.ndarray]) -> np.ndarray:
+    """Return which vehicles touch the one ahead."""
+    return np.asarray((values["gap"] <= 0.0) & (values["present"] > 0))
+
+
+@dataclass(frozen=True)
+class _View:
+    """What is shown of a road: from ``back`` to ``front`` (m), ``scale`` pixels a metre, lanes so many pixels wide."""
+
+    back: float
+    front: float
+    lanes: int
+    lane: float
+
+    @property
+    def scale(self) -> float:
+        return (WIDE - 2 * _EDGE) / (self.front - self.back)
+
+    @property
+    def wider(self) -> float:
+        """How many times as large widths are drawn as lengths."""
+        return self.lane / (LANE_M * self.scale)
+
+    @property
+    def bottom(self) -> float:
+        """Where the road ends below (pixels)."""
+        return _TOP + self.lanes * self.lane
+
+    @property
+    def step(self) -> float:
+        """Metres between numbers along the road."""
+        return next((m for m in _TICKS_M if m * self.scale > 70.0), _TICKS_M[-1])
+
+    def x(self, position: float) -> float:
+        """Return the pixel of a position (m)."""
+        return WIDE - _EDGE - (self.front - position) * self.scale
+
+    def y(self, lane: int) -> float:
+        """Return the pixel of a lane's middle; lane 0 is on top."""
+        return _TOP + (lane + 0.5) * self.lane
+
+
+def _view(task: Task, values: dict[str, np.ndarray], lanes: int) -> _View:
+    """Return the whole of a road that ends, else what is around its vehicles, at least 170 m."""
+    there = values["present"] > 0
+    if isinstance(task.road, Lanes) and task.road.length is not None:
+        wanted = LANE_M * (WIDE - 2 * _EDGE) / task.road.length
+        return _View(0.0, task.road.length, lanes, float(np.clip(wanted, *_LANE_PIXELS)))
+    if isinstance(task.road, Lanes):
+        middle = float(values["position"][task.agents[0]])
+        return _View(middle - _NEAR, middle + _NEAR, lanes, _LANE_PIXELS[1])
+    front = float(values["position"][there].max()) if there.any() else 2.0 * _NEAR
+    back = float((values["position"] - values["length"])[there].min()) if there.any() else 0.0
+    return _View(min(back, front - 2.0 * _NEAR), front, lanes, _LANE_PIXELS[1])
+
+
 class Viewer:
-    """Draws one environment: vehicles coloured by speed, controlled ones outlined in blue with a dot.
+    """Draws one environment to scale: vehicles coloured by speed, agents framed in blue, crashes marked by a cross.
 
     ``mode`` is ``"rgb_array"`` (a picture is returned; no display is needed) or ``"human"`` (a window; without a
     display it is drawn into memory).
@@ -75,7 +138,7 @@ class Viewer:
         self._lanes: np.ndarray | None = None
         self._changes: dict[int, tuple[int, float]] = {}
         self._pygame.font.init()
-        self._font = self._pygame.font.Font(None, 22)
+        self._font, self._small = (self._pygame.font.Font(None, size) for size in (24, 20))
 
     def show(self, task: Task, state: State, row: int = 0) -> np.ndarray | None:
         """Return the picture of one row of a state as ``(height, width, 3)`` uint8, or show it in the window."""
@@ -84,8 +147,6 @@ class Viewer:
         if isinstance(task.road, Lanes) and state.links is not None:
             # The left lane is on top, as seen by drivers who go to the right.
             lane, lanes = task.road.count - 1 - state.links.lane[row].cpu().numpy(), task.road.count
-        canvas = self._pygame.Surface((SIZE, SIZE if ring else _LANE_HEIGHT + 40 * (lanes - 1)))
-        canvas.fill(_GROUND)
         values = {
             name: getattr(state, name)[row].detach().cpu().double().numpy()
             for name in ("position", "speed", "gap", "length")
@@ -97,8 +158,14 @@ class Viewer:
         if isinstance(task.road, Lanes) and task.road.length is None:
             _around(task, values, task.road.ring)
         fastest = 10.0 if ring else 30.0
-        (self._ring if ring else self._lane)(canvas, task, values, fastest)
-        self._legend(canvas, task, state, row, values, fastest)
+        view = _view(task, values, lanes)
+        canvas = self._pygame.Surface((SIZE, SIZE) if ring else (WIDE, 2 * math.ceil(0.5 * (view.bottom + 34))))
+        canvas.fill(_GROUND)
+        if ring:
+            self._ring(canvas, task, values, fastest)
+        else:
+            self._lane(canvas, task, values, fastest, view)
+        self._legend(canvas, task, state, row, values, fastest, 1.0 if ring else view.wider)
         if self._mode == "human":
             self._display(canvas)
             return None
@@ -116,82 +183,112 @@ class Viewer:
     def _ring(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float) -> None:
         circumference = float((values["gap"] + values["length"]).sum())
         radius, middle = 0.38 * SIZE, 0.5 * SIZE
-        self._pygame.draw.circle(canvas, _ASPHALT, (middle, middle), radius + 13, 26)
-        for i, (position, length) in enumerate(zip(values["position"], values["length"], strict=True)):
-            angle = 2.0 * math.pi * ((position - 0.5 * length) % circumference) / circumference
-            centre = middle + radius * math.cos(angle), middle - radius * math.sin(angle)
-            along = 2.0 * math.pi * radius * length / circumference
-            self._vehicle(canvas, centre, angle + 0.5 * math.pi, along, values["speed"][i], fastest, i in task.agents)
+        pixels = 2.0 * math.pi * radius / circumference
+        lane = max(LANE_M * pixels, 18.0)
 
-    def _lane(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float) -> None:
-        there = values["present"] > 0
-        lanes = (canvas.get_height() - _LANE_HEIGHT) // 40 + 1
-        top = 0.55 * _LANE_HEIGHT
-        height = top + 40 * (lanes - 1)
+        def place(position: float, away: float = 0.0) -> tuple[tuple[float, float], float]:
+            angle = 2.0 * math.pi * (position % circumference) / circumference
+            far = radius + away
+            return (middle + far * math.cos(angle), middle - far * math.sin(angle)), angle
+
+        self._pygame.draw.circle(canvas, _ASPHALT, (middle, middle), radius + 0.5 * lane, round(lane))
+        step = next((m for m in _TICKS_M if m * pixels > 80.0), _TICKS_M[-1])
+        for post in np.arange(0.0, circumference - 0.3 * step, step):
+            ends = [place(post, 0.5 * lane + away)[0] for away in (2.0, 8.0)]
+            self._pygame.draw.line(canvas, _INK, *ends)
+            self._text(canvas, f"{post:.0f} m", place(post, 0.5 * lane + 24.0)[0])
+        crashed = _crashed(values)
+        for i, (position, length) in enumerate(zip(values["position"], values["length"], strict=True)):
+            centre, angle = place(position - 0.5 * length)
+            size = length * pixels, VEHICLE_M / LANE_M * lane
+            self._vehicle(canvas, centre, angle + 0.5 * math.pi, size, values["speed"][i], fastest, i in task.agents)
+        for i in np.flatnonzero(crashed):
+            self._crash(canvas, place(values["position"][i])[0])
+
+    def _lane(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float, view: _View) -> None:
+        draw = self._pygame.draw
         road = task.road if isinstance(task.road, Lanes) and task.road.ring is None else None
-        front, back = 150.0, 0.0
-        if road is not None and road.length is not None:
-            front = road.length
-        elif there.any():
-            front = float(values["position"][there].max())
-            back = float((values["position"] - values["length"])[there].min())
-        shown = max(front - back, 150.0)
-        scale = 0.94 * SIZE / shown
-        for lane in range(lanes):
-            left, right = 0.0, float(SIZE)
+        for lane in range(view.lanes):
+            first, last = view.back - 1e4, view.front + 1e4
+            stops = math.inf
             if road is not None:
                 k = road.count - 1 - lane
-                ends = min(road.table("stops")[k], road.table("leaves")[k])
-                left = 0.97 * SIZE - (front - road.table("begins")[k]) * scale
-                right = min(0.97 * SIZE - (front - ends) * scale, right)
-            self._pygame.draw.rect(canvas, _ASPHALT, (left, top + 40 * lane - 13, right - left, 26))
-        # Posts stand still on the ground, so that motion can be seen.
-        for post in range(math.ceil((front - shown) / 50.0), math.floor(front / 50.0) + 1):
-            x = 0.97 * SIZE - (front - 50.0 * post) * scale
-            self._pygame.draw.line(canvas, _ASPHALT, (x, height + 17), (x, height + 24), 2)
-        for i in np.flatnonzero(there):
-            length = values["length"][i]
-            x = 0.97 * SIZE - (front - values["position"][i] + 0.5 * length) * scale
-            y = top + 40 * (int(values["lane"][i]) % lanes)
+                first, stops = road.table("begins")[k], road.table("stops")[k]
+                last = min(stops, road.table("leaves")[k], last)
+            left, right = (min(max(view.x(m), 0.0), float(WIDE)) for m in (first, last))
+            top = view.y(lane) - 0.5 * view.lane
+            draw.rect(canvas, _ASPHALT, (left, top, right - left, view.lane + 1))
+            # Marks stand still on the ground, so that motion can be seen.
+            for mark in range(math.ceil(view.back / 12.0) - 9, math.floor(view.front / 12.0) + 9) if lane else ():
+                ends = [min(max(view.x(12.0 * mark + m), left), right) for m in (0.0, 4.0)]
+                draw.line(canvas, _PAINT, *((x, top) for x in ends))
+            if stops < view.front:
+                draw.line(canvas, _CRASH, (right, top), (right, top + view.lane), 3)
+        for post in np.arange(view.step * math.ceil(view.back / view.step), view.front + 1e-6, view.step):
+            x = view.x(post)
+            draw.line(canvas, _INK, (x, view.bottom + 3), (x, view.bottom + 9))
+            lap = task.road.ring if isinstance(task.road, Lanes) else None
+            self._text(canvas, f"{post if lap is None else post % lap:.0f} m", (x, view.bottom + 20))
+        for i in np.flatnonzero(values["present"] > 0):
+            x = view.x(values["position"][i] - 0.5 * values["length"][i])
+            y = view.y(int(values["lane"][i]) % view.lanes)
+            size = values["length"][i] * view.scale, VEHICLE_M / LANE_M * view.lane
+            self._vehicle(canvas, (x, y), 0.0, size, values["speed"][i], fastest, i in task.agents)
             if int(i) in self._changes:
                 # An arrow from the lane that it has left.
-                side = math.copysign(1.0, y - (top + 40 * self._changes[int(i)][0]))
-                self._pygame.draw.line(canvas, _CHANGE, (x, y - 34 * side), (x, y - 8 * side), 3)
-                tip = [(x, y - 7 * side), (x - 5, y - 16 * side), (x + 5, y - 16 * side)]
-                self._pygame.draw.polygon(canvas, _CHANGE, tip)
-            self._vehicle(canvas, (x, y), 0.0, length * scale, values["speed"][i], fastest, i in task.agents)
+                before = view.y(self._changes[int(i)][0])
+                side = math.copysign(1.0, y - before)
+                draw.line(canvas, _CHANGE, (x, before), (x, y - 0.3 * view.lane * side), 3)
+                tip = y - 0.1 * view.lane * side
+                draw.polygon(canvas, _CHANGE, [(x, tip), (x - 5, tip - 7 * side), (x + 5, tip - 7 * side)])
+        for i in np.flatnonzero(_crashed(values)):
+            self._crash(canvas, (view.x(values["position"][i]), view.y(int(values["lane"][i]) % view.lanes)))
+
+    def _crash(self, canvas: Any, at: tuple[float, float]) -> None:
+        """Draw a cross where two vehicles touch."""
+        self._pygame.draw.circle(canvas, _CRASH, at, 11)
+        self._pygame.draw.circle(canvas, _INK, at, 11, 2)
+        for side in (-1, 1):
+            ends = (at[0] - 5, at[1] - 5 * side), (at[0] + 5, at[1] + 5 * side)
+            self._pygame.draw.line(canvas, _INK, *ends, 3)
+
+    def _text(self, canvas: Any, words: str, at: tuple[float, float]) -> None:
+        """Write small words around a place, within the picture."""
+        drawn = self._small.render(words, True, _INK)
+        half = 0.5 * drawn.get_width()
+        x = min(max(at[0], half + 2), canvas.get_width() - half - 2)
+        canvas.blit(drawn, (x - half, at[1] - 0.5 * drawn.get_height()))
 
     def _vehicle(
-        self,
-        canvas: Any,
-        centre: tuple[float, float],
-        heading: float,
-        along: float,
-        speed: float,
-        fastest: float,
-        marked: bool,
-    ) -> None:
+        self, canvas: Any, centre: tuple[float, float], heading: float, size: tuple[float, float], speed: float,
+        fastest: float, marked: bool,
+    ) -> None:  # fmt: skip
+        """Draw a vehicle of a length and a width (pixels) in the colour of its speed; a controlled one has a frame."""
         c, s = math.cos(heading), -math.sin(heading)
-        half, side = max(0.5 * along, 2.0), 6.0
-        corners = [(-half, -side), (half, -side), (half, side), (-half, side)]
-        points = [(centre[0] + x * c - y * s, centre[1] + x * s + y * c) for x, y in corners]
-        self._pygame.draw.polygon(canvas, colour(speed, fastest), points)
-        self._pygame.draw.polygon(canvas, _MARK if marked else _INK, points, 3 if marked else 1)
-        if marked:
-            self._pygame.draw.circle(canvas, _MARK, (centre[0] + 20 * s, centre[1] - 20 * c), 5)
+        for more, fill in ((3.0, _MARK), (0.0, colour(speed, fastest))) if marked else ((0.0, colour(speed, fastest)),):
+            half, side = max(0.5 * size[0], 2.0) + more, max(0.5 * size[1], 2.0) + more
+            corners = [(-half, -side), (half, -side), (half, side), (-half, side)]
+            points = [(centre[0] + x * c - y * s, centre[1] + x * s + y * c) for x, y in corners]
+            self._pygame.draw.polygon(canvas, fill, points)
+        self._pygame.draw.polygon(canvas, _INK, points, 1)
 
     def _legend(
-        self, canvas: Any, task: Task, state: State, row: int, values: dict[str, np.ndarray], fastest: float
-    ) -> None:
+        self, canvas: Any, task: Task, state: State, row: int, values: dict[str, np.ndarray], fastest: float,
+        wider: float,
+    ) -> None:  # fmt: skip
         there = values["present"] > 0
         mean = float(values["speed"][there].mean()) if there.any() else 0.0
         seconds = float(state.step.expand(len(state.speed))[row]) * task.simulator.dt
-        text = f"{task.name}   t = {seconds:.1f} s   mean speed {mean:.1f} m/s"
+        crash = "   crash" if _crashed(values).any() else ""
+        text = f"{task.name}   t = {seconds:.1f} s   mean speed {mean:.1f} m/s{crash}"
         canvas.blit(self._font.render(text, True, _INK), (12, 10))
-        left, top, width = 12, 34, 120
+        left, top, width = 12, 36, 120
         for x in range(width):
             self._pygame.draw.line(canvas, colour(x / width * fastest, fastest), (left + x, top), (left + x, top + 8))
-        canvas.blit(self._font.render(f"0 to {fastest:.0f} m/s", True, _INK), (left + width + 8, top - 4))
+        self._pygame.draw.rect(canvas, _MARK, (left + width + 110, top - 1, 20, 10))
+        canvas.blit(self._small.render(f"0 to {fastest:.0f} m/s", True, _INK), (left + width + 8, top - 3))
+        told = "agent" + ("" if wider < 1.2 else f"      widths are drawn {wider:.0f} times as large")
+        canvas.blit(self._small.render(told, True, _INK), (left + width + 136, top - 3))
 
     def _display(self, canvas: Any) -> None:
         pygame = self._pygame

@@ -8,6 +8,7 @@ from matplotlib.patches import Polygon
 
 from idm_env.data.scenario import Agent, Scenario
 from idm_env.prediction.predict import Prediction
+from idm_env.reports.diagrams import less
 
 STOP, CAUTION = "#c1121f", "#e09f3e"
 LANE, OTHERS, OWN, FUTURE, TRUTH = "#cfcfcf", "#9a9a9a", "#111111", "#0b5fa5", "#d1495b"
@@ -61,8 +62,11 @@ def scene_picture(scenario: Scenario, prediction: Prediction) -> tuple[Figure, s
         axis.plot(*agent.position[later].T, "--", color=TRUTH, lw=1.8, zorder=5, label="what it did")
         axis.plot(*agent.position[later[-1]], "x", color=TRUTH, ms=7, mew=2, zorder=5)
     axis.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach), aspect="equal")
-    axis.set(xlabel="x (m)", ylabel="y (m)")
-    axis.ticklabel_format(useOffset=False)
+    for ticks, name, low in ((axis.xaxis, "x", middle[0] - reach), (axis.yaxis, "y", middle[1] - reach)):
+        first = 10.0 * np.ceil(0.1 * low)
+        along = np.arange(0.0, low + 2.0 * reach - first, 10.0 * np.ceil(reach / 30.0))
+        ticks.set_ticks(first + along, [f"{m:.0f}" for m in along])
+        ticks.set_label_text(f"{less(name, first, 'm')} (m)")
     axis.legend(loc="upper right", fontsize=8, framealpha=0.9)
     how = "on lanes" if prediction.source == "lane" else "off the lanes"
     return figure, f"{scenario.id}: {agent.kind} {agent.id}, predicted {how}"

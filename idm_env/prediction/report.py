@@ -17,21 +17,20 @@ def write(out: Path, report: dict[str, Any], pictures: Iterable[page.Block]) -> 
     """Write ``report.json`` and ``report.html``."""
     storage.write_json(out / "report.json", report)
     left_out = report["left_out"]
-    scored = f"{report['agents_with_known_future']} of them have a known future and are scored, at 2 Hz."
+    scored = f"Of {report['agents']} agents {report['agents_with_known_future']} have a known future and are scored."
     blocks = [
         page.lead(f"{scored} {report['account']}"),
+        page.gallery(pictures),
         page.note(
-            "minADE and minFDE are those of the best of up to six futures; an agent is missed where no future ends in "
-            "a box around the truth that grows with time and speed. mAP asks besides that confident futures be the "
-            "right ones. The other methods have one future each."
+            "Scored at 2 Hz. minADE and minFDE are those of the best of up to six futures; an agent is missed where no "
+            "future ends in a box around the truth that grows with time and speed. mAP asks besides that confident "
+            "futures be the right ones. The other methods have one future each."
         ),
         page.heading("All agents"),
         metrics(report["methods"]),
         page.note(_how(report)),
         *_groups("By kind", "kind", report["kinds"]),
         *_groups("By scene", "scene", report["scenes"]),
-        page.heading("From above"),
-        page.gallery(pictures),
         page.heading("Data"),
         page.text(report["account"]),
     ]
@@ -67,8 +66,7 @@ def _how(report: dict[str, Any]) -> str:
     few = (
         ""
         if whole
-        else f" They say nothing of how scenes differ, of which there are only {len(report['scenes'])}: another one "
-        "may lie outside."
+        else f" They say nothing of how scenes differ (there are {len(report['scenes'])}): another may lie outside."
     )
     return f"95 %: bootstrap intervals, {words}.{few} A click on a heading sorts."
 

@@ -195,10 +195,12 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
     coloured = None
     stride = _stride(drawn, MOST_DRAWN)
     for axes, panel in zip(grid, drawn, strict=False):
+        began = far_from_0(_range([line.time for line in panel.lines]))
+        first = 0.0 if panel.ring_length else far_from_0(_range([line.position for line in panel.lines]))
         for line in panel.lines:
             line = _thinned(line, stride)
             place = line.position if panel.ring_length is None else line.position % panel.ring_length
-            points = np.stack((line.time, place), axis=-1)
+            points = np.stack((line.time - began, place - first), axis=-1)
             segments: Any = np.stack((points[:-1], points[1:]), axis=1)
             whole = line.whole(panel.ring_length)
             if line.marked:
@@ -209,7 +211,8 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
             coloured = axes.add_collection(lines)
         axes.autoscale()
         axes.margins(0.01)
-        axes.set(xlabel="time (s)", ylabel=place_label(panel.ring_length))
+        place_name = f"{less('position', first, 'm')} (m)" if first else place_label(panel.ring_length)
+        axes.set(xlabel=f"{less('time', began, 's')} (s)", ylabel=place_name)
         if any(line.marked for line in panel.lines):
             axes.plot([], [], color=CONTROLLED, lw=3.0, label="controlled")
             axes.legend(loc="upper left", fontsize=8, framealpha=0.9)
@@ -241,6 +244,20 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     words = f"One line per vehicle, coloured by speed.{several}"
     thinned = f" Every {stride}th sample is drawn." if stride > 1 else ""
     page.write_page(path, title, [page.note(words + thinned), page.html(fragment)])
+
+
+def far_from_0(values: tuple[float, float]) -> float:
+    """Return what is subtracted of values between two: nothing, unless they lie far from 0 for the width they have."""
+    low, high = values
+    if not low > 2.0 * (high - low) and not high < -2.0 * (high - low):
+        return 0.0
+    unit = 10.0 ** np.floor(np.log10(high - low) - 1.0)
+    return float(np.floor(low / unit) * unit)
+
+
+def less(name: str, offset: float, unit: str) -> str:
+    """Return the name of an axis from which an offset is subtracted."""
+    return name if not offset else f"{name} {'−' if offset > 0 else '+'} {abs(offset):.12g} {unit}"
 
 
 def place_label(ring_length: float | None) -> str:

@@ -11,7 +11,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
-from idm_env.envs.render import colour, space_time
+from idm_env.envs.render import Viewer, colour, space_time
 from idm_env.reports.diagrams import lane_panels, panels, write_html
 from idm_env.simulator import Trajectory
 
@@ -175,3 +175,42 @@ def test_lanes_have_a_panel_each_and_changes_go_on_in_another():
     assert [(x.name, len(x.time), x.marked) for x in left.lines] == [("1", 12, True)]
     assert sorted((x.name, len(x.time)) for x in right.lines) == [("0", 5), ("0", 15), ("1", 9), ("2", 12)]
     assert right.lines[2].time[-1] == left.lines[0].time[0] == 9.0  # a change leaves no hole
+
+
+def test_a_road_is_drawn_to_scale_with_numbers_along_it():
+    """A vehicle of 5 m by 1.9 m has these sides in pixels of one scale, where the road is no longer than the view."""
+    env = gym.make("DiffIDM-v0", task="highway", vehicles=2, length=500.0, render_mode="rgb_array")
+    env.reset(seed=1)
+    picture = env.render()[64:].astype(int)
+    assert picture.shape[1] == 1000
+    frame = np.argwhere(np.abs(picture - BLUE).sum(-1) < 10)
+    height, width = np.ptp(frame, axis=0) + 1 - 6  # the frame is 3 pixels wide
+    length = float(env.unwrapped.state.length[0, env.unwrapped.task.agents[0]])
+    assert width / height == pytest.approx(length / 1.9, rel=0.2)
+    ink = (np.abs(picture - np.array([30, 32, 36])).sum(-1) < 10)[4 * 20 + 3 : 4 * 20 + 9]
+    assert ink.all(0).sum() in (8, 9)  # a tick every 20 m of the 170 m around the agent
+
+
+@pytest.mark.parametrize("task", ["ring", "follow"])
+def test_a_crash_is_marked_where_it_happens(task):
+    env = gym.make("DiffIDM-v0", task=task, render_mode="rgb_array", **({"warmup": 0} if task == "ring" else {}))
+    env.reset(seed=1)
+
+    viewer, state = Viewer("rgb_array", 10), env.unwrapped.state
+
+    def marked(state):
+        return int((viewer.show(env.unwrapped.task, state) == np.array([255, 210, 0])).all(-1).sum())
+
+    gap = state.gap.clone()
+    gap[0, env.unwrapped.task.agents[0]] = -0.1
+    assert marked(state) == 0 and 100 < marked(state._replace(gap=gap)) < 600
+
+
+def test_axes_begin_at_0_with_the_offset_in_the_label():
+    """A clock of seconds since 1970, and places far from an origin, would fill the axis with digits."""
+    table = pl.DataFrame(rows("a", 1, 2)).with_columns(pl.col("time_s") + 1113433186.0, pl.col("position_m") - 8420.0)
+    axes = space_time(table).axes[0]
+    assert axes.get_xlabel() == "time − 1113433186 s (s)" and axes.get_ylabel() == "position + 8420 m (m)"
+    assert -1.0 < axes.get_xlim()[0] <= 0.0 and axes.get_xlim()[1] < 3.0
+    near = space_time(pl.DataFrame(rows("a", 1, 2))).axes[0]
+    assert (near.get_xlabel(), near.get_ylabel()) == ("time (s)", "position (m)")
