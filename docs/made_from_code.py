@@ -25,13 +25,21 @@ MODULES = {
     "core": ("Simulate", ("simulator", "types", "parameters", "roads")),
     "effects": ("Effects", ("effects",)),
     "environments": ("Environments and tasks", ("envs.gym", "envs.vector", "envs.pettingzoo", "tasks", "metrics")),
-    "data": ("Read and generate data", ("data", "data.episode", "data.synthetic", "config")),
+    "data": ("Read and generate data", ("data", "data.episode", "data.synthetic", "model_file")),
     "fitting": ("Calibrate", ("fitting.fit", "fitting.job", "fitting.options")),
     "discovery": ("Find what a model lacks", ("discovery.discover", "discovery.sets", "drift.forecast")),
     "trajectories": ("Filter, reconstruct, predict", ("trajectories.files", "prediction.files")),
     "work": (
         "Long work, pictures and reports",
-        ("plot", "diagrams", "executor", "keep", "parts", "progress", "report"),
+        (
+            "reports.plot",
+            "reports.diagrams",
+            "reports.page",
+            "jobs.executor",
+            "jobs.storage",
+            "jobs.shards",
+            "jobs.progress",
+        ),
     ),
 }
 """Pages of the reference by job, those that everything else needs first."""

@@ -39,8 +39,9 @@ _LAZY = {
 }
 
 _MOVED = {
-    "config": "model_file", "diagrams": "reports.diagrams", "executor": "jobs.executor", "plot": "reports.plot",
-    "population": "multilane.demand", "trust": "jobs.trust",
+    "config": "model_file", "diagrams": "reports.diagrams", "executor": "jobs.executor", "keep": "jobs.storage",
+    "parts": "jobs.shards", "plot": "reports.plot", "population": "multilane.demand", "progress": "jobs.progress",
+    "report": "reports.page", "trust": "jobs.trust",
 }  # fmt: skip
 """Modules that documents of 0.1 named, and where they are now; the old names work for one version."""
 
