@@ -1,11 +1,10 @@
-"""The tidy trajectory table: its columns, its constants and the pandera check of both.
+"""The tidy trajectory table: its columns, its constants and the check of both.
 
 One row per vehicle and time. Positions are front bumpers along the lane, gaps are bumper to bumper, units are SI.
 """
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import polars as pl
@@ -44,45 +43,41 @@ SHORTEST_TRACK_S = 5.0
 """Stretches shorter than this say nothing about a driver; they are left out (s)."""
 
 
-@cache
-def _schema() -> Any:
-    import pandera.polars as pa  # a second, which a refusal does not wait for
-
-    return pa.DataFrameSchema(
-        {
-            "run_id": pa.Column(pl.String),
-            "vehicle_id": pa.Column(pl.String),
-            "leader_id": pa.Column(pl.String, nullable=True),
-            "lane": pa.Column(pl.Int64, nullable=True),
-            "time_s": pa.Column(pl.Float64),
-            "position_m": pa.Column(pl.Float64),
-            "speed_mps": pa.Column(pl.Float64, pa.Check.in_range(LOWEST_SPEED_MPS, HIGHEST_SPEED_MPS)),
-            "length_m": pa.Column(pl.Float64, pa.Check.in_range(0.0, LONGEST_LENGTH_M, include_min=False)),
-            "gap_m": pa.Column(pl.Float64, nullable=True),
-            "gap_measured": pa.Column(pl.Boolean),
-        },
-        strict=False,
-    )
+_ANY, _FINITE = (pl.lit(True), ""), (lambda name: (pl.col(name).is_finite(), "finite"))
+COLUMNS: dict[str, tuple[Any, bool, pl.Expr, str]] = {
+    "run_id": (pl.String, True, *_ANY),
+    "vehicle_id": (pl.String, True, *_ANY),
+    "leader_id": (pl.String, False, *_ANY),
+    "lane": (pl.Int64, False, *_ANY),
+    "time_s": (pl.Float64, True, *_FINITE("time_s")),
+    "position_m": (pl.Float64, True, *_FINITE("position_m")),
+    "speed_mps": (
+        pl.Float64, True, pl.col("speed_mps").is_between(LOWEST_SPEED_MPS, HIGHEST_SPEED_MPS),
+        f"{LOWEST_SPEED_MPS:g} to {HIGHEST_SPEED_MPS:g} m/s",
+    ),
+    "length_m": (
+        pl.Float64, True, pl.col("length_m").is_between(0.0, LONGEST_LENGTH_M, closed="right"),
+        f"above 0, up to {LONGEST_LENGTH_M:g} m",
+    ),
+    "gap_m": (pl.Float64, False, *_FINITE("gap_m")),
+    "gap_measured": (pl.Boolean, True, *_ANY),
+}  # fmt: skip
+"""Columns of the tidy table: type, whether every row has a value, what holds of every value, and how that is said."""
 
 
 def check(table: pl.DataFrame, source: str) -> pl.DataFrame:
     """Return `table` unchanged if it obeys the schema of tidy trajectories.
 
     Raises:
-        DataError: If a column is missing, has another type, or breaks a bound; names the column and the rule.
+        DataError: If a column is missing, has another type, lacks a value or breaks a bound.
     """
-    from pandera.errors import SchemaError, SchemaErrors
-
-    for name in _schema().columns:
+    for name, (kind, always, rule, said) in COLUMNS.items():
         if name not in table.columns:
             raise DataError(f"{source}: column {name!r} of the tidy table is missing.")
-    try:
-        _schema().validate(table)
-    except (SchemaError, SchemaErrors) as error:
-        column = getattr(getattr(error, "schema", None), "name", None)
-        rule = getattr(error, "check", None)
-        raise DataError(f"{source}: column {column!r} breaks the rule {rule} of the tidy table.") from None
-    for name in ("time_s", "position_m", "speed_mps", "length_m", "gap_m"):
-        if not table[name].is_finite().fill_null(True).all():
-            raise DataError(f"{source}: column {name!r} holds values that are not finite.")
+        if table.schema[name] != kind:
+            raise DataError(f"{source}: column {name!r} is {table.schema[name]} and must be {kind} in the tidy table.")
+        if always and table[name].null_count():
+            raise DataError(f"{source}: column {name!r} of the tidy table lacks a value.")
+        if not table.select(rule.all()).item():
+            raise DataError(f"{source}: column {name!r} of the tidy table holds values that are not {said}.")
     return table

@@ -163,11 +163,26 @@ def test_types_that_no_rule_foresaw(tmp_path: Path) -> None:
         load(write(table, tmp_path / "t.parquet"))
 
 
-def test_the_schema_names_column_and_rule() -> None:
+@pytest.mark.parametrize(("name", "value", "told"), [
+    ("speed_mps", 200.0, "-1 to 70 m/s"), ("speed_mps", float("nan"), "-1 to 70 m/s"),
+    ("length_m", 0.0, "above 0, up to 30 m"), ("length_m", float("nan"), "above 0, up to 30 m"),
+    ("gap_m", float("inf"), "finite"), ("time_s", float("nan"), "finite"), ("lane", 1.5, "must be Int64"),
+    ("position_m", "far", "must be Float64"), ("vehicle_id", pl.lit(None, pl.String), "lacks a value"),
+])  # fmt: skip
+def test_the_schema_names_column_and_rule(name: str, value: object, told: str) -> None:
     table = Trajectories.from_frame(platoon()).table
-    for spoilt in (table.with_columns(speed_mps=200.0), table.drop("lane"), table.with_columns(gap_m=float("inf"))):
-        with pytest.raises(DataError, match=r"column '(speed_mps|lane|gap_m)'"):
-            schema.check(spoilt, "table")
+    given = value if isinstance(value, pl.Expr) else pl.lit(value)
+    with pytest.raises(DataError, match=rf"^table: column '{name}' .*{told}"):
+        schema.check(table.with_columns(given.alias(name)), "table")
+
+
+def test_the_schema_lets_pass_what_the_tidy_table_may_lack_and_no_missing_column() -> None:
+    table = Trajectories.from_frame(platoon()).table
+    empty = table.with_columns(pl.lit(None, pl.Int64).alias("lane"), pl.lit(None, pl.Float64).alias("gap_m"))
+    assert schema.check(empty, "table") is empty
+    for name in schema.COLUMNS:
+        with pytest.raises(DataError, match=rf"column '{name}' of the tidy table is missing"):
+            schema.check(table.drop(name), "table")
 
 
 @quick
