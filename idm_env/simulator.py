@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from idm_env import backends, compat, parameters
+from idm_env.multilane import before
 from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead, normals
 from idm_env.types import Inputs, Params, State, mapped
 
@@ -34,12 +35,20 @@ def _kept(state: State) -> Trajectory:
 class Simulator(Stepping):
     """A road, a tuple of effects and a time step (s): the static half of a traffic model.
 
-    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps; ``Stepping``
-    says more. ``rollout`` repeats it.
+    ``Stepping`` says what happens in one step. ``rollout`` repeats it.
     """
 
     kernels: ClassVar[bool] = True
     """Whether a kernel may stand in for repeated steps."""
+
+    def step(self, state: State, inputs: Inputs, params: Params) -> State:
+        """Return the state Δt later. Pure: the same arguments give the same result, with or without a graph.
+
+        Where a road has several lanes, vehicles enter, leave and change lanes first (``multilane.before``); then all
+        drive on (``Stepping.step``). ``inputs`` maps effect names to what they take at this step; ``params`` maps
+        effect and parameter names to tensors that broadcast against ``(..., vehicles)``.
+        """
+        return super().step(before(self, state, inputs, params), inputs, params)
 
     def compile(self, *, backend: str = "inductor", dynamic: bool | None = False) -> Simulator:
         """Return this simulator with a compiled step; where nothing can compile it, with one warning, as it is."""
@@ -154,7 +163,7 @@ class Simulator(Stepping):
             copied, given, values = (
                 mapped(lambda x: x.detach().clone(), each) for each in (state, self.slices(inputs, 1)[0], numbers)
             )
-            Stepping.step(self, copied, given, values)  # type: ignore[arg-type]
+            Simulator.step(self, copied, given, values)  # type: ignore[arg-type]
         self.__dict__["_tried"] = True
 
     def advance(self, state: State, inputs: Inputs, params: Params) -> State:

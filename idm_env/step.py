@@ -20,9 +20,7 @@ from idm_env import parameters
 from idm_env.delay_buffer import PAST, History
 from idm_env.effects.base import HOOKS, CarFollowing, Effect, Hook
 from idm_env.effects.limits import unspoken
-from idm_env.multilane import incentives
-from idm_env.multilane.demand import turnover
-from idm_env.multilane.lane_change import decided
+from idm_env.roads import merging
 from idm_env.roads.base import Road
 from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, PastScenes, Scene, State
 
@@ -34,8 +32,8 @@ S = TypeVar("S", bound="Stepping")
 class Stepping:
     """A road, a tuple of effects and a time step (s): all of a simulator that is one step.
 
-    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps. Where vehicles
-    enter or lanes are changed, that comes first (``multilane/``).
+    One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps. It knows
+    one lane's neighbours: what several lanes need comes before it (``multilane.before``, in ``Simulator.step``).
 
     ``integration`` is ``"ballistic"`` (``x += v Δt + a Δt²/2``, and a car that would reverse stops inside the step) or
     ``"euler"`` (the paper's: ``x += v Δt`` with the old speed). ``"midpoint"`` is ballistic with speeds and gaps of the
@@ -251,7 +249,7 @@ class Stepping:
                 memory[effect.name] = normals(f"{effect.name} at the start", seed or 0, held) if drawn else held
         if self.looks_back:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
-        return {**memory, **incentives.nobody(state.speed)} if self.sees_mergers else memory
+        return {**memory, **merging.nobody(state.speed)} if self.sees_mergers else memory
 
     def scene(self, state: State, inputs: Inputs) -> Scene:
         """Return what this step looks like to every vehicle."""
@@ -273,7 +271,7 @@ class Stepping:
             inputs=inputs,
             memory=state.memory,
             history=self._history(state),
-            merger=incentives.merger(state.memory, state.speed) if self.sees_mergers else None,
+            merger=merging.merger(state.memory, state.speed) if self.sees_mergers else None,
         )
         return half_ahead(scene) if self.integration == "midpoint" else scene
 
@@ -321,15 +319,11 @@ class Stepping:
         return self._respond(state, inputs, params)[0]
 
     def step(self, state: State, inputs: Inputs, params: Params) -> State:
-        """Return the state Δt later. Pure: the same arguments give the same result, with or without a graph.
+        """Return the state Δt later, nobody changing lanes. Pure: the same arguments give the same result.
 
         ``inputs`` maps effect names to what they take at this step; ``params`` maps effect and parameter names to
         tensors that broadcast against ``(..., vehicles)``.
         """
-        if state.links is not None and state.present is not None:
-            state = turnover(self, state, params)
-        if state.links is not None and self.changes:
-            state = decided(self, state, inputs, params)
         accel, scene, driver = self._respond(state, inputs, params)
         displacement, speed, accel = INTEGRATORS[self.integration](state.speed, accel, self.dt)
         if state.present is not None:  # whoever is not there stands still, whatever he wants or is commanded
@@ -345,7 +339,7 @@ class Stepping:
         }
         if scene.history is not None:
             memory[PAST] = scene.history.pushed(scene)
-        memory |= incentives.driven_on(state.memory, motion.displacement, self.dt)
+        memory |= merging.driven_on(state.memory, motion.displacement, self.dt)
         gap, links = self._gaps(state, motion), state.links
         if motion.lane is not None:
             gap, links = self.road.view(state).placed(state, motion, gap)

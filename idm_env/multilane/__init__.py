@@ -1,1 +1,20 @@
-"""What several lanes need of a step: trips that enter and leave, incentives, and changes of lane."""
+"""What several lanes need of a step, as functions of a state that run before it: trips, incentives, lane changes."""
+
+from __future__ import annotations
+
+from idm_env.multilane.demand import turnover
+from idm_env.multilane.lane_change import decided
+from idm_env.step import Stepping
+from idm_env.types import Inputs, Params, State
+
+
+def before(stepping: Stepping, state: State, inputs: Inputs, params: Params) -> State:
+    """Return the state after entries, exits and lane changes that are due at this step; on one lane, the same state."""
+    if state.links is None:
+        return state
+    if state.present is not None:
+        state = turnover(stepping, state, params)
+    return decided(stepping, state, inputs, params) if stepping.changes else state
+
+
+__all__ = ["before"]

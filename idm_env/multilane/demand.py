@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from idm_env.roads.lanes import Lanes
 from idm_env.roads.linked import Linked, standing, still_changing, without_absent
+from idm_env.step import Stepping
 from idm_env.types import FAR, Moving, Params, State, Trips
-
-if TYPE_CHECKING:
-    from idm_env.step import Stepping
 
 
 class Counts(NamedTuple):

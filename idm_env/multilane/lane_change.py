@@ -5,17 +5,13 @@ Choices are frozen: gradients flow through gaps alone, and are exact where no ch
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
 from idm_env.multilane.incentives import beside, seen_merging, wished
 from idm_env.roads.adjacent import preferred
 from idm_env.roads.linked import Linked, still_changing, without_absent
+from idm_env.step import Stepping
 from idm_env.types import Inputs, Params, State
-
-if TYPE_CHECKING:
-    from idm_env.step import Stepping
 
 
 def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) -> State:

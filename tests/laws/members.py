@@ -7,8 +7,8 @@ from torch import Tensor
 
 from idm_env.effects import ALL, IDM, Brakes, CarFollowing, Curve, DriverCurve, Effect, Grade, PerceptionNoise, Wander
 from idm_env.effects.free import FEATURES
-from idm_env.multilane.incentives import MERGER_GAP, MERGER_SPEED
 from idm_env.roads import Lane, Ring, Road
+from idm_env.roads.merging import MERGER_GAP, MERGER_SPEED
 from idm_env.simulator import Simulator
 from idm_env.types import FAR, Adjacent, Command, Imagined, Params, Record, State
 

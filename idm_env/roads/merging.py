@@ -1,0 +1,41 @@
+"""Whoever signals from a lane beside: what drivers remember of him from one decision about lanes to the next."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from idm_env.types import FAR, Memory, Neighbour
+
+MERGER_GAP, MERGER_SPEED = "merger_gap", "merger_speed"
+"""Memories of whoever drivers see signalling beside them: the gap to him (m) and his speed (m/s), as they last decided.
+
+Until they decide again he is taken to drive on at that speed.
+"""
+
+
+def nobody(like: Tensor) -> dict[str, Tensor]:
+    """Return the memories of drivers beside whom nobody signals."""
+    return {MERGER_GAP: torch.full_like(like, FAR), MERGER_SPEED: torch.zeros_like(like)}
+
+
+def merger(memory: Memory, speed: Tensor) -> Neighbour:
+    """Return whoever is remembered to signal, as a leader would be seen."""
+    if MERGER_GAP not in memory:
+        none = torch.zeros_like(speed)
+        return Neighbour(none + FAR, speed, none, none)
+    gap = memory[MERGER_GAP]
+    some = gap < 0.5 * FAR
+    none = torch.zeros_like(gap)
+    return Neighbour(gap, torch.where(some, memory[MERGER_SPEED], speed), none, torch.where(some, none + 1.0, none))
+
+
+def driven_on(memory: Memory, displacement: Tensor, dt: float) -> dict[str, Tensor]:
+    """Return the memories of whoever signals a step later, if there are any."""
+    if MERGER_GAP not in memory:
+        return {}
+    gap, speed = memory[MERGER_GAP], memory[MERGER_SPEED]
+    return {MERGER_GAP: torch.where(gap < 0.5 * FAR, gap + speed * dt - displacement, gap), MERGER_SPEED: speed}
+
+
+__all__ = ["MERGER_GAP", "MERGER_SPEED", "driven_on", "merger", "nobody"]
