@@ -290,7 +290,8 @@ def test_a_small_file_cannot_take_time_and_memory(data: Path, tmp_path: Path) ->
     path = tmp_path / "model.yaml"
     path.write_text(HOSTILE["laughs"])
     code = (
-        "import resource, sys; from idm_env import cli; from idm_env.fitting import job; sys.argv[0] = 'idm-env'\n"
+        "import resource, sys; from idm_env.cli import commands as cli\n"
+        "from idm_env.fitting import job; sys.argv[0] = 'idm-env'\n"
         "def used(): usage = resource.getrusage(resource.RUSAGE_SELF); return usage.ru_utime, usage.ru_maxrss / 1e3\n"
         "before = used(); resource.setrlimit(resource.RLIMIT_CPU, (int(before[0]) + 30, int(before[0]) + 30))\n"
         "try: cli.run()\nfinally: print(used()[1] - before[1])"
@@ -384,7 +385,7 @@ def test_any_bytes_as_a_scenario_are_refused_in_one_line(tmp_path: Path, content
 def test_a_full_disk_is_one_line(data: Path, tmp_path: Path, command: str) -> None:
     """Files cannot grow beyond a limit, which to a program is a full disk."""
     code = (
-        "import resource, sys; from idm_env import cli\n"
+        "import resource, sys; from idm_env.cli import commands as cli\n"
         "cli.app([*sys.argv[1:-1], sys.argv[-1] + '-before'], standalone_mode=False)  # compiled loops are files too\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1200, 1200)); sys.argv[0] = 'idm-env'; cli.run()"
     )
