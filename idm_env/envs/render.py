@@ -202,8 +202,8 @@ class Viewer:
             centre, angle = place(position - 0.5 * length)
             size = length * pixels, VEHICLE_M / LANE_M * lane
             self._vehicle(canvas, centre, angle + 0.5 * math.pi, size, values["speed"][i], fastest, i in task.agents)
-        for i in np.flatnonzero(crashed):
-            self._crash(canvas, place(values["position"][i])[0])
+        for position in values["position"][crashed]:
+            self._crash(canvas, place(position)[0])
 
     def _lane(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float, view: _View) -> None:
         draw = self._pygame.draw
