@@ -1,16 +1,19 @@
 """Environment steps per second beside HighwayEnv, and what warm-up costs.
 
 CPU time of one thread, everything in one run, so that ratios hold wherever it runs: ratios are the figures to compare,
-rates depend on the machine. Run: python benchmarks/environments.py [--quick]
+rates depend on the machine. Run: python benchmarks/environments.py [--quick]. With --returns it writes what episodes of
+every task return under no command, IDM, the best of 24 rules and an agent: 5 seeds.
 """
 
 from __future__ import annotations
 
 import argparse
 import statistics
+import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -19,6 +22,7 @@ import torch
 
 import idm_env  # noqa: F401
 from idm_env.effects import CANDIDATES
+from idm_env.tasks import TASKS
 
 warnings.filterwarnings("ignore")
 
@@ -186,13 +190,83 @@ def warmup(count: int) -> None:
     print(f"  making the pool once (256 worlds, ms in all) {1e3 * (time.process_time() - begin):12.1f}")
 
 
+RULES, CHOSEN_ON, JUDGED_ON = 24, range(100, 105), range(5)
+"""Rules that are tried, seeds on which the best is chosen, and seeds of what is reported."""
+
+
+def returns(tasks: list[str], out: Path) -> None:
+    """Write the returns of an episode of every task, a row each: zero action, IDM, best rule, best agent."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+    import train_apg
+
+    rows = [line.split(",") for line in out.read_text().splitlines()[1:]] if out.exists() else []
+    for task in tasks:
+        begin = time.process_time()
+        env = gym.make("DiffIDM-v0", task=task)
+        names, limit = env.unwrapped.task.features.names, env.unwrapped.task.command_limits[1]
+        shape = env.action_space.shape
+        found = {
+            "zero action": train_apg.returns(task, lambda seen, shape=shape: torch.zeros(len(seen), *shape), JUDGED_ON),
+            "IDM": train_apg.returns(task, None, JUDGED_ON),
+        }
+        # v0 (m/s), T (s), s0 (m), a, b (m/s²) and a share, drawn evenly in their logarithms.
+        low, high = torch.tensor([(2.5, 0.5, 1.0, 0.3, 0.5, 0.02), (35.0, 3.0, 6.0, 2.0, 4.0, 1.0)]).log()
+        drawn = (low + (high - low) * torch.rand(RULES, 6, generator=torch.Generator().manual_seed(0))).exp()
+        each = drawn.repeat_interleave(len(CHOSEN_ON), 0)
+        tried = train_apg.returns(task, rule(each, names, limit), [*CHOSEN_ON] * RULES).view(RULES, -1).mean(1)
+        best = drawn[int(tried.argmax())]
+        found["best rule"] = train_apg.returns(task, rule(best.repeat(len(JUDGED_ON), 1), names, limit), JUDGED_ON)
+        if task in train_apg.RECIPES:
+            policy = train_apg.trained(task, shown=lambda words: None)
+            found["best agent"] = train_apg.returns(task, policy, JUDGED_ON)
+        rows = [row for row in rows if row[0] != task]
+        for name, each in found.items():
+            rows.append([task, name, *(f"{x:.1f}" for x in (each.mean(), each.min(), each.max()))])
+        print(f"{task}: {time.process_time() - begin:.0f} CPU s", *rows[-len(found) :], sep="\n  ", flush=True)
+        head = "task,policy,mean,lowest,highest"
+        out.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
+
+
+def rule(values: torch.Tensor, names: Sequence[str], limit: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return actions of IDM's formula with a row of values per environment, times a share, from raw observations."""
+    v0, headway, s0, a, b, share = values.unbind(-1)
+    at = {name: i for i, name in enumerate(names)}
+
+    def act(seen: torch.Tensor) -> torch.Tensor:
+        seen = seen.reshape(len(values), -1)
+        speed = seen[:, at["speed"]]
+        if "ahead_0" in at:  # the nearest ahead on the own lane
+            count = sum(name.startswith("ahead_") for name in names)
+            column = {k: torch.stack([seen[:, at[f"{k}_{i}"]] for i in range(count)], -1) for k in NEIGHBOUR}
+            mine = (column["there"] > 0.5) & (column["left"].abs() < 0.5) & (column["ahead"] > 0.0)
+            far = torch.where(mine, column["ahead"], 1e4)
+            distance, which = far.min(-1)
+            gap, closing = distance - 5.0, -column["speed"].gather(-1, which.unsqueeze(-1)).squeeze(-1)
+            closing = torch.where(distance < 1e4, closing, 0.0)
+        else:
+            gap = seen[:, at["gap"]] if "gap" in at else seen[:, at["headway"]] - 5.0
+            closing = speed - seen[:, at["lead_speed"]] if "lead_speed" in at else -seen[:, at["relative_speed"]]
+        wish = s0 + (speed * headway + speed * closing / (2.0 * (a * b).sqrt())).clamp_min(0.0)
+        accel = share * a * (1.0 - (speed / v0) ** 4 - (wish / gap.clamp_min(0.5)) ** 2)
+        return (accel / limit).clamp(-1.0, 1.0).unsqueeze(-1)
+
+    return act
+
+
+NEIGHBOUR = ("there", "ahead", "left", "speed")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="short measurements")
     parser.add_argument("--envs", type=int, default=4096)
     parser.add_argument("--gradients", action="store_true", help="only steps with their gradients")
+    parser.add_argument("--returns", nargs="*", metavar="TASK", help="returns of tasks (all), into docs/returns.csv")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if options.returns is not None:
+        returns(options.returns or list(TASKS), Path(__file__).resolve().parents[1] / "docs" / "returns.csv")
+        return
     gradients(3 if options.quick else 7)
     if options.gradients:
         return

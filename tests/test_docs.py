@@ -24,6 +24,7 @@ from idm_env import IDM, Brakes, Lane, Replay, Simulator
 from idm_env.data import synthetic
 from idm_env.effects import ALL
 from idm_env.model_file import Model, save_model
+from idm_env.tasks import TASKS
 from idm_env.types import Record
 from tests.prediction import scenes
 
@@ -195,7 +196,9 @@ def test_the_first_hour_runs(folder: Path, monkeypatch: pytest.MonkeyPatch, caps
             assert cell["outputs"] == [] and cell["execution_count"] is None
             exec(compile("".join(cell["source"]), f"cell {number}", "exec"), space.__dict__)
     told = capsys.readouterr().out
-    assert "verdict: named, delay" in told and "d(return)/d(gain)" in told
+    assert "verdict: named, delay" in told
+    human, agent = map(int, re.findall(r"return of an episode: human (\d+), agent (\d+)", told)[0])
+    assert agent > human
 
 
 def test_blocks_are_found_and_markers_give_a_reason() -> None:
@@ -246,3 +249,13 @@ def test_every_document_has_its_place_on_the_site() -> None:
     listed = {line for tree in re.findall(r"```\{toctree\}(.*?)```", text, re.DOTALL) for line in tree.split()}
     pages = {p.relative_to(ROOT / "docs").with_suffix("").as_posix() for p in DOCUMENTS if "docs" in p.parts}
     assert pages - {"index"} <= listed
+
+
+def test_every_task_has_its_returns() -> None:
+    """Of no command, IDM and a rule, and where there is a recipe of an agent, who does at least as well as drivers."""
+    lines = (ROOT / "docs" / "returns.csv").read_text(encoding="utf-8").splitlines()
+    rows = {(task, policy): float(mean) for task, policy, mean, *_ in (line.split(",") for line in lines[1:])}
+    assert {task for task, _ in rows} == set(TASKS)
+    for task in TASKS:
+        assert {policy for name, policy in rows if name == task} >= {"zero action", "IDM", "best rule"}
+    assert all(rows[task, "best agent"] > rows[task, "IDM"] for task in ("ring", "follow"))

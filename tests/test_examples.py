@@ -13,6 +13,7 @@ import pytest
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
 NEEDS = {
     "train_rllib": {"tree": "RLlib pins another gymnasium and has an environment of its own: make rllib"},
+    "export_minari": {"minari": "minari is not installed (pip install 'minari[create,hdf5]')"},
     "tune_an_agent": {"ray": "ray is not installed (pip install 'idm-env[ray]')"},
 }
 """Modules without which an example is left out, and what to do."""
