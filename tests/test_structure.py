@@ -276,6 +276,30 @@ def test_a_path_is_never_taken_for_a_pattern(path: Path) -> None:
             assert told.get("glob") == "False", f"line {node.lineno} without glob=False"
 
 
+def named_in(cls: type) -> set[str]:
+    """Return the files of the package, its own left out, that name a class."""
+    own = Path(sys.modules[cls.__module__].__file__ or "")
+    return {
+        str(path.relative_to(PACKAGE))
+        for path in FILES
+        if path != own and re.search(rf"\b{cls.__name__}\b", path.read_text()) and cls.__name__ in words_of(path)
+    }
+
+
+def test_what_is_added_to_the_package_is_named_in_few_of_its_files() -> None:
+    """An effect in one, a task in two: its class where tasks are listed, its name where ids are registered."""
+    from idm_env.effects import ALL, CANDIDATES
+    from idm_env.tasks import TASKS
+
+    for name in CANDIDATES:
+        assert named_in(ALL[name]) == {"effects/__init__.py"}, name
+    assert {*TASKS} == {*idm_env._TASKS}
+    for task in TASKS.values():
+        heirs = {str(Path(sys.modules[cls.__module__].__file__ or "").relative_to(PACKAGE)) for cls in TASKS.values()
+                 if issubclass(cls, task)}  # fmt: skip
+        assert named_in(task) - heirs == {"tasks/__init__.py"}, task
+
+
 STUDIES = sorted(p for p in (ROOT / "studies").iterdir() if p.is_dir())
 
 
