@@ -113,7 +113,7 @@ def test_workers_have_one_thread_and_are_other_processes(tmp_path: Path) -> None
 def test_processes_end_with_whoever_asked_for_them(tmp_path: Path) -> None:
     """Also where that was killed: no orphan goes on."""
     code = (
-        "from pathlib import Path; from idm_env import executor; from tests.test_executor import sleep, Part\n"
+        "from pathlib import Path; from idm_env.jobs import executor; from tests.test_executor import sleep, Part\n"
         f"if __name__ == '__main__':\n    with executor.opened('processes', 1) as run:\n"
         f"        list(run.map(sleep, [Part(0, Path({str(tmp_path)!r})), Part(1, Path({str(tmp_path)!r}))]))\n"
     )

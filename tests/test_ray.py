@@ -90,7 +90,7 @@ def node_and_wait(part: Part, on_progress: OnProgress) -> str:
 def test_a_cluster_of_this_machine_is_heard_by_nobody_else(tmp_path: Path) -> None:
     """Whatever of it listens does so on 127.0.0.1, and asks for a token."""
     code = (
-        "import os, sys; from pathlib import Path; from idm_env import executor\n"
+        "import os, sys; from pathlib import Path; from idm_env.jobs import executor\n"
         "from tests.test_executor import Part, square\n"
         "if sys.argv[2] == 'imported': import ray\n"
         "with executor.opened('ray', 1) as run:\n"

@@ -160,7 +160,7 @@ for name in open("modules.txt").read().split():
     except ImportError as error:
         print(name, error, sep="\\t")
 """
-OF_EXTRAS = {"cli", "data", "discovery", "drift", "envs", "fitting", "kernels", "parts", "prediction", "trajectories"}
+OF_EXTRAS = {"cli", "data", "discovery", "drift", "envs", "fitting", "jobs", "kernels", "prediction", "trajectories"}
 """Parts of the package of which some module needs an extra (of ``envs``: Stable-Baselines3's face)."""
 
 STEPPING = """
