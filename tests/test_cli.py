@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import json
 import os
 import signal
@@ -15,6 +17,8 @@ import numpy as np
 import polars as pl
 import pytest
 
+from idm_env.cli.commands import app
+from idm_env.cli.options import FileOptions, JobOptions
 from idm_env.data import synthetic
 from idm_env.jobs import storage
 from tests.commands import spawned, typed
@@ -72,6 +76,20 @@ def test_bad_input_is_one_line_and_exit_code_1(frame: pl.DataFrame, tmp_path: Pa
     assert len(lines) == 1 and lines[0].startswith("error: ")
     assert any(word in lines[0] for word in words.split("|")), lines[0]
     assert not (tmp_path / "out" / "report.json").exists()
+
+
+def test_options_that_go_together_are_in_every_command_of_their_kind() -> None:
+    """Work that can be taken up again can be done by others, and a file that is cut by rows is read in any layout."""
+    commands = {c.name or c.callback.__name__: set(inspect.signature(c.callback).parameters)
+                for c in app.registered_commands if c.callback}  # fmt: skip
+    job = {field.name for field in dataclasses.fields(JobOptions)}
+    file = {field.name for field in dataclasses.fields(FileOptions)}
+    assert (
+        {name for name, options in commands.items() if options & job}
+        == {name for name, options in commands.items() if job <= options}
+        == {"fit", "explain", "filter", "reconstruct", "predict"}
+    )
+    assert {name for name, options in commands.items() if file <= options} == {"fit", "explain", "simulate", "drift"}
 
 
 def test_bad_paths_and_options(frame: pl.DataFrame, tmp_path: Path) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
-import math
 import os
 import signal
 import sys
@@ -14,8 +14,31 @@ from typing import Annotated, Any, NoReturn
 import idm_env
 from idm_env import validation
 from idm_env.cli import refusals
+from idm_env.cli.options import (
+    Base,
+    Columns,
+    Corrected,
+    Data,
+    DataOrFolder,
+    FileOptions,
+    FixedParameters,
+    JobOptions,
+    Layout,
+    MaxGap,
+    MinSeconds,
+    Out,
+    Recipe,
+    RingLength,
+    Seed,
+    Step,
+    Trust,
+    Where,
+    Window,
+    ranged,
+    spread,
+)  # fmt: skip
 from idm_env.extras import needed
-from idm_env.jobs import storage, trust
+from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, shown
 
 with needed("the command line"):
@@ -67,77 +90,6 @@ def _options(
     pass
 
 
-def _ranged(*names: str, help: str, low: float, high: float, unit: str = "") -> Any:
-    """Return an option whose number must lie in ``[low, high]``: all flags' numbers are checked here."""
-
-    def check(param: typer.CallbackParam, value: float | None) -> float | None:
-        if value is not None:
-            validation.within(param.opts[0], value, low, high, unit)
-        return value
-
-    return typer.Option(*names, help=help, callback=check)
-
-
-Data = Annotated[Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.")]
-DataOrFolder = Annotated[
-    Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.")
-]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if missing.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
-Seed = Annotated[int, _ranged(help="Seed of everything random.", low=0, high=1e9)]
-RingLength = Annotated[
-    float | None, _ranged(help="Circumference (m), if the traffic runs on a ring.", low=1.0, high=1e6, unit="m")
-]
-Place = Annotated[str | None, typer.Option(help="Column that names places, such as track_s_m on a lap.")]
-Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim, openacc, ultra_av, highd, exid, pneuma or i24.")]
-Columns = Annotated[
-    str | None, typer.Option(help="Your names and units: time_s=t,vehicle_id=car,position_m=x[ft],speed_mps=v[km/h].")
-]
-MaxGap = Annotated[
-    float,
-    _ranged(help="Gaps above this (m) mean a lost leader and are left out.", low=0.1, high=math.inf, unit="m"),
-]
-MinSeconds = Annotated[
-    float, _ranged(help="Shorter stretches behind one leader are left out (s).", low=0.0, high=1e6, unit="s")
-]
-Where = Annotated[
-    list[str] | None, typer.Option(help='Only runs or drivers with "column=value"; given twice, both must hold.')
-]
-Window = Annotated[
-    float | None, _ranged(help="Cut longer stretches into windows of so many seconds.", low=1.0, high=1e6, unit="s")
-]
-Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
-Base = Annotated[
-    str | None,
-    typer.Option(
-        help="Car-following law: idm (the default), idm_plus, iidm, fvdm, gipps, constant_time_gap, my_file.py:MyLaw."
-    ),
-]
-
-
-def _trust(given: bool) -> None:
-    if given:
-        trust.always()
-
-
-Trust = Annotated[
-    bool, typer.Option("--trust", callback=_trust, help="Run Python code that YAML files name, as my_file.py:MyEffect.")
-]
-Step = Annotated[
-    float | None, _ranged("--dt", help="Use every n-th sample, to this step (s).", low=0.001, high=100.0, unit="s")
-]
-
-Workers = Annotated[
-    str, typer.Option("--executor", help="Where parts of the work run: serial, processes or ray. Results are the same.")
-]
-Jobs = Annotated[
-    int | None, _ranged(help="Parts that run at a time, one thread each; default: one per processor.", low=1, high=1e5)
-]
-RayAddress = Annotated[
-    str | None, typer.Option(help="Address of a Ray cluster, host:port or auto; default: Ray on this machine.")
-]
-
-
 _stopped: list[int] = []
 """Signals that have ended the work."""
 
@@ -169,6 +121,7 @@ def _show(title: str, rows: list[dict[str, Any]]) -> None:
 @app.command()
 def fit(
     context: typer.Context,
+    *,
     data: DataOrFolder,
     out: Out = Path("out/fit"),
     by: Annotated[str, typer.Option(help="driver, all, or a column such as vehicle_name.")] = "driver",
@@ -178,26 +131,19 @@ def fit(
     loss: Annotated[str, typer.Option(help="rmse (mean over episodes) or mse (all samples alike).")] = "rmse",
     method: Annotated[str, typer.Option(help="lm (Levenberg-Marquardt) or adam (as in the paper).")] = "lm",
     integration: Annotated[str, typer.Option(help="ballistic, or euler as in the paper.")] = "ballistic",
-    starts: Annotated[int, _ranged(help="Starts per group.", low=1, high=1000)] = 4,
+    starts: Annotated[int, ranged(help="Starts per group.", low=1, high=1000)] = 4,
     substeps: Annotated[
-        int | None, _ranged(help="Simulated steps per sample; default: steps of 25 ms.", low=1, high=1000)
+        int | None, ranged(help="Simulated steps per sample; default: steps of 25 ms.", low=1, high=1000)
     ] = None,
     model: Corrected = None,
     base: Base = None,
     seed: Seed = 0,
-    ring_length: RingLength = None,
-    place: Place = None,
-    layout: Layout = "auto",
-    columns: Columns = None,
+    file: FileOptions,
     max_gap: MaxGap = 80.0,
     min_seconds: MinSeconds = 5.0,
     window: Window = None,
     dt: Step = None,
-    where: Where = None,
-    resume: Resume = False,
-    executor: Workers = "serial",
-    jobs: Jobs = None,
-    ray_address: RayAddress = None,
+    job: JobOptions,
     sumo: Annotated[
         Path | None, typer.Option(help="Also write the drivers as SUMO's vTypes, an additional file: vtypes.add.xml.")
     ] = None,
@@ -205,10 +151,10 @@ def fit(
         bool, typer.Option("--lane-changes", help="Fit MOBIL to the lane changes of the file, by their likelihood.")
     ] = False,
     every: Annotated[
-        float, _ranged(help="--lane-changes: seconds between decisions.", low=0.1, high=60.0, unit="s")
+        float, ranged(help="--lane-changes: seconds between decisions.", low=0.1, high=60.0, unit="s")
     ] = 1.0,
     ahead: Annotated[
-        float, _ranged(help="--lane-changes: seconds from a decision to the new lane number.", low=0.0, high=10.0)
+        float, ranged(help="--lane-changes: seconds from a decision to the new lane number.", low=0.0, high=10.0)
     ] = 0.0,
     first_lane: Annotated[str, typer.Option(help="--lane-changes: where the lowest lane is, left or right.")] = "left",
     trusted: Trust = False,
@@ -222,7 +168,7 @@ def fit(
         source_of_changes = {"data", "out", "model", "base", "seed", "ring_length", "layout", "columns", "where",
                              "lane_changes", "every", "ahead", "first_lane", "trusted"}  # fmt: skip
         _only(context, "--lane-changes", source_of_changes)
-        _fit_lane_changes(data, out, model, base, seed, ring_length, layout, columns, where, every, ahead, first_lane)
+        _fit_lane_changes(data, out, model, base, seed, file, every, ahead, first_lane)
         return
     _only(context, "", set(context.params) - {"every", "ahead", "first_lane"})
     share: str | float | None = held_out
@@ -233,7 +179,6 @@ def fit(
         from idm_env.fitting import sumo as vtypes
         from idm_env.fitting.job import fit_file
         from idm_env.fitting.options import Options, Source
-        from idm_env.jobs.executor import opened
         from idm_env.model_file import load_model
 
         if sumo is not None:
@@ -241,13 +186,13 @@ def fit(
             vtypes.refuse(sumo, base or "idm")
         _work_begins()
         source = Source(
-            data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where, columns=columns
+            data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, window=window, **dataclasses.asdict(file)
         )
         options = Options(
             by, share, objective, relative, loss, method, integration, starts, seed, substeps, model, base,  # type: ignore[arg-type]
         )  # fmt: skip
-        with opened(executor, jobs, ray_address) as workers:
-            result = fit_file(source, options, out, resume=resume, executor=workers, on_progress=report)
+        with job.workers() as workers:
+            result = fit_file(source, options, out, resume=job.resume, executor=workers, on_progress=report)
         if sumo is not None:
             vtypes.write(sumo, load_model(out / "model.yaml"))
     if result["over_fitting"]:
@@ -272,8 +217,8 @@ def _only(context: typer.Context, mode: str, known: set[str]) -> None:
 
 
 def _fit_lane_changes(
-    data: Path, out: Path, model: str | None, base: str | None, seed: int, ring_length: float | None, layout: str,
-    columns: str | None, where: list[str] | None, every: float, ahead: float, first_lane: str,
+    data: Path, out: Path, model: str | None, base: str | None, seed: int, file: FileOptions,
+    every: float, ahead: float, first_lane: str,
 ) -> None:  # fmt: skip
     with shown(console) as report:
         from idm_env.fitting.lane_changes import ChangeOptions, fit_lane_changes
@@ -281,7 +226,7 @@ def _fit_lane_changes(
 
         _work_begins()
         options = ChangeOptions(model, base, every, ahead, first_lane, None, int(seed))
-        source = Source(data, ring_length, None, layout, where=where, columns=columns)
+        source = Source(data, **dataclasses.asdict(file))
         result = fit_lane_changes(source, options, out, on_progress=report)
     shown_of = ("parameter", "symbol", "unit", "estimate", "standard_error", "identified")
     _show("MOBIL by the likelihood of lane changes", [{n: row[n] for n in shown_of} for row in result["parameters"]])
@@ -293,6 +238,7 @@ def _fit_lane_changes(
 
 @app.command()
 def explain(
+    *,
     data: Annotated[
         list[Path],
         typer.Argument(help="Trajectories: csv, csv.gz, parquet. Several data sets: files, a folder, 'drives/*.csv'."),
@@ -306,19 +252,12 @@ def explain(
     known: Annotated[str | None, typer.Option(help="Effects whose values are in the file, such as grade.")] = None,
     base: Base = None,
     seed: Seed = 0,
-    ring_length: RingLength = None,
-    place: Place = None,
-    layout: Layout = "auto",
-    columns: Columns = None,
-    where: Where = None,
+    file: FileOptions,
     split_runs: Annotated[
         str | None,
         typer.Option(help="Cut recordings into runs of so many seconds, 60s; each driver counts in one of them."),
     ] = None,
-    resume: Resume = False,
-    executor: Workers = "serial",
-    jobs: Jobs = None,
-    ray_address: RayAddress = None,
+    job: JobOptions,
 ) -> None:
     """Fit a law, find the residual, trace it to the effect that the model lacks, add it, and report before and after.
 
@@ -334,27 +273,25 @@ def explain(
         read = None
         if len(files) == 1:  # what one recording cannot tell is said before anything slow is imported
             report("reading", 0, 0, files[0].name)
-            read = pieces.recordings(files[0], ring_length=ring_length, place=place, layout=layout, columns=columns,
-                                     where=where, seconds=seconds)  # fmt: skip
+            read = pieces.recordings(files[0], **dataclasses.asdict(file), seconds=seconds)
             cure = pieces.cure(read)
             if cure is not None:
                 _undecided(undecided.write(read, cure, out, files), out)
                 return
         from idm_env.discovery.sets import Question, explain_sets
         from idm_env.discovery.sets import explain as explain_one
-        from idm_env.jobs.executor import opened
 
         asked = Question(
-            by, candidates, given, seed, ring_length, place, layout, None if where is None else tuple(where),
-            base or "idm", columns, seconds,
+            by, candidates, given, seed, file.ring_length, file.place, file.layout,
+            None if file.where is None else tuple(file.where), base or "idm", file.columns, seconds,
         )  # fmt: skip
         _work_begins()
         rows: list[dict[str, Any]] = []
         if read is not None:
-            result, models = explain_one(files[0], out, asked, resume=resume, on_progress=report, trajectories=read)
+            result, models = explain_one(files[0], out, asked, resume=job.resume, on_progress=report, trajectories=read)
         else:
-            with opened(executor, jobs, ray_address) as workers:
-                rows = explain_sets(files, out, asked, resume=resume, executor=workers, on_progress=report)
+            with job.workers() as workers:
+                rows = explain_sets(files, out, asked, resume=job.resume, executor=workers, on_progress=report)
     if not rows:
         _explained(result, models, out)
         return
@@ -435,7 +372,7 @@ def demo(
     ] = None,
     columns: Columns = None,
     out: Out = Path("out/demo"),
-    seed: Annotated[int, _ranged(help="Seed of the generated data.", low=0, high=1e9)] = 7,
+    seed: Annotated[int, ranged(help="Seed of the generated data.", low=0, high=1e9)] = 7,
 ) -> None:
     """Show the main job: a platoon whose generator has an effect that the fitted model is not told of.
 
@@ -464,20 +401,17 @@ def demo(
 
 @app.command()
 def simulate(
+    *,
     data: Data,
     model: Annotated[Path | None, typer.Option(help="A model.yaml of fit or explain, or one of your own.")] = None,
     base: Base = None,
     out: Out = Path("out/simulate"),
     seed: Seed = 0,
-    ring_length: RingLength = None,
-    place: Place = None,
-    layout: Layout = "auto",
-    columns: Columns = None,
+    file: FileOptions,
     max_gap: MaxGap = 80.0,
     min_seconds: MinSeconds = 5.0,
     window: Window = None,
     dt: Step = None,
-    where: Where = None,
     trusted: Trust = False,
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
@@ -489,7 +423,7 @@ def simulate(
 
         _work_begins()
         source = Source(
-            data, ring_length, place, layout, max_gap, min_seconds, dt, window=window, where=where, columns=columns
+            data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, window=window, **dataclasses.asdict(file)
         )
         result = simulate_file(source, model, out, base=base, seed=seed, on_progress=report)
     _show("Errors in free simulation", [result["error"]])
@@ -499,17 +433,14 @@ def simulate(
 
 @app.command()
 def drift(
+    *,
     data: Data,
     out: Out = Path("out/drift"),
-    drivers: Annotated[int, _ranged(help="Drivers at most, evenly spread over the file.", low=2, high=10000)] = 60,
-    ring_length: RingLength = None,
-    place: Place = None,
-    layout: Layout = "auto",
-    columns: Columns = None,
+    drivers: Annotated[int, ranged(help="Drivers at most, evenly spread over the file.", low=2, high=10000)] = 60,
+    file: FileOptions,
     max_gap: MaxGap = 80.0,
     min_seconds: MinSeconds = 20.0,
     dt: Step = None,
-    where: Where = None,
 ) -> None:
     """Say how unsteady drivers are: what of them wanders, how much (sigma) and for how long (tau).
 
@@ -520,7 +451,7 @@ def drift(
         from idm_env.fitting.options import Source
 
         _work_begins()
-        source = Source(data, ring_length, place, layout, max_gap, min_seconds, dt, where=where, columns=columns)
+        source = Source(data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, **dataclasses.asdict(file))
         result = drift_file(source, out, drivers=drivers, on_progress=report)
     _show("Log-likelihood that every sort of drift gains over drivers who do not drift", result["sorts"])
     console.print(result["sentence"], soft_wrap=True, highlight=False)
@@ -592,7 +523,7 @@ def plot(
         bool, typer.Option("--html", help="Write an interactive page too, beside the picture: zoom, and point.")
     ] = False,
     panels: Annotated[
-        int, _ranged(help="Panels at most, one per run and lane, the largest first.", low=1, high=1000)
+        int, ranged(help="Panels at most, one per run and lane, the largest first.", low=1, high=1000)
     ] = 6,
     ring_length: RingLength = None,
     layout: Layout = "auto",
@@ -600,7 +531,7 @@ def plot(
     where: Where = None,
     seconds: Annotated[
         float,
-        _ranged(help="Length of a rollout, all vehicles left to their drivers (s).", low=0.1, high=1e5, unit="s"),
+        ranged(help="Length of a rollout, all vehicles left to their drivers (s).", low=0.1, high=1e5, unit="s"),
     ] = 300.0,
     seed: Seed = 0,
     trusted: Trust = False,
@@ -693,12 +624,9 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
     return [rollout_panel(states, dt=dt, ring_length=length, marked=env.task.agents)]
 
 
-Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]
-FixedParameters = Annotated[bool, typer.Option("--fixed-parameters", help="Keep the driver parameters fixed.")]
-
-
 @app.command("filter")
 def filter_(
+    *,
     data: DataOrFolder,
     out: Out = Path("out/filter"),
     recipe: Recipe = "default",
@@ -707,21 +635,17 @@ def filter_(
     layout: Layout = "auto",
     columns: Columns = None,
     ring_length: RingLength = None,
-    resume: Resume = False,
-    executor: Workers = "serial",
-    jobs: Jobs = None,
-    ray_address: RayAddress = None,
+    job: JobOptions,
     trusted: Trust = False,
 ) -> None:
     """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
     with shown(console) as report:
-        from idm_env.jobs.executor import opened
         from idm_env.trajectories.files import filter_file
 
         _work_begins()
-        with opened(executor, jobs, ray_address) as workers:
+        with job.workers() as workers:
             result = filter_file(
-                data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
+                data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=job.resume,  # type: ignore[arg-type]
                 columns=columns, ring_length=ring_length, model=model, executor=workers, on_progress=report,
             )  # fmt: skip
     _methods(result)
@@ -741,30 +665,27 @@ def _methods(result: dict[str, Any]) -> None:
 
 @app.command()
 def reconstruct(
+    *,
     data: DataOrFolder,
     out: Out = Path("out/reconstruct"),
-    dt: Annotated[float, _ranged(help="Step of the dense trajectories (s).", low=0.01, high=2.0, unit="s")] = 0.1,
+    dt: Annotated[float, ranged(help="Step of the dense trajectories (s).", low=0.01, high=2.0, unit="s")] = 0.1,
     recipe: Recipe = "default",
     fixed_parameters: FixedParameters = False,
     model: Corrected = None,
     layout: Layout = "auto",
     columns: Columns = None,
     ring_length: RingLength = None,
-    resume: Resume = False,
-    executor: Workers = "serial",
-    jobs: Jobs = None,
-    ray_address: RayAddress = None,
+    job: JobOptions,
     trusted: Trust = False,
 ) -> None:
     """Reconstruct dense trajectories from sparse ones, a second or more between points."""
     with shown(console) as report:
-        from idm_env.jobs.executor import opened
         from idm_env.trajectories.files import reconstruct_file
 
         _work_begins()
-        with opened(executor, jobs, ray_address) as workers:
+        with job.workers() as workers:
             result = reconstruct_file(
-                data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=resume,  # type: ignore[arg-type]
+                data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=job.resume,  # type: ignore[arg-type]
                 columns=columns, ring_length=ring_length, model=model, executor=workers, on_progress=report,
             )  # fmt: skip
     _methods(result)
@@ -773,21 +694,18 @@ def reconstruct(
 
 @app.command()
 def predict(
+    *,
     scenarios: Annotated[list[Path], typer.Argument(help="Waymo Open Motion scenarios: JSON, json.gz or TFRecord.")],
     out: Out = Path("out/predict"),
-    resume: Resume = False,
-    executor: Workers = "serial",
-    jobs: Jobs = None,
-    ray_address: RayAddress = None,
+    job: JobOptions,
 ) -> None:
     """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
     with shown(console) as report:
-        from idm_env.jobs.executor import opened
         from idm_env.prediction.files import predict_files
 
         _work_begins()
-        with opened(executor, jobs, ray_address) as workers:
-            result = predict_files(scenarios, out, resume=resume, executor=workers, on_progress=report)
+        with job.workers() as workers:
+            result = predict_files(scenarios, out, resume=job.resume, executor=workers, on_progress=report)
     names = {"minADE_8s": "minADE (m)", "minFDE_8s": "minFDE (m)", "miss_rate_8s": "miss rate", "mAP_8s": "mAP"}
     rows = [{"method": r["method"], **{title: r[key] for key, title in names.items()}} for r in result["methods"]]
     _show(f"8 s ahead, {result['agents_with_known_future']} agents", rows)
@@ -798,7 +716,7 @@ def predict(
 def bench(
     out: Out = Path("out/bench"),
     sizes: Annotated[str, typer.Option(help="Numbers of vehicles, by comma.")] = "2000,20000,200000,2000000",
-    rounds: Annotated[int, _ranged(help="Interleaved rounds; minimum and median are reported.", low=1, high=1000)] = 5,
+    rounds: Annotated[int, ranged(help="Interleaved rounds; minimum and median are reported.", low=1, high=1000)] = 5,
     compiled: Annotated[bool, typer.Option(help="Include the step compiled by inductor.")] = True,
     peers: Annotated[bool, typer.Option(help="Include SUMO and HighwayEnv.")] = True,
     verbose: Annotated[bool, typer.Option("--verbose", help="Say which path ran, and why.")] = False,
@@ -842,7 +760,8 @@ def _done(out: Path, account: str) -> None:
 
 
 for _command in app.registered_commands:
-    _command.cls = _Refusing
+    assert _command.callback is not None
+    _command.cls, _command.callback = _Refusing, spread(_command.callback)
 
 
 def run() -> None:
