@@ -130,7 +130,7 @@ def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
         ("jobs/files.html", "position_m"),
         ("generated/effects.html", "speed-dependent gap"),
     ):
-        assert place in near and words in (site / page).read_text(encoding="utf-8")
+        assert place in near and words in (site / place).read_text(encoding="utf-8")
 
 
 def links(site: Path, page: str) -> set[str]:

@@ -139,7 +139,7 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def spreading(**given: Any) -> None:
         for name, kind in groups.items():
-            given[name] = kind(**{field.name: given.pop(field.name) for field in dataclasses.fields(kind)})
+            given[name] = kind(**{field.name: given.pop(field.name) for field in dataclasses.fields(kind)})  # type: ignore[operator]
         command(**given)
 
     spreading.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]

@@ -168,12 +168,12 @@ class PolicyRows(RowFunction):
     def _view(self, x: Tensor, kind: str) -> None:
         if storage(x) in self._whole:
             array, start, _ = self._stores[storage(x)]
-            self._places[id(x)] = Place(array, start, int(x.storage_offset()), tuple(x.stride()), kind)
+            self._enter(x, Place(array, start, int(x.storage_offset()), tuple(x.stride()), kind))
             return
         super()._view(x, kind)
         place = self._places[id(x)]
         strides = tuple(s * PITCH for s in place.strides)
-        self._places[id(x)] = place._replace(offset=place.offset * PITCH, strides=strides)
+        self._enter(x, place._replace(offset=place.offset * PITCH, strides=strides))
 
     def _number(self, value: float | int | bool, kind: str) -> str:
         # As it stands: a table of constants would be read anew for every row.

@@ -112,6 +112,7 @@ class RowFunction:
     ) -> None:  # fmt: skip
         self._rows = rows
         self._places: dict[int, Place] = {}
+        self._noted: list[Tensor] = []
         self._stores: dict[int, tuple[str, str, int]] = {}
         self._room = {"f": 0, "i": 0, "b": 0}
         self._constants: dict[float, int] = {}
@@ -160,6 +161,7 @@ class RowFunction:
         header = HEADER.format(kind=real.name, arguments=arguments, **said, **room)
         self._held = [np.array(list(self._constants) or [0.0], real), *self._tables]
         self.fixed = addresses(self._held)
+        self._noted.clear()
         """Addresses that every call begins with."""
         self.call: int = library.load("rows", header + body(lines)).run.address
         """Address of the loops: (first row, row behind the last, addresses of arrays that hold row after row)."""
@@ -236,7 +238,12 @@ class RowFunction:
         array, start, width = self._stores[storage(x)]
         if x.dim() == 0 or x.shape[0] != self._rows or x.stride(0) != width or x.storage_offset() >= max(width, 1):
             raise Untraceable("an operation mixes rows")
-        self._places[id(x)] = Place(array, start, int(x.storage_offset()), tuple(x.stride()[1:]), kind)
+        self._enter(x, Place(array, start, int(x.storage_offset()), tuple(x.stride()[1:]), kind))
+
+    def _enter(self, x: Tensor, place: Place) -> None:
+        """Note where a tensor lies; it is held, or another one might have its id."""
+        self._noted.append(x)
+        self._places[id(x)] = place
 
     def _fresh(self, x: Tensor) -> Place:
         """Give a result its place: a local name for one number a row, else a part of the workspace."""
@@ -286,6 +293,7 @@ class RowFunction:
 
     def _table(self, x: Tensor, values: np.ndarray) -> Place:
         if id(x) not in self._table_of:
+            self._noted.append(x)
             self._table_of[id(x)] = f"t{len(self._tables)}"
             real = values.astype(np.float32 if self._floats == torch.float32 else np.float64)
             flat = real if self._kind(x) == "f" else values
