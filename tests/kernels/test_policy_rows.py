@@ -57,7 +57,6 @@ def test_a_tensor_whose_place_is_noted_lives_while_loops_are_recorded(monkeypatc
         noted.append((self, weakref.ref(x)))
 
     monkeypatch.setattr(RowFunction, "_enter", watched)
-    Driver(
-        nn.Sequential(nn.Linear(3, 7), nn.Tanh(), nn.Linear(7, 37), nn.ReLU(), nn.Linear(37, 2)), 3, 2, torch.float64
-    )
+    policy = nn.Sequential(nn.Linear(3, 7), nn.Tanh(), nn.Linear(7, 37), nn.ReLU(), nn.Linear(37, 2))
+    Driver(policy.to(torch.float64), 3, 2, torch.float64)
     assert len(noted) > 10
