@@ -14,6 +14,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -94,7 +95,24 @@ def test_versions_agree(wheel: zipfile.ZipFile) -> None:
     cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert cited is not None and newest is not None
-    assert declared == idm_env.__version__ == cited[1] == newest[1]
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text())
+    assert declared == idm_env.__version__ == cited[1] == newest[1] == recipe["package"]["version"]
+
+
+def test_the_conda_recipe_asks_for_what_the_wheel_asks_for(wheel: zipfile.ZipFile) -> None:
+    """The same packages in the same lowest versions, torch by its name there, and extras as constraints."""
+    head = email.message_from_bytes(wheel.read(next(n for n in wheel.namelist() if n.endswith(".dist-info/METADATA"))))
+    declared = [Requirement(line) for line in head.get_all("Requires-Dist") or []]
+    needs = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text())["requirements"]
+    core = {
+        canonicalize_name(one.name).replace("torch", "pytorch"): str(one.specifier)
+        for one in declared
+        if not one.marker
+    }
+    asked = dict(line.split(" ") for line in needs["run"])
+    assert asked == {"python": head["Requires-Python"], **core}
+    extras = {(one.name, str(one.specifier)) for one in declared}
+    assert all(tuple(line.split(" ")) in extras for line in needs["run_constraints"])
 
 
 def environment(wheel: zipfile.ZipFile, place: Path, *extras: str) -> Path:
