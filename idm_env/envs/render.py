@@ -182,16 +182,16 @@ class Viewer:
 
     def _ring(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float) -> None:
         circumference = float((values["gap"] + values["length"]).sum())
-        radius, middle = 0.38 * SIZE, 0.5 * SIZE
+        radius, middle, level = 0.38 * SIZE, 0.5 * SIZE, 0.53 * SIZE  # below the legend
         pixels = 2.0 * math.pi * radius / circumference
         lane = max(LANE_M * pixels, 18.0)
 
         def place(position: float, away: float = 0.0) -> tuple[tuple[float, float], float]:
             angle = 2.0 * math.pi * (position % circumference) / circumference
             far = radius + away
-            return (middle + far * math.cos(angle), middle - far * math.sin(angle)), angle
+            return (middle + far * math.cos(angle), level - far * math.sin(angle)), angle
 
-        self._pygame.draw.circle(canvas, _ASPHALT, (middle, middle), radius + 0.5 * lane, round(lane))
+        self._pygame.draw.circle(canvas, _ASPHALT, (middle, level), radius + 0.5 * lane, round(lane))
         step = next((m for m in _TICKS_M if m * pixels > 80.0), _TICKS_M[-1])
         for post in np.arange(0.0, circumference - 0.3 * step, step):
             ends = [place(post, 0.5 * lane + away)[0] for away in (2.0, 8.0)]
