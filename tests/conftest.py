@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from idm_env.effects import ALL
+
 # Examples take as long as the machine is busy; fixtures that examples share hold nothing that one of them changes.
 settings.register_profile(
     "suite", deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
@@ -43,6 +45,15 @@ def pytest_collection_finish() -> None:
     """Keep what the imports made out of every later collection of garbage, which then takes milliseconds."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def the_same_catalogue() -> Iterator[None]:
+    """Effects that a test enters are gone after it."""
+    before = dict(ALL)
+    yield
+    ALL.clear()
+    ALL.update(before)
 
 
 @pytest.fixture(autouse=True)

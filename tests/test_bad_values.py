@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -24,7 +23,6 @@ from agents.policy import Policy
 from idm_env import validation
 from idm_env.cli import commands as cli
 from idm_env.data import synthetic
-from idm_env.effects import ALL
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.model_file import load_environment, load_model
 from tests.commands import refused, typed
@@ -87,16 +85,12 @@ USES: dict[str, tuple[object, ...]] = {
 
 
 @pytest.fixture
-def same_catalogue(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What a test enters, and whom it trusts, is gone after it."""
+def no_trust(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whom a test trusts is gone after it."""
     monkeypatch.setenv("IDM_ENV_TRUST", "0")
-    before = dict(ALL)
-    yield
-    ALL.clear()
-    ALL.update(before)
 
 
-@pytest.mark.usefixtures("same_catalogue")
+@pytest.mark.usefixtures("no_trust")
 @pytest.mark.parametrize("use", USES)
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_file_of_effects_that_ends_the_process_is_one_line(data: Path, tmp_path: Path, ending: str, use: str) -> None:

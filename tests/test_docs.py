@@ -22,7 +22,6 @@ import torch
 
 from idm_env import IDM, Brakes, Lane, Replay, Simulator
 from idm_env.data import synthetic
-from idm_env.effects import ALL
 from idm_env.model_file import Model, save_model
 from idm_env.tasks import TASKS
 from idm_env.types import Record
@@ -151,13 +150,10 @@ FILES = {
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Work in an empty folder; modules read from there, and effects registered by them, are gone afterwards."""
+    """Work in an empty folder; modules read from there are gone afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    catalogue = dict(ALL)
     yield tmp_path
-    ALL.clear()
-    ALL.update(catalogue)
     for name, module in list(sys.modules.items()):
         if str(getattr(module, "__file__", None)).startswith(str(tmp_path)):
             del sys.modules[name]

@@ -48,6 +48,8 @@ def outside(words: list[str]) -> str | None:
     if words[1] == "-m" and words[2] == "pytest":
         missing = [w for w in words[3:] if w.startswith("tests") and not (ROOT / w).exists()]
         return f"no {missing}" if missing else None
+    if words[1:3] in (["-m", "pip"], ["-m", "venv"]):
+        return outside(words[2:]) if words[2] == "pip" else None
     file = ROOT / (words[2].replace(".", "/") + ".py" if words[1] == "-m" else words[1])
     if not file.exists():
         return f"no {file}"

@@ -13,7 +13,6 @@ import polars as pl
 import pytest
 import torch
 
-from idm_env.cli.commands import EXPLAINED
 from idm_env.data import synthetic
 from idm_env.discovery import write
 from idm_env.fitting import job
@@ -22,6 +21,7 @@ from idm_env.fitting.options import Options, Source
 from idm_env.jobs import storage
 from idm_env.jobs.shards import Parts
 from idm_env.prediction.files import predict_files
+from idm_env.reports.undecided import EXPLAINED
 from idm_env.trajectories import files
 from tests.commands import refused
 

@@ -29,7 +29,6 @@ from idm_env.validation import whole
 
 if TYPE_CHECKING:
     from idm_env.envs.values import Values
-    from idm_env.envs.window import Unrolled
 
 _POOL_STREAM = 2
 _NORMALS_AT_ONCE = 1 << 12
@@ -68,6 +67,23 @@ class Outcome(NamedTuple):
         rest = {name: told[key] for name, key in _DETAILS if key in told}
         whole = Whole(told["whole_reward"], told["whole_terminated"], told["whole_truncated"])
         return cls(told["observation"], told["reward"], told["terminated"], told["truncated"], whole, rest)
+
+
+class Unrolled(NamedTuple):
+    """A window of n environments, time first, with its graph.
+
+    ``observation`` ``(steps + 1, n, features)`` is what the policy saw, and sees next: where an episode ended, that of
+    the next one, through which no gradient flows. ``action`` ``(steps, n, actions)`` is what it did. ``reward``,
+    ``terminated`` and ``truncated`` ``(steps, n)`` are those of ``step``. ``final`` ``(steps, n, features)`` is what is
+    observed after each step, before any reset.
+    """
+
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    final: Tensor
 
 
 _DETAILS = tuple((name, f"info_{name}") for name in INFO)
@@ -273,18 +289,18 @@ class Batch:
 
     def unroll(self, policy: Callable[[Tensor], Tensor], steps: int, push: Tensor | None) -> Unrolled:
         """Return a window of steps with a policy between them; see ``Face.unroll``."""
-        from idm_env.envs import window
-
         shape = (self.count, len(self.task.agents) * len(self.task.commands))
         extra = torch.zeros(shape, dtype=self.settings.dtype) if push is None else push.expand(shape).contiguous()
         values = self._values
         fits = values is not None and not self.task.simulator.untried and dispatch.surroundings() is None
         if values is not None and fits:
+            from idm_env.envs import window
+
             try:
                 self.settle()
                 made = window.compiled(self, values, policy, steps, extra)
                 if made is not None:
-                    return made
+                    return Unrolled(*made)
             except Untraceable:
                 pass
         kept: list[tuple[Tensor, ...]] = []
@@ -304,7 +320,7 @@ class Batch:
             first.append(seen)
             kept.append((action, *outcome.whole, final))
         action, reward, terminated, truncated, final = (torch.stack(x) for x in zip(*kept, strict=True))
-        return window.Unrolled(torch.stack(first), action, reward, terminated, truncated, final)
+        return Unrolled(torch.stack(first), action, reward, terminated, truncated, final)
 
     def step(self, action: Tensor | np.ndarray | None, live: Tensor | None = None) -> Outcome:
         """Advance every row; ``action`` has shape ``(n, agents)``, None leaves everybody to the drivers.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,16 +13,13 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from idm_env import compat
-from idm_env.envs.batch import Batch
+from idm_env.envs.batch import Batch, Unrolled
 from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.tasks import Task
 from idm_env.types import Params, State, mapped
 from idm_env.validation import whole
-
-if TYPE_CHECKING:
-    from idm_env.envs.window import Unrolled
 
 LIMIT = "max_episode_steps"
 

@@ -26,23 +26,6 @@ _MANY = 1009
 """Rows of the recording of a policy: no other dimension."""
 
 
-class Unrolled(NamedTuple):
-    """A window of n environments, time first, with its graph.
-
-    ``observation`` ``(steps + 1, n, features)`` is what the policy saw, and sees next: where an episode ended, that of
-    the next one, through which no gradient flows. ``action`` ``(steps, n, actions)`` is what it did. ``reward``,
-    ``terminated`` and ``truncated`` ``(steps, n)`` are those of ``step``. ``final`` ``(steps, n, features)`` is what is
-    observed after each step, before any reset.
-    """
-
-    observation: Tensor
-    action: Tensor
-    reward: Tensor
-    terminated: Tensor
-    truncated: Tensor
-    final: Tensor
-
-
 class Driver:
     """A policy as compiled loops: what it does, and the vector-Jacobian product of that.
 
@@ -315,8 +298,8 @@ class _Window(torch.autograd.Function):
         return (None,) * 4 + tuple(found)
 
 
-def compiled(batch: Batch, values: Values, policy: Any, steps: int, push: Tensor) -> Unrolled | None:
-    """Return a window whose policy runs inside the loops, or None where it cannot; all or nothing is done."""
+def compiled(batch: Batch, values: Values, policy: Any, steps: int, push: Tensor) -> tuple[Tensor, ...] | None:
+    """Return the fields of a window whose policy runs inside the loops, or None where it cannot."""
     seen = batch.seen()
     driver = driver_of(policy, seen[0].numel(), push.shape[-1], seen.dtype)
     if driver is None:
@@ -340,4 +323,4 @@ def compiled(batch: Batch, values: Values, policy: Any, steps: int, push: Tensor
     rows = plan.rows
     batch.saw(out[2][-1].view(rows, len(batch.task.agents), -1))
     ends, cuts = (torch.from_numpy(x.copy()) for x in (tape.ends, tape.cuts))
-    return Unrolled(out[2], out[3], out[4], ends, cuts, out[5])
+    return (out[2], out[3], out[4], ends, cuts, out[5])
