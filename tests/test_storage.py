@@ -14,14 +14,12 @@ import pytest
 import torch
 
 from idm_env.data import synthetic
-from idm_env.discovery import write
 from idm_env.fitting import job
 from idm_env.fitting.job import fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
 from idm_env.jobs import storage
 from idm_env.jobs.shards import Parts
 from idm_env.prediction.files import predict_files
-from idm_env.reports.undecided import EXPLAINED
 from idm_env.trajectories import files
 from tests.commands import refused
 
@@ -129,10 +127,6 @@ def test_an_output_that_is_an_input_is_refused_through_links_too(tmp_path: Path,
     with pytest.raises(ValueError, match=r"is an input, and .* would overwrite it"):
         run(out, "2", (given,))
     assert content(tmp_path) == before
-
-
-def test_the_names_that_the_command_line_guards_are_those_that_are_written() -> None:
-    assert set(EXPLAINED) == set(write.OUTPUT)
 
 
 def test_fit_and_simulate_refuse_to_overwrite_what_they_read(data: Path, tmp_path: Path) -> None:
