@@ -22,7 +22,7 @@ from idm_env.envs.moves import Moves
 from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
 from idm_env.roads import Lanes
-from idm_env.scalar.record import Untraceable
+from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import Draw, World
 from idm_env.types import Params, State, mapped
 from idm_env.validation import whole
@@ -292,7 +292,9 @@ class Batch:
         shape = (self.count, len(self.task.agents) * len(self.task.commands))
         extra = torch.zeros(shape, dtype=self.settings.dtype) if push is None else push.expand(shape).contiguous()
         values = self._values
-        fits = values is not None and not self.task.simulator.untried and dispatch.surroundings() is None
+        # On several lanes a window is its steps, each of which is compiled.
+        fits = not (isinstance(self.task.road, Lanes) or self.task.simulator.untried)
+        fits = fits and values is not None and dispatch.surroundings() is None
         if values is not None and fits:
             from idm_env.envs import window
 
@@ -365,11 +367,13 @@ class Batch:
             who = None if live is None else live.numpy().reshape(-1)
             told = values.step(action, who, noise, max(self.used - 1, 0), self.driven())
         except Untraceable as why:
-            # Where an effect is why it was said before (``kernels.printed``); NaN the step itself tells.
-            if self.settings.output == "torch" and not isinstance(self.task.road, Lanes):
-                warnings.warn(f"no compiled step, the torch path runs instead: {why}.", stacklevel=4)
             self._world, self._loaded = self.world, False
-            self._values, self.used, self._block = None, used, block
+            self.used, self._block = used, block
+            if not isinstance(why, Unordered):
+                # Where an effect is why it was said before (``kernels.printed``); NaN the step itself tells.
+                if self.settings.output == "torch" or isinstance(self.task.road, Lanes):
+                    warnings.warn(f"no compiled step, the torch path runs instead: {why}.", stacklevel=4)
+                self._values = None
             return None
         # What is told is written to by whom it pleases.
         seen = told["observation"]

@@ -25,10 +25,11 @@ from idm_env.kernels.memory import addresses
 from idm_env.kernels.operands import Strides, operand, table
 from idm_env.kernels.printed import TileKernel, tile_kernel
 from idm_env.kernels.rows import RowFunction, adjoint
+from idm_env.kernels.several import between
 from idm_env.kernels.world_loop import retreat_worlds, step_worlds, workspaces
 from idm_env.scalar.record import Form, Untraceable, slot_name
 from idm_env.tasks import World
-from idm_env.types import Params, State
+from idm_env.types import Params, Record, State
 
 Array = np.ndarray
 _ROWS = (1009, 1013, 1019, 1021, 1031)
@@ -86,6 +87,8 @@ class Moment:
     past: Array
     newest: int
     bound: Bound | None = None
+    lanes: Any = None
+    """What becomes of links (``lane_plan.Crossing``) on a road of several lanes."""
     asked: dict[str, Array] = field(default_factory=dict)
 
 
@@ -209,6 +212,8 @@ class Plan:
         Untraceable: For a task or a simulator that cannot be recorded.
     """
 
+    kind_of_laid = Laid
+
     def __init__(
         self, moves: Moves, world: World, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
     ) -> None:
@@ -227,11 +232,12 @@ class Plan:
         self.constant = {n: np.repeat(x[None], rows, 0) for n, x in made.after.constants.items()}
         past = world.state.memory.get(PAST)
         self.slots = past.shape[-2] if past is not None and kernel.signals else 0
-        wide = tiles.width(size, self.slots)
+        along = self._along()
+        wide = tiles.width(along, self.slots)
         around = tiles.halo(1, kernel.program.reach)
-        self.groups = tiles.tiles(rows, size, wide, around) if size <= wide else rows
-        self._one = tiles.tiles(rows, size, wide, around) == 1
-        self.extent = np.array((self.slots, rows, size, wide, around))
+        self.groups = tiles.tiles(rows, along, wide, around) if along <= wide else rows
+        self._one = tiles.tiles(rows, along, wide, around) == 1
+        self.extent = np.array((self.slots, rows, along, wide, around))
         self._small = rows * size < 2 * pool.GRAIN
         self.work = workspaces(kernel, self.slots, real)
         self.loops = (
@@ -244,9 +250,13 @@ class Plan:
         program = kernel.program
         self.fixed = len(program.statics) + len(program.parameters)
         self.layout = layout
-        self._laid = Laid(self, layout)
+        self._laid = self.kind_of_laid(self, layout)
         self._bound: Bound | None = None
         self._loaded: Bound | None = None
+
+    def _along(self) -> int:
+        """Return how many vehicles the kernel steps in a row."""
+        return int(self.size)
 
     # -- forwards ------------------------------------------------------------------------------------------------
 
@@ -254,7 +264,7 @@ class Plan:
         """Return what parameters give, laid out once for many steps."""
         bound = self._bound
         if layout.version != self._laid.layout.version:
-            self._laid, bound = Laid(self, layout), None
+            self._laid, bound = self.kind_of_laid(self, layout), None
         if bound is None or bound.params is not params or bound.changed():
             bound = self._bound = self._laid.bind(params)
         return bound
@@ -300,6 +310,10 @@ class Plan:
             pool.split(part, self.groups, 1, threads)
         for i in self._carried:
             later[i].copy_(now[i])
+        return self._finished(later, told, clock, bound)
+
+    def _finished(self, later: Tensor, told: dict[str, Array], clock: Array, bound: Bound) -> dict[str, Array]:
+        """Return all that is told; Untraceable where an effect of the user's own returned NaN."""
         if self.task.simulator.own and bool(later[bound.laid.layout.blocks.index("state_speed")].isnan().any()):
             raise Untraceable("an effect returned nan: the step itself tells which")
         told["clock"] = clock
@@ -349,29 +363,10 @@ class Plan:
         """
         bound, room = moment.bound, self.scratch
         assert bound is not None
-        layout, (asks, tells) = bound.laid.layout, bound.laid.back
-        on_now = np.zeros((len(layout.blocks), self.count), self.real)
-        on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
-        on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
-        seeded, begun = room.zeros if on_later is None else address(on_later), address(on_now)
-        given = {**room.there, **{f"on_{n}": room.zeros if x is None else address(x) for n, x in on_told.items()}}
-        for i, name in enumerate(layout.blocks):
-            step = i * self.pitch
-            given[f"seed_{name}"] = room.zeros if on_later is None else seeded + step
-            given[f"begin_{name}"] = begun + step
-        if on_later is not None:
-            for i in self._carried:
-                on_now[i] = on_later.reshape(on_now.shape)[i]
-        given["state_step"] = address(moment.clock)
+        asks, tells = bound.laid.back
         clock = moment.clock + 1
-        given["later_state_step"] = address(clock)
-        if moment.action is not None:
-            given["action"], given["on_action"] = address(moment.action), address(on_action)
-        if moment.live is not None:
-            given["live"] = address(moment.live)
-        between = {n: address(x) for n, x in moment.asked.items()}
-        given |= {n: between[n] for n in _GIVEN if n in between}
-        given |= {n: between[o] for n, (o, _) in self.recorded.before.same.items() if n in _GIVEN}
+        on_now, on_action, given, between = self._seeded(moment, on_told, on_later, clock, room)
+        on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
         before, after = self.recorded.backward
         signals = self.slots * self.kernel.signals
         on_past = np.zeros((signals, self.count), self.real) if on_past is None else on_past
@@ -384,6 +379,34 @@ class Plan:
             self.groups,
         )  # fmt: skip
         return on_now, on_action, on_parameters, past
+
+    def _seeded(
+        self, moment: Moment, on_told: Mapping[str, Array | None], on_later: Array | None, clock: Array, room: Scratch
+    ) -> tuple[Array, Array | None, dict[str, int], dict[str, int]]:
+        """Return what falls on blocks and on actions, to be filled, and addresses: of all, and of what is between."""
+        assert moment.bound is not None
+        layout = moment.bound.laid.layout
+        on_now = np.zeros((len(layout.blocks), self.count), self.real)
+        on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
+        seeded, begun = room.zeros if on_later is None else address(on_later), address(on_now)
+        given = {**room.there, **{f"on_{n}": room.zeros if x is None else address(x) for n, x in on_told.items()}}
+        for i, name in enumerate(layout.blocks):
+            step = i * self.pitch
+            given[f"seed_{name}"] = room.zeros if on_later is None else seeded + step
+            given[f"begin_{name}"] = begun + step
+        if on_later is not None:
+            for i in self._carried:
+                on_now[i] = on_later.reshape(on_now.shape)[i]
+        given["state_step"] = address(moment.clock)
+        given["later_state_step"] = address(clock)
+        if moment.action is not None:
+            given["action"], given["on_action"] = address(moment.action), address(on_action)
+        if moment.live is not None:
+            given["live"] = address(moment.live)
+        between = {n: address(x) for n, x in moment.asked.items()}
+        given |= {n: between[n] for n in _GIVEN if n in between}
+        given |= {n: between[o] for n, (o, _) in self.recorded.before.same.items() if n in _GIVEN}
+        return on_now, on_action, given, between
 
 
 class Scratch:
@@ -420,10 +443,15 @@ class Bound:
         self.params, self.places, self.strides = params, places, strides
         self._arrays = arrays  # so that their addresses stay theirs
         pairs = [name.split(".", 1) for name in names]
-        self._watched = [(params[e], p, params[e][p], params[e][p]._version) for e, p in pairs]
-        self.wanted = [(i, x) for i, (_, _, x, _) in enumerate(self._watched) if x.requires_grad]
+        read = self._read(pairs)
+        self._watched = [(params[e], p, params[e][p], params[e][p]._version) for e, p in read]
+        self.wanted = [(i, params[e][p]) for i, (e, p) in enumerate(pairs) if params[e][p].requires_grad]
         """Parameters that require a gradient, with their numbers."""
         self._names = [names[i] for i, _ in self.wanted]
+
+    def _read(self, pairs: list[list[str]]) -> list[list[str]]:
+        """Return the effects and parameters that steps read, given those of the kernel."""
+        return pairs
 
     def with_values(self, values: Sequence[Tensor]) -> dict[str, dict[str, Tensor]]:
         """Return the parameters with others in place of those that are ``wanted``."""
@@ -444,16 +472,14 @@ class Bound:
 
 def _record(moves: Moves, world: World, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Recorded:
     """Record a step with or without actions, and with or without saying whose count (``kind`` as in ``Plan``)."""
-    if world.state.links is not None:
-        raise Untraceable("vehicles change lanes: the torch path steps several lanes")
     idle, every = kind
     task = moves.task
+    simulator = task.simulator if world.state.links is None else between(task.simulator)
     size, count = world.state.speed.shape[-1], len(task.agents)
     # A number of rows that is no other dimension tells rows apart from everything else.
     many = next(p for p in _ROWS if p not in (size, count))
     dtype = world.state.speed.dtype
-    leaves = {n: x.detach() for n, x in named(world).items()}
-    sample = {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in leaves.items()}
+    sample = examples_of(world, many)
     given = {} if idle else {"action": torch.zeros(many, count * len(task.commands), dtype=dtype)}
     if not (idle or every):
         given["live"] = torch.ones(many, count, dtype=torch.bool)
@@ -475,7 +501,8 @@ def _record(moves: Moves, world: World, kind: tuple[bool, bool], draws: tuple[st
         return out
 
     first = RowFunction(early, {**sample, **given}, many)
-    kernel = tile_kernel(task.simulator, Form.of(world.state, seen))
+    inside = {effect: _without_lane(value) for effect, value in seen.items() if effect in simulator.by_name}
+    kernel = tile_kernel(simulator, Form.of(world.state._replace(links=None, trips=None), inside))
     if isinstance(kernel, str):
         raise Untraceable(kernel)
 
@@ -533,6 +560,17 @@ def _record(moves: Moves, world: World, kind: tuple[bool, bool], draws: tuple[st
     return Recorded(first, kernel, last, seen, slots, many, flowing, back)
 
 
+def examples_of(world: World, many: int) -> dict[str, Tensor]:
+    """Return the leaves of many worlds like the first of these."""
+    leaves = {n: x.detach() for n, x in named(world).items()}
+    return {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in leaves.items()}
+
+
+def _without_lane(value: Any) -> Any:
+    """Return an input without the lanes of a record: vehicles are put there after the kernel's step."""
+    return value._replace(lane=None) if isinstance(value, Record) else value
+
+
 def _sum(x: Tensor, more: Tensor | None) -> Tensor:
     return x.clone() if more is None else x + more
 
@@ -550,6 +588,9 @@ def named(world: World) -> dict[str, Tensor]:
     found = {f"state_{n}": x for n, x in zip(State._fields, state, strict=True) if isinstance(x, Tensor)}
     shape = state.speed.shape
     found |= {f"memory_{n}": x.expand(shape) for n, x in state.memory.items() if n != PAST}
+    for part in ("links", "trips"):
+        held = getattr(state, part)
+        found |= {} if held is None else {f"{part}_{n}": x.expand(shape) for n, x in held._asdict().items()}
     return found | {f"episode_{n}": x for n, x in world.episode.items()}
 
 
@@ -558,7 +599,14 @@ def world_of(leaves: Mapping[str, Tensor], like: World, prefix: str = "") -> Wor
     own = {n.removeprefix(prefix): x for n, x in leaves.items() if n.startswith(prefix)}
     fields = {n.removeprefix("state_"): x for n, x in own.items() if n.startswith("state_")}
     episode = {n.removeprefix("episode_"): x for n, x in own.items() if n.startswith("episode_")}
-    return World(like.state._replace(**fields), episode)  # type: ignore[arg-type]
+    state = like.state._replace(**fields)  # type: ignore[arg-type]
+    for part in ("links", "trips"):
+        held = getattr(state, part)
+        if held is not None:
+            parts = {n: own[f"{part}_{n}"] for n in held._fields}
+            state = state._replace(**{part: held._replace(**parts)})
+    memory = {n: own.get(f"memory_{n}", x) for n, x in state.memory.items()}
+    return World(state._replace(memory=memory), episode)
 
 
 def _plain(slot: str) -> str:

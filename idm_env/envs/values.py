@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from idm_env.delay_buffer import PAST
+from idm_env.envs.lane_plan import WHOLE, Chain, Crossing, LanePlan
 from idm_env.envs.moves import Moves
 from idm_env.envs.past import Past
 from idm_env.envs.plan import Array, Bound, Layout, Moment, Plan, named, world_of
@@ -43,6 +44,8 @@ class Values:
         self._spare: Tensor | None = None
         self._token: Tensor | None = None
         self._clock: Array
+        self._whole: Array | None = None
+        self._chain: Chain | None = None
         self.past: Past
         self._world: World
 
@@ -61,6 +64,8 @@ class Values:
         self._key, self._world = key, mapped(lambda x: x.detach(), world)
         still = {n: np.array(x.numpy(), order="C").reshape(-1) for n, x in leaves.items() if n not in blocks}
         self._clock = still.pop("state_step")
+        whole = [still.pop(n) for n in WHOLE if n in still]
+        self._whole, self._chain = np.stack(whole) if whole else None, None
         old = self.layout.still
         if still.keys() != old.keys() or not all(np.array_equal(x, old[n]) for n, x in still.items()):
             self.layout = Layout((*blocks, "clock"), still, self.layout.version + 1)
@@ -85,6 +90,12 @@ class Values:
             self.blocks[:, index] = blocks
         self._clock[rows] = leaves["state_step"]
         self.past.replace(rows, fresh.state)
+        if self._whole is not None:
+            self._whole = self._whole.copy()
+            for i, name in enumerate(n for n in WHOLE if n in leaves):
+                self._whole[i].reshape(len(self._clock), -1)[rows] = leaves[name]
+        if self._chain is not None:
+            self._chain.stale[rows] = True
         for name, held in self.layout.still.items():
             values = leaves[name]
             old = held.reshape(len(self._clock), *values.shape[1:])
@@ -100,13 +111,15 @@ class Values:
     def current(self, own: bool = True) -> World:
         """Return the worlds as tensors of their own, or as views until the next step, without graph and past."""
         held, clock, layout = self.blocks if own else self.blocks.detach(), self._clock, self.layout
+        whole = self._whole
         if own:
             clock, layout = clock.copy(), layout._replace(still={n: x.copy() for n, x in layout.still.items()})
+            whole = None if whole is None else whole.copy()
             held = held if self._graph else held.clone()
         past = self.past.tensor() if own and self.past.slots else None
         if past is not None and self._token is not None:
             past = _Leave.apply(self._token, past)
-        return _world(self._world, layout, held, clock, past)
+        return _world(self._world, layout, held, clock, past, whole)
 
     def detach(self) -> None:
         """Cut the graph behind the worlds."""
@@ -134,6 +147,8 @@ class Values:
         moment = Moment(
             0, 0, self._clock, given, live, normals, at, self.past.rows, self.past.newest, bound
         )  # fmt: skip
+        if self._whole is not None:
+            moment.lanes = Crossing(self._whole, self._chain, self._graph)
         told: dict[str, Any]
         if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
             told = self._noted(plan, moment, action, bound)
@@ -146,6 +161,8 @@ class Values:
                 clock = told.pop("clock")
                 told = {n: torch.from_numpy(x) for n, x in told.items()} | {"clock": clock}
         self._clock = told.pop("clock")
+        if moment.lanes is not None:
+            self._whole, self._chain = moment.lanes.whole_later, moment.lanes.chain
         if self.past.slots:
             self.past.newest += 1
         return told
@@ -173,7 +190,8 @@ class Values:
         plan = self._plans.get(kind)
         if plan is None:
             world = self.current(own=False)
-            plan = Plan(self._moves, world, self.layout, kind, draws)
+            make = Plan if world.state.links is None else LanePlan
+            plan = make(self._moves, world, self.layout, kind, draws)
             if self._graph:
                 _ = plan.recorded.backward
             self._plans[kind] = plan
@@ -263,7 +281,8 @@ def _again(
     past = _recent(moment, plan, shape)
     if past is not None and token is not None:
         past = _Leave.apply(token, past)
-    world = _world(plan.world, layout, blocks, moment.clock, past)
+    whole = None if moment.lanes is None else moment.lanes.whole
+    world = _world(plan.world, layout, blocks, moment.clock, past, whole)
     live = None if moment.live is None else torch.from_numpy(moment.live).view(shape[0], -1)
     drawn = moment.normals
     normals = None if drawn is None else {n: torch.from_numpy(x).view(-1, *shape)[moment.at] for n, x in drawn.items()}
@@ -272,18 +291,21 @@ def _again(
     return _block(after, layout.blocks), None if last is None else _as_rows(last, shape), told
 
 
-def _world(like: World, layout: Layout, blocks: Tensor, clock: Array, past: Tensor | None) -> World:
+def _world(
+    like: World, layout: Layout, blocks: Tensor, clock: Array, past: Tensor | None, whole: Array | None = None
+) -> World:  # fmt: skip
     """Return worlds as tensors that share the memory given."""
     leaves = dict(zip(layout.blocks, blocks, strict=True))
+    if whole is not None:
+        shape = like.state.speed.shape
+        names = (n for n in WHOLE if n.startswith("links") or like.state.trips is not None)
+        leaves |= {n: torch.from_numpy(x).view(shape) for n, x in zip(names, whole, strict=True)}
     for name, x in named(like).items():
         if name not in leaves:
             array = clock if name == "state_step" else layout.still[name]
             leaves[name] = torch.from_numpy(array).view(x.shape)
-    memory = {name: leaves.get(f"memory_{name}", x) for name, x in like.state.memory.items()}
-    if past is not None:
-        memory[PAST] = past
     made = world_of(leaves, like)
-    return made._replace(state=made.state._replace(memory=memory))
+    return made if past is None else made._replace(state=made.state._replace(memory={**made.state.memory, PAST: past}))
 
 
 def _block(world: World, names: Sequence[str]) -> Tensor:

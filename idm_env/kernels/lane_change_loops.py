@@ -116,10 +116,10 @@ def find(w, target, kind, at, m, exists, to, behind, begin, lap, ring, tables):
 
 
 @exact
-def fill_alike(w, slots, plan, row):
-    """Fill the rows that are the same for all vehicles of a batch row, and for row 0 those that are for all rows."""
+def fill_alike(w, slots, plan, row, first):
+    """Fill the rows that are the same for all vehicles of a batch row, and at first those that are for all rows."""
     for i in range(slots):
-        if plan[i, KIND] == ARRAY and plan[i, BY_VEHICLE] == 0 and (row == 0 or plan[i, BY_ROW] != 0):
+        if plan[i, KIND] == ARRAY and plan[i, BY_VEHICLE] == 0 and (first or plan[i, BY_ROW] != 0):
             fill(w, i * ROW, number(plan[i, ADDRESS], row * plan[i, BY_ROW], w), CHUNK)
 
 
@@ -210,14 +210,14 @@ def relink(order, begin, count, ring, base, lane, leader, follower, fresh):
 
 @exact
 def settle(w, results, at, m, own_lane, left, right, begin, ring, left_hand, base, order, winner, utility, to_left,
-           looks, signals, refused, blocked, turn):  # fmt: skip
+           looks, signals, refused, blocked, turns, stage):  # fmt: skip
     """Grant the best claim on each gap so far, and count the others; return whether there was any, −1 for NaN."""
     some = 0
     for j in range(m):
         r = at + j
         if looks:
             signals[r] = w[results + 4 * ROW + j]
-        if len(turn) and not turn[order[r]]:
+        if len(turns) and turns[order[r]] != stage:
             continue
         comes_to_nothing = w[results + 3 * ROW + j]
         if comes_to_nothing != 0:
@@ -260,11 +260,11 @@ def count_changes(winner, order, left, right, to_left, begin, ring, base, lane, 
 
 
 @exact
-def any_of(turn, order, at, m):
+def any_of(turns, stage, order, at, m):
     """Whether it is the turn of any of the ranks ``at`` to ``at + m``."""
     some = False
     for j in range(m):
-        some |= turn[order[at + j]]
+        some |= turns[order[at + j]] == stage
     return some
 
 
@@ -289,16 +289,16 @@ def find_mergers(order, begin, count, place, ring, left, right, signals, granted
 
 @exact
 def decide(
-    links, position, present, coming, rows, n, count, ring, left_hand, tables, plan, places, phase, k, slots, fresh,
-    merger, turn, orders, begins,
+    links, position, present, coming, rows, stages, n, count, ring, left_hand, tables, plan, places, phase, k, slots,
+    fresh, merger, turns, orders, begins,
 ):  # fmt: skip
-    """Decide in all rows: ``links`` (7, rows · n; as ``types.Links``) change in place, ``fresh`` marks new leaders.
+    """Decide in some rows: ``links`` (7, slots; as ``types.Links``) change in place, ``fresh`` marks new leaders.
 
-    ``plan`` says what the ``slots`` rows of the printed ``phase`` are filled with, ``places`` whose. ``merger`` (rows ·
-    n own slots, or empty if nobody looks) gets who signals beside everybody; those slots decide whose ``turn``
-    it is (empty: all). ``orders`` (rows · n) and ``begins`` (rows · (count + 1)) get the order of every row afterwards,
-    as ``walk`` would put it. Returns False, with some rows decided, where links are not the order of positions, or a
-    wish is NaN.
+    ``rows`` are those that decide, in their ``stages``: of their slots those whose ``turns`` are the same (none:
+    all of them). ``plan`` says what the ``slots`` rows of the printed ``phase`` are filled with, ``places`` whose.
+    ``merger`` (rows · n own slots, or empty if nobody looks) gets who signals beside everybody. ``orders`` (rows · n)
+    and ``begins`` (rows · (count + 1)) get the order of every row afterwards, as ``walk`` would put it. Returns False,
+    with some rows decided, where links are not the order of positions, or a wish is NaN.
     """
     lane, leader, follower, changed, refused, blocked, unjudged = links
     w, which = workspace((slots + RESULTS) * ROW, k), np.empty(len(places) * CHUNK, np.int64)
@@ -307,7 +307,8 @@ def decide(
     left, right, winner = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n + count, np.int64)
     utility, to_left, granted = np.empty(n, k.dtype), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     signals, nearest, lap = np.zeros(n, np.int8), np.empty(n), np.zeros(n, np.int64)
-    for row in range(rows):
+    for i in range(len(rows)):
+        row, stage = rows[i], stages[i]
         base = row * n
         if not walk(leader, follower, lane, position, present, coming, n, count, ring, base, order, begin, place):
             return False
@@ -315,13 +316,13 @@ def decide(
             count_laps(position, base, order, place, begin[count], ring, lap)
         beside(place, begin, count, 1, left)
         beside(place, begin, count, -1, right)
-        fill_alike(w, slots, plan, row)
+        fill_alike(w, slots, plan, row, i == 0)
         winner[:] = -1
         some = 0
         for own in range(count):
             for at in range(begin[own], begin[own + 1], CHUNK):
                 m = min(CHUNK, begin[own + 1] - at)
-                if len(turn) and not any_of(turn, order, at, m):
+                if len(turns) and not any_of(turns, stage, order, at, m):
                     continue
                 fill_rows(
                     w, slots, plan, places, which, at, m, own, begin, count, order, left, right, lap, base, row,
@@ -330,7 +331,7 @@ def decide(
                 call(phase, w, padded(m), k)  # type: ignore[call-arg]
                 found = settle(
                     w, slots * ROW, at, m, own, left, right, begin, ring, left_hand, base, order, winner, utility,
-                    to_left, len(merger) > 0, signals, refused, blocked, turn,
+                    to_left, len(merger) > 0, signals, refused, blocked, turns, stage,
                 )  # fmt: skip
                 if found < 0:
                     return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
@@ -131,11 +132,11 @@ class Traffic:
             return True
         lanes_of, leader, follower = (dense(x, self.shape) for x in self.links[:3])
         position, there = dense(state.position, self.shape), self._present(state)
-        given = leader, follower, lanes_of, position, *there, self.rows, self.n, count, self._ring, around, wide
-        return bool(order_loops.laid(*given, *to))
+        given = leader, follower, lanes_of, position, *there, np.arange(self.rows), self.n, count, self._ring
+        return bool(order_loops.laid(*given, around, wide, *to))
 
-    def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params, turn: Tensor) -> State | None:
-        """Return the state after those have decided whose ``turn`` it is, or None where links are no order."""
+    def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params, stage: int) -> State | None:
+        """Return the state after those have decided whose turn it is at a stage, or None where links are no order."""
         if isinstance(found, str):
             after = decided(self.simulator, state._replace(links=self.links), inputs, params)
             self._take(after.links)
@@ -145,14 +146,14 @@ class Traffic:
         plan, places, held = self._plan(found, state, inputs, params)
         fresh = np.zeros(self.rows * self.n, np.uint8)
         sees = self.simulator.sees_mergers
-        turns = turn.numpy() if self.simulator.decides_in_blocks else np.empty(0, np.bool_)
+        turns = self.simulator.turns(self.n).numpy() if self.simulator.decides_in_blocks else np.empty(0, np.int64)
         merger = np.tile(np.arange(self.n), self.rows if sees else 0)
         order, begin = np.empty(self.rows * self.n, np.int64), np.empty(self.rows * (self.road.count + 1), np.int64)
         tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], kind)
         done = lane_change_loops.decide(
-            self._links, dense(state.position, self.shape), *self._present(state), self.rows, self.n,
-            self.road.count, self._ring, self.road.handed == "left", tables, plan, places, phase, constants,
-            len(found.slots), fresh, merger, turns, order, begin,
+            self._links, dense(state.position, self.shape), *self._present(state), np.arange(self.rows),
+            np.full(self.rows, stage), self.n, self.road.count, self._ring, self.road.handed == "left", tables, plan,
+            places, phase, constants, len(found.slots), fresh, merger, turns, order, begin,
         )  # fmt: skip
         del held
         self._given = None
@@ -188,20 +189,16 @@ class Traffic:
         return plan, places, [*held, *more]
 
     def _begun(self, found: Decision, state: State, inputs: Inputs, params: Params) -> _Lasting:
-        rows, held, moving = [], [], []
-        places: dict[tuple[int, int], int] = {}
-        for i, slot in enumerate(found.slots):
-            side, name = _side(slot)
-            if name in KINDS:
-                rows.append((KINDS[name], side, 0, 0, 0, 0))
-                continue
+        held, moving = [], []
+
+        def find(i: int, name: str) -> tuple[int, int, int]:
             array, by_row, by_vehicle = self._operand(name, state, inputs, params)
-            place = places.setdefault((side, slot.shift), len(places)) if by_vehicle else 0
-            rows.append((lane_change_loops.ARRAY, side, place, int(addresses([array])[0]), by_row, by_vehicle))
             held.append(array)
             if not self._lasts(name):
                 moving.append((i, name))
-        return np.array(rows, np.int64), np.array(list(places), np.int64).reshape(-1, 2), moving, held
+            return int(addresses([array])[0]), by_row, by_vehicle
+
+        return *rows_of(found.slots, find), moving, held
 
     def _operand(self, name: str, state: State, inputs: Inputs, params: Params) -> tuple[Array, int, int]:
         """Return an array and its strides by row and vehicle."""
@@ -234,6 +231,20 @@ KINDS = {
     HERE[0]: lane_change_loops.OPENS, HERE[1]: lane_change_loops.CLOSES, HERE[2]: lane_change_loops.STOPS,
 }  # fmt: skip
 """Rows that are searched for instead of read from an array."""
+
+
+def rows_of(slots: Sequence[Leaf], find: Callable[[int, str], tuple[int, int, int]]) -> tuple[Array, Array]:
+    """Return the plan of a phase's rows and whose numbers these are; ``find`` returns an address and its strides."""
+    rows, places = [], dict[tuple[int, int], int]()
+    for i, slot in enumerate(slots):
+        side, name = _side(slot)
+        if name in KINDS:
+            rows.append((KINDS[name], side, 0, 0, 0, 0))
+            continue
+        at, by_row, by_vehicle = find(i, name)
+        place = places.setdefault((side, slot.shift), len(places)) if by_vehicle else 0
+        rows.append((lane_change_loops.ARRAY, side, place, at, by_row, by_vehicle))
+    return np.array(rows, np.int64), np.array(list(places), np.int64).reshape(-1, 2)
 
 
 def _side(slot: Leaf) -> tuple[int, str]:

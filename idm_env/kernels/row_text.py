@@ -14,6 +14,9 @@ UNARY = {
     "expm1": "np.expm1({0})",
     "rsqrt": "(F(1.0) / np.sqrt({0}))",
     "log": "np.log({0})",
+    "floor": "np.floor({0})",
+    "round": "np.rint({0})",
+    "isinf": "np.isinf({0})",
     "sin": "np.sin({0})",
     "cos": "np.cos({0})",
     "relu": "larger({0}, F(0))",
@@ -32,6 +35,7 @@ BINARY = {
     "minimum": "smaller({0}, {1})",
     "maximum": "larger({0}, {1})",
     "pow": "({0} ** {1})",
+    "remainder": "({0} % {1})",
     "tanh_backward": "({0} * (F(1.0) - {1} * {1}))",
     "threshold_backward": "({0} if {1} > F(0) else F(0))",
     "bitwise_and": "({0} and {1})",
@@ -72,7 +76,7 @@ def loops(shape: Sequence[int], line: Callable[[list[str]], str | list[str]]) ->
     return head + ["    " * depth + text for text in lines]
 
 
-_ELEMENT = re.compile(r"\b(?:[fib]|out_\w+)\[U\((\d+|r)[^\[\]]*\]")
+_ELEMENT = re.compile(r"\b(?:[fdib]|out_\w+)\[U\((\d+|r)[^\[\]]*\]")
 """An element of the workspace or of an output: its text, and where its storage begins."""
 
 

@@ -23,10 +23,19 @@ from idm_env.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, body, fused
 from idm_env.scalar import library
 from idm_env.scalar.record import Untraceable
 
-_TEXT = {"f": "F", "i": "np.int64", "b": "np.bool_"}
+_TEXT = {"f": "F", "d": "np.float64", "i": "np.int64", "b": "np.bool_"}
 KINDS = {torch.float32: "f", torch.float64: "f", torch.int64: "i", torch.bool: "b"}
-TYPES = {"i": np.dtype(np.int64), "b": np.dtype(np.bool_)}
-_BLANK = {"new_zeros": 0.0, "zeros_like": 0.0, "zeros": 0.0, "new_ones": 1.0, "ones_like": 1.0, "empty_like": 0.0}
+TYPES = {"d": np.dtype(np.float64), "i": np.dtype(np.int64), "b": np.dtype(np.bool_)}
+"""Types of numbers beside those of the recording; ``d`` are doubles in a recording in single precision."""
+_BLANK = {
+    "new_zeros": 0.0,
+    "zeros_like": 0.0,
+    "zeros": 0.0,
+    "new_ones": 1.0,
+    "ones_like": 1.0,
+    "empty_like": 0.0,
+    "new_empty_strided": 0.0,
+}
 _FULL = {"new_full": 2, "full_like": 1, "full": 1, "fill_": 1}
 """Constants of one value, which backward passes write to: the value, or the place of the argument that it is."""
 
@@ -56,7 +65,7 @@ def smaller(x, y):
 
 @phase(types.void(types.int64, types.int64, types.CPointer(types.int64)){options})
 def run(begin, end, at):
-{arguments}    f, i, b = np.empty({f}, F), np.empty({i}, np.int64), np.empty({b}, np.bool_)
+{arguments}    f, d, i, b = np.empty({f}, F), np.empty({d}), np.empty({i}, np.int64), np.empty({b}, np.bool_)
 {around}'''
 
 
@@ -114,7 +123,7 @@ class RowFunction:
         self._places: dict[int, Place] = {}
         self._noted: list[Tensor] = []
         self._stores: dict[int, tuple[str, str, int]] = {}
-        self._room = {"f": 0, "i": 0, "b": 0}
+        self._room = {"f": 0, "d": 0, "i": 0, "b": 0}
         self._constants: dict[float, int] = {}
         self._tables: list[np.ndarray] = []
         self._table_of: dict[int, str] = {}
@@ -130,7 +139,9 @@ class RowFunction:
                 self._blanks[storage(out)] = _BLANK[called]
             elif called in _FULL:
                 self._blanks[storage(out)] = args[_FULL[called]]
+        _refuse_forks(recorder.calls, list(inputs.values()))
         calls = _needed(recorder.calls, list(found.values()))
+        self._calls = calls
         for call in calls:
             self._print(*call)
         self.constants = {name: self._plain(x) for name, x in found.items() if not (apart or self._known(x))}
@@ -217,7 +228,7 @@ class RowFunction:
     def _kind(self, x: Tensor) -> str:
         if x.dtype not in KINDS:
             raise Untraceable(f"a tensor of {x.dtype}")
-        return KINDS[x.dtype]
+        return "d" if x.dtype == torch.float64 != self._floats else KINDS[x.dtype]
 
     def _keep(self, x: Tensor, array: str, start: str, width: int, kind: str) -> None:
         self._stores[storage(x)] = (array, start, width)
@@ -269,6 +280,8 @@ class RowFunction:
             if key != key:
                 return "F(np.nan)"
             return f"c[{self._constants.setdefault(key, len(self._constants))}]"
+        if kind == "d":
+            return f"np.float64({float(value)!r})" if math.isfinite(value) else f"np.float64(np.{float(value)!r})"
         return str(bool(value)) if kind == "b" else str(int(value))
 
     def _at(self, x: Any, at: Sequence[str], kind: str | None = None) -> str:
@@ -289,7 +302,7 @@ class RowFunction:
             raise Untraceable("an operation mixes rows")
         lined = ["0" if n == 1 else i for n, i in zip(shape, at[len(at) - len(shape) :], strict=True)]
         text = index(place, lined)
-        return text if kind == own else f"F({text})" if kind == "f" else f"np.int64({text})"
+        return text if kind == own else f"{_TEXT[kind]}({text})"
 
     def _table(self, x: Tensor, values: np.ndarray) -> Place:
         if id(x) not in self._table_of:
@@ -305,6 +318,9 @@ class RowFunction:
 
     def _print(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> None:
         if name in _BLANK or name in _FULL or not any(self._known(x) for x in _tensors(args)):
+            return
+        if name == "sort":
+            self._parts.append(self._sorted(args, kwargs, out))
             return
         inplace = name.endswith("_") and not name.endswith("__")
         for x in out if isinstance(out, (list, tuple)) else (out,):
@@ -336,6 +352,12 @@ class RowFunction:
             return self._spread(name, args, shape, to)
         if name == "index_add":
             return self._added(args, to)
+        if name == "gather":
+            return self._gathered(args, shape, to)
+        if name in ("scatter", "scatter_add"):
+            return self._scattered(name, args, kwargs, shape, to)
+        if name == "copy":
+            name, args = "clone", args[1:]
         if name == "masked_fill":
             name, args = "where", (args[1], args[2], args[0])
         if name in self.unary or name in ("_to_copy", "clone"):
@@ -384,7 +406,7 @@ class RowFunction:
         kinds = [
             self._kind(a) if isinstance(a, Tensor) else "f" if isinstance(a, float) else "i" for a in args
         ]  # fmt: skip
-        return "f" if "f" in kinds else "i" if "i" in kinds else "b"
+        return next(kind for kind in "dfib" if kind in kinds)
 
     def _clamp(
         self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], shape: tuple[int, ...], to: Place
@@ -493,6 +515,69 @@ class RowFunction:
         first = self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at, to.kind)}")
         return [*first, *self._loops(source.shape[1:], line)]
 
+    def _gathered(self, args: Sequence[Any], shape: tuple[int, ...], to: Place) -> list[str]:
+        """Print ``source.gather(dim, which)``."""
+        source, dim, which = args[:3]
+        along = dim % source.dim() - 1
+        if along < 0:
+            raise Untraceable("gather of rows")
+
+        def line(at: list[str]) -> list[str]:
+            # In two lines: loops that look elsewhere are not fused.
+            there = ["k" if d == along else i for d, i in enumerate(at)]
+            return [f"k = {self._at(which, at)}", f"{index(to, at)} = {self._at(source, there, to.kind)}"]
+
+        return self._loops(shape, line)
+
+    def _scattered(
+        self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], shape: tuple[int, ...], to: Place
+    ) -> list[str]:  # fmt: skip
+        """Print ``x.scatter(dim, which, source)``, or with what was there added to it."""
+        x, dim, which, source = args[:4]
+        along = dim % x.dim() - 1
+        if along < 0 or len(args) > 4 or kwargs:
+            raise Untraceable(f"{name} of rows, or with a reduction")
+
+        def line(at: list[str]) -> list[str]:
+            there = index(to, ["k" if d == along else i for d, i in enumerate(at)])
+            value = self._at(source, at, to.kind)
+            return [f"k = {self._at(which, at)}", f"{there} = {value if name == 'scatter' else f'{there} + {value}'}"]
+
+        first = self._loops(shape, lambda at: f"{index(to, at)} = {self._at(x, at, to.kind)}")
+        return [*first, *self._loops(which.shape[1:], line)]
+
+    def _sorted(self, args: Sequence[Any], kwargs: Mapping[str, Any], out: Sequence[Tensor]) -> list[str]:
+        """Print the first of ``x.sort(stable=True)``, as many as are read: of equals the one that came first."""
+        x, (values, slots) = args[0], out
+        if not kwargs.get("stable") or kwargs.get("descending") or kwargs.get("dim", -1) % x.dim() != x.dim() - 1:
+            raise Untraceable("a sort that is not stable, descends, or is of another dimension than the last")
+        first, second, count = self._fresh(values), self._fresh(slots), x.shape[-1]
+        most = min(count, self._read_of(slots))
+
+        def line(at: list[str]) -> list[str]:
+            def put(to: Place, k: str) -> str:
+                return index(to, [*at, k])
+
+            return [
+                "m = 0", f"for j in range({count}):", f"    s = {self._at(x, [*at, 'j'])}",
+                f"    if m < {most} or s < {put(first, str(most - 1))}:", f"        k = min(m, {most - 1})",
+                f"        while k > 0 and s < {put(first, '(k - 1)')}:",
+                f"            {put(first, 'k')} = {put(first, '(k - 1)')}",
+                f"            {put(second, 'k')} = {put(second, '(k - 1)')}", "            k -= 1",
+                f"        {put(first, 'k')} = s", f"        {put(second, 'k')} = j", f"        m = min(m + 1, {most})",
+            ]  # fmt: skip
+
+        return self._loops(x.shape[1:-1], line)
+
+    def _read_of(self, slots: Tensor) -> int:
+        """Return how many of the last dimension's numbers are read, from the first on."""
+        ends = []
+        for name, args, _, _ in self._calls:
+            if any(storage(x) == storage(slots) and x.shape == slots.shape for x in _tensors(args)):
+                first = name == "slice" and args[1] % slots.dim() == slots.dim() - 1 and args[2] == 0
+                ends.append(args[3] if first else slots.shape[-1])
+        return max(ends, default=1)
+
     def _picked(self, name: str, args: Sequence[Any], x: Tensor, to: Place) -> list[str]:
         """Print ``source[index, …]``: rows of a table by recorded indices, or columns by constant ones."""
         source = args[0]
@@ -508,12 +593,13 @@ class RowFunction:
                 ),
             )
         parts = args[1]
-        if self._known(source) or any(p is None or p.dim() != 1 for p in parts):
+        if self._known(source) or any(p is None for p in parts) or len({p.dim() for p in parts}) > 1:
             raise Untraceable("an index into what changes")
-        values = source.detach().cpu().numpy()
+        values, own = source.detach().cpu().numpy(), parts[0].dim() - 1
         table = self._table(source, values)
         return self._loops(
-            x.shape[1:], lambda at: f"{index(to, at)} = {index(table, [*(self._at(p, []) for p in parts), *at])}"
+            x.shape[1:],
+            lambda at: f"{index(to, at)} = {index(table, [*(self._at(p, at[:own]) for p in parts), *at[own:]])}",
         )
 
 
@@ -524,6 +610,16 @@ def storage(x: Tensor) -> int:
 
 def _tensors(args: Sequence[Any]) -> list[Tensor]:
     return [x for a in args for x in (a if isinstance(a, (list, tuple)) else (a,)) if isinstance(x, Tensor)]
+
+
+def _refuse_forks(calls: Sequence[Any], inputs: Sequence[Tensor]) -> None:
+    """Raise Untraceable where Python has asked for a number that depends on inputs: it may have chosen by it."""
+    known = {storage(x) for x in inputs}
+    for name, args, _, out in calls:
+        if any(storage(x) in known for x in _tensors(args)):
+            if name == "_local_scalar_dense":
+                raise Untraceable("a fork on values")
+            known |= {storage(x) for x in _tensors((out,))}
 
 
 def _needed(calls: Sequence[Any], found: Sequence[Tensor]) -> list[Any]:

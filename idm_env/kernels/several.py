@@ -160,7 +160,7 @@ def _decided(traffic: Traffic, wishes: Any, state: State, inputs: Inputs, params
         state = traffic.begin(state, params)
     if not simulator.changes:
         return state
-    return traffic.decide(wishes, state, inputs, params, simulator.turns(state.speed.shape[-1]) == stage)
+    return traffic.decide(wishes, state, inputs, params, stage)
 
 
 def _some_decided(

@@ -7,7 +7,7 @@ moved: at any time ``due = inside + left + queued``, and a queue that grows is a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import torch
@@ -121,11 +121,16 @@ def turnover(stepping: Stepping, state: State, params: Params) -> State:
     if state.present is None or state.links is None:
         return state
     now = state.clock.remainder(stepping.decides_after) == 0
-    if not bool(now.any()):
-        return state
+    return turned(stepping, state, params, now, bool) if bool(now.any()) else state
+
+
+def turned(
+    stepping: Stepping, state: State, params: Params, now: Tensor, asked: Callable[[Tensor], bool] = lambda _: True
+) -> State:
+    """Return the state after that, in all rows where it is ``now``; a recording does not ask whether anybody waits."""
     if stepping.road.leaving:
         state = _departed(stepping, state, now)
-    return state if state.trips is None else _entered(stepping, state, params, now)
+    return state if state.trips is None else _entered(stepping, state, params, now, asked)
 
 
 def _departed(stepping: Stepping, state: State, now: Tensor) -> State:
@@ -143,7 +148,9 @@ def _departed(stepping: Stepping, state: State, now: Tensor) -> State:
     )
 
 
-def _entered(stepping: Stepping, state: State, params: Params, now: Tensor) -> State:
+def _entered(
+    stepping: Stepping, state: State, params: Params, now: Tensor, asked: Callable[[Tensor], bool]
+) -> State:  # fmt: skip
     """Return the state after those have entered for whom it is time and who have room, one on each lane.
 
     Of a lane's queue the first enters at the beginning of the lane, where the gap s to the last vehicle there allows::
@@ -157,7 +164,7 @@ def _entered(stepping: Stepping, state: State, params: Params, now: Tensor) -> S
     road, given = stepping.road, state.trips
     assert isinstance(road, Lanes)
     waits = (state.present <= 0) & (due(given, stepping.time(state)) > given.entered) & now
-    if not bool(waits.any()):
+    if not asked(waits.any()):
         return state
     view = road.view(state)
     assert isinstance(view, Linked)

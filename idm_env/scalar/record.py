@@ -19,7 +19,7 @@ from idm_env.roads.chains import Chains
 from idm_env.roads.ends import Ending
 from idm_env.roads.ring import Ring
 from idm_env.scalar.graph import Graph, Node, TimeStep
-from idm_env.scalar.scalar import Scalar, Untraceable, static, value_of
+from idm_env.scalar.scalar import Scalar, Unordered, Untraceable, static, value_of
 from idm_env.step import Stepping
 from idm_env.types import Motion, Scene, State
 
@@ -285,6 +285,7 @@ __all__ = [
     "Parameters",
     "Recording",
     "SeenRoad",
+    "Unordered",
     "Untraceable",
     "inputs_of_form",
     "record",

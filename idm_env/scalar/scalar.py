@@ -19,6 +19,10 @@ class Untraceable(Exception):  # noqa: N818  (a property of a step, met and pass
     """A step that cannot be recorded; the message names the effect and the function."""
 
 
+class Unordered(Untraceable):
+    """Links that are not the order of positions, as after a crash: torch does such a step, and no other for that."""
+
+
 class Scalar:
     """One node of a graph, in the clothes of a tensor with no dimension."""
 

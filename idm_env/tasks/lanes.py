@@ -195,7 +195,8 @@ class LanesTask(Task):
             away = torch.where(both > 0, away, torch.inf)
         away = away.scatter(-1, own.view(-1, 1).expand(*away.shape[:-1], 1), torch.inf)
         count = min(self.seen, self.vehicles - 1)
-        near = away.topk(count, dim=-1, largest=False, sorted=True).indices
+        # Of two that are equally near the one in the first slot comes first, however that is computed.
+        near = away.sort(dim=-1, stable=True).indices[..., :count]
 
         def beside(x: Tensor) -> Tensor:
             return x.unsqueeze(-2).expand(away.shape).gather(-1, near) - self.pick(x).unsqueeze(-1)

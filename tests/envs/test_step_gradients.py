@@ -43,6 +43,28 @@ CASES = {
     "platoon": ("platoon", {"controlled": 2, "noise": 0.1}),
     "replay": ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
     "single": ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
+    # Several lanes: who enters and leaves, changes, is let in, is put on a lane by a record, begins anew.
+    "highway": (
+        "highway",
+        {"vehicles": 12, "length": 200.0, "controlled": 2, "noise": 0.1, "failsafe": 3.0, "max_episode_steps": 22},
+    ),
+    "merge": (
+        "merge",
+        {
+            "vehicles": 20,
+            "ramp_inflow": 1500.0,
+            "controlled": 2,
+            "lane_commands": True,
+            "failsafe": 4.5,
+            "max_episode_steps": 33,
+        },
+    ),
+    "bottleneck": ("bottleneck", {"vehicles": 20, "integration": "euler", "max_episode_steps": 33}),
+    "open_highway": ("open_highway", {"vehicles": 12, "lanes_count": 2, "length": 150.0, "max_episode_steps": 33}),
+    "replay_lanes": (
+        "replay_lanes",
+        {"controlled": 2, "lane_changes": "drivers", "lane_commands": True, "max_episode_steps": 20},
+    ),
 }
 PARAMETERS = ("time_gap", "max_accel")
 
@@ -179,7 +201,7 @@ def test_what_cannot_be_recorded_steps_by_torch_and_is_named():
     env = DiffIDMVectorEnv(2, task=Asks(warmup=0), output="torch")
     env.reset(seed=0)
     action = torch.zeros(2, 1, requires_grad=True)
-    with pytest.warns(UserWarning, match="sort"):
+    with pytest.warns(UserWarning, match="a fork on values"):
         env.step(action)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

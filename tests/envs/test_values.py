@@ -12,6 +12,7 @@ from idm_env.envs.values import Values
 from idm_env.kernels.rows import RowFunction
 from idm_env.scalar.record import Untraceable
 from idm_env.simulator import Simulator
+from tests.envs.test_step_gradients import CASES as LANES
 
 pytest.importorskip("numba")
 
@@ -24,7 +25,7 @@ CASES = [
     ("platoon", {"controlled": 2, "noise": 0.1}),
     ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
     ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
-    ("highway", {"vehicles": 12, "length": 200.0, "controlled": 2, "noise": 0.1, "failsafe": 3.0}),
+    *(LANES[name] for name in ("highway", "merge", "replay_lanes")),
 ]
 
 
@@ -67,7 +68,7 @@ def test_a_single_environment_is_a_row_of_a_vector_and_the_torch_path(task, keyw
             _same(single[0].reset()[0], rows[0])
             single[1].reset()
     compiled = single[0].unwrapped.batch._values is not None
-    assert compiled == (task != "highway"), "the torch path ran, which is for several lanes alone"
+    assert compiled, "the torch path ran"
     _same(single[0].unwrapped.state.gap, single[1].unwrapped.state.gap)
     _same(vector.unwrapped.state.speed[:1], single[1].unwrapped.state.speed)
 
