@@ -6,6 +6,7 @@ Choices are frozen; what they do to gaps and memories is recorded as everything 
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -82,8 +83,8 @@ class Chain:
 
     def copy(self) -> Chain:
         """Return another one, with memory of its own."""
-        arrays = (self.slots, self.own, self.led, self.leads, self.ends, self.stale)
-        return Chain(*(x.copy() for x in arrays), self.serial, self.before)
+        arrays = {n: getattr(self, n).copy() for n in ("slots", "own", "led", "leads", "ends", "stale")}
+        return dataclasses.replace(self, **arrays)
 
 
 @dataclass

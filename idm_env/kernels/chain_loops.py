@@ -9,7 +9,7 @@ of all slots.
 from __future__ import annotations
 
 import numpy as np
-from numba import carray
+from numba import carray  # type: ignore[attr-defined]
 
 from idm_env.kernels.memory import located
 from idm_env.kernels.order_loops import lay, walk

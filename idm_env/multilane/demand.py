@@ -125,12 +125,12 @@ def turnover(stepping: Stepping, state: State, params: Params) -> State:
 
 
 def turned(
-    stepping: Stepping, state: State, params: Params, now: Tensor, asked: Callable[[Tensor], bool] = lambda _: True
+    stepping: Stepping, state: State, params: Params, now: Tensor, sure: Callable[[Tensor], bool] = lambda _: True
 ) -> State:
     """Return the state after that, in all rows where it is ``now``; a recording does not ask whether anybody waits."""
     if stepping.road.leaving:
         state = _departed(stepping, state, now)
-    return state if state.trips is None else _entered(stepping, state, params, now, asked)
+    return state if state.trips is None else _entered(stepping, state, params, now, sure)
 
 
 def _departed(stepping: Stepping, state: State, now: Tensor) -> State:
@@ -149,7 +149,7 @@ def _departed(stepping: Stepping, state: State, now: Tensor) -> State:
 
 
 def _entered(
-    stepping: Stepping, state: State, params: Params, now: Tensor, asked: Callable[[Tensor], bool]
+    stepping: Stepping, state: State, params: Params, now: Tensor, sure: Callable[[Tensor], bool]
 ) -> State:  # fmt: skip
     """Return the state after those have entered for whom it is time and who have room, one on each lane.
 
@@ -164,7 +164,7 @@ def _entered(
     road, given = stepping.road, state.trips
     assert isinstance(road, Lanes)
     waits = (state.present <= 0) & (due(given, stepping.time(state)) > given.entered) & now
-    if not asked(waits.any()):
+    if not sure(waits.any()):
         return state
     view = road.view(state)
     assert isinstance(view, Linked)
