@@ -180,11 +180,11 @@ class LaneLaid(Laid):
                 source, by = operand(tensor.to(like.dtype), (rows,), n)
             self._enter(bound, bound.stays, source, by, False, places, strides)
         for i, (slot, (x, by)) in enumerate(zip((*kernel.numbers, *kernel.flags), self.inputs, strict=True)):
-            name = self.given.get(2 * states + plan.fixed + i)
-            source = x if name is None else ("given", name)
-            into = bound.stays if name is None else bound.moves
-            if name is not None and by[2] == 0:
-                bound.given[len(places)] = name
+            asked = self.given.get(2 * states + plan.fixed + i)
+            source = x if asked is None else ("given", asked)
+            into = bound.stays if asked is None else bound.moves
+            if asked is not None and by[2] == 0:
+                bound.given[len(places)] = asked
                 places.append(0)
                 strides.append(by)
                 continue
