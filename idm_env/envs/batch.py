@@ -86,6 +86,9 @@ class Unrolled(NamedTuple):
     final: Tensor
 
 
+EAGER_STEPS = 10_000
+"""Steps on several lanes that torch does before they are compiled, which takes as long as these: half a minute."""
+
 _DETAILS = tuple((name, f"info_{name}") for name in INFO)
 
 
@@ -103,6 +106,7 @@ class Batch:
         self._world: World | None = None
         self._moves = Moves(made)
         self._values = self._compiled()
+        self._on_lanes = 0
         self._loaded = False
         self._seen: Any = None
         self._draw: Draw | None = None
@@ -331,7 +335,9 @@ class Batch:
 
         ``live`` (bool, ``(n, agents)``) leaves only single agents' vehicles to their drivers, and drops their commands.
         """
-        if self._values is not None and not self.task.simulator.untried:
+        self._on_lanes += isinstance(self.task.road, Lanes)
+        eager = self.task.simulator.untried or 0 < self._on_lanes <= EAGER_STEPS
+        if self._values is not None and not eager:
             told = self._step_values(action, live)
             if told is not None:
                 return Outcome.of(told)

@@ -17,6 +17,13 @@ from idm_env.simulator import Simulator
 
 pytest.importorskip("numba")
 
+
+@pytest.fixture(autouse=True)
+def compiled_at_once(monkeypatch):
+    """Several lanes are compiled at the first step, not after many."""
+    monkeypatch.setattr("idm_env.envs.batch.EAGER_STEPS", 0)
+
+
 CASES = {
     "ring": ("ring", {"start": "wave", "warmup": 20, "failsafe": 3.0}),
     "agents": (
