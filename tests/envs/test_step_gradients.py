@@ -66,8 +66,6 @@ CASES = {
             "max_episode_steps": 33,
         },
     ),
-    "bottleneck": ("bottleneck", {"vehicles": 20, "integration": "euler", "max_episode_steps": 33}),
-    "open_highway": ("open_highway", {"vehicles": 12, "lanes_count": 2, "length": 150.0, "max_episode_steps": 33}),
     "replay_lanes": (
         "replay_lanes",
         {"controlled": 2, "lane_changes": "drivers", "lane_commands": True, "max_episode_steps": 20},

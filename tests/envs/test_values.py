@@ -34,7 +34,9 @@ CASES = [
     ("platoon", {"controlled": 2, "noise": 0.1}),
     ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
     ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
-    *(LANES[name] for name in ("highway", "merge", "replay_lanes")),
+    LANES["highway"],
+    ("bottleneck", {"vehicles": 20, "integration": "euler", "max_episode_steps": 33}),
+    ("open_highway", {"vehicles": 12, "lanes_count": 2, "length": 150.0, "max_episode_steps": 33}),
 ]
 
 
