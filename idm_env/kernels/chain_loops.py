@@ -9,13 +9,16 @@ of all slots.
 from __future__ import annotations
 
 import numpy as np
-from numba import carray  # type: ignore[attr-defined]
 
+from idm_env.extras import needed
 from idm_env.kernels.memory import located
 from idm_env.kernels.order_loops import lay, walk
 from idm_env.kernels.phases import call_rows
 from idm_env.kernels.tiles import exact
 from idm_env.kernels.world_loop import advance, cut, retreat
+
+with needed("a compiled loop"):
+    from numba import carray  # type: ignore[attr-defined]
 
 SIZE = (1 << 40,)
 BYTE = np.empty(0, np.uint8)
