@@ -114,7 +114,7 @@ def _show(title: str, rows: list[dict[str, Any]]) -> None:
             name.replace("_", " "), overflow="fold", justify="left" if isinstance(rows[0][name], str) else "right"
         )
     for row in rows:
-        table.add_row(*(number(v) if isinstance(v, float) else str(v) for v in row.values()))
+        table.add_row(*("–" if v is None else number(v) if isinstance(v, float) else str(v) for v in row.values()))
     Console(**PLAIN).print(table)
 
 

@@ -111,6 +111,21 @@ class Estimate:
         return rows
 
     @property
+    def why_not(self) -> str:
+        """Why these numbers are no estimate, "" where they are: nothing finite, or a drift at an end of the search."""
+        if not math.isfinite(self.log_likelihood):
+            return "its likelihood is not finite"
+        limits, packed = _limits(self.drivers, None), self.settings.packed()
+        drifts = len(self.settings.sigma)
+        for j in range(drifts):
+            if packed[j] < limits[j, 0] + NEAR:
+                continue  # no drift at all, and τ of nothing
+            for i, symbol in ((j, "sigma"), (drifts + j, "tau")):
+                if packed[i] > limits[i, 1] - 1e-6 or packed[i] < limits[i, 0] + 1e-6:
+                    return f"{symbol} is at the end of what is searched, {math.exp(packed[i]):.3g}"
+        return ""
+
+    @property
     def theta(self) -> np.ndarray:
         """Every driver's most likely own log θ [rows, p]."""
         own = self.path.theta + self.path.level[0, :, : len(self.drivers.free)]

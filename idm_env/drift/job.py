@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from idm_env.data import Trajectories
 from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import fitted_on
 from idm_env.drift.estimate import Estimate
@@ -31,6 +32,17 @@ def evenly(count: int, most: int = DRIVERS) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
 
 
+STEP_S = 0.5
+"""Time between two samples that are used: drift lasts seconds, and a file of 10 Hz takes five times as long."""
+
+
+def step_of(trajectories: Trajectories) -> float | None:
+    """Return the multiple of a file's step that is nearest to ``STEP_S``, None where runs have several steps."""
+    steps = {round(step, 9) for step in trajectories.steps.values()}
+    step = max(steps)
+    return step * max(1, round(STEP_S / step)) if len(steps) == 1 else None
+
+
 def drift_file(
     source: Source, out: Path, *, drivers: int = DRIVERS, on_progress: OnProgress | None = None
 ) -> dict[str, Any]:
@@ -42,7 +54,8 @@ def drift_file(
         progress = on_progress or silent
         progress("reading", 0, 0, source.path.name)
         trajectories = source.trajectories()
-        smooth, measured = (replace(source, smooth=x).episodes(trajectories) for x in (True, False))
+        thinned = replace(source, dt=source.dt or step_of(trajectories))
+        smooth, measured = (replace(thinned, smooth=x).episodes(trajectories) for x in (True, False))
         chosen = evenly(len(smooth), drivers)
         pair = [[found[i] for i in chosen] for found in (smooth, measured)]
         told = tell(*pair, on_progress=lambda name, done, total, _: progress(name, done, total, ""))
@@ -56,7 +69,9 @@ def drift_file(
             "one_of": list(told.one_of),
             "sentence": sentence(told),
             "sorts": _sorts(told),
-            "estimates": {name: e.table() for name, e in {"none": told.steady, **told.found}.items()},
+            "estimates": {
+                name: [] if e.why_not else e.table() for name, e in {"none": told.steady, **told.found}.items()
+            },
             "data": {
                 **trajectories.summary(), "episodes": len(smooth), "taken": len(chosen), "dt": best.drivers.batch.dt,
                 "account": page.account(by_kind(trajectories.repairs), by_kind(smooth.left_out)),
@@ -91,6 +106,9 @@ def model_of(found: Estimate) -> Model:
 
 def sentence(told: Told) -> str:
     """Return in one sentence how drivers drift."""
+    if told.verdict == "cannot_tell":
+        why = told.steady.why_not or "; ".join(f"{name}: {e.why_not}" for name, e in told.found.items())
+        return f"These data cannot tell how drivers drift: {why}."
     if not told.one_of:
         return "No drift: white noise beside steady drivers explains these records as well."
     titles = {kind.name: f"{kind.title} ({kind.name})" for kind in DRIFTS}
@@ -105,11 +123,17 @@ def sentence(told: Told) -> str:
 
 
 def _sorts(told: Told) -> list[dict[str, Any]]:
-    rows = []
-    for name in sorted(told.found, key=lambda n: -told.gain[n]):
+    rows: list[dict[str, Any]] = []
+    for name in sorted(told.found, key=lambda n: (bool(told.found[n].why_not), -told.gain[n])):
+        if why := told.found[name].why_not or told.steady.why_not:
+            rows.append({
+                "sort": name, "log_likelihood": None, "sigma": None, "tau_s": None, "note": f"not estimated: {why}",
+            })  # fmt: skip
+            continue
         found = {str(row["name"]): row for row in told.found[name].table()}
         rows.append({
             "sort": name, "log_likelihood": told.gain[name],
             "sigma": found[f"{name}.sigma"]["estimate"], "tau_s": found[f"{name}.memory_time"]["estimate"],
+            "note": "",
         })  # fmt: skip
     return rows

@@ -27,7 +27,8 @@ APART = 5.0
 class Told:
     """Estimates by name of the drift, that without any, and ``one_of``: sorts that the data do not tell apart.
 
-    ``one_of`` is empty for drivers who do not drift; its first is the likeliest.
+    ``one_of`` is empty for drivers who do not drift; its first is the likeliest. Sorts that were not estimated
+    (``Estimate.why_not``) are compared with nothing.
     """
 
     steady: Estimate
@@ -41,7 +42,9 @@ class Told:
 
     @property
     def verdict(self) -> str:
-        """``none``, ``named`` or ``one_of``."""
+        """``none``, ``named``, ``one_of``, or ``cannot_tell`` where no sort or no steady driver is estimated."""
+        if self.steady.why_not or all(e.why_not for e in self.found.values()):
+            return "cannot_tell"
         return "none" if not self.one_of else "named" if len(self.one_of) == 1 else "one_of"
 
 
@@ -78,7 +81,9 @@ def tell(
     steady = one(0)
     found = {kind.name: one(i + 1, kind) for i, kind in enumerate(kinds)}
     told = Told(steady, found, ())
-    order = sorted(found, key=lambda name: -told.gain[name])
+    order = sorted((n for n in found if not found[n].why_not), key=lambda name: -told.gain[name])
+    if told.verdict == "cannot_tell":
+        return told
     best = order[0]
     usual_sigma = {kind.name: catalogue((kind,))[f"{kind.name}.sigma"].default for kind in kinds}
     if told.gain[best] < FOUND or found[best].settings.sigma[0] < LEAST * usual_sigma[best]:

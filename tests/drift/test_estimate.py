@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -12,9 +13,9 @@ import torch
 pytest.importorskip("numba")
 
 from idm_env.data import Episode, Trajectories, episodes
-from idm_env.drift import forecast
+from idm_env.drift import forecast, kinds
 from idm_env.drift.estimate import Estimate, estimate, usual
-from idm_env.drift.job import drift_file
+from idm_env.drift.job import _sorts, drift_file, sentence
 from idm_env.drift.kinds import tell
 from idm_env.effects import IDM, AccelNoise, Brakes, Delay, Effect, Replay, Wander
 from idm_env.fitting.batch import Batch
@@ -121,9 +122,32 @@ def test_the_model_of_a_file_drifts(tmp_path) -> None:
     report = drift_file(Source(file), tmp_path / "out")
     model = load_model(tmp_path / "out" / "model.yaml")
     assert report["one_of"][0] in {e.name for e in model.effects} and len(model.drivers) == 4
+    assert report["data"]["dt"] == pytest.approx(0.4), "thinned to the multiple of the file's step nearest to 0.5 s"
     assert report["one_of"][0] in report["sentence"] and "tau" in report["sentence"]
     rows = {r["sort"]: r for r in report["sorts"]}
     assert model.parameters["wander"]["sigma"] == pytest.approx(rows["wander"]["sigma"])
+
+
+def test_what_is_not_finite_or_at_a_limit_is_not_estimated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A likelihood that is not finite sorts nothing: it once turned gains of thousands into no drift."""
+    smooth, raw = (x[:3] for x in both(driven(Wander(), 0.25, 8.0)))
+    one = tell(smooth, raw, (Wander(),))
+    steady, right = one.steady, one.found["wander"]
+    for broken, why in (
+        (replace(right, log_likelihood=math.nan), "not finite"),
+        (replace(right, log_likelihood=math.inf), "not finite"),
+        (replace(right, settings=replace(right.settings, memory_time=np.array([300.0]))), "tau"),
+    ):
+        assert why in broken.why_not and not right.why_not
+        answers = iter((steady, broken, right))
+        monkeypatch.setattr(kinds, "estimate", lambda *_, answers=answers, **__: next(answers))
+        told = tell(smooth, raw, (AccelNoise(), Wander()))
+        assert told.one_of == ("wander",), "the other sort stands"
+        rows = _sorts(told)
+        assert rows[-1]["log_likelihood"] is None and why in rows[-1]["note"] and not rows[0]["note"]
+        alone = replace(told, found={"accel_noise": broken}, one_of=())
+        assert alone.verdict == "cannot_tell" and why in sentence(alone)
+    assert replace(one, steady=replace(steady, log_likelihood=math.nan)).verdict == "cannot_tell"
 
 
 def test_scores_of_a_known_normal() -> None:
