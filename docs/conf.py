@@ -37,7 +37,7 @@ smartquotes = False  # options begin with two hyphens
 html_theme = "furo"
 html_title = "idm_env"
 html_static_path: list[str] = []
-html_show_sphinx = False
+html_show_sphinx = html_show_copyright = False
 html_copy_source = False
 templates_path: list[str] = []
 myst_enable_extensions = ["colon_fence", "deflist"]

@@ -73,14 +73,13 @@ def environments() -> dict[str, str]:
         '`gymnasium.make("DiffIDM-v0", task=NAME, …)`; `make_vec` for a native batch; `idm_env.envs.pettingzoo` for '
         "one agent per controlled vehicle. Every task has a page with its picture, spaces, observation, reward, ends "
         "and keywords.", "",
-        "| task | | what it is |", "| --- | --- | --- |",
     ]  # fmt: skip
     pages = {}
     for name, cls in TASKS.items():
         pages[f"tasks/{name}.md"] = "\n".join(_environment(name, cls)) + "\n"
-        lines.append(f"| [`{name}`](tasks/{name}.md) | ![{name}](../tasks/{name}.png) | {_described(cls)[0]} |")
+        lines += [f"**[{name}](tasks/{name}.md).** {_described(cls)[0]}", "", f"![{name}](../tasks/{name}.png)", ""]
     lines += [
-        "", "## Keywords of every task", "", "Each is a keyword of `make`, and may stand in YAML.", "",
+        "## Keywords of every task", "", "Each is a keyword of `make`, and may stand in YAML.", "",
         *_keywords(_base(TASKS["ring"]), None), "", "```{toctree}", ":hidden:", "",
         *(f"tasks/{name}" for name in TASKS), "```",
     ]  # fmt: skip
@@ -95,8 +94,12 @@ def _environment(name: str, cls: Any) -> list[str]:
     from idm_env import _task_id
 
     first, parts = _described(cls)
+    if not any("Reward" in part for part in parts):  # what its kind says holds for it
+        kind = next(c for c in cls.__mro__[1:] if "Reward, per agent" in (c.__doc__ or ""))
+        parts += [_described(kind)[0], *_described(kind)[1]]
     lines = [f"# {name}", "", first, "", f"![After 40 s without commands](../../tasks/{name}.png)", ""]
-    lines += [paragraph + "\n" for paragraph in parts]
+    # Observation, reward and end are looked for, so each has a paragraph of its own.
+    lines += [re.sub(r"(?<=[.)]) (?=Reward[ ,]|Terminated )", "\n\n", paragraph) + "\n" for paragraph in parts]
     lines += [
         f'```text\nenv = gymnasium.make("{_task_id(name)}")  # or "DiffIDM-v0", task="{name}"\n```',
         "",
@@ -117,8 +120,8 @@ def _faces(name: str) -> list[str]:
     features = task.features
     lines = [
         "## Spaces", "",
-        f"| | by default |\n| --- | --- |\n| observation | `{env.observation_space}` |\n"
-        f"| action | `{env.action_space}` |", "",
+        f"| | by default |\n| --- | --- |\n| observation | {_space(env.observation_space)} |\n"
+        f"| action | {_space(env.action_space)} |", "",
         "## Observation", "",
         "Of each agent. An entry is divided by its scale, unless `observation=\"raw\"`.", "",
         "| entry | unit | divided by | lowest | highest |", "| --- | --- | --- | --- | --- |",
@@ -141,6 +144,15 @@ def _faces(name: str) -> list[str]:
     ]  # fmt: skip
 
 
+def _space(space: Any) -> str:
+    """Return a box in one line: its shape, and its bounds where one pair is all."""
+    low, high = ({float(x) for x in bound.flat} for bound in (space.low, space.high))
+    one = len(low) == len(high) == 1
+    bounds = f"{low.pop():g}, {high.pop():g}, " if one else ""
+    told = "" if one else "; bounds are those below, over their scales"
+    return f"`Box({bounds}{space.shape}, {space.dtype})`{told}"
+
+
 def _returns(name: str) -> list[str]:
     """Return the table of returns of a task, as ``benchmarks.environments --returns`` measured them."""
     rows = [line.split(",") for line in (ROOT / "docs" / "returns.csv").read_text(encoding="utf-8").splitlines()[1:]]
@@ -157,7 +169,7 @@ def _returns(name: str) -> list[str]:
         "| 5 episodes, seeds 0 to 4 | mean | lowest | highest |", "| --- | --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in mine), "",
         f"{trained}IDM drives without commands, which costs nothing. The best rule is IDM's formula as commands, with "
-        "the best of 24 drawn sets of parameters on five other seeds. `python -m benchmarks.environments --returns`, "
+        "the parameters that a search found on other seeds. `python -m benchmarks.environments --returns`, "
         "2026-11-23, 2 cores, no GPU.", "",
     ]  # fmt: skip
 
@@ -467,13 +479,18 @@ def reports(pictures: Path) -> None:
     import base64
     import tempfile
 
+    from idm_env.cli.commands import app
     from idm_env.data import synthetic
     from idm_env.fitting.job import fit_file, simulate_file
     from idm_env.fitting.options import Options, Source
     from idm_env.trajectories.files import filter_file, reconstruct_file
 
-    if all((pictures / f"{name}-0.png").exists() for name in ("fit", "simulate", "filter", "reconstruct")):
+    if all((pictures / f"{name}-0.png").exists() for name in ("fit", "simulate", "filter", "reconstruct", "plot")):
         return
+    app(
+        ["plot", str(ROOT / "configs" / "ring.yaml"), "--seconds", "600", "--out", str(pictures / "plot-0.png")],
+        standalone_mode=False,
+    )
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         made, _ = synthetic.generate(3, runs=4, followers=2, seconds=60.0, noise=0.15)

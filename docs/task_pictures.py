@@ -1,12 +1,18 @@
-"""Small pictures of the tasks for README and the site: ``python docs/task_pictures.py`` writes docs/tasks/TASK.png."""
+"""Pictures of the tasks for README and the site, and of the teacher's page.
+
+``python docs/task_pictures.py`` writes docs/tasks/TASK.png, docs/teach-diagram.png and docs/teach-wave.gif.
+"""
 
 from __future__ import annotations
 
+import os
+import re
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import gymnasium
-from PIL import Image
+from PIL import Image, ImageSequence
 
 import idm_env  # noqa: F401 (registers DiffIDM-v0)
 from idm_env.tasks import TASKS
@@ -35,6 +41,26 @@ def pictures(folder: Path = FOLDER) -> list[Path]:
     return written
 
 
+def teaching(folder: Path = FOLDER.parent) -> list[Path]:
+    """Run the block of the teacher's page, and keep its pictures, the moving one in few colours; return the files."""
+    code = re.findall(
+        r"^```python\n(.*?)^```$", (FOLDER.parent / "teach.md").read_text("utf-8"), re.MULTILINE | re.DOTALL
+    )
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as place:
+        os.chdir(place)
+        try:
+            exec(code[0], {})
+            still, moving = Image.open("diagram.png"), Image.open("wave.gif")
+            frames = [f.convert("RGB").quantize(32, dither=Image.Dither.NONE) for f in ImageSequence.Iterator(moving)]
+            written = [folder / "teach-diagram.png", folder / "teach-wave.gif"]
+            still.quantize(64).save(written[0], optimize=True)
+            frames[0].save(written[1], save_all=True, append_images=frames[1:], duration=200, loop=0)
+        finally:
+            os.chdir(before)
+    return written
+
+
 if __name__ == "__main__":
-    for path in pictures():
+    for path in [*pictures(), *teaching()]:
         print(path)
