@@ -177,7 +177,7 @@ def fit(
         validation.within("--held-out", share, 0.001, 0.999)
     with shown(console) as report:
         from idm_env.fitting import sumo as vtypes
-        from idm_env.fitting.job import fit_file
+        from idm_env.fitting.job import fit_file, in_words
         from idm_env.fitting.options import Options, Source
         from idm_env.model_file import load_model
 
@@ -200,8 +200,7 @@ def fit(
     rows = [{"": "fitted", **result["fit"]}]
     if result["held_out"] is not None:
         rows.append({"": "held out", **result["held_out"]})
-    names = ("", "episodes", "gap_rmse_m", "gap_rmse_median_m", "gap_mae_m", "speed_rmse_mps", "collisions")
-    _show("Errors in free simulation", [{n: row[n] for n in names} for row in rows])
+    _show("Errors in free simulation", in_words(rows))
     console.print(result["at_bounds"], soft_wrap=True, highlight=False)
     _done(out, result["data"]["account"])
 
@@ -259,9 +258,10 @@ def explain(
     ] = None,
     job: JobOptions,
 ) -> None:
-    """Fit a law, find the residual, trace it to the effect that the model lacks, add it, and report before and after.
+    """Find the effect that a calibrated car-following model lacks, add it, and report the errors before and after.
 
-    Writes report.json, report.html and model.yaml, the corrected model. The errors are of runs held out of everything.
+    Writes report.json, report.html and model.yaml, the corrected model. Errors are of a test set: runs used
+    neither for fitting nor for model selection.
     """
     with shown(console) as report:
         from idm_env.data import pieces
@@ -319,7 +319,7 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
     console.print(result["sentence"], soft_wrap=True, highlight=False)
     before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
     if before is not None:
-        _show("Errors on runs that neither fitted nor chose anything", [
+        _show("Errors on the test set", [
             _error_row(name, unit, before[key], after[key], models, result["helps"].get(key))
             for key, (name, unit) in ERRORS.items()
         ])  # fmt: skip
@@ -374,9 +374,9 @@ def demo(
     out: Out = Path("out/demo"),
     seed: Annotated[int, ranged(help="Seed of the generated data.", low=0, high=1e9)] = 7,
 ) -> None:
-    """Show the main job: a platoon whose generator has an effect that the fitted model is not told of.
+    """Generate platoons with a hidden effect, and find it: the whole of `explain` in half a minute.
 
-    The data are written to OUT/platoon.csv first, without a word on the effect; `explain` then has to find it.
+    The data are written to OUT/platoon.csv first; nothing in them names the effect.
     """
     from idm_env.reports.undecided import EXPLAINED
 
@@ -418,7 +418,7 @@ def simulate(
     if (model is None) == (base is None):
         raise ValueError("simulate takes either a model (--model) or a car-following law (--base). Give one of them.")
     with shown(console) as report:
-        from idm_env.fitting.job import simulate_file
+        from idm_env.fitting.job import in_words, simulate_file
         from idm_env.fitting.options import Source
 
         _work_begins()
@@ -426,7 +426,7 @@ def simulate(
             data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, window=window, **dataclasses.asdict(file)
         )
         result = simulate_file(source, model, out, base=base, seed=seed, on_progress=report)
-    _show("Errors in free simulation", [result["error"]])
+    _show("Errors in free simulation", in_words([result["error"]]))
     console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)
     _done(out, result["data"]["account"])
 
@@ -442,9 +442,9 @@ def drift(
     min_seconds: MinSeconds = 20.0,
     dt: Step = None,
 ) -> None:
-    """Say how unsteady drivers are: what of them wanders, how much (sigma) and for how long (tau).
+    """Estimate how unsteady drivers are: which quantity wanders, by how much (sigma), with which memory time (tau).
 
-    Writes report.json, and model.yaml, drivers who drift: for simulate --model, and as `effects` of every environment.
+    Writes report.json, and model.yaml with drivers who drift, for simulate --model and as `effects` of environments.
     """
     with shown(console) as report:
         from idm_env.drift.job import drift_file
@@ -453,7 +453,9 @@ def drift(
         _work_begins()
         source = Source(data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, **dataclasses.asdict(file))
         result = drift_file(source, out, drivers=drivers, on_progress=report)
-    _show("Log-likelihood that every sort of drift gains over drivers who do not drift", result["sorts"])
+    names = {"log_likelihood": "gain in log-likelihood", "tau_s": "tau (s)"}
+    rows = [{names.get(name, name): x for name, x in row.items()} for row in result["sorts"]]
+    _show("Every sort of drift against drivers who do not drift", rows)
     console.print(result["sentence"], soft_wrap=True, highlight=False)
     console.print(result["data"]["account"], soft_wrap=True, highlight=False)
     _told("Model", out / "model.yaml")
@@ -759,6 +761,12 @@ def _done(out: Path, account: str) -> None:
     _told("Report", out / "report.html")
 
 
+_ORDER = (
+    "demo", "plot", "filter", "reconstruct", "fit", "explain", "simulate", "drift", "predict", "effects", "doctor",
+    "bench",
+)  # fmt: skip
+"""Of commands in the help and on the site: each takes a file of the one before."""
+app.registered_commands.sort(key=lambda c: _ORDER.index(str(c.name or getattr(c.callback, "__name__", ""))))
 for _command in app.registered_commands:
     assert _command.callback is not None
     _command.cls, _command.callback = _Refusing, spread(_command.callback)

@@ -40,8 +40,8 @@ DATA = {
     "drivers": ("groups of parameters", "drivers, or what --by names, with IDM parameters of their own"),
     "vehicle_seconds": ("vehicle seconds", "time behind a leader, all followers added"),
     "windows": ("5 s windows", "predictions that candidates were fitted to"),
-    "runs_to_choose_on": ("runs to choose on", "all but those kept back"),
-    "smallest_p_value": ("smallest possible p-value", "0.5 to the power of the runs to choose on"),
+    "runs_to_choose_on": ("runs for model selection", "all but the test set"),
+    "smallest_p_value": ("smallest possible p-value", "0.5 to the power of the runs for model selection"),
     "gap_noise_m": ("white noise of the gap (m)", "from third differences: slow drift does not show in it"),
     "residual_autocorrelation": ("autocorrelation of the whitened residual", "0: the model of noise is right"),
     "share_following": ("share of time following", "behind a leader, closing by at most 1 m/s"),
@@ -86,7 +86,7 @@ def blocks(d: Discovery) -> Iterator[Block]:
     yield pages.bullets(r["details"])
     yield pages.note(
         f"{r['data']['source']} · {r['data']['drivers']} groups of parameters in {r['data']['runs']} runs · "
-        f"{len(r['error']['held_out_runs'])} runs kept back for the final check · seed {r['seed']}"
+        f"{len(r['error']['held_out_runs'])} runs in the test set · seed {r['seed']}"
     )
     yield from _errors(d)
     yield from _laws(r)
@@ -118,7 +118,7 @@ def _lights(r: dict[str, Any], law: str) -> Iterator[Block]:
 
 def known_instead(r: dict[str, Any], law: str) -> list[tuple[str, str]]:
     """Return names and words of the cards of a report in which no second model is compared with the law."""
-    cards = [("Runs", f"{r['data']['runs']}, of them {r['data']['runs_to_choose_on']} to choose on")]
+    cards = [("Runs", f"{r['data']['runs']}, of them {r['data']['runs_to_choose_on']} for model selection")]
     if r["verdict"] == Verdict.CANNOT_TELL.value:
         cards.append(("What to do", "record more runs: seven decide, ten are better"))
     if r["shared"] is not None:
@@ -130,22 +130,22 @@ def known_instead(r: dict[str, Any], law: str) -> list[tuple[str, str]]:
     before = r["error"]["before"]
     if before is not None:
         floor = r["error"]["floor"]["gap_rmse_m"]
-        cards.append((f"Gap in free simulation, {law}", f"{number(before['gap_rmse_m'])} m on runs kept back; "
-                      f"the noise of the sensors alone leaves {number(floor)} m"))  # fmt: skip
+        cards.append((f"Gap in free simulation, {law}", f"{number(before['gap_rmse_m'])} m on the test set; "
+                      f"sensor noise alone leaves {number(floor)} m"))  # fmt: skip
     return cards
 
 
 def _first_picture(d: Discovery) -> Iterator[Block]:
     figure = pictures.first_screen(d)
     if figure is None:
-        yield pages.note("No run could be kept back for a final check.")
+        yield pages.note("Too few runs for a test set.")
         return
     follower = pictures.typical(d)
     assert follower is not None and d.judgement.before is not None
     run, vehicle = d.judgement.before.followers[follower]
     yield pages.picture(
         figure,
-        f"The follower kept back whose error with {d.judgement.titles[0]} is the median one: run {run}, vehicle "
+        f"The follower of the test set with the median error by {d.judgement.titles[0]}: run {run}, vehicle "
         f"{vehicle}. Below: simulated less measured gap.",
         pictures.first_screen(d, (4.2, 4.6)),
     )
@@ -153,9 +153,9 @@ def _first_picture(d: Discovery) -> Iterator[Block]:
 
 def _errors(d: Discovery) -> Iterator[Block]:
     r, judgement = d.report, d.judgement
-    yield pages.heading("Errors on runs that neither fitted nor chose anything")
+    yield pages.heading("Errors on the test set")
     if judgement.before is None:
-        yield pages.text("No run could be kept back for a final check.")
+        yield pages.text("Too few runs for a test set.")
         return
     results = {name: judged.summary() for name, judged, *_ in pictures.named(d)}
     rows = []
@@ -173,7 +173,7 @@ def _errors(d: Discovery) -> Iterator[Block]:
     files = "; ".join(f"{file} is {name}" for file, name in r["models"].items())
     best = " model.yaml predicts best: the smaller geometric mean of the three errors." if r["helps"] else ""
     yield pages.note(
-        f"Models: {files}.{best} All are calibrated the same way. Runs kept back: "
+        f"Models: {files}.{best} All are calibrated the same way. Runs of the test set: "
         + ", ".join(pages.shortened(r["error"]["held_out_runs"], 20))
     )
     told = words.ceilings(r["ceilings"], r["error"]["before"]["gap_rmse_m"], r["error"]["floor"]["gap_rmse_m"])
@@ -186,7 +186,7 @@ def _errors(d: Discovery) -> Iterator[Block]:
     partial = r["partial"]
     if partial:
         yield pages.note(
-            f"{percent(partial['share_of_drivers_improved'])} of the followers kept back improve with "
+            f"{percent(partial['share_of_drivers_improved'])} of the followers of the test set improve with "
             f"{partial['effect']}, which was not added."
         )
 
@@ -323,11 +323,11 @@ def _tried(r: dict[str, Any]) -> Iterator[Block]:
         "ahead, all judged by one model of noise (correlated within and between windows, so that drivers' own noise is "
         "not taken for an effect). Every trial of a candidate lets all drivers re-adjust. Its gain is measured on runs "
         "that its parameters have not seen, and tested by sign flips of whole runs (of followers within their runs, "
-        f"where fewer than {ENOUGH_RUNS}, in free simulation {MANY_RUNS}, are left to choose on) with the maximum over "
-        "the whole list (Westfall and Young). Gains in free simulation, of stretches that the drivers' parameters have "
-        f"not seen, have a share of {FREE_SHARE:.0%} of the test's level. It must be significant at {percent(ALPHA)}, "
-        f"gain at least {percent(LEAST_GAIN, 1)}, explain at least {percent(LEAST_SHARE)} of what any smooth function "
-        "of the state explains, not make free simulation worse, and hold on the runs kept back, where it is called an "
-        "improvement only if an error falls, none is worse, and the gap in free simulation rises by "
+        f"where fewer than {ENOUGH_RUNS}, in free simulation {MANY_RUNS}, are left for model selection) with the "
+        "maximum over the whole list (Westfall and Young). Gains in free simulation, of stretches that the drivers' "
+        f"parameters have not seen, have a share of {FREE_SHARE:.0%} of the test's level. It must be significant at "
+        f"{percent(ALPHA)}, gain at least {percent(LEAST_GAIN, 1)}, explain at least {percent(LEAST_SHARE)} of what "
+        "any smooth function of the state explains, not make free simulation worse, and hold on the test set, where it "
+        "is called an improvement only if an error falls, none is worse, and the gap in free simulation rises by "
         f"{HOLDS - 1.0:.0%} at most, or falls for most followers."
     )

@@ -67,12 +67,12 @@ def all_of(d: Discovery) -> list[tuple[str, Block]]:
     put("Residual over position and time", "The same acceleration as a map.", maps(d))
     put(
         "Measured and simulated gap",
-        "Best, median and worst follower kept back, in free simulation behind the measured leader; in every "
+        "Best, median and worst follower of the test set, in free simulation behind the measured leader; in every "
         "stretch (up to 30 s) with the driver's own parameters from those before and after it.",
         gaps(d),
     )
     put(
-        "Error of every follower kept back",
+        "Error of every follower of the test set",
         "Free simulation; below the line the model on the axis is better.",
         scatter(d),
     )
@@ -295,7 +295,7 @@ def _trace(judged: Judged, follower: int) -> tuple[np.ndarray, ...]:
 
 
 def typical(d: Discovery) -> int | None:
-    """Return the follower kept back whose error with IDM is the median one, or None where no run was kept."""
+    """Return the follower of the test set whose error with IDM is the median one, or None where no run was kept."""
     if d.judgement.before is None:
         return None
     error = d.judgement.before.gap_rmse
@@ -340,7 +340,7 @@ def first_screen(d: Discovery, size: tuple[float, float] = (9.0, 4.0)) -> Figure
 
 
 def gaps(d: Discovery) -> Figure | None:
-    """Best, median and worst follower kept back."""
+    """Best, median and worst follower of the test set."""
     if d.judgement.before is None:
         return None
     models = named(d)
@@ -365,7 +365,7 @@ def gaps(d: Discovery) -> Figure | None:
 
 
 def scatter(d: Discovery) -> Figure | None:
-    """Errors of both models, one point per follower kept back."""
+    """Errors of both models, one point per follower of the test set."""
     if d.judgement.before is None or d.judgement.compared is None:
         return None
     (plain, before, _, _), (corrected, after, _, _) = named(d)

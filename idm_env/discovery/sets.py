@@ -162,7 +162,7 @@ def _page(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
         page.lead(f"{told}."),
         page.table(table, digits={"gap RMSE before (m)": 2, "after (m)": 2}),
         page.note(
-            "Errors are of runs kept back in every set. Each set was judged by itself: over many sets some verdicts "
+            "Errors are of each set's test runs. Each set was judged by itself: over many sets some verdicts "
             "are wrong by chance. Every set has its own report, in the folder of its name."
         ),
     ]

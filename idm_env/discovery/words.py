@@ -118,14 +118,14 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
         return ""
     figure = refusal.figure
     return {
-        Reason.FEW_RUNS: f"only {figure:.0f} run{' is' if figure == 1 else 's are'} left to choose on",
-        Reason.NO_POWER: f"most effects would not have been found at their usual strengths in the {figure:.0f} runs "
-        "left to choose on",
+        Reason.FEW_RUNS: f"only {figure:.0f} run{' is' if figure == 1 else 's are'} left for model selection",
+        Reason.NO_POWER: f"the {figure:.0f} runs left for model selection would not have shown most effects at their "
+        "usual strengths",
         Reason.NO_GAIN: "no candidate gains enough on held-out runs",
         Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",
         Reason.FREE_SIMULATION: f"{tried} makes free simulation worse",
-        Reason.LOCKBOX: f"the runs kept back do not confirm {tried}",
-        Reason.HELD_OUT: f"predictions of the runs kept back get no better with {tried}",
+        Reason.LOCKBOX: f"the test set does not confirm {tried}",
+        Reason.HELD_OUT: f"predictions of the test set get no better with {tried}",
         Reason.LAW: "another law predicts better than all that was added to IDM",
     }[refusal.reason]  # fmt: skip
 
@@ -161,20 +161,17 @@ def headline(
         return f"{text[0].upper()}{text[1:]}{unnamed}{_but(errors)}."
     if verdict is Verdict.NONE:
         return (
-            "Nothing is missing that these data could show: no candidate lowers the error on runs that it was not "
-            f"fitted to{_limits(strengths or {})}."
+            "Nothing is missing that these data could show: no candidate lowers the held-out error"
+            f"{_limits(strengths or {})}."
         )
     if verdict is Verdict.CANNOT_TELL:
         powerless = refusal is not None and refusal.reason is Reason.NO_POWER
         needed = "more runs, ten or more," if powerless else "four runs of three followers or seven runs, better ten,"
-        return (
-            f"These data cannot tell: {reason(refusal, tried)}; {needed} are needed (a quarter is kept for the final "
-            "check)."
-        )
+        return f"These data cannot tell: {reason(refusal, tried)}; {needed} are needed (a quarter is the test set)."
     if refusal is not None and refusal.reason is Reason.HELD_OUT:
         return (
-            f"Something is missing, but no model tried predicts better: with {tried}, found on the runs that chose, "
-            f"{_rises(errors, median_ratio)} on the runs kept back."
+            f"Something is missing, but no candidate predicts better: {tried} was selected, and "
+            f"{_rises(errors, median_ratio)} on the test set."
         )
     return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
 
@@ -207,9 +204,9 @@ def _but(errors: Mapping[str, Comparison]) -> str:
     """Say what the errors on runs kept back take from a finding."""
     worse = [ERRORS[k][0] for k, c in errors.items() if c.light is Light.WORSE]
     if worse:
-        return f"; on the runs kept back the error of the {' and the '.join(worse)} gets worse by it"
+        return f"; on the test set the error of the {' and the '.join(worse)} is larger with it"
     if errors and not any(c.light is Light.BETTER for c in errors.values()):
-        return "; no error on the runs kept back is measurably lower for it"
+        return "; no error on the test set is significantly lower with it"
     return ""
 
 
@@ -315,9 +312,9 @@ def weight(prior: Mapping[str, Any]) -> str:
         for seconds, error in zip(prior["tried_s"], prior["gap_rmse_m"], strict=True)
     )
     return (
-        f"Before any effect was judged, the population's weight for a driver was chosen by the gap in free simulation "
-        f"of stretches that his parameters had not seen, on the runs that choose: errors of "
-        f"{number(prior['alike_s'])} s count as one ({tried})."
+        f"Every driver's parameters are drawn towards the population's. How strongly was chosen before any effect was "
+        "tested, by the gap in free simulation of validation runs: errors within "
+        f"{number(prior['alike_s'])} s count as one (tried: {tried})."
     )
 
 
@@ -328,19 +325,14 @@ def ceilings(told: Mapping[str, float | None], before_m: float | None, floor_m: 
     if share is not None:
         parts.append(f"{100 * share:.0f} % of the gap's squared error repeats in matched situations of other runs")
     if halves is not None:
-        parts.append(f"drivers' time gaps in the two halves of their time correlate by {number(halves, 2)}")
+        parts.append(f"a driver's time gaps in the first and second half of a record correlate by {number(halves, 2)}")
     if refit is not None and before_m is not None:
-        parts.append(
-            f"drivers refitted to the very stretches that are scored leave {number(refit)} m of {number(before_m)} m"
-        )
+        parts.append(f"parameters fitted to the test set itself leave {number(refit)} m of {number(before_m)} m")
     smooth = told.get("smooth_function_gain")
     if smooth is not None:
-        parts.append(
-            f"the best smooth function of the state that was tried lowers the error of predictions of 5 s by "
-            f"{100 * smooth:.1f} %"
-        )
+        parts.append(f"the best smooth function of the state lowers the error 5 s ahead by {100 * smooth:.1f} %")
     if floor_m is not None:
-        parts.append(f"noise and drift of the sensors alone leave {number(floor_m, 2)} m")
+        parts.append(f"sensor noise alone leaves {number(floor_m, 2)} m")
     text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 

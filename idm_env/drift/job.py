@@ -110,11 +110,12 @@ def sentence(told: Told) -> str:
         why = told.steady.why_not or "; ".join(f"{name}: {e.why_not}" for name, e in told.found.items())
         return f"These data cannot tell how drivers drift: {why}."
     if not told.one_of:
-        return "No drift: white noise beside steady drivers explains these records as well."
+        return "No drift: steady drivers and white noise explain these records as well."
     titles = {kind.name: f"{kind.title} ({kind.name})" for kind in DRIFTS}
     rows = {str(row["name"]): row for row in told.found[told.one_of[0]].table()}
     told_of = []
-    for key, symbol, unit in (("sigma", "sigma", ""), ("memory_time", "tau", " s")):
+    size = next(p.unit for e in DRIFTS if e.name == told.one_of[0] for p in e.parameters if p.name == "sigma")
+    for key, symbol, unit in (("sigma", "sigma", "" if size == "1" else f" {size}"), ("memory_time", "tau", " s")):
         row = rows[f"{told.one_of[0]}.{key}"]
         told_of.append(f"{symbol} {row['estimate']:.3g}{unit} ({row['low']:.3g} to {row['high']:.3g})")
     others = ", ".join(titles[n] for n in told.one_of[1:])

@@ -246,7 +246,7 @@ def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, A
         page.lead(lead),
         *([page.lead(result["over_fitting"])] if result["over_fitting"] else []),
         page.text(result["at_bounds"]),
-        _errors_table(rows),
+        page.table(in_words(rows)),
         page.note(
             f"{result['fit']['converged']} of {result['fit']['groups']} groups converged. A value on its bound is not "
             "an estimate: the data would have it beyond."
@@ -356,7 +356,7 @@ def _simulate_file(
             f"{error.summary()['gap_rmse_m']:.2f} m, {result['fitted_on']['words']} {matched} of them have driver "
             "parameters of their own."
         ),
-        _errors_table([error.summary()]),
+        page.table(in_words([error.summary()])),
         pictures.examples(problem, error, simulated),
         page.heading("Residuals"),
         pictures.residuals(problem, simulated),
@@ -368,14 +368,14 @@ def _simulate_file(
     return result
 
 
-def _errors_table(rows: list[dict[str, Any]]) -> page.Block:
-    """Return a table of errors under their names in words and units."""
+def in_words(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return errors under their names in words and units."""
     names = {
         "": "", "gap_rmse_m": "gap RMSE (m)", "gap_rmse_median_m": "median gap RMSE (m)",
         "gap_mae_m": "mean |gap error| (m)", "speed_rmse_mps": "speed RMSE (m/s)", "collisions": "collisions",
         "episodes": "episodes",
     }  # fmt: skip
-    return page.table([{title: row[name] for name, title in names.items() if name in row} for row in rows])
+    return [{title: row[name] for name, title in names.items() if name in row} for row in rows]
 
 
 def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, torch.Tensor, int]:

@@ -22,7 +22,7 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
 
     The report has the keys of every report of ``explain``; there is no model.
     """
-    sentence = f"{trajectories.source} is one recording, of which no run can be held out for a final check. {cure}"
+    sentence = f"{trajectories.source} is one recording, so no run can be held out as a test set. {cure}"
     found: dict[str, Any] = {
         "verdict": "cannot_tell", "reason": "few_runs", "sentence": sentence, "details": [cure], "found": [],
         "known": [], "helps": {}, "interval": None, "models": {}, "partial": None, "candidates": [], "shared": None,

@@ -218,7 +218,7 @@ def test_what_makes_every_error_worse_is_not_named(monkeypatch: pytest.MonkeyPat
     found = discover(few(effect="lag"), effects=["lag", "drag"])
     report = found.report
     assert report["verdict"] == "unexplained" and report["reason"] == "held_out" and report["found"] == []
-    assert "no error falls on the runs kept back" in report["sentence"] and "response lag" in report["sentence"]
+    assert "no error falls on the test set" in report["sentence"] and "response lag" in report["sentence"]
     assert "τ dA/dt = a − A" in " ".join(report["details"])
     assert all(told["ratio"] > 1.0 for told in report["helps"].values())
     assert report["error"]["after"] == report["error"]["before"]
@@ -246,7 +246,8 @@ def test_whoever_gave_seven_runs_is_not_told_that_seven_are_needed() -> None:
     few = words.headline(Verdict.CANNOT_TELL, [], Refusal(Reason.FEW_RUNS, 2), "", {})
     assert "only 2 runs are left" in few and "four runs of three followers or seven runs, better ten, are needed" in few
     weak = words.headline(Verdict.CANNOT_TELL, [], Refusal(Reason.NO_POWER, 5), "", {})
-    assert "in the 5 runs left to choose on; more runs, ten or more, are needed" in weak
+    assert "the 5 runs left for model selection would not have shown most effects" in weak
+    assert "more runs, ten or more, are needed" in weak
 
 
 def test_none_says_what_is_excluded_and_what_would_not_have_been_seen() -> None:
@@ -276,8 +277,8 @@ def test_ceilings_are_told_with_the_smooth_function_and_the_sensors(lag: Discove
     assert 0.05 < told["smooth_function_gain"] < 1.0
     text = words.ceilings(told, lag.report["error"]["before"]["gap_rmse_m"], lag.report["error"]["floor"]["gap_rmse_m"])
     assert (
-        f"predictions of 5 s by {100 * told['smooth_function_gain']:.1f} %" in text
-        and "sensors alone leave 0.0" in text
+        f"error 5 s ahead by {100 * told['smooth_function_gain']:.1f} %" in text
+        and "sensor noise alone leaves 0.0" in text
     )
 
 
@@ -292,5 +293,5 @@ def test_what_is_not_compared_has_cards_all_the_same() -> None:
             {"verdict": told, "data": data, "shared": common, "error": error, "helps": {}}, "IDM"
         )
         assert [name for name, _ in cards] == [*names, "Gap in free simulation, IDM"]
-        assert all(card for _, card in cards) and "2 m on runs kept back" in cards[-1][1]
+        assert all(card for _, card in cards) and "2 m on the test set" in cards[-1][1]
     assert cards[1][1] == "run a, 10 to 20 s, 3 followers"
