@@ -31,6 +31,14 @@ class CodeStore(Protocol):
     def save(self, name: str, content: bytes) -> None: ...  # noqa: D102
 
 
+class SymbolTable(Protocol):
+    """Compiled functions that others call by a symbol: ``known`` are what ``enter`` takes to enter each of them."""
+
+    known: dict[str, tuple[Any, ...]]
+
+    def enter(self, *made: Any) -> Any: ...  # noqa: D102
+
+
 class _KeptCode:
     """Machine code of one function in a ``CodeStore``, in place of numba's own cache of it.
 
@@ -42,15 +50,22 @@ class _KeptCode:
 
     cache_path = ""
 
-    def __init__(self, name: Callable[[str], str], store: CodeStore) -> None:
-        self._name, self._store = name, store
+    def __init__(self, name: Callable[[str], str], store: CodeStore, links: SymbolTable | None) -> None:
+        self._name, self._store, self._links = name, store, links
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         from numba.core.compiler import CompileResult
 
         context.refresh()
         name = self._name(f"{signature} {context.codegen().magic_tuple()}")
-        return self._store.load(name, lambda kept: CompileResult._rebuild(context, *pickle.loads(kept)))
+
+        def rebuilt(kept: bytes) -> Any:
+            calls, made = pickle.loads(kept)
+            for call in calls:
+                self._links.enter(*call)  # type: ignore[union-attr]
+            return CompileResult._rebuild(context, *made)
+
+        return self._store.load(name, rebuilt)
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         from numba.core.serialize import dumps
@@ -58,22 +73,37 @@ class _KeptCode:
         if compiled.library.has_dynamic_globals or not all(loop.can_cache for loop in compiled.lifted):
             return
         name = self._name(f"{signature} {compiled.codegen.magic_tuple()}")
-        self._store.save(name, dumps(compiled._reduce()))
+        known = {} if self._links is None else self._links.known
+        symbols = [f.name for f in compiled.library._final_module.functions if f.is_declaration] if known else []
+        self._store.save(name, dumps(([known[s] for s in symbols if s in known], compiled._reduce())))
 
     def flush(self) -> None:
         """Nothing: what is stale has another name."""
 
 
-def compiled_loop(function: Function, options: dict[str, Any], name: Callable[[str], str], store: CodeStore) -> Any:
+def compiled_loop(
+    function: Function, options: dict[str, Any], name: Callable[[str], str], store: CodeStore, links: SymbolTable
+) -> Any:
     """Return a function compiled by ``numba.njit``, whose machine code is kept in a store.
 
-    ``name`` makes a name of what tells one compiled version of the function from the others (types, machine).
+    ``name`` makes a name of what tells one compiled version of the function from the others (types, machine). What it
+    calls by a symbol of ``links`` is entered before its code is loaded.
     """
     import numba
 
     made: Any = numba.njit(**options)(function)
-    made._cache = _KeptCode(name, store)
+    made._cache = _KeptCode(name, store, links)
     return made
+
+
+def address_of(loop: Any, kinds: tuple[Any, ...]) -> tuple[int, Any]:
+    """Return where a compiled loop begins for arguments of these types, as C calls it, and the type that it returns.
+
+    Why: numba gives addresses of callbacks only, whose types stand in the text. Tried: numba 0.60.0 and 0.68.1.
+    """
+    loop.compile(kinds)
+    made = loop.overloads[kinds]
+    return made.library.get_pointer_to_function(made.fndesc.llvm_cfunc_wrapper_name), made.signature.return_type
 
 
 def compiled_callback(
@@ -83,9 +113,21 @@ def compiled_callback(
     from numba.core import ccallback, sigutils
 
     made: Any = ccallback.CFunc(function, sigutils.normalize_signature(signature), locals={}, options=options)
-    made._cache = _KeptCode(name, store)
+    made._cache = _KeptCode(name, store, None)
     made.compile()
     return made
+
+
+class Uncompiled:
+    """Mixed into a ``TorchDispatchMode``: what it sees is not compiled, and nothing is imported to say so.
+
+    Why: torch wraps such a mode so that its compiler leaves it alone, and imports the compiler for it, 2 CPU s, at the
+    first operation. Tried: torch 2.13.0; older versions do not ask.
+    """
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False
 
 
 @contextmanager

@@ -86,8 +86,8 @@ class Unrolled(NamedTuple):
     final: Tensor
 
 
-EAGER_STEPS = 10_000
-"""Steps on several lanes that torch does before they are compiled, which takes as long as these: half a minute."""
+EAGER_STEPS = 2_000
+"""Steps on several lanes that torch does before they are compiled, which takes as long as these."""
 
 _DETAILS = tuple((name, f"info_{name}") for name in INFO)
 

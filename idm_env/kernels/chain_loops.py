@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from idm_env.extras import needed
+from idm_env.kernels.compiler import apart
 from idm_env.kernels.memory import located
 from idm_env.kernels.order_loops import lay, walk
 from idm_env.kernels.phases import call_rows
@@ -80,7 +81,7 @@ def to_places(rows, sources, strides, truths, targets, slots, wide, like):
                     to[p] = numbers[row * by_row + slots[p] * by_vehicle]
 
 
-@exact
+@apart
 def to_slots(low, high, sources, targets, own, n, wide, like):
     """Copy what lies at places back to the slots of the vehicles themselves."""
     for i in range(len(sources)):
@@ -90,7 +91,7 @@ def to_slots(low, high, sources, targets, own, n, wide, like):
                 target[s] = source[row * wide + own[s]]
 
 
-@exact
+@apart
 def seeds_to_places(low, high, sources, targets, own, n, wide, like):
     """Copy what falls on vehicles to their places; nothing falls on copies."""
     for i in range(len(sources)):
@@ -101,7 +102,7 @@ def seeds_to_places(low, high, sources, targets, own, n, wide, like):
                 target[row * wide + own[s]] = source[s]
 
 
-@exact
+@apart
 def sums_to_slots(low, high, sources, targets, slots, n, wide, like):
     """Add what falls on all places of a vehicle, its copies included, to what falls on its slot."""
     for i in range(len(sources)):
@@ -111,7 +112,7 @@ def sums_to_slots(low, high, sources, targets, slots, n, wide, like):
                 target[row * n + slots[p]] += source[p]
 
 
-@exact
+@apart
 def put_in_lanes(low, high, said, before, links, position, was, present, coming, n, count, fresh):
     """Put vehicles where records say (``said``; −1 where they do not), as ``Order.of`` and ``Order.links`` do.
 

@@ -34,7 +34,7 @@ from idm_env.scalar.record import Form, Untraceable, record, slot_name
 from idm_env.step import Integration, Stepping
 from idm_env.types import Inputs, Params, Record, State
 
-BESIDE = """beside = phase(types.void(REAL, REAL, types.int64, REAL), fastmath={"contract"})
+BESIDE = """beside = emitted(types.void(REAL, REAL, types.int64, REAL), fastmath={"contract"})
 
 """
 """Compiler of the phases that carry one direction's rows."""

@@ -6,6 +6,7 @@ The states within a block live only in the workspace of a tile, so that the tape
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
+from idm_env.kernels.compiler import apart
 from idm_env.kernels.lane_loops import (
     CLOSE,
     FLAGS,
@@ -56,7 +57,7 @@ from idm_env.kernels.tiles import (
 )  # fmt: skip
 
 
-@exact
+@apart
 def send(w, n, size, measures, sends, phase):
     """Add what fell on neighbours' numbers to their adjoints; further than one vehicle it is handed on."""
     ring = measures[IS_RING]
@@ -89,7 +90,7 @@ def give_back(w, ah, n, signals, recalls, now):
                 ah[((now - back) * signals + signal) * ROW + j] += number(w, on + j, w)
 
 
-@exact
+@apart
 def step_back(w, h, pitch, ah, n, size, measures, phases, back, looks, recalls, sends, k, now, then):
     """Carry the adjoint of a tile back by one step, in place; the states are those before that step.
 

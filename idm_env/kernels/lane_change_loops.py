@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from idm_env.kernels.compiler import apart
 from idm_env.kernels.memory import copy, fill, gather, number
 from idm_env.kernels.order_loops import walk
 from idm_env.kernels.phases import call
@@ -72,7 +73,7 @@ def whose(which, places, c, at, m, step, to, behind, begin, order, ring, base):
         which[c * CHUNK + j] = base + order[q]
 
 
-@exact
+@apart
 def count_laps(position, base, order, place, count, ring, lap):
     """Write how many laps of the ring the vehicle of each rank has driven."""
     for r in range(count):
@@ -123,7 +124,7 @@ def fill_alike(w, slots, plan, row, first):
             fill(w, i * ROW, number(plan[i, ADDRESS], row * plan[i, BY_ROW], w), CHUNK)
 
 
-@exact
+@apart
 def fill_rows(
     w, slots, plan, places, which, at, m, own_lane, begin, count, order, left, right, lap, base, row, ring, tables,
 ):  # fmt: skip
@@ -168,7 +169,7 @@ def better(utility, by_hand, slot, other, other_by_hand, other_slot):
     return slot < other_slot
 
 
-@exact
+@apart
 def reordered(order, begin, place, count, ring, winner, granted, fresh_order, fresh_begin):
     """Write the order after the granted changes."""
     at = 0
@@ -193,7 +194,7 @@ def reordered(order, begin, place, count, ring, winner, granted, fresh_order, fr
     fresh_begin[count] = at
 
 
-@exact
+@apart
 def relink(order, begin, count, ring, base, lane, leader, follower, fresh):
     """Write links that follow an order; ``fresh`` marks who has another leader than before."""
     for k in range(count):
@@ -208,7 +209,7 @@ def relink(order, begin, count, ring, base, lane, leader, follower, fresh):
             follower[base + i], lane[base + i] = after, k
 
 
-@exact
+@apart
 def settle(w, results, at, m, own_lane, left, right, begin, ring, left_hand, base, order, winner, utility, to_left,
            looks, signals, refused, blocked, turns, stage):  # fmt: skip
     """Grant the best claim on each gap so far, and count the others; return whether there was any, −1 for NaN."""
@@ -242,7 +243,7 @@ def settle(w, results, at, m, own_lane, left, right, begin, ring, left_hand, bas
     return some
 
 
-@exact
+@apart
 def count_changes(winner, order, left, right, to_left, begin, ring, base, lane, follower, changed, unjudged):
     """Count the changes that were granted, and those in front of another follower than the one who was judged."""
     for key in range(len(winner)):
@@ -268,7 +269,7 @@ def any_of(turns, stage, order, at, m):
     return some
 
 
-@exact
+@apart
 def find_mergers(order, begin, count, place, ring, left, right, signals, granted, base, nearest, merger):
     """Write, for everybody who stays, the slot of the nearest of those who signal and would have him as follower."""
     nearest[:] = np.inf

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from idm_env.kernels.compiler import apart
 from idm_env.kernels.memory import LINE, copy, number, prefetch, stream
 from idm_env.kernels.phases import call
 from idm_env.kernels.tiles import (
@@ -45,7 +46,7 @@ BEFORE = 0
 """First column of ``looks``: 0 for the whole rollout, or the phase before which they are needed."""
 
 
-@exact
+@apart
 def load_static(w, operands, strides, row, first, n, size, again, measures, phases, looks, k):
     """Load what holds for the rollout; ``again`` says that a tile of at least this size filled this workspace."""
     for i in range(measures[STATICS] + measures[PARAMETERS]):
@@ -56,7 +57,7 @@ def load_static(w, operands, strides, row, first, n, size, again, measures, phas
     look(w, n, size, measures, looks, BEFORE)
 
 
-@exact
+@apart
 def load_inputs(w, operands, strides, t, row, first, n, size, measures):
     """Load the inputs of step ``t``: numbers, then truth values."""
     o, numbers = measures[STATICS] + measures[PARAMETERS], measures[NUMBERS]
@@ -65,7 +66,7 @@ def load_inputs(w, operands, strides, t, row, first, n, size, measures):
         load(w, to, operands[o + i], strides, o + i, t, row, first, n, size, i >= numbers)
 
 
-@exact
+@apart
 def look(w, n, size, measures, looks, when):
     """Copy neighbours' numbers beside one's own, as far as a phase needs them."""
     for i in range(looks.shape[0]):
@@ -76,7 +77,7 @@ def look(w, n, size, measures, looks, when):
                 look_back(w, looks[i, 2], looks[i, 3], n, size, measures[IS_RING])
 
 
-@exact
+@apart
 def fetch(w, h, pitch, n, signals, recalls, now):
     """Fill the rows of what drivers recall; ``now`` is the place of this step in the past."""
     for i in range(recalls.shape[0]):
@@ -96,7 +97,7 @@ def remember(w, h, pitch, n, signals, signal_rows, now):
         copy(h, (now * signals + i) * pitch, w, signal_rows + i * ROW, n)
 
 
-@exact
+@apart
 def perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now):
     """Do all of a step that comes before the response."""
     m = padded(n)
@@ -110,7 +111,7 @@ def perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now):
         fetch(w, h, pitch, n, measures[SIGNALS], recalls, now)
 
 
-@exact
+@apart
 def step(w, h, pitch, n, size, measures, phases, looks, recalls, k, now):
     """Advance a tile by one step, in place; ``now`` is the place of this step in the past.
 
@@ -121,14 +122,14 @@ def step(w, h, pitch, n, size, measures, phases, looks, recalls, k, now):
     close(w, n, size, measures, phases, looks, k)
 
 
-@exact
+@apart
 def close(w, n, size, measures, phases, looks, k):
     """Move gaps on, once everybody has responded."""
     look(w, n, size, measures, looks, CLOSE)
     call(phases[CLOSE], w, padded(n), k)  # type: ignore[call-arg]
 
 
-@exact
+@apart
 def load_past(h, past, alike, begin, slots, signals, strides, row, first, n, size, count):
     """Fill the past of a tile from an address; slot 0 is the newest, at place ``begin + slots − 1``.
 
@@ -151,7 +152,7 @@ def store_past(h, past, newest, slots, signals, at, skip, own, count):
             copy(past, (s * signals + i) * count + at, h, ((newest - s) * signals + i) * ROW + skip, own)
 
 
-@exact
+@apart
 def respond_and_fetch(w, m, phases, k, sources, following, size):
     """Respond, a piece of the tile at a time, and start fetching as much of the next tile each time.
 
@@ -164,7 +165,7 @@ def respond_and_fetch(w, m, phases, k, sources, following, size):
         call(phases[RESPOND], w[j:], min(PIECE, m - j), k)  # type: ignore[call-arg]
 
 
-@exact
+@apart
 def dense_arrays(start, read, operands, strides, many, size):
     """Return the addresses of what a tile is filled from and that has a number for every vehicle."""
     found, count = np.empty(len(read) + many, np.int64), 0
@@ -178,7 +179,7 @@ def dense_arrays(start, read, operands, strides, many, size):
     return found[:count]
 
 
-@exact
+@apart
 def store(ends, at, w, rows, count, n):
     """Store the first ``n`` numbers of rows that lie ``ROW`` apart, at ``at`` of as many addresses that are not 0.
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from idm_env.kernels.compiler import apart
 from idm_env.kernels.tiles import exact
 
 
-@exact
+@apart
 def walk(leader, follower, lane, position, present, coming, n, count, ring, base, order, begin, place):
     """Put one row in order by its links, and places (m, within one lap) by rank; False if places do not fall.
 
@@ -64,7 +65,7 @@ def walk(leader, follower, lane, position, present, coming, n, count, ring, base
     return at == n
 
 
-@exact
+@apart
 def lay(order, begin, n, count, halo, wide, base, to, slots, own, led, leads):
     """Lay one row of ``wide`` places out, from place ``to`` on: lanes behind one another, with copies at both ends.
 

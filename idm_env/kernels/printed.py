@@ -34,15 +34,15 @@ Printed by idm_env from one recorded step; see idm_env/scalar. Delete at will: i
 import numpy as np
 from numba import carray, types
 
-from idm_env.kernels.compiler import phase
+from idm_env.kernels.emitted import emitted
 from idm_env.kernels.functions import exp_{kind} as exp, log1p_{kind} as log1p, sigmoid_{kind} as sigmoid
 
 ROW = {row}
 SIZE = (1 << 40,)
 REAL = types.CPointer(types.{kind})
 SIGNATURE = types.void(REAL, types.int64, REAL)
-exact = phase(SIGNATURE)
-swift = phase(SIGNATURE, fastmath={{"contract"}})
+exact = emitted(SIGNATURE)
+swift = emitted(SIGNATURE, fastmath={{"contract"}})
 
 '''
 

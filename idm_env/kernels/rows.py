@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from idm_env.compat import Uncompiled
 from idm_env.kernels.memory import addresses
 from idm_env.kernels.row_text import BINARY, COMPARE, REDUCE, UNARY, body, fused, loops
 from idm_env.scalar import library
@@ -42,30 +43,19 @@ _FULL = {"new_full": 2, "full_like": 1, "full": 1, "fill_": 1}
 HEADER = '''"""Printed by idm_env from one call of a task's functions; see idm_env/kernels/rows.py. Delete at will."""
 
 import numpy as np
-from numba import carray, njit, types
+from numba import carray, types
 
-from idm_env.kernels.compiler import phase
+from idm_env.kernels.emitted import emitted
 from idm_env.kernels.memory import located
 
 F, U = np.{kind}, np.uint64
 SIZE = (1 << 40,)
-inlined = njit(nogil=True, error_model="numpy", forceinline=True)
 {imports}
 
-@inlined
-def larger(x, y):
-    """Comparisons so that a NaN in x stays one."""
-    return y if x < y else x
-
-
-@inlined
-def smaller(x, y):
-    return y if x > y else x
-
-
-@phase(types.void(types.int64, types.int64, types.CPointer(types.int64)){options})
+@emitted(types.void(types.int64, types.int64, types.CPointer(types.int64)){options})
 def run(begin, end, at):
-{arguments}    f, d, i, b = np.empty({f}, F), np.empty({d}), np.empty({i}, np.int64), np.empty({b}, np.bool_)
+{arguments}    f, d = np.empty({f}, F), np.empty({d}, np.float64)
+    i, b = np.empty({i}, np.int64), np.empty({b}, np.bool_)
 {around}'''
 
 
@@ -79,7 +69,7 @@ class Place(NamedTuple):
     kind: str
 
 
-class _Recorder(TorchDispatchMode):
+class _Recorder(Uncompiled, TorchDispatchMode):
     """Keeps every operation with what went in and what came out."""
 
     def __init__(self, simpler: Mapping[Any, Callable[..., Any]]) -> None:
@@ -650,13 +640,24 @@ def adjoint(
             if not names:
                 return {}
             # With a graph of its own autograd writes nothing in place that is still read.
-            found = torch.autograd.grad(
-                [out[n] for n in names], [own[n] for n in by], [leaves[f"on_{n}"] for n in names],
-                create_graph=True, allow_unused=True,
-            )  # fmt: skip
+            end = _End.apply([leaves[f"on_{n}"] for n in names], *(out[n] for n in names))
+            found = torch.autograd.grad(end, [own[n] for n in by], create_graph=True, allow_unused=True)
         return {n: g.detach() for n, g in zip(by, found, strict=True) if g is not None}
 
     return back
+
+
+class _End(torch.autograd.Function):
+    """Where what falls on outputs comes from. Given to torch itself it would import sympy, to compare shapes."""
+
+    @staticmethod
+    def forward(ctx: Any, seeds: list[Tensor], *outputs: Tensor) -> Tensor:
+        ctx.seeds = seeds
+        return seeds[0].new_zeros(())
+
+    @staticmethod
+    def backward(ctx: Any, on: Tensor) -> Any:  # type: ignore[override]
+        return None, *ctx.seeds
 
 
 def index(place: Place, at: Sequence[str]) -> str:

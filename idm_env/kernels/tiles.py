@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from idm_env.extras import needed
 
 with needed("a compiled loop"):
-    from idm_env.kernels.compiler import compiler
+    from idm_env.kernels.compiler import apart, compiler
 
 from idm_env.kernels.memory import LINE, add, copy, copy_truth, fill, number
 
@@ -147,7 +147,7 @@ def _fetch(w, to, source, at, n, truth):
         copy(w, to, source, at, n)
 
 
-@exact
+@apart
 def load(w, to, source, strides, which, t, row, first, n, size, truth):
     """Fill a workspace row from an address, whose strides by step, row and vehicle are ``strides[which]``.
 

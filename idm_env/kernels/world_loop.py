@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from idm_env.kernels.compiler import apart
 from idm_env.kernels.lane_adjoint import step_back
 from idm_env.kernels.lane_loops import (
     FLAGS,
@@ -43,7 +44,7 @@ from idm_env.kernels.printed import TileKernel
 from idm_env.kernels.tiles import ROW, Array, exact, load, padded, place, workspace
 
 
-@exact
+@apart
 def piece_of_past(h, past, newest, slots, signals, strides, row, first, n, size, count):
     """Fill the past of a piece of a long row, oldest step first."""
     for s in range(slots):
@@ -52,7 +53,7 @@ def piece_of_past(h, past, newest, slots, signals, strides, row, first, n, size,
             load(h, (s * signals + i) * ROW, source, strides, len(strides) - 1, 0, row, first, n, size, False)
 
 
-@exact
+@apart
 def advance(
     places, strides, w, h, past, newest, measures, phases, looks, recalls, read, k, extent, t, kept, begin, end,
 ):  # fmt: skip
@@ -122,7 +123,7 @@ def step_worlds(
     call_rows(after, low, high, told)  # type: ignore[call-arg]
 
 
-@exact
+@apart
 def retreat(
     places, strides, w, h, ah, past, newest, on_end, on_begin, on_past_end, on_past, on_parameters, on_inputs,
     measures, phases, looks, recalls, back, sends, again, k, extent, t, begin, end,

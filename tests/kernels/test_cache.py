@@ -27,16 +27,17 @@ def twice(x):
     return 2 * value(x)
 """
 CALLEE = """
-from idm_env.kernels.tiles import exact
+from idm_env.kernels.compiler import apart, compiler
 
 
-@exact
+@{how}
 def value(x):
     return x + {added}
 """
 
 
-def test_a_change_in_a_function_that_a_loop_calls_is_noticed(tmp_path):
+@pytest.mark.parametrize("how", ["compiler()", "apart"])
+def test_a_change_in_a_function_that_a_loop_calls_is_noticed(tmp_path, how):
     """Numba itself looks only at the file of the outermost function."""
     copy = tmp_path / "idm_env"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -52,12 +53,12 @@ def test_a_change_in_a_function_that_a_loop_calls_is_noticed(tmp_path):
         assert done.returncode == 0, done.stderr
         return int(done.stdout)
 
-    callee.write_text(CALLEE.format(added=1))
+    callee.write_text(CALLEE.format(added=1, how=how))
     assert run() == 8
     compiled = sorted((tmp_path / "cache").rglob("*.nbc"))
     assert run() == 8
     assert compiled and sorted((tmp_path / "cache").rglob("*.nbc")) == compiled  # used again
-    callee.write_text(CALLEE.format(added=100))
+    callee.write_text(CALLEE.format(added=100, how=how))
     assert run() == 206
 
 
