@@ -1,18 +1,17 @@
-"""Pages that are made from the code at every build: tasks, effects, commands, reports, API."""
+"""Pages that are made from the code at every build: tasks, effects, commands, reports, API; examples: gallery_of.py."""
 
 from __future__ import annotations
 
 import dataclasses
 import html
 import inspect
-import json
 import re
-import shutil
 import textwrap
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import gallery_of
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,8 +56,8 @@ def write(folder: Path) -> None:
         path = out / name
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
-    examples()
     reports(out / "pictures")
+    gallery_of.examples(ROOT)
 
 
 # -- environments ----------------------------------------------------------------------------------------------------
@@ -437,41 +436,6 @@ def api() -> dict[str, str]:
         pages[f"api/{page}.rst"] = "\n".join(lines)
         index.append(f"   api/{page}")
     return pages | {"api.rst": "\n".join([*index, ""])}
-
-
-def examples() -> None:
-    """Copy the examples for the gallery, each with its first sentence as a title."""
-    out = ROOT / "build" / "examples"
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
-    (out / "README.rst").write_text("Examples\n========\n\nEach runs by itself: ``python examples/NAME.py``.\n")
-    for path in sorted((ROOT / "examples").glob("*.py")):
-        text = path.read_text(encoding="utf-8")
-        found = re.match(r'"""(.*?)"""\n', text, re.DOTALL)
-        assert found, path
-        title = path.stem.replace("_", " ").capitalize()
-        words = " ".join(found[1].split())
-        head = f'"""\n{title}\n{"=" * len(title)}\n\n{words}\n"""\n'
-        (out / path.name).write_text(head + text[found.end() :], encoding="utf-8")
-    (out / "first_hour.py").write_text(_script(ROOT / "examples" / "first_hour.ipynb"), encoding="utf-8")
-
-
-def _script(notebook: Path) -> str:
-    """Return a notebook as the gallery takes it: words as comments in reStructuredText, code as it is."""
-    cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(notebook.read_text("utf-8"))["cells"]]
-    made = []
-    for kind, text in cells:
-        if kind == "code":
-            made.append(text)
-            continue
-        text = re.sub(r"`([^`]+)`", r"``\1``", text)
-        text = re.sub(r"^# (.*)$", lambda m: f"{m[1]}\n{'=' * len(m[1])}", text, flags=re.MULTILINE)
-        text = re.sub(r"^## (.*)$", lambda m: f"{m[1]}\n{'-' * len(m[1])}", text, flags=re.MULTILINE)
-        if made:
-            made.append("# %%\n" + "\n".join(f"# {line}".rstrip() for line in text.splitlines()) + "\n")
-        else:
-            made.append(f'"""\n{text}\n"""\n')
-    return "\n\n".join(made) + "\n"
 
 
 def reports(pictures: Path) -> None:

@@ -7,7 +7,7 @@ the package has no such name, ``<!-- not run: REASON -->`` always. Commands: see
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import re
 import sys
@@ -247,18 +247,28 @@ def test_every_document_has_its_place_on_the_site() -> None:
     assert pages - {"index"} <= listed
 
 
-def test_pages_of_tasks_are_whole() -> None:
+def test_pages_of_tasks_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every table has as many cells in each row as in its head, and every page says what pays: so of all tasks."""
-    spec = importlib.util.spec_from_file_location("made_from_code", ROOT / "docs" / "made_from_code.py")
-    assert spec is not None and spec.loader is not None
-    made = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(made)
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    made = importlib.import_module("made_from_code")
     for name, text in made.environments().items():
         for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
             cells = {len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines()}
             assert len(cells) == 1 and all(row.endswith("|") for row in table.splitlines()), (name, table)
         if name != "environments.md":
             assert re.search("^Reward[ ,]", text, re.MULTILINE), name
+
+
+def test_every_example_has_a_picture_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No grey placeholder in the gallery: of all examples, run there or not."""
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    figures = importlib.import_module("gallery_of").FIGURES
+    assert set(figures) == {path.stem for path in (ROOT / "examples").glob("*.py")}
+    ran = re.search(r'"filename_pattern": r"(.*?)",$', (ROOT / "docs" / "conf.py").read_text("utf-8"), re.MULTILINE)
+    assert ran is not None
+    for name, (picture, more) in figures.items():
+        assert picture.startswith("generated/") or (ROOT / "docs" / picture).exists(), picture
+        assert bool(re.search(ran[1], f"/{name}.py")) == ("\n" in more), f"{name}: code draws where it runs"
 
 
 def test_every_task_has_its_returns() -> None:
