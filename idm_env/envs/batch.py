@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from idm_env.envs.values import Values
 
 _POOL_STREAM = 2
-_NORMALS_AT_ONCE = 1 << 12
+_NORMALS_AT_ONCE = 1 << 14
 _WINDOW = 1 << 20
 """Most normals that are drawn ahead of steps one by one, and of a window."""
 _MARKED = ("_world", "_loaded", "_seen", "_draw", "_driven", "_block", "_drawn", "_drawn_steps", "used", "_pool")

@@ -94,16 +94,19 @@ class Rows:
     def begun(self, rows: np.ndarray) -> dict[str, Any]:
         """Return the info of resets of some rows (bool)."""
         info: dict[str, Any] = {}
-        if self._ids is not None:
-            self._put(info, "vehicle_id", self._ids, rows)
+        if self._ids is not None and rows.any():
+            self._put(info, "vehicle_id", self._ids, rows, bool(rows.all()))
         return info
 
     def stepped(self, outcome: Outcome, rows: np.ndarray) -> dict[str, Any]:
         """Return the info of a step of some rows (bool); to be called before any row is reset."""
         info: dict[str, Any] = {}
+        if not rows.any():
+            return info
+        every = bool(rows.all())
         for name, value in outcome.details.items():
             whole = value.any(-1) if name == "crash" else value
-            self._put(info, name, _out(self.batch, whole), rows)
+            self._put(info, name, _out(self.batch, whole), rows, every)
         if "crash" in outcome.details:
             ended = outcome.terminated.any(-1)
             crashed = (ended.cpu().numpy() if isinstance(ended, Tensor) else ended) & rows
@@ -112,22 +115,18 @@ class Rows:
                 reasons = np.full(self.batch.count, None, dtype=object)
                 for row in np.flatnonzero(crashed):
                     reasons[row] = self.batch.task.crash_reason(world, int(row))
-                self._put(info, "crash_reason", reasons, crashed)
+                self._put(info, "crash_reason", reasons, crashed, bool(crashed.all()))
         return info
 
-    def _put(self, info: dict[str, Any], name: str, value: Any, rows: np.ndarray) -> None:
-        if not rows.any():
-            return
-        mask: Any = rows.copy()
+    def _put(self, info: dict[str, Any], name: str, value: Any, rows: np.ndarray, every: bool) -> None:
+        mask: Any = torch.from_numpy(rows.copy()) if self._torch else rows.copy()
         if isinstance(value, Tensor):
-            mask = torch.as_tensor(mask, device=value.device)
-            if not rows.all():
+            mask = mask if value.is_cpu else mask.to(value.device)
+            if not every:
                 value = torch.where(mask.view(-1, *(1,) * (value.dim() - 1)), value, torch.zeros_like(value))
         else:
-            if self._torch:
-                mask = torch.as_tensor(mask)
             value = value.copy()
-            if not rows.all():
+            if not every:
                 value[~rows] = None if value.dtype == object else 0
         info[name], info[f"_{name}"] = value, mask
 

@@ -27,10 +27,18 @@ _LOW = 0xFFFFFFFF
 
 def mix(z: Tensor) -> Tensor:
     """Return the SplitMix64 finaliser of int64 counters: every input bit changes half of the output bits."""
+    return _mixed(z.clone())
+
+
+def _mixed(z: Tensor) -> Tensor:
+    """Mix in place: numbers of many vehicles and steps at once would ask the system for fresh memory each time."""
     # torch shifts int64 arithmetically: the mask makes each shift a logical one.
-    z = (z ^ ((z >> 30) & ((1 << 34) - 1))) * _FIRST
-    z = (z ^ ((z >> 27) & ((1 << 37) - 1))) * _SECOND
-    return z ^ ((z >> 31) & ((1 << 33) - 1))
+    high = (z >> 30).bitwise_and_((1 << 34) - 1)
+    z.bitwise_xor_(high).mul_(_FIRST)
+    torch.bitwise_right_shift(z, 27, out=high)
+    z.bitwise_xor_(high.bitwise_and_((1 << 37) - 1)).mul_(_SECOND)
+    torch.bitwise_right_shift(z, 31, out=high)
+    return z.bitwise_xor_(high.bitwise_and_((1 << 33) - 1))
 
 
 class Draw(NamedTuple):
@@ -63,7 +71,8 @@ class Draw(NamedTuple):
         """
         pairs = (width + 1) // 2
         block = torch.arange(steps * pairs, dtype=torch.int64, device=self.key.device).view(steps, 1, pairs) + 1
-        z = mix((block + (step * pairs).view(1, -1, 1)) * GOLDEN + self.key.view(1, -1, 1))
-        radius = (((z >> 32) & _LOW).to(dtype) + 0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
-        angle = (z & _LOW).to(dtype).mul_(2.0 * math.pi * 2.0**-32)
+        z = _mixed((block + (step * pairs).view(1, -1, 1)).mul_(GOLDEN).add_(self.key.view(1, -1, 1)))
+        high = (z >> 32).bitwise_and_(_LOW)
+        radius = high.to(dtype).add_(0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
+        angle = z.bitwise_and_(_LOW).to(dtype).mul_(2.0 * math.pi * 2.0**-32)
         return torch.cat((radius * angle.cos(), radius * angle.sin_()), dim=-1)[..., :width]
