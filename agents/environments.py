@@ -40,7 +40,7 @@ def desynchronise(env: DiffIDMVectorEnv) -> Tensor:
     Environment i of n starts at step ``i · limit / n``; traffic and records are as they were at step 0.
     """
     batch, state = env.batch, env.state
-    step = (torch.arange(env.num_envs) * (batch.limit or 0)) // env.num_envs
+    step = (torch.arange(env.num_envs) * (batch.limit or 0)) // env.num_envs * env.task.held
     batch.episodes -= 1
     observation: Tensor = env.reset(options={"state": state._replace(step=state.step + step)})[0]
     assert batch.world is not None

@@ -196,7 +196,7 @@ def evaluate_follow(
     """
     start = episodes_start(environment, count, draws=draws)
     task = start.task
-    driven = drive(start, act, task.horizon or STEPS)
+    driven = drive(start, act, task.steps)
     first = task.agents[0]
     speed, accel, gap = (x.double() for x in (driven.speed, driven.accel, driven.gap))
     fuel = {name: metrics.fuel(speed, accel, name) for name in metrics.FUELS}

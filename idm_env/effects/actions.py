@@ -16,18 +16,21 @@ from idm_env.types import Command, Driver, Motion, Record, Scene
 class Control(Effect):
     """An agent's acceleration in place of the driver's, wherever its command is active.
 
-    Input ``control``: a ``Command(accel, active)``. Power, lag and brakes still act on it.
+    Input ``control``: a ``Command(accel, active)``. Power, lag and brakes still act on it. A ``careful`` command counts
+    only as far as the driver himself would go: ``min(command, driver)``.
     """
 
     kind: ClassVar[str] = "control"
     takes: ClassVar[type | None] = Command
     adds: ClassVar[bool] = False
     rank: ClassVar[int] = 35
+    careful: bool = False
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the command where active."""
         command: Command = scene.input(self.name)
-        return torch.where(command.active, command.accel, accel)
+        given = torch.minimum(command.accel, accel) if self.careful else command.accel
+        return torch.where(command.active, given, accel)
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,19 @@ class Unrolled(NamedTuple):
     final: Tensor
 
 
+def _held(before: Outcome, after: Outcome, over: Any) -> Outcome:
+    """Return what two steps under one action give: sums of rewards, the rest of the second; where over of the first."""
+
+    def kept(x: Any, y: Any) -> Any:
+        mask = over.reshape(-1, *(1,) * (x.ndim - 1))
+        return torch.where(mask, x, y) if isinstance(x, Tensor) else np.where(mask, x, y)
+
+    both = before.whole.reward + after.whole.reward
+    total = after._replace(reward=before.reward + after.reward, whole=after.whole._replace(reward=both))
+    details = {name: kept(x, after.details[name]) for name, x in before.details.items()}
+    return Outcome(*map(kept, before[:4], total[:4]), Whole(*map(kept, before.whole, total.whole)), details)
+
+
 EAGER_STEPS = 2_000
 """Steps on several lanes that torch does before they are compiled, which takes as long as these."""
 
@@ -109,6 +122,7 @@ class Batch:
         self._on_lanes = 0
         self._loaded = False
         self._seen: Any = None
+        self._reasons: dict[int, str] = {}
         self._draw: Draw | None = None
         self._driven: Params | None = None
         self._pool: World | None = None
@@ -296,8 +310,8 @@ class Batch:
         shape = (self.count, len(self.task.agents) * len(self.task.commands))
         extra = torch.zeros(shape, dtype=self.settings.dtype) if push is None else push.expand(shape).contiguous()
         values = self._values
-        # On several lanes a window is its steps, each of which is compiled.
-        fits = not (isinstance(self.task.road, Lanes) or self.task.simulator.untried)
+        # On several lanes, and where actions are held, a window is its steps, each of which is compiled.
+        fits = self.task.held == 1 and not (isinstance(self.task.road, Lanes) or self.task.simulator.untried)
         fits = fits and values is not None and dispatch.surroundings() is None
         if values is not None and fits:
             from idm_env.envs import window
@@ -334,7 +348,33 @@ class Batch:
         It is a tensor, or an array of the simulation's precision with numpy output.
 
         ``live`` (bool, ``(n, agents)``) leaves only single agents' vehicles to their drivers, and drops their commands.
+
+        An action is held for ``task.held`` steps of Δt; rewards are summed. A row that ends before them tells of its
+        end; until it is reset it drives on unseen.
         """
+        self._reasons = {}
+        outcome = self._once(action, live)
+        for _ in range(self.task.held - 1):
+            over = outcome.whole.terminated | outcome.whole.truncated
+            if bool(over.all()):
+                break
+            outcome = _held(outcome, self._once(action, live), over)
+        return outcome
+
+    def crash_reason(self, row: int, agent: int | None = None) -> str:
+        """Return how a row has crashed in this step, or one of its agents."""
+        return self._reasons.get(row) or self.task.crash_reason(self.glance(), row, agent)
+
+    def _once(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> Outcome:
+        """Advance every row by Δt."""
+        outcome = self._stepped(action, live)
+        if self.task.held > 1 and self.count > 1 and "crash" in outcome.details:
+            crashed = outcome.terminated.any(-1)
+            for row in np.flatnonzero(crashed.cpu().numpy() if isinstance(crashed, Tensor) else crashed).tolist():
+                self._reasons[row] = self.crash_reason(row)
+        return outcome
+
+    def _stepped(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> Outcome:
         self._on_lanes += isinstance(self.task.road, Lanes)
         eager = self.task.simulator.untried or 0 < self._on_lanes <= EAGER_STEPS
         if self._values is not None and not eager:

@@ -66,8 +66,7 @@ def single(batch: Batch, outcome: Outcome) -> dict[str, Any]:
         crash = info["crash"]
         info["crash"] = crash.item() if len(batch.task.agents) == 1 else bool(crash.any())
     if info.get("crash"):
-        assert batch.world is not None
-        info["crash_reason"] = batch.task.crash_reason(batch.world, 0)
+        info["crash_reason"] = batch.crash_reason(0)
     return info | begun(batch) if batch.task.vehicle_ids else info
 
 
@@ -111,10 +110,9 @@ class Rows:
             ended = outcome.terminated.any(-1)
             crashed = (ended.cpu().numpy() if isinstance(ended, Tensor) else ended) & rows
             if crashed.any():
-                world = self.batch.glance()
                 reasons = np.full(self.batch.count, None, dtype=object)
                 for row in np.flatnonzero(crashed):
-                    reasons[row] = self.batch.task.crash_reason(world, int(row))
+                    reasons[row] = self.batch.crash_reason(int(row))
                 self._put(info, "crash_reason", reasons, crashed, bool(crashed.all()))
         return info
 

@@ -17,7 +17,8 @@ class Moves:
     """The functions of a step, of what environments are made of."""
 
     def __init__(self, made: Settings) -> None:
-        self.task, self._limit, self._info = made.task, made.limit, made.info
+        self.task, self._info = made.task, made.info
+        self._limit = None if made.limit is None else made.limit * made.task.held
         # With torch output always the step itself, so that values are the same bits with and without a graph.
         self._advance = self.task.simulator.step if made.output == "torch" else self.task.simulator.advance
 

@@ -126,9 +126,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         """Return what ``idm_env.envs.info`` says of a step, as numbers of one agent."""
         info: dict[str, Any] = {name: value[0, i].item() for name, value in outcome.details.items()}
         if info.get("crash"):
-            assert self.batch.world is not None
-            alone = i if self.task.shares > 1 else None
-            info["crash_reason"] = self.task.crash_reason(self.batch.world, 0, alone)
+            info["crash_reason"] = self.batch.crash_reason(0, i if self.task.shares > 1 else None)
         return info | self._begun(agent)
 
     def _action(self, agent: str, actions: dict[str, np.ndarray]) -> np.ndarray:

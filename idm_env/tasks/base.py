@@ -68,7 +68,10 @@ class Task(abc.ABC):
             who brakes as hard, or where its lane ends, are cut, and may then brake beyond ``max_command``; 0 is none.
             Rewards are for the command as it was given. See ``idm_env.tasks.failsafe.safe_accel``.
         failsafe_time: Time (s) that the failsafe allows for before braking begins, as SUMO's tau.
-        max_episode_steps: Steps after which an episode is cut off; None is the task's own number, −1 is no limit.
+        hold: Time (s) for which an action is held: a step of the environment is so long, and its reward the sum over
+            it; a whole number of Δt. None is the task's own: one Δt, or 1 s where vehicles enter and leave.
+        max_episode_steps: Steps of the environment after which an episode is cut off; None is the task's own number, −1
+            is no limit.
         observation: ``"scaled"``: each entry over a fixed scale that the task documents, about unit size; ``"raw"``: in
             SI units (m, m/s). Both are clipped to ``bounds``.
         crash_cost: What a crash costs; None is the smallest that makes it worse than any survival
@@ -93,6 +96,7 @@ class Task(abc.ABC):
     max_command: float | Sequence[float] = 1.0
     failsafe: float = 0.0
     failsafe_time: float = 1.0
+    hold: float | None = None
     max_episode_steps: int | None = None
     observation: str = "scaled"
     crash_cost: float | None = None
@@ -112,9 +116,12 @@ class Task(abc.ABC):
         "warmup_pool": Range(0, 100_000, whole=True),
         "failsafe": Range(0.0, 100.0, "m/s²"),
         "failsafe_time": Range(0.0, 60.0, "s"),
+        "hold": Range(1e-3, 60.0, "s"),
         "crash_cost": Range(0.0, 1e12),
     }
     """Where numbers may lie: of a kind of task its own, beside those that it inherits."""
+    usual_hold: ClassVar[float | None] = None
+    """Time (s) for which an action is held where nothing is said; None: one Δt."""
     first_free: ClassVar[int] = 0
     """Vehicles before this one cannot be controlled: they are recorded."""
 
@@ -126,7 +133,7 @@ class Task(abc.ABC):
             raise ValueError(f"warmup_pool = {self.warmup_pool} has no use without warm-up. Give warmup=750 as well.")
         self._check_episode()
         self.params(torch.float64, "cpu")
-        _ = self._ranges
+        _ = self._ranges, self.held
 
     def _check_episode(self) -> None:
         """Check what every task says of its commands, episodes and observations."""
@@ -153,29 +160,43 @@ class Task(abc.ABC):
         """The accelerations (m/s²) that actions of −1 and 1 command."""
         return limits_of(self.max_command)
 
+    @cached_property
+    def held(self) -> int:
+        """Steps of Δt for which an action is held; ValueError where ``hold`` is no whole number of them."""
+        hold, dt = self.usual_hold if self.hold is None else self.hold, self._behaviour.dt
+        steps = 1 if hold is None else max(1, round(hold / dt))
+        if self.hold is not None and abs(self.hold - steps * dt) > 1e-6 * dt:
+            raise ValueError(f"hold = {self.hold:g} s must be a whole number of Δt = {dt:g} s, such as {steps * dt:g}.")
+        return steps
+
     @property
     def usual_steps(self) -> int:
-        """Steps of an episode where nothing else is said."""
+        """Steps of Δt of an episode where nothing else is said."""
         return 3000
 
     @property
     def horizon(self) -> int | None:
-        """Steps after which an episode is cut off, or None."""
+        """Steps of the environment, ``held`` Δt each, after which an episode is cut off, or None."""
         if self.max_episode_steps is None:
-            return self.usual_steps
+            return max(1, self.usual_steps // self.held)
         return None if self.max_episode_steps == -1 else self.max_episode_steps
+
+    @property
+    def steps(self) -> int:
+        """The most steps of Δt of an episode; without a limit those of a usual one."""
+        return self.usual_steps if self.horizon is None else self.horizon * self.held
 
     @property
     @abc.abstractmethod
     def pay(self) -> Pay:
-        """The lowest (at most 0) and the highest (at least 0) reward of a step without a crash."""
+        """The lowest (at most 0) and the highest (at least 0) reward of a Δt without a crash."""
 
     @cached_property
     def cost_of_crash(self) -> float:
         """What an agent pays for a crash: ``crash_cost``, or the smallest that makes it worse than any survival."""
         if self.crash_cost is not None:
             return self.crash_cost
-        return self.shares * lawful_cost(self.pay, self.horizon or self.usual_steps)
+        return self.shares * lawful_cost(self.pay, self.steps)
 
     @property
     def shares(self) -> int:

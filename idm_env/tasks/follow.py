@@ -133,7 +133,7 @@ class FollowTask(Task):
         like = self.like(params)
         device = draw.key.device
         steps = self.constant("steps", self.leaders.steps, device, torch.int64)
-        trace, start = starts(draw, steps, (self.horizon or self.usual_steps) + self.warmup)
+        trace, start = starts(draw, steps, self.steps + self.warmup)
         episode = {"trace": trace, "start": start + self.warmup}
         first = self._motion(episode, torch.full_like(start, -self.warmup), like.dtype)
         speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()

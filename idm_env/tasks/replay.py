@@ -83,10 +83,11 @@ class ReplayTask(Task):
         self._check_episode()
         self.params(torch.float64, "cpu")
         _ = self.agents, self._simulated, self._starts
-        if (self.max_episode_steps or 0) > self._longest:
+        if (self.max_episode_steps or 0) * self.held > self._longest:
+            most = self._longest // self.held
             raise ValueError(
-                f"max_episode_steps = {self.max_episode_steps} exceeds the {self._longest} steps that the agents' "
-                f"records go on. Take at most {self._longest}, or control others."
+                f"max_episode_steps = {self.max_episode_steps} exceeds the {most} steps that the agents' "
+                f"records go on. Take at most {most}, or control others."
             )
 
     @property
@@ -97,7 +98,7 @@ class ReplayTask(Task):
     @property
     def _wanted(self) -> int:
         """Steps for which agents should be there: those asked for, else 300."""
-        return HORIZON if self.max_episode_steps in (None, -1) else int(self.max_episode_steps or 0)
+        return HORIZON if self.max_episode_steps in (None, -1) else int(self.max_episode_steps or 0) * self.held
 
     @cached_property
     def _longest(self) -> int:

@@ -1,0 +1,63 @@
+"""An action is held for some steps of Δt, in every task: what a step of the environment then is, and pays."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import idm_env  # noqa: F401
+from idm_env.tasks import TASKS, make_task
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_held_action_is_so_many_steps_under_it(name: str) -> None:
+    """Observations, ends and infos are those of the last of them, the reward is their sum."""
+    choices = {"task": name, "controlled": 1, "warmup": 10} if name == "ring" else {"task": name, "controlled": 1}
+    once, held = (
+        gym.make("DiffIDM-v0", **choices, hold=hold, max_episode_steps=n) for hold, n in ((0.1, 12), (0.3, 4))
+    )
+    np.testing.assert_array_equal(once.reset(seed=3)[0], held.reset(seed=3)[0])
+    for k in range(4):
+        action = held.action_space.sample() * 0 + np.float32(0.3 * (-1) ** k)
+        total = 0.0
+        for _ in range(3):
+            seen, reward, terminated, truncated, info = once.step(action)
+            total += reward
+        found = held.step(action)
+        np.testing.assert_array_equal(found[0], seen)
+        assert found[1] == pytest.approx(total, rel=1e-5, abs=1e-6)
+        assert found[2:4] == (terminated, truncated) == (False, k == 3)
+        assert all(np.array_equal(found[4][key], value) for key, value in info.items())
+
+
+def test_rows_that_end_while_an_action_is_held_tell_of_their_end() -> None:
+    """Rewards, last observations and reasons are those of the step in which each row crashed."""
+    choices = {"task": "ring", "warmup": 10, "max_command": 6.0}
+    held = gym.make_vec("DiffIDM-v0", num_envs=4, **choices, hold=2.0)
+    held.reset(seed=5)
+    ended: dict[int, int] = {}
+    for step in range(30):
+        _, reward, terminated, _, info = held.step(np.ones((4, 1), np.float32))
+        for row in np.flatnonzero(terminated):
+            if row in ended:
+                continue
+            ended[row] = step
+            once = gym.make("DiffIDM-v0", **choices)
+            once.reset(seed=5 + int(row))
+            over, paid, k = False, [], 0
+            while not over:
+                seen, paid_now, over, _, told = once.step(np.ones(1, np.float32))
+                paid.append(paid_now)
+                k += 1
+            assert k <= 20 * (step + 1) < k + 20
+            np.testing.assert_array_equal(info["final_obs"][row], seen)
+            assert reward[row] == pytest.approx(sum(paid[20 * step :]), rel=1e-5)
+            assert info["final_info"]["crash_reason"][row] == told["crash_reason"]
+    assert len(ended) == 4
+
+
+def test_a_hold_that_is_no_whole_number_of_steps_is_one_line() -> None:
+    """Value, rule and cure."""
+    with pytest.raises(ValueError, match=r"^hold = 0\.25 s must be a whole number of Δt = 0\.1 s, such as 0\.2\.$"):
+        make_task("ring", hold=0.25)
