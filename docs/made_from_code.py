@@ -17,7 +17,7 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 UNITS = {
     "speed": "m/s", "relative_speed": "m/s", "headway": "m", "gap": "m", "deviation": "m", "accel": "m/s²",
-    "lead_accel": "m/s²",
+    "lead_accel": "m/s²", "ends": "m", "position": "m", "next_end": "m",
 }  # fmt: skip
 JOBS = ("explain", "fit", "filter", "reconstruct", "predict", "simulate")
 MODULES = {
@@ -94,7 +94,7 @@ def _environment(name: str, cls: Any) -> list[str]:
 
     first, parts = _described(cls)
     if not any("Reward" in part for part in parts):  # what its kind says holds for it
-        kind = next(c for c in cls.__mro__[1:] if "Reward, per agent" in (c.__doc__ or ""))
+        kind = next(c for c in cls.__mro__[1:] if "Reward, " in (c.__doc__ or ""))
         parts += [_described(kind)[0], *_described(kind)[1]]
     lines = [f"# {name}", "", first, "", f"![After 40 s without commands](../../tasks/{name}.png)", ""]
     # Observation, reward and end are looked for, so each has a paragraph of its own.
@@ -139,7 +139,7 @@ def _faces(name: str) -> list[str]:
         *_returns(name),
         "## Ends", "",
         f"An episode is terminated where vehicles touch, and truncated after {task.horizon} steps of "
-        f"{task.simulator.dt:g} s.", "",
+        f"{task.held * task.simulator.dt:g} s.", "",
     ]  # fmt: skip
 
 

@@ -15,8 +15,15 @@
 ``lane_changes``, ``lane_refusals``
     How often in this episode each agent's vehicle has changed lanes, and how often it wished or was commanded to and
     could not: there was no lane or no safe room, or another claim won. Only in tasks on several lanes.
-``queued``
-    How many vehicles wait at the entries for want of room; only in tasks that vehicles enter.
+``present``
+    Whether each agent's vehicle is on the road (bool): the mask of the joint face; only in tasks that vehicles enter,
+    as all that follows.
+``queued``, ``inside``
+    How many vehicles wait at the entries for want of room, and how many are on the road.
+``outflow``, ``ramp``
+    How many vehicles have left the road in this episode, and how many of those who enter on lane 0 have left it.
+``standing``, ``co2``
+    How many vehicles are below 0.5 m/s now, and what all emit now (g/s, by Kamal's fuel).
 
 ``info="none"``, or some of these names, leaves the rest out. With torch output accelerations are tensors, with their
 graph.

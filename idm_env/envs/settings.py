@@ -19,7 +19,10 @@ from idm_env.validation import nearest, one_of, shown
 OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 RENDER_MODES = ("rgb_array", "human")
-INFO = ("accel", "command", "failsafe", "crash", "vehicle_id", "lane_changes", "lane_refusals", "queued")
+INFO = (
+    "accel", "command", "failsafe", "crash", "vehicle_id", "lane_changes", "lane_refusals", "present",
+    "queued", "inside", "outflow", "ramp", "standing", "co2",
+)  # fmt: skip
 KEYWORDS = (
     "task",
     "config",

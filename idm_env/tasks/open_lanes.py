@@ -12,38 +12,52 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
+from idm_env.effects import IDM, Brakes, Control, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
+from idm_env.metrics import fuel
 from idm_env.multilane import demand
 from idm_env.roads import Lanes, lane_drop, on_ramp
-from idm_env.tasks.base import World
+from idm_env.tasks.base import Pay, World
 from idm_env.tasks.checks import Range, at_least
-from idm_env.tasks.lanes import FASTEST, LanesTask
+from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.types import Params, State, Trips
 
 _PLACE_STREAM = 37
 _FLOW = Range(0.0, 1e5, "vehicles an hour")
 _SIGHT = 500.0
-"""How far ahead an agent sees that its lane ends (m)."""
+"""How far ahead an agent sees that a lane ends (m)."""
+_STANDS = 0.5
+"""Below this speed (m/s) a vehicle stands."""
+_CO2 = 2.31
+"""CO₂ of a millilitre of petrol (g)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OpenLanesTask(LanesTask):
-    """Trips begin evenly in time, lane by lane, and slots make them again and again, so that an episode has no end.
+    """Vehicles enter, lane by lane, and leave at the end; a share of those who enter are agents.
 
-    An episode begins with free traffic up to ``filled``, where lanes are still all there; the first slots are in front.
-    Whoever finds no room at his entry waits and is counted (``multilane.demand.counts``). Agents act as ``LanesTask``
-    says; while an agent's vehicle waits or has left, it stands still, its observation and infos are zeros, and its
-    command does and costs nothing: its reward is what the traffic earns.
+    Headways at the entries are random: half of the mean, and an exponential half. Slots make their trips again and
+    again in that order, so arrivals repeat after ``vehicles / inflow``. An episode begins with free traffic up to
+    ``filled``. Whoever finds no room at his entry waits and is counted (``multilane.demand.counts``).
+
+    An agent is the vehicle of a slot: it appears when its trip begins and ends with it. With PettingZoo every trip is
+    an agent of its own; the joint face tells by ``info["present"]`` who is there. Commands are accelerations, held for
+    1 s; with ``careful`` they count only as far as the driver himself would go, and no command makes a crash. While an
+    agent's vehicle waits or has left, its observation and infos are zeros, and its command does nothing.
 
     Drivers let in whoever signals, accept closer gaps near the end of a lane and where they have stood
     (``GapAcceptance``), and take turns at an end as at a zipper (``Courtesy``, ``MandatoryChange``).
 
-    Observation, per agent: own speed, lane, 1 if it is on the road, how far its lane goes on (m, at most 500); then the
-    nearest vehicles as in ``highway``. Reward, per agent: ``V/40 − 0.1 (u/u_max)²``, V the sum of the speeds of all on
-    the road over the number of these and of those queued: keeping others out pays nothing. Terminated where vehicles
-    touch, or an agent drives over the end of a lane, which pays ``−crash_cost`` instead (``idm_env.tasks.crash``). Cut
-    off after 3000 steps.
+    Observation, per agent: own speed, lane, 1 if it is on the road, how far its lane goes on (m, at most 500), its
+    place (m), how far it is to the next end of any lane (m, at most 500) and how many lanes to the left that is; then
+    the nearest vehicles as in ``highway``. Reward, the same for all agents: minus the delay of all in this step
+    (vehicle-seconds), ``−Δt (Σ (1 − min(v/v0, 1)) + queued)``, so that its sum is the total delay against free travel
+    at every driver's v0. Terminated where vehicles touch, or an agent drives over the end of a lane, which pays
+    ``−crash_cost`` instead (``idm_env.tasks.crash``). Cut off after 600 s.
+
+    Args:
+        entry_speed: Speed at which vehicles ask to enter (m/s).
+        careful: Whether a command counts only as far as the driver himself would go: ``min(command, driver)``.
     """
 
     own_effects: ClassVar[tuple[Effect, ...]] = (
@@ -55,11 +69,14 @@ class OpenLanesTask(LanesTask):
         "courtesy": {"weight": 1.0, "zipper": 1.0},
     }
 
+    usual_hold: ClassVar[float | None] = 1.0
     ranges: ClassVar[Mapping[str, Range]] = {"entry_speed": Range(1.0, 70.0, "m/s"), "inflow": _FLOW}
 
-    vehicles: int = 80
-    controlled: int | float | str | Sequence[int] = (4,)
+    vehicles: int = 120
+    controlled: int | float | str | Sequence[int] = 0.1
+    max_command: float | Sequence[float] = 2.0
     entry_speed: float = 20.0
+    careful: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,24 +100,47 @@ class OpenLanesTask(LanesTask):
     def filled(self) -> float:
         """Up to where vehicles are when an episode begins (m)."""
 
-    def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
-        """Return trips, of which the first ones began before the episode did; each up to a quarter aside in time."""
+    @property
+    def usual_steps(self) -> int:
+        """Those of 600 s."""
+        return round(600.0 / self._behaviour.dt)
+
+    @property
+    def machinery(self) -> tuple[Effect, ...]:  # type: ignore[override]
+        """Effects through which agents act."""
+        return (Control(careful=self.careful), *super().machinery[1:])
+
+    @cached_property
+    def _slots(self) -> tuple[tuple[float, float], ...]:
+        """Lane and mean headway (s) of every slot."""
         flows, total = self.inflows, sum(self.inflows.values())
         counts = {k: max(1, round(self.vehicles * flow / total)) for k, flow in flows.items()}
-        departs, again, lane = demand.evenly(flows, counts, first=0)
-        by_time = sorted(range(len(departs)), key=lambda i: departs[i])[: self.vehicles]
-        while len(by_time) < self.vehicles:  # shares that are rounded down leave a slot to spare: it never drives
-            by_time.append(-1)
-        columns = [[*x, y] for x, y in ((departs, math.inf), (again, math.inf), (lane, 0))]
+        slots = sorted((3600.0 / flows[k] * i, k) for k, count in counts.items() for i in range(count))
+        found = [(float(k), 3600.0 / flows[k]) for _, k in slots[: self.vehicles]]
+        # Shares that are rounded down leave a slot to spare: it never drives.
+        return (*found, *[(0.0, math.inf)] * (self.vehicles - len(found)))
+
+    def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
+        """Return trips at random headways, of which the first began before the episode did, in the order of time."""
         device = draw.key.device
-        first, more, at = (torch.tensor([c[i] for i in by_time], dtype=torch.float64, device=device) for c in columns)
-        interval = torch.tensor([3600.0 / flows.get(int(k), math.inf) for k in at], dtype=torch.float64, device=device)
-        aside = 0.5 * (draw.uniforms(_PLACE_STREAM, self.vehicles, torch.float64) - 0.5)
-        shape = tuple(aside.shape)
-        departs_at = first + interval * (aside + 0.25) - self.filled / self.entry_speed
+        lane, mean = (torch.tensor(x, dtype=torch.float64, device=device) for x in zip(*self._slots, strict=True))
+        some = mean.isfinite()
+        shape = (len(draw.key), self.vehicles)
+        headway = torch.where(some, mean, 0.0) * 0.5 * (
+            1.0 - draw.uniforms(_PLACE_STREAM, self.vehicles, torch.float64).log()
+        )  # fmt: skip
+        departs, again = (torch.full(shape, torch.inf, dtype=torch.float64, device=device) for _ in range(2))
+        for k in sorted(self.inflows):
+            mine = torch.nonzero(some & (lane == k)).squeeze(-1)
+            times = headway[:, mine].cumsum(-1)
+            cycle = mean[mine[0]] * len(mine)
+            departs[:, mine] = times * (cycle / times[:, -1:])
+            again[:, mine] = cycle
+        order = departs.argsort(dim=-1, stable=True)
         none = torch.zeros(shape, dtype=torch.int64, device=device)
         return Trips(
-            departs_at.to(dtype), more.to(dtype).expand(shape), at.long().expand(shape),
+            (departs.gather(-1, order) - self.filled / self.entry_speed).to(dtype), again.gather(-1, order).to(dtype),
+            lane.long().expand(shape).gather(-1, order),
             torch.full(shape, self.entry_speed, dtype=dtype, device=device), none, none.clone(),
         )  # fmt: skip
 
@@ -117,32 +157,76 @@ class OpenLanesTask(LanesTask):
             present=inside.to(like.dtype), lane=trips.lane,
             step=torch.full((len(place),), -self.warmup, device=like.device),
         )  # fmt: skip
-        return World(state._replace(trips=trips._replace(entered=inside.long())), {})
+        free = self.simulator.base.driver(dict(params[self.simulator.base.name])).desired_speed.detach()
+        return World(
+            state._replace(trips=trips._replace(entered=inside.long())),
+            {"free_speed": free.to(place.dtype).expand_as(place).contiguous()},
+        )
 
     @property
     def own_features(self) -> tuple[tuple[str, float, float, float], ...]:
-        """As in ``LanesTask``, and whether one is on the road, and how far one's lane goes on."""
-        return (*super().own_features, ("present", 1.0, 0.0, 1.0), ("ends", 100.0, 0.0, _SIGHT))
+        """As in ``LanesTask``; who is there, where, and how far it is to the end of one's lane and of any."""
+        last = float(self.road.count - 1)
+        return (
+            *super().own_features, ("present", 1.0, 0.0, 1.0), ("ends", 100.0, 0.0, _SIGHT),
+            ("position", 100.0, 0.0, 1e6), ("next_end", 100.0, 0.0, _SIGHT), ("next_left", 1.0, -last, last),
+        )  # fmt: skip
 
     def seen_of_self(self, state: State) -> list[Tensor]:
         """Return ``own_features``."""
         assert state.links is not None and state.present is not None
         ends = (self.road.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT)
-        return [*super().seen_of_self(state), self.pick(state.present), self.pick(ends)]
+        own, lane = self.pick(state.position), self.pick(state.links.lane)
+        next_end, beside = torch.full_like(own, _SIGHT), torch.zeros_like(own)
+        for end in self.road.ends:
+            way = end.end - own
+            nearer = end.closed & (way >= 0.0) & (way < next_end)
+            next_end = torch.where(nearer, way, next_end)
+            beside = torch.where(nearer, (end.lane - lane).to(own.dtype), beside)
+        return [*super().seen_of_self(state), self.pick(state.present), self.pick(ends), own, next_end, beside]
 
     def told(self, world: World) -> dict[str, Tensor]:
-        """As in ``LanesTask``, and how many wait at the entries: a queue that grows is an inflow beyond capacity."""
-        queued = demand.counts(self.simulator, world.state).queued
-        return {**super().told(world), "queued": queued.unsqueeze(-1).expand(-1, len(self.agents)).contiguous()}
+        """As in ``LanesTask``, and of all traffic what became of trips, who stands and what is burnt, now or so far.
+
+        ``present``: agents that are there; ``queued``: vehicles that wait at the entries, a queue that grows is an
+        inflow beyond capacity; ``inside``; ``outflow``: vehicles that have left; ``ramp``: of those who enter on lane 0
+        how many have left it; ``standing``: vehicles below 0.5 m/s; ``co2``: g/s of all on the road (Kamal's fuel).
+        """
+        state = world.state
+        assert state.present is not None and state.trips is not None and state.links is not None
+        found, there = demand.counts(self.simulator, state), state.present > 0
+        from_ramp = state.trips.lane == 0
+        still = from_ramp & there & (state.links.lane == 0)
+        every = {
+            "queued": found.queued, "inside": found.inside, "outflow": found.left,
+            "ramp": (torch.where(from_ramp, state.trips.entered, 0) - still.long()).sum(-1),
+            "standing": (there & (state.speed < _STANDS)).sum(-1),
+            "co2": _CO2 * torch.where(there, fuel(state.speed, state.accel), 0.0).sum(-1),
+        }  # fmt: skip
+        own = {**super().told(world), "present": self.pick(there)}
+        return own | {n: x.unsqueeze(-1).expand(-1, len(self.agents)).contiguous() for n, x in every.items()}
+
+    @cached_property
+    def _most(self) -> float:
+        """No more trips are due in an episode."""
+        seconds = (self.steps + 10) * self.simulator.dt + self.filled / self.entry_speed
+        return 2.0 * self.vehicles + sum(self.inflows.values()) * seconds / 3600.0
+
+    @property
+    def pay(self) -> Pay:
+        """At most everybody who is due stands."""
+        return Pay(-self._most * self.simulator.dt, 0.0)
+
+    def delay(self, world: World) -> Tensor:
+        """Return how many vehicles' time is lost: ``Σ (1 − min(v/v0, 1))`` of those on the road, and all in a queue."""
+        state = world.state
+        assert state.present is not None
+        lost = 1.0 - (state.speed / world.episode["free_speed"]).clamp_max(1.0)
+        return (lost * state.present).sum(-1) + demand.counts(self.simulator, state).queued
 
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
-        """Return ``V/40 − 0.1 (u/u_max)²``."""
-        state = after.state
-        assert state.present is not None
-        found = demand.counts(self.simulator, state)
-        pace = (state.speed.clamp_max(FASTEST) * state.present).sum(-1) / (found.inside + found.queued).clamp_min(1)
-        hardest = max(abs(limit) for limit in self.command_limits)
-        return pace.unsqueeze(-1) / FASTEST - 0.1 * (command / hardest).square().clamp_max(1.0)
+        """Return minus the delay of all in this step (vehicle-seconds)."""
+        return (-self.simulator.dt * self.delay(after)).unsqueeze(-1).expand(-1, len(self.agents))
 
     def crashed(self, world: World) -> Tensor:
         """Return whose episodes end in a crash: of all, where vehicles touch or one drives over the end of its lane."""
@@ -215,8 +299,8 @@ class MergeTask(OpenLanesTask):
     name: ClassVar[str] = "merge"
     ranges: ClassVar[Mapping[str, Range]] = {"ramp_inflow": _FLOW}
 
-    inflow: float = 2400.0
-    ramp_inflow: float = 500.0
+    inflow: float = 3000.0
+    ramp_inflow: float = 800.0
 
     @cached_property
     def road(self) -> Lanes:  # type: ignore[override]
@@ -247,7 +331,7 @@ class BottleneckTask(OpenLanesTask):
 
     name: ClassVar[str] = "bottleneck"
 
-    inflow: float = 2600.0
+    inflow: float = 1900.0
 
     @cached_property
     def road(self) -> Lanes:  # type: ignore[override]

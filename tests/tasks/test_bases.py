@@ -35,7 +35,8 @@ def drivers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_task_takes_every_law(name: str, how: str, drivers: Path) -> None:
     """It starts, drives on for two decisions about lanes without an agent, and nobody crashes or stands still."""
     many = "lanes" if issubclass(TASKS[name], LanesTask) else "one"
-    choices: dict[str, Any] = {"task": name, "dtype": "float64", **({"warmup": 0} if name == "ring" else {})}
+    choices: dict[str, Any] = {"task": name, "dtype": "float64", "hold": 0.1}
+    choices |= {"warmup": 0} if name == "ring" else {}
     for law in BASES:
         given = [law] if how == "effects" else str(drivers / f"{law}-{many}.yaml")
         with backends.off():

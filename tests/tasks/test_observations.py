@@ -68,10 +68,12 @@ def test_the_ring_varies_by_more_than_hundredths():
 def test_raw_is_si_and_scaled_is_raw_over_documented_scales(task):
     scaled, raw = (gym.make("DiffIDM-v0", task=task, observation=kind) for kind in ("scaled", "raw"))
     first, second = scaled.reset(seed=3)[0], raw.reset(seed=3)[0]
-    np.testing.assert_allclose(first * np.array(scaled.unwrapped.task.features.scales), second, rtol=1e-6)
+    scales = np.tile(scaled.unwrapped.task.features.scales, len(scaled.unwrapped.task.agents))
+    np.testing.assert_allclose(first * scales, second, rtol=1e-6)
     agent = raw.unwrapped.task.agents[0]
     assert second[0] == pytest.approx(float(raw.unwrapped.state.speed[0, agent]))
-    np.testing.assert_array_equal(raw.observation_space.high, np.float32(raw.unwrapped.task.features.high))
+    high = np.tile(np.float32(raw.unwrapped.task.features.high), len(raw.unwrapped.task.agents))
+    np.testing.assert_array_equal(raw.observation_space.high, high)
 
 
 def test_a_misspelled_kind_has_a_suggestion():

@@ -84,7 +84,7 @@ def test_what_lies_outside_is_one_line_and_takes_nothing(name: str) -> None:
         ("open_highway", {"length": 1e12}, r"^length = 1e\+12 m must be at most 1e\+06"),
         ("merge", {"entry_speed": 1e6}, r"entry_speed = 1e\+06 m/s must be at most 70"),
         ("merge", {"inflow": 1e9}, r"^inflow = 1e\+09 vehicles an hour must be at most 100000"),
-        ("merge", {"inflow": 1e5, "ramp_inflow": 1.0}, "vehicles = 80 leaves none for lane 0.* Take at least 100001"),
+        ("merge", {"inflow": 1e5, "ramp_inflow": 1.0}, "vehicles = 120 leaves none for lane 0.* Take at least 100001"),
         ("ring", {"dt": 1e-9}, "dt = 1e-09 s must be at least 0.001"),
         ("highway", {"lane_commands": "no"}, "lane_commands = 'no' must be True or False"),
         ("highway", {"spread": 0.9, "parameters": {"idm.desired_speed": 60.0}}, "idm.desired_speed = .* is outside"),

@@ -20,9 +20,9 @@ CASES = {
     "replay": {"task": "replay"},
     "replay lanes": {"task": "replay_lanes", "controlled": 2, "lane_commands": True},
     "highway": {"task": "highway", "vehicles": 30, "length": 300.0, "max_command": 4.0, "controlled": 3},
-    "open highway": {"task": "open_highway", "vehicles": 40, "max_command": 4.0, "controlled": 3},
-    "merge": {"task": "merge", "vehicles": 40, "max_command": 4.0, "controlled": 3},
-    "bottleneck": {"task": "bottleneck", "vehicles": 40, "max_command": 4.0, "controlled": 3},
+    "open highway": {"task": "open_highway", "vehicles": 40, "max_command": 4.0, "controlled": 3, "careful": False},
+    "merge": {"task": "merge", "vehicles": 40, "max_command": 4.0, "controlled": 3, "careful": False},
+    "bottleneck": {"task": "bottleneck", "vehicles": 40, "max_command": 4.0, "controlled": 12, "careful": False},
     "replay, follow": {"task": "replay", "controlled": 3, "reward_terms": "follow"},
 }
 STEPS, COUNT = 150, 24
@@ -75,7 +75,7 @@ def test_no_state_pays_beyond_the_bounds_that_the_cost_is_made_of(name):
     task = make_task(**CASES[name])
     assert task.pay.low <= 0.0 <= task.pay.high
     shared = task.cost_of_crash / task.shares
-    assert (task.horizon - 1) * task.pay.high - shared < task.horizon * task.pay.low
+    assert (task.steps - 1) * task.pay.high - shared < task.steps * task.pay.low
     params = task.params(torch.float64, "cpu")
     draw = Draw.of(torch.arange(500), torch.zeros(500, dtype=torch.int64))
     world = task.begin(draw, params)
