@@ -351,9 +351,14 @@ class Batch:
         ``live`` (bool, ``(n, agents)``) leaves only single agents' vehicles to their drivers, and drops their commands.
 
         An action is held for ``task.held`` steps of Δt; rewards are summed. A row that ends before them tells of its
-        end; until it is reset it drives on unseen.
+        end; until it is reset it drives on unseen. Whoever enters meanwhile is commanded from the next action on.
         """
         self._reasons = {}
+        if self.task.journeys and action is not None:
+            state = self.glance().state
+            assert state.present is not None
+            there = self.task.pick(state.present) > 0
+            live = there if live is None else live & there
         outcome = self._once(action, live)
         for _ in range(self.task.held - 1):
             over = outcome.whole.terminated | outcome.whole.truncated

@@ -30,7 +30,9 @@ _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (PettingZoo's name)
     """All agents step at once: agent ``vehicle_i`` commands vehicle i.
 
-    An agent that has terminated or been truncated leaves ``agents``, and its vehicle goes back to its driver.
+    An agent that has terminated or been truncated leaves ``agents``, and its vehicle goes back to its driver. Where
+    vehicles enter and leave, every trip is an agent of its own, ``vehicle_i_trip_k``: it appears when its vehicle
+    enters, and terminates when that has left. While no agent is there traffic goes on until one is, or the end.
     ``state()`` is the whole traffic: speed/30 of every vehicle, then gap/100 (capped at 1000 m). Numpy only:
     gradients are the business of the Gymnasium faces.
 
@@ -55,8 +57,10 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         self.max_cycles = made.limit
         self.render_mode = made.render_mode
         self.batch = Batch(made, 1)
-        self.possible_agents = [f"vehicle_{i}" for i in self.task.agents]
+        trips = [f"_trip_{k}" for k in range(1, self.task.journeys + 1)] or [""]
+        self.possible_agents = [f"vehicle_{i}{trip}" for i in self.task.agents for trip in trips]
         self.agents: list[str] = []
+        self._slots: list[str] = []
         self.observation_spaces = {a: observation_box(self.task, made.dtype, 1) for a in self.possible_agents}
         self.action_spaces = {a: action_space(self.task, 1) for a in self.possible_agents}
         kind, n = numpy_dtype(made.dtype), self.task.vehicles
@@ -86,20 +90,24 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         self.batch.limit = self.max_cycles
         state = options.get("state") if isinstance(options, dict) else None
         seen = np.asarray(self.batch.reset(state=state)[0])
-        self.agents = list(self.possible_agents)
+        self.agents = self._appear()
+        while not self.agents:
+            seen = np.asarray(self.batch.step(None).observation[0])
+            self.agents = self._appear()
         if self.render_mode == "human":
             self.render()
-        return self._by_agent(seen), {agent: self._begun(agent) for agent in self.agents}
+        return self._by_agent(seen), {agent: self._begun(i) for i, agent in enumerate(self._slots) if agent}
 
     def step(
         self, actions: dict[str, np.ndarray]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """Advance by Δt with one action for every agent that is still there."""
+        """Advance by the time for which an action is held, with one action for every agent that is still there."""
         if not self.agents:
             return {}, {}, {}, {}, {}
-        live = [agent in self.agents for agent in self.possible_agents]
+        before = self._slots
+        live = [agent in self.agents for agent in before]
         commands = np.zeros((1, len(self.task.commands), len(live)))
-        for i, agent in enumerate(self.possible_agents):
+        for i, agent in enumerate(before):
             if live[i]:
                 commands[0, :, i] = self._action(agent, actions)
         made = self.settings
@@ -109,25 +117,57 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
                 torch.as_tensor(commands.reshape(1, -1), dtype=made.dtype, device=made.device),
                 None if everybody else torch.tensor([live], device=made.device),
             )
-        seen = self._by_agent(np.asarray(outcome.observation[0]))
+        told = self._by_agent(np.asarray(outcome.observation[0]))
         rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:4])
-        infos = {agent: self._info(i, agent, outcome) for i, agent in enumerate(self.possible_agents) if live[i]}
+        infos = {agent: self._info(i, outcome) for i, agent in enumerate(before) if live[i]}
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
+        if self.task.journeys and self.agents:
+            self._arrived(outcome, (told, rewards, terminated, truncated, infos))
         if self.render_mode == "human":
             self.render()
-        return seen, rewards, terminated, truncated, infos
+        return told, rewards, terminated, truncated, infos
 
-    def _begun(self, agent: str) -> dict[str, Any]:
+    def _appear(self) -> list[str]:
+        """Return the agents that are there now, and note whose every slot is ("" for nobody's)."""
+        if not self.task.journeys:
+            self._slots = list(self.possible_agents)
+            return list(self._slots)
+        state = self.batch.glance().state
+        assert state.present is not None and state.trips is not None
+        there, trip = (self.task.pick(x)[0].tolist() for x in (state.present, state.trips.entered))
+        self._slots = [
+            f"vehicle_{i}_trip_{k}" if here else "" for i, here, k in zip(self.task.agents, there, trip, strict=True)
+        ]
+        return [agent for agent in self._slots if agent]
+
+    def _arrived(self, outcome: Outcome, told: tuple[dict[str, Any], ...]) -> None:
+        """End the agents whose trips are over, and begin those of whose vehicles have entered."""
+        seen, rewards, terminated, truncated, infos = told
+        now = self._appear()
+        for agent in set(self.agents) - set(now):
+            terminated[agent], seen[agent] = True, np.zeros_like(seen[agent])
+        while not now:
+            outcome = self.batch.step(None)
+            if bool(outcome.whole.terminated[0] | outcome.whole.truncated[0]):
+                break
+            now = self._appear()
+        for i, agent in enumerate(self._slots):
+            if agent and agent not in self.agents:
+                seen[agent], infos[agent] = np.asarray(outcome.observation[0, i]), self._info(i, outcome)
+                rewards[agent], terminated[agent], truncated[agent] = 0.0, False, False
+        self.agents = now
+
+    def _begun(self, i: int) -> dict[str, Any]:
         """Return the recorded id of an agent's vehicle, where there is one."""
         known = ids(self.batch)
-        return {} if known is None else {"vehicle_id": known[self.possible_agents.index(agent)]}
+        return {} if known is None else {"vehicle_id": known[i]}
 
-    def _info(self, i: int, agent: str, outcome: Outcome) -> dict[str, Any]:
+    def _info(self, i: int, outcome: Outcome) -> dict[str, Any]:
         """Return what ``idm_env.envs.info`` says of a step, as numbers of one agent."""
         info: dict[str, Any] = {name: value[0, i].item() for name, value in outcome.details.items()}
         if info.get("crash"):
             info["crash_reason"] = self.batch.crash_reason(0, i if self.task.shares > 1 else None)
-        return info | self._begun(agent)
+        return info | self._begun(i)
 
     def _action(self, agent: str, actions: dict[str, np.ndarray]) -> np.ndarray:
         if agent not in actions:
@@ -144,7 +184,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         return action
 
     def _by_agent(self, values: Any) -> dict[str, Any]:
-        return {agent: values[i] for i, agent in enumerate(self.possible_agents) if agent in self.agents}
+        return {agent: values[i] for i, agent in enumerate(self._slots) if agent in self.agents}
 
     def state(self) -> np.ndarray:
         """Return the whole traffic, within ``state_space``."""

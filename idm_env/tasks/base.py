@@ -204,6 +204,11 @@ class Task(abc.ABC):
         return 1
 
     @property
+    def journeys(self) -> int:
+        """The most trips of an agent's slot in an episode; 0 where agents are there from its beginning on."""
+        return 0
+
+    @property
     def commands(self) -> tuple[str, ...]:
         """What an agent commands: an action holds the first of all agents, then the second of all, and so on."""
         return ("accel",)

@@ -206,6 +206,12 @@ class OpenLanesTask(LanesTask):
         own = {**super().told(world), "present": self.pick(there)}
         return own | {n: x.unsqueeze(-1).expand(-1, len(self.agents)).contiguous() for n, x in every.items()}
 
+    @property
+    def journeys(self) -> int:
+        """One that began before the episode, one that is due at once, and one for every time that a slot's are due."""
+        cycle = min(sum(mean for k, mean in self._slots if k == lane) for lane in self.inflows)
+        return 2 + math.ceil((self.steps * self.simulator.dt + self.filled / self.entry_speed) / cycle)
+
     @cached_property
     def _most(self) -> float:
         """No more trips are due in an episode."""

@@ -22,6 +22,10 @@ EVERYBODY = [
     {"task": "platoon", "controlled": 0.5},
     {"task": "replay", "controlled": "all"},
 ]
+TRIPS = [
+    {"task": "merge", "vehicles": 20, "controlled": 0.2},
+    {"task": "bottleneck", "vehicles": 8, "controlled": [1], "inflow": 2000.0},
+]
 
 
 @pytest.mark.filterwarnings("error::UserWarning")
@@ -30,7 +34,14 @@ def test_parallel_api(keywords):
     parallel_api_test(parallel_env(**keywords, max_cycles=40), num_cycles=60)
 
 
-@pytest.mark.parametrize("keywords", [QUICK, *EVERYBODY], ids=str)
+@pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
+@pytest.mark.parametrize("keywords", TRIPS, ids=str)
+def test_parallel_api_where_agents_come_and_go(keywords):
+    """Of the trips that an episode may have not all begin in it."""
+    parallel_api_test(parallel_env(**keywords, max_cycles=40), num_cycles=60)
+
+
+@pytest.mark.parametrize("keywords", [QUICK, *EVERYBODY, TRIPS[0]], ids=str)
 @pytest.mark.parametrize("make", [env, raw_env])
 def test_api(make, keywords):
     api_test(make(**keywords, max_cycles=30), num_cycles=60)
@@ -105,3 +116,21 @@ def test_bad_actions_are_errors(bad):
 def test_a_misspelled_keyword_has_a_suggestion():
     with pytest.raises(TypeError, match="Did you mean 'vehicles'"):
         parallel_env(vehicels=3)
+
+
+def test_agents_of_trips_come_and_go():
+    """Every trip is an agent: it appears with its vehicle, and terminates with it, however long none is there."""
+    many = parallel_env(task="merge", vehicles=30, controlled=[2, 9], inflow=2400.0, ramp_inflow=500.0, max_cycles=150)
+    seen, _ = many.reset(seed=4)
+    at = many.task.bounds.names.index("present")
+    began, ended, last = set(many.agents), set(), None
+    while many.agents:
+        assert set(seen) >= set(many.agents) and all(seen[agent][at] == 1.0 for agent in many.agents)
+        seen, reward, terminated, truncated, _ = many.step({a: np.zeros(1, np.float32) for a in many.agents})
+        over = {a for a in terminated if terminated[a] or truncated[a]}
+        assert not over & ended and not ended & set(many.agents)
+        assert all(seen[a][at] == 0.0 and reward[a] < 0.0 for a in terminated if terminated[a])
+        ended, began, last = ended | over, began | set(many.agents), truncated
+    assert began == ended <= set(many.possible_agents) and len(began) >= 5
+    assert {name.split("_trip_")[0] for name in began} == {"vehicle_2", "vehicle_9"}
+    assert last is not None
