@@ -31,17 +31,18 @@ from agents.rollout import (
     Start,
     drive,
     episodes_start,
-    moments,
+    held_moments,
     ring_start,
     uniform_speed,
 )
 from idm_env import metrics
 from idm_env.envs.gym import DiffIDMEnv
 from idm_env.jobs import trust
-from idm_env.multilane import demand
+from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.tasks.ring import RingTask
 
 STEPS = 3000
+STEPS_OF_LANES = 6000
 JUDGED = 1000
 SPEED_RATIO, SPEED_STD, TIME_GAP, IN_A_ROW = 0.97, 0.15, 0.8, 5
 FOLLOW_REWARD = 0.88
@@ -237,35 +238,35 @@ def evaluate_lanes(act: Act | None, environment: Mapping[str, Any], count: int =
 def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, Any]]:
     """Return the figures of policies that drive together, each in its share of the episodes, one after the other.
 
-    Episodes last 300 s; the first 100 s fill the road and are not judged. ``speed``: mean of all on the road (m/s);
-    ``outflow``: vehicles that leave, an hour; ``queued``: vehicles waiting at the entries at the end; each the mean
-    over episodes, the outflow also of each in ``outflows``. ``reward``: mean per step, as if nobody crashed;
-    ``collisions``: episodes with a crash.
+    Whole episodes are judged. ``reward``: their return, minus the total delay (vehicle-seconds), as if nobody crashed;
+    ``outflow``: vehicles that leave, an hour; ``ramp``: of those who enter on lane 0 those who leave it, an hour;
+    ``queued``: vehicles waiting at the entries at the end; ``travel``: time on the road and in the queue per vehicle
+    that leaves (s); ``standing``: share of vehicle-seconds below 0.5 m/s; ``co2``: g per vehicle that leaves; each the
+    mean over episodes, return and outflow also of each in ``rewards`` and ``outflows``. ``collisions``: episodes with a
+    crash; ``passed``: there are none.
     """
     task, like = start.task, start.world.state.speed
-    rows = len(like)
-    none = like.new_zeros(rows, len(task.agents))
+    assert isinstance(task, OpenLanesTask)
+    steps = min(task.steps, STEPS_OF_LANES)
+    rows, dt = len(like), task.simulator.dt
     crashed = torch.zeros(rows, dtype=torch.bool)
-    inside, way, reward, left = (torch.zeros(rows, dtype=torch.float64) for _ in range(4))
-    with torch.no_grad():
-        for t, (before, _, command, after) in enumerate(moments(start, act, STEPS)):
-            state, trips = after.state, after.state.trips
-            assert state.present is not None and trips is not None
-            crashed |= task.crashed(after).any(-1)
-            gone = trips.left.sum(-1).double()
-            if t < JUDGED:
-                left = gone
-                continue
-            inside += state.present.sum(-1)
-            way += (state.present * state.speed).sum(-1)
-            reward += task.earned(before, none if command is None else command, after).mean(-1)
-    judged = STEPS - JUDGED
+    lost, spent, stood, burnt = (torch.zeros(rows, dtype=torch.float64) for _ in range(4))
+    for _, _, world in held_moments(start, act, steps):
+        state = world.state
+        assert state.present is not None
+        there = state.present > 0
+        crashed |= task.crashed(world).any(-1)
+        lost += dt * task.delay(world)
+        spent += dt * there.sum(-1)
+        stood += dt * (there & (state.speed < 0.5)).sum(-1)
+        burnt += dt * task.told(world)["co2"][:, 0]
+    told = task.told(world)
+    hourly, left = 3600.0 / (steps * dt), told["outflow"][:, 0].double()
     columns = {
-        "speed": way / inside,
-        "outflow": (gone - left) * 3600.0 / (judged * task.simulator.dt),
-        "queued": demand.counts(task.simulator, state).queued.double(),
-        "reward": reward / judged,
-    }
+        "reward": -lost, "outflow": left * hourly, "ramp": told["ramp"][:, 0].double() * hourly,
+        "queued": told["queued"][:, 0].double(), "travel": (spent + lost) / left.clamp_min(1.0),
+        "standing": stood / spent.clamp_min(1.0), "co2": burnt / left.clamp_min(1.0),
+    }  # fmt: skip
     parts = {name: x.view(policies, -1) for name, x in columns.items()}
     crashes = crashed.view(policies, -1).sum(-1)
     return [
@@ -273,7 +274,7 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
             **{name: float(x[i].mean()) for name, x in parts.items()},
             "collisions": int(crashes[i]),
             "passed": not bool(crashes[i]),
-            "outflows": parts["outflow"][i].tolist(),
+            **{f"{name}s": parts[name][i].tolist() for name in ("reward", "outflow")},
         }
         for i in range(policies)
     ]

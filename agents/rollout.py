@@ -15,6 +15,7 @@ from agents.policy import Driving, Policy
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.envs.batch import Batch
 from idm_env.envs.settings import settings
+from idm_env.simulator import stacked
 from idm_env.tasks import Draw, Task, World
 from idm_env.types import Params
 
@@ -86,6 +87,44 @@ def moments(start: Start, act: Act | None, steps: int) -> Iterator[Moment]:
             after = task.step(world, command, now, params, advance=task.simulator.advance)
         yield Moment(world, action, command, after)
         world = after
+
+
+def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[World, Tensor | None, World]]:
+    """Roll a policy out with its actions held; yield, of every Δt, the worlds of its decision and after it, and action.
+
+    Without a failsafe, which looks at every Δt, what lies between two decisions is one compiled rollout; of the worlds
+    in between what ``Trajectory`` keeps is theirs, and the rest that of the end.
+    """
+    task, world, _, params = start
+    assert not task.simulator.draws
+    act = begun(act)
+    with torch.no_grad():
+        for done in range(0, steps, task.held):
+            before = world
+            assert world.state.present is not None
+            action = None if act is None else act(task.observe(world).flatten(1))
+            command = None if action is None else task.command(action)
+            live = task.pick(world.state.present) > 0
+            count = min(task.held, steps - done)
+            if task.failsafe:
+                for _ in range(count):
+                    world = task.step(world, command, None, params, live=live, advance=task.simulator.advance)
+                    yield before, action, world
+                continue
+            inputs = task.wishes(task.inputs(world, command, None, live), action, live)
+            given = {name: _repeated(x, count) for name, x in inputs.items()}
+            driven = task.driven(world.episode, params)
+            state, kept = task.simulator.rollout(world.state, given, driven, count)
+            for t in range(count):
+                now = {name: x[t] for name, x in kept._asdict().items()}
+                world = before._replace(state=state._replace(**now, step=before.state.step + t + 1))
+                yield before, action, world
+            world = before._replace(state=state)
+
+
+def _repeated(x: Any, count: int) -> Any:
+    """Return an input of one step for so many steps."""
+    return stacked([x] * count)
 
 
 def drive(start: Start, act: Act | None, steps: int) -> Driven:

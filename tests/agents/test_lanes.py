@@ -9,28 +9,38 @@ import torch
 
 from agents import apg, common, evaluate, ppo
 from agents.environments import human_driving, make_env, task_of
-from agents.rollout import episodes_start
+from agents.rollout import SEED, episodes_start
 
 FREE = {"task": "bottleneck", "inflow": 720.0, "vehicles": 40, "controlled": [4], "failsafe": 3.0}
 
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(evaluate, "STEPS", 1200)
-    monkeypatch.setattr(evaluate, "JUDGED", 600)
+    monkeypatch.setattr(evaluate, "STEPS_OF_LANES", 1200)
 
 
 def test_in_free_traffic_what_comes_goes(short):
-    """720 an hour are 12 in the 60 s that are judged, give or take who is just at an end, and nobody waits."""
+    """720 an hour are 24 in 120 s, and nobody waits or stands; a trip of 800 m takes half a minute."""
     found = evaluate.evaluate_lanes(None, FREE, 2)
-    assert all(abs(flow - 720.0) <= 2 * 60.0 for flow in found["outflows"])
-    assert found["queued"] == 0 and found["passed"] and 20.0 < found["speed"] < 32.0
+    assert all(abs(flow - 720.0) <= 6 * 30.0 for flow in found["outflows"])
+    assert found["queued"] == found["standing"] == 0 and found["passed"] and 20.0 < found["travel"] < 50.0
     assert found["outflow"] == pytest.approx(sum(found["outflows"]) / 2)
 
 
+def test_the_return_that_is_judged_is_the_environments(monkeypatch):
+    """A rollout between two decisions pays what the steps of an environment pay, human drivers or agents."""
+    monkeypatch.setattr(evaluate, "STEPS_OF_LANES", 150)
+    chosen = {"task": "merge", "vehicles": 30}
+    for act in (None, lambda seen: -torch.ones(len(seen), 3)):
+        found = evaluate.evaluate_lanes(act, chosen, 2)
+        env = make_env(chosen, 2, output="torch", autoreset_mode="Disabled")
+        env.reset(seed=SEED)
+        pays = [env.step(None if act is None else -torch.ones(2, 3))[1] for _ in range(15)]
+        torch.testing.assert_close(torch.tensor(found["rewards"]).float(), torch.stack(pays).sum(0), rtol=1e-4, atol=0)
+
+
 def test_policies_that_drive_together_drive_as_alone(monkeypatch):
-    monkeypatch.setattr(evaluate, "STEPS", 300)
-    monkeypatch.setattr(evaluate, "JUDGED", 100)
+    monkeypatch.setattr(evaluate, "STEPS_OF_LANES", 300)
     task = task_of(FREE)
     accels = (-3.0, 0.3)
 
@@ -45,7 +55,7 @@ def test_policies_that_drive_together_drive_as_alone(monkeypatch):
     together = evaluate.judge_lanes(episodes_start(FREE, 2, 2), act, 2)
     alone = [evaluate.evaluate_lanes(one, FREE, 2) for one in family.values()]
     assert together == alone
-    assert together[0]["speed"] < together[1]["speed"] - 1.0  # who stands holds up those behind
+    assert together[0]["reward"] < together[1]["reward"] - 5.0  # who stands holds up those behind
 
 
 def test_apg_learns_in_traffic_that_flows(quick, monkeypatch):

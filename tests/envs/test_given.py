@@ -75,8 +75,10 @@ NUMBERS = [
     *((put(field, bad), f"{field} = ") for field in ("position", "speed", "accel", "gap", "length")
       for bad in (np.nan, np.inf, -np.inf, 1e30)),
     *((put(field, -1), f"{field} = -1") for field in ("speed", "length", "step")),
-    (put("gap", 7777.0), r"gap = .* m of vehicle . of environment 0, and positions say"),
-    (put("position", 7e5), r"gap = .* and positions say"),
+    (lambda s: s._replace(gap=torch.where(s.gap == s.gap.amin(), 7777.0, s.gap)),
+     r"gap = .* m of vehicle \d+ of environment \d, and positions say"),
+    (lambda s: s._replace(position=torch.where(s.gap == s.gap.amin(), s.position - 10.0, s.position)),
+     r"gap = .* and positions say"),
 ]  # fmt: skip
 SHAPES = [
     (lambda s: 7, "is of type int: give a State"),
@@ -98,7 +100,7 @@ LINKS = [
     (lambda s: s._replace(links=None), "links.lane is missing"),
     (lambda s: s._replace(links=s.links._replace(lane=s.links.lane.float())), "lane is a torch.Tensor of torch.f"),
     (lambda s: s._replace(links=s.links._replace(leader=s.links.leader.roll(1, -1))), "do not follow"),
-    (lambda s: s._replace(links=s.links._replace(lane=s.links.lane.clamp_min(1))), "do not follow"),
+    (lambda s: s._replace(links=s.links._replace(lane=s.links.lane.clamp_max(0))), "do not follow"),
     (lambda s: s._replace(links=s.links._replace(leader=s.links.follower, follower=s.links.leader)), "do not follow"),
 ]  # fmt: skip
 TRIPS = [
