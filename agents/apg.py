@@ -86,7 +86,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     if arguments.start is not None and not saved:
         policy = common.load_for(arguments.start, task)[0]
     done = saved.get("update", -1) + 1
-    env = environments.make_env(arguments.environment, arguments.count, output="torch")
+    env = environments.make_env(arguments.trained_in, arguments.count, output="torch")
     env.reset(seed=environments.first_seed(arguments.seed, arguments.count))
     optimiser = torch.optim.Adam(policy.parameters(), lr=arguments.learning_rate)
     if saved:

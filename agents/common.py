@@ -55,7 +55,7 @@ class Arguments:
         seed: Of everything random.
         updates: Updates of the policy; the learning rate falls with their count.
         cpu_seconds: Training also ends after that many CPU seconds, evaluations not counted; 0 is no limit.
-        evaluate_every: CPU seconds of training between evaluations; 0 evaluates after every update.
+        evaluate_every: Updates between evaluations, so that no machine's speed decides; one comes after the last.
         log: Where figures go: csv, tensorboard, or both with a comma.
         resume: Go on from the last checkpoint in ``out``.
         hidden: Widths of the policy's hidden layers.
@@ -70,7 +70,7 @@ class Arguments:
     seed: int = 0
     updates: int = 60
     cpu_seconds: float = 0.0
-    evaluate_every: float = 2.0
+    evaluate_every: int = 2
     log: str = "csv"
     resume: bool = False
     hidden: tuple[int, ...] = (32, 32)
@@ -94,6 +94,12 @@ class Arguments:
         unknown = [name for name in self.log.split(",") if name not in LOGS]
         if unknown:
             raise ValueError(f"log = '{unknown[0]}' is unknown.{nearest(unknown[0], LOGS)}")
+
+    @property
+    def trained_in(self) -> dict[str, Any]:
+        """The environment, where it has a warm-up pool with one of this seed's own."""
+        own = {"warmup_pool_seed": self.seed + 1} if self.environment.get("warmup_pool") else {}
+        return {**own, **self.environment}
 
 
 A = TypeVar("A", bound=Arguments)
@@ -315,7 +321,7 @@ def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[s
                 )
         return policy, content["training"]
     policy = Policy(len(task.bounds.names), arguments.hidden, **made)
-    observations, actions = human_driving(arguments.environment, first_seed(arguments.seed, 0))
+    observations, actions = human_driving(arguments.trained_in, first_seed(arguments.seed, 0))
     policy.mean.copy_(observations.mean(0))
     policy.scale.copy_(observations.std(0).clamp_min(1e-3))
     if arguments.clone:

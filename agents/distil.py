@@ -45,7 +45,7 @@ class Arguments(common.Arguments):
 
     out: Path = Path("runs/distil")
     updates: int = 8
-    evaluate_every: float = 0.0
+    evaluate_every: int = 1
     teacher: Path = Path("configs/ring-apg.yaml")
     count: int = 64
     steps: int = 900
@@ -114,7 +114,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
         seen.append(saved["seen"])
         wanted.append(saved["wanted"])
     done = saved.get("update", -1) + 1
-    env = environments.make_env(arguments.environment, arguments.count, output="torch")
+    env = environments.make_env(arguments.trained_in, arguments.count, output="torch")
     with Monitor("distil", arguments, began, saved) as monitor:
         if not done:
             monitor.untrained(policy)

@@ -20,7 +20,8 @@ PARTS: dict[str, Any] = {"links": Links, "trips": Trips, "moving": Moving}
 
 def task_of(environment: Mapping[str, Any]) -> Task:
     """Return the task of an environment's keywords."""
-    return make_task(**{k: v for k, v in environment.items() if k == "task" or k not in KEYWORDS})
+    own = ("task", "max_episode_steps")
+    return make_task(**{k: v for k, v in environment.items() if k in own or k not in KEYWORDS})
 
 
 def make_env(environment: Mapping[str, Any], count: int, **keywords: Any) -> DiffIDMVectorEnv:
@@ -30,7 +31,7 @@ def make_env(environment: Mapping[str, Any], count: int, **keywords: Any) -> Dif
 
 
 def first_seed(seed: int, count: int) -> int:
-    """Return the seed of the first of ``count`` environments (the starts of a warm-up pool are the same for all)."""
+    """Return the seed of the first of ``count`` environments."""
     return 10_000 * (seed + 1) + count
 
 
@@ -86,16 +87,24 @@ def human_driving(
 ) -> tuple[Tensor, Tensor]:
     """Return what agents observe while human drivers keep the wheel, and the actions that would do what they do.
 
-    Shapes ``(samples, features)`` and ``(samples,)``; actions would command what drivers do, clipped.
+    Shapes ``(samples, features)`` and ``(samples,)``; actions would command what drivers do, clipped. Where an action
+    is held that is their mean acceleration. Whoever is not on the road, from one decision to the next, is no sample.
     """
     env = make_env(environment, count, output="numpy")
     seen, done = [env.reset(seed=seed)[0]], []
+    hold = env.task.held * env.task.simulator.dt
+    state = env.state
     for _ in range(steps):
+        before = state
         observation, _, terminated, truncated, _ = env.step(None)
         seen.append(observation)
+        state = env.state
+        accel = state.accel if env.task.held == 1 else (state.speed - before.speed) / hold
         # The first step of a new episode has no acceleration yet.
-        over = torch.as_tensor(terminated | truncated).unsqueeze(-1)
-        done.append(torch.where(over, torch.nan, env.task.pick(env.state.accel)))
+        over = torch.as_tensor(terminated | truncated).unsqueeze(-1).expand_as(accel)
+        if state.present is not None and before.present is not None:
+            over = over | (state.present <= 0) | (before.present <= 0)
+        done.append(env.task.pick(torch.where(over, torch.nan, accel)))
     observations = torch.as_tensor(np.stack(seen[:-1])).float().reshape(-1, len(env.task.bounds.names))
     actions = env.task.action(torch.stack(done).float()).flatten()
     known = actions.isfinite()

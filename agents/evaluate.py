@@ -38,6 +38,7 @@ from agents.rollout import (
 from idm_env import metrics
 from idm_env.envs.gym import DiffIDMEnv
 from idm_env.jobs import trust
+from idm_env.model_file import nested
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.tasks.ring import RingTask
 
@@ -59,12 +60,14 @@ TEST: dict[str, dict[str, Any]] = {
 def as_judged(environment: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return the environment in which a policy trained in ``environment`` is judged.
 
-    ``changes`` are keywords of the test besides ``TEST``: an agent's ``judged_in``. ValueError for a task without one.
+    ``changes`` are keywords of the test besides ``TEST``: an agent's ``judged_in``. Episodes of the test are as long as
+    the task's own. ValueError for a task without one.
     """
     task = environment.get("task", "ring")
     if task not in TEST:
         raise ValueError(f"task '{task}' has no test of agents. Tests exist for {' and '.join(TEST)}.")
-    return {**environment, **TEST[task], **(changes or {})}
+    trained = {name: value for name, value in environment.items() if name != "max_episode_steps"}
+    return {**trained, **TEST[task], **(changes or {})}
 
 
 def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
@@ -131,25 +134,36 @@ def solved_at(history: Sequence[Mapping[str, Any]]) -> int | None:
 
 
 def drivers_of(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the IDM parameters of the human drivers of a task."""
-    return {**task_of(environment).own_parameters["idm"], **environment.get("parameters", {}).get("idm", {})}
+    """Return the IDM parameters of the human drivers of a task: a number, or one for each vehicle."""
+    return {**task_of(environment).own_parameters["idm"], **nested(environment.get("parameters") or {}).get("idm", {})}
+
+
+def among(environment: Mapping[str, Any], drivers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the environment with these IDM parameters of its drivers; those of other effects stay."""
+    return {**environment, "parameters": {**nested(environment.get("parameters") or {}), "idm": dict(drivers)}}
+
+
+def _times(value: Any, factor: Any) -> Any:
+    """Return a parameter, one number or one for each vehicle, times a factor or one for each vehicle."""
+    dtype = factor.dtype if isinstance(factor, Tensor) else torch.float64
+    return (torch.as_tensor(value, dtype=dtype) * factor).tolist()
 
 
 def mixed(environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return an environment in which every driver's every parameter is drawn from ±20 %."""
     generator, vehicles = torch.Generator().manual_seed(SEED), task_of(environment).vehicles
     drawn = {
-        name: (value * (0.8 + 0.4 * torch.rand(vehicles, generator=generator))).tolist()
+        name: _times(value, 0.8 + 0.4 * torch.rand(vehicles, generator=generator))
         for name, value in drivers_of(environment).items()
     }
-    return {**environment, "parameters": {"idm": drawn}}
+    return among(environment, drawn)
 
 
 def kinds(environment: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return environments in which one IDM parameter of all human drivers is 20 % lower or higher, ten, by name."""
     idm = drivers_of(environment)
     return {
-        f"{name} {sign}20 %": {**environment, "parameters": {"idm": {**idm, name: value * factor}}}
+        f"{name} {sign}20 %": among(environment, {**idm, name: _times(value, factor)})
         for name, value in idm.items()
         for sign, factor in (("−", 0.8), ("+", 1.2))
     }
@@ -164,8 +178,8 @@ def held_out(act: Act | None, environment: Mapping[str, Any]) -> dict[str, Any]:
     """
     cases = kinds(environment)
     result = {"lengths": evaluate_ring(act, environment, UNSEEN, draws=(1,))}
-    for name, among in cases.items():
-        result[name] = evaluate_ring(act, among, draws=(1,))
+    for name, case in cases.items():
+        result[name] = evaluate_ring(act, case, draws=(1,))
     result["mixed"] = evaluate_ring(act, mixed(environment), draws=(1,))
     result["drivers"] = worst([result[name] for name in cases])
     return result

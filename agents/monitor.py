@@ -91,9 +91,8 @@ class Monitor:
         spent, self.steps = self.cpu_seconds, self.steps + steps
         over = update + 1 >= self.arguments.updates or 0.0 < self.arguments.cpu_seconds <= spent
         begin = time.process_time()
-        since = spent - (self.history[-1]["cpu_seconds"] if self.history else 0.0)
         row: dict[str, Any] = {}
-        if over or since >= self.arguments.evaluate_every:
+        if over or (update + 1) % self.arguments.evaluate_every == 0:
             row = {"updates": update + 1, "steps": self.steps, "cpu_seconds": spent}
             row |= evaluate(policy, self.test)
             self.history.append(row)

@@ -11,7 +11,7 @@ numbers only: SB3's own files are pickles, which run whatever code somebody has 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -21,7 +21,9 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
@@ -33,6 +35,7 @@ from agents.policy import ACTIVATIONS, Policy
 from idm_env.envs.sb3 import SB3VecEnv
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.jobs import storage
+from idm_env.tasks import Task
 from idm_env.validation import nearest
 
 
@@ -136,7 +139,10 @@ class Desynchronised(SB3VecEnv):
 
 
 class Shared(Desynchronised):
-    """The adapter with every agent of every environment a row of its own: one policy, and the reward of their team."""
+    """The adapter with every agent of every environment a row of its own: one policy, and the reward of their team.
+
+    Where vehicles enter and leave, an agent's episode ends with its trip; ``OnTheRoad`` leaves out what lies between.
+    """
 
     def __init__(self, vector_env: DiffIDMVectorEnv, hold: int = 1) -> None:
         super().__init__(vector_env, hold)
@@ -147,6 +153,7 @@ class Shared(Desynchronised):
             np.array(bounds.low, np.float32), np.array(bounds.high, np.float32)
         )
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.present = present_in(vector_env.task)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the environments, one after the other."""
@@ -170,11 +177,34 @@ class Shared(Desynchronised):
             rows = [None] * self.agents if last is None else last.reshape(self.agents, -1)
             told += [info if row is None else {**info, "terminal_observation": row} for row in rows]
         reward, done = (np.repeat(x, self.agents) for x in (reward, done))
-        return observation.reshape(self.num_envs, -1), reward, done, told
+        observation = observation.reshape(self.num_envs, -1)
+        away = False if self.present is None else observation[:, self.present] <= 0.0
+        return observation, reward, done | away, told
 
 
-def make_model(arguments: Arguments, env: VecEnv, policy: Policy) -> BaseAlgorithm:
-    """Return SB3's algorithm, its actor of the size and the normalisation of ``policy``."""
+def present_in(task: Task) -> int | None:
+    """Return which entry of an agent's observation tells whether it is on the road; None where all always are."""
+    names = task.bounds.names
+    return names.index("present") if "present" in names else None
+
+
+class OnTheRoad(RolloutBuffer):
+    """PPO's samples, of which those count whose agent is on the road: its observation's ``present`` is above 0."""
+
+    def __init__(self, *given: Any, present: int, **keywords: Any) -> None:
+        self.present = present
+        super().__init__(*given, **keywords)
+
+    def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
+        """Yield batches without whoever is away, so that neither loss nor advantages' mean and deviation see him."""
+        for samples in super().get(batch_size):
+            there = samples.observations[:, self.present] > 0.0
+            if int(there.sum()) > 1:
+                yield RolloutBufferSamples(*(part[there] for part in samples))
+
+
+def make_model(arguments: Arguments, env: VecEnv, policy: Policy, present: int | None = None) -> BaseAlgorithm:
+    """Return SB3's algorithm, its actor of the size and the normalisation of ``policy``; ``present`` as above."""
     net: dict[str, Any] = {
         "net_arch": list(arguments.hidden),
         "activation_fn": ACTIVATIONS[arguments.activation],
@@ -192,6 +222,8 @@ def make_model(arguments: Arguments, env: VecEnv, policy: Policy) -> BaseAlgorit
             learning_starts=arguments.learning_starts, **same,
         )  # fmt: skip
     net["log_std_init"] = arguments.log_std_init
+    if present is not None:
+        same |= {"rollout_buffer_class": OnTheRoad, "rollout_buffer_kwargs": {"present": present}}
     return PPO(
         "MlpPolicy", env, policy_kwargs=net, ent_coef=entropy, n_steps=arguments.n_steps, n_epochs=arguments.n_epochs,
         gae_lambda=arguments.gae_lambda, clip_range=arguments.clip_range, max_grad_norm=arguments.clip, **same,
@@ -282,12 +314,13 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     name = arguments.algorithm
     squash = "tanh" if name == "sac" else "clip"
     policy, saved = common.begin(arguments, name, activation=arguments.activation, squash=squash)
-    made = environments.make_env(arguments.environment, arguments.count, output="numpy")
-    agents = len(made.task.agents)
-    vector = (Desynchronised if agents == 1 else Shared)(made, arguments.hold)
+    made = environments.make_env(arguments.trained_in, arguments.count, output="numpy")
+    present = present_in(made.task)
+    alone = len(made.task.agents) == 1 and present is None
+    vector = (Desynchronised if alone else Shared)(made, arguments.hold)
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
     env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
-    file, model = arguments.out / "learner.pt", make_model(arguments, env, policy)
+    file, model = arguments.out / "learner.pt", make_model(arguments, env, policy, present)
     if saved:
         storage.read(file, lambda path: goes_on(model, env, torch.load(path, weights_only=True)), storage.AFRESH)
     elif arguments.clone:

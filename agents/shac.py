@@ -51,6 +51,7 @@ class Arguments(common.Arguments):
 
     out: Path = Path("runs/shac")
     updates: int = 400
+    evaluate_every: int = 10
     learning_rate: float = 1e-3
     count: int = 64
     window: int = 64
@@ -174,11 +175,11 @@ def train(a: Arguments) -> list[dict[str, Any]]:
     """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
     began = time.process_time()
     torch.manual_seed(a.seed)
-    env = environments.make_env(a.environment, a.count, output="torch", autoreset_mode="Disabled")
+    env = environments.make_env(a.trained_in, a.count, output="torch", autoreset_mode="Disabled")
     env.reset(seed=environments.first_seed(a.seed, a.count))
     policy, saved = common.begin(a, "shac")
     observation = environments.restore(env, saved["episodes"]) if saved else environments.desynchronise(env)
-    critic = Critic(human_scenes(a.environment, environments.first_seed(a.seed, 0)), a.critic_hidden)
+    critic = Critic(human_scenes(a.trained_in, environments.first_seed(a.seed, 0)), a.critic_hidden)
     target = deepcopy(critic)
     target.requires_grad_(False)
     actor_steps = torch.optim.Adam(policy.parameters(), lr=a.learning_rate)

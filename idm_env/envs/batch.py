@@ -30,6 +30,7 @@ from idm_env.validation import whole
 if TYPE_CHECKING:
     from idm_env.envs.values import Values
 
+_LARGEST_POOL = 100_000
 _POOL_STREAM = 2
 _NORMALS_AT_ONCE = 1 << 14
 _WINDOW = 1 << 20
@@ -222,7 +223,7 @@ class Batch:
             return self.task.reset(draw, self.params)
         if self._pool is None:
             size, device = self.task.warmup_pool, self.settings.device
-            seeds = torch.arange(size, device=device)
+            seeds = torch.arange(size, device=device) + _LARGEST_POOL * self.task.warmup_pool_seed
             self._pool = self.task.reset(Draw.of(seeds, torch.full_like(seeds, -1)), self.params)
         picked = (draw.uniforms(_POOL_STREAM, 1, torch.float64).squeeze(-1) * self.task.warmup_pool).long()
         return mapped(lambda pooled: pooled[picked], self._pool)

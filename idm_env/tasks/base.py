@@ -61,6 +61,7 @@ class Task(abc.ABC):
             none.
         warmup: Steps before an episode begins, in which nobody is controlled.
         warmup_pool: If above 0, episodes begin in one of that many warmed-up worlds, which are made once.
+        warmup_pool_seed: Number of the pool; those of two numbers have no world in common.
         max_command: Acceleration that an action of 1 commands (m/s²), and an action of −1 its negative; or
             ``[hardest braking, strongest acceleration]``, such as ``[-4.5, 2.6]``: actions below 0 are then in parts of
             the former, those above in parts of the latter, and an action of 0 commands 0 in any case.
@@ -93,6 +94,7 @@ class Task(abc.ABC):
     noise: float = 0.0
     warmup: int = 0
     warmup_pool: int = 0
+    warmup_pool_seed: int = 0
     max_command: float | Sequence[float] = 1.0
     failsafe: float = 0.0
     failsafe_time: float = 1.0
@@ -114,6 +116,7 @@ class Task(abc.ABC):
         "noise": Range(0.0, 10.0, "m/s²"),
         "warmup": Range(0, 100_000, whole=True),
         "warmup_pool": Range(0, 100_000, whole=True),
+        "warmup_pool_seed": Range(0, 1e9, whole=True),
         "failsafe": Range(0.0, 100.0, "m/s²"),
         "failsafe_time": Range(0.0, 60.0, "s"),
         "hold": Range(1e-3, 60.0, "s"),

@@ -33,7 +33,7 @@ def ring() -> dict[str, Any]:
 def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Arguments of a short training; its evaluation is one that costs nothing."""
     monkeypatch.setattr("agents.monitor.evaluate", lambda policy, environment: PASSED)
-    return {"environment": dict(RING), "out": tmp_path / "run", "updates": 4, "evaluate_every": 0.0, "hidden": (8, 8)}
+    return {"environment": dict(RING), "out": tmp_path / "run", "updates": 4, "evaluate_every": 1, "hidden": (8, 8)}
 
 
 PASSED: dict[str, Any] = {"speed_ratio": 1.0, "speed_std": 0.1, "time_gap": 1.0, "collisions": 0, "passed": True}

@@ -84,7 +84,7 @@ def test_a_teacher_may_be_a_training_that_comes_first(small, tmp_path):
     file = tmp_path / "first.yaml"
     file.write_text(
         "configures: agent\nagent: apg\nenvironment: {task: ring, vehicles: 8, length: [60.0, 75.0], warmup: 20, "
-        "warmup_pool: 8, failsafe: 3.0}\nupdates: 2\ncount: 4\nwindow: 20\nhidden: [8, 8]\nevaluate_every: 0\n"
+        "warmup_pool: 8, failsafe: 3.0}\nupdates: 2\ncount: 4\nwindow: 20\nhidden: [8, 8]\nevaluate_every: 1\n"
     )
     small = dataclasses.replace(small, teacher=file, fits=20, steps=30, updates=1)
     trained = small.out / "teacher" / "last.pt"

@@ -285,3 +285,22 @@ def test_a_kind_of_drivers_is_what_its_name_says():
         start = ring_start(made[name], (230.0,), 5)
         assert float(start.params["idm"]["time_gap"]) == pytest.approx(1.5 * factor)
         assert float(start.params["idm"]["max_accel"]) == 1.0
+
+
+def test_drivers_are_told_by_dotted_names_and_as_mappings_and_other_effects_stay():
+    """With a number or one for each vehicle."""
+    dotted = {"task": "ring", "parameters": {"idm.time_gap": 1.5, "noise.sigma": 0.3}}
+    as_mapping = {"task": "ring", "parameters": {"idm": {"time_gap": 1.5}, "noise": {"sigma": 0.3}}}
+    assert evaluate.drivers_of(dotted) == evaluate.drivers_of(as_mapping)
+    assert evaluate.drivers_of(dotted)["time_gap"] == 1.5
+    for made in (*kinds(dotted).values(), evaluate.mixed(dotted)):
+        assert made["parameters"]["noise"] == {"sigma": 0.3}
+    assert kinds(dotted)["time_gap +20 %"] == kinds(as_mapping)["time_gap +20 %"]
+    each = {"task": "ring", "parameters": {"idm.time_gap": [1.0] * 11 + [2.0] * 11}}
+    assert kinds(each)["time_gap −20 %"]["parameters"]["idm"]["time_gap"] == [0.8] * 11 + [1.6] * 11
+
+
+def test_a_task_keeps_the_length_of_its_episodes_and_a_test_has_its_own():
+    """Agents of a record are those who are there for so long."""
+    assert task_of({"task": "follow", "max_episode_steps": 70}).horizon == 70
+    assert evaluate.as_judged({"task": "follow", "max_episode_steps": 70}) == {"task": "follow"}

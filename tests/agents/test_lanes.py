@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
 from agents import apg, common, evaluate, ppo
 from agents.environments import human_driving, make_env, task_of
+from agents.policy import Policy
 from agents.rollout import SEED, episodes_start
 
 FREE = {"task": "bottleneck", "inflow": 720.0, "vehicles": 40, "controlled": [4], "failsafe": 3.0}
@@ -80,6 +82,39 @@ def test_a_ring_of_twice_the_vehicles_is_twice_as_long(monkeypatch):
     assert made == [[220.0, 270.0], [440.0, 540.0]]
 
 
+def test_nobody_learns_from_who_is_not_on_the_road(monkeypatch):
+    """Neither clones nor normalisation, nor PPO's batches; an agent's episode ends with its trip."""
+    chosen = {**FREE, "controlled": 0.2, "max_episode_steps": 50}
+    seen, actions = human_driving(chosen, 5, count=2, steps=40)
+    at = task_of(chosen).bounds.names.index("present")
+    assert 0 < len(seen) == len(actions) < 0.9 * 2 * 40 * 8 and bool((seen[:, at] == 1.0).all())
+    rows = ppo.Shared(make_env(chosen, 2, output="numpy"))
+    rows.seed(3)
+    policy = Policy(len(rows.vector_env.task.bounds.names), (4,))
+    arguments = ppo.Arguments(environment=chosen, count=2, n_steps=40, batch_size=64, hidden=(4,))
+    model = ppo.make_model(arguments, rows, policy, ppo.present_in(rows.vector_env.task))
+    model.learn(40 * 16)
+    buffer = model.rollout_buffer
+    away = buffer.observations.reshape(-1, seen.shape[-1])[:, at] <= 0.0
+    # Learning has laid the samples of each agent one after the other.
+    there, starts = buffer.observations.reshape(16, 40, -1)[..., at].T > 0.0, buffer.episode_starts > 0.0
+    assert starts[1:][~there[1:]].all() and starts[1:][there[1:]].mean() < 0.1
+    batches = [part.observations[:, at] for part in buffer.get(64)]
+    assert 0 < away.sum() < away.size and sum(map(len, batches)) == (~away).sum()
+    assert all(bool((part > 0.0).all()) for part in batches)
+
+
+def test_a_clone_of_held_actions_learns_what_they_came_to():
+    """The mean acceleration of a second, not that of its last tenth."""
+    chosen = {"task": "ring", "hold": 1.0, "warmup": 50, "max_command": 4.0}
+    env = make_env(chosen, 2, output="numpy")
+    env.reset(seed=5)
+    before = env.state.speed
+    env.step(None)
+    _, actions = human_driving(chosen, 5, count=2, steps=1)
+    torch.testing.assert_close(env.task.command(actions.view(2, 1)), env.task.pick(env.state.speed - before))
+
+
 def test_ppo_learns_one_policy_for_all_agents_of_an_environment(quick, monkeypatch):
     """Every agent is a row of its own, with what it observes; the team's reward goes to all."""
     monkeypatch.setattr(common, "human_driving", partial(human_driving, count=2, steps=60))
@@ -89,6 +124,7 @@ def test_ppo_learns_one_policy_for_all_agents_of_an_environment(quick, monkeypat
     rows.seed(3)
     seen = rows.reset()
     assert seen.shape == (6, len(vector.task.bounds.names)) and rows.observation_space.contains(seen[4])
+    away = vector.task.bounds.names.index("present")
     together = vector.task.observe(vector.batch.world).reshape(6, -1)
     assert torch.equal(torch.as_tensor(seen), together)
     ended = 0
@@ -96,9 +132,11 @@ def test_ppo_learns_one_policy_for_all_agents_of_an_environment(quick, monkeypat
         seen, reward, done, infos = rows.step(0.1 * torch.arange(6).reshape(6, 1).numpy())
         assert reward.shape == done.shape == (6,) and len(infos) == 6
         for world in (slice(0, 3), slice(3, 6)):
-            assert len(set(reward[world])) == 1 and len(set(done[world])) == 1
-        ended += int(done.sum())
-        assert all(infos[i]["terminal_observation"].shape == seen[i].shape for i in done.nonzero()[0])
+            assert len(set(reward[world])) == 1
+        over = ["terminal_observation" in info for info in infos]
+        assert done[over].all() and (seen[done & ~np.array(over), away] == 0.0).all()
+        assert all(infos[i]["terminal_observation"].shape == seen[i].shape for i in np.flatnonzero(over))
+        ended += sum(over)
     assert ended >= 6
     arguments = {**quick, "environment": environment, "updates": 2}
     history = ppo.train(ppo.Arguments(**arguments, count=2, n_steps=10, batch_size=30, n_epochs=1))

@@ -63,6 +63,25 @@ def test_a_resumed_training_goes_on_where_it_was(name, quick):
     assert [len(part) - 1 for part in rows] == [2, 3]  # what was logged before stays
 
 
+def test_evaluations_come_after_so_many_updates_however_long_they_take(quick, monkeypatch):
+    """The same rows on every machine, and one after the last update."""
+    seconds = iter(range(0, 10_000, 100))
+    monkeypatch.setattr("agents.monitor.time.process_time", lambda: float(next(seconds)))
+    history = apg.train(apg.Arguments(**{**quick, "updates": 5, "evaluate_every": 2}, **SMALL))
+    assert [row["updates"] for row in history] == [0, 2, 4, 5]
+
+
+def test_starts_of_a_warm_up_pool_differ_by_seed(quick):
+    """Two seeds have no start in common; of one seed they are the same, whichever agent trains."""
+    starts = []
+    for seed in (1, 1, 2):
+        env = environments.make_env(apg.Arguments(**quick, seed=seed).trained_in, 16, output="torch")
+        env.reset(seed=3)
+        starts.append(env.state.speed)
+    assert torch.equal(starts[0], starts[1])
+    assert not (starts[0][:, None] == starts[2]).all(-1).any()
+
+
 def test_apg_resumes_exactly(quick, tmp_path):
     whole = apg.Arguments(**quick, **SMALL)
     apg.train(dataclasses.replace(whole, out=tmp_path / "whole"))
