@@ -250,27 +250,27 @@ def searched(of: Callable[[torch.Tensor, Sequence[int]], torch.Tensor]) -> torch
 
 
 def rule(values: torch.Tensor, names: Sequence[str], limit: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return actions of IDM's formula with a row of values per environment, times a share, from raw observations."""
-    v0, headway, s0, a, b, share = values.unbind(-1)
+    """Return actions of IDM's formula with a row of values per environment, times a share; observations are raw."""
+    v0, headway, s0, a, b, share = values.unsqueeze(1).unbind(-1)
     at = {name: i for i, name in enumerate(names)}
 
     def act(seen: torch.Tensor) -> torch.Tensor:
-        seen = seen.reshape(len(values), -1)
-        speed = seen[:, at["speed"]]
+        seen = seen.reshape(len(values), -1, len(names))
+        speed = seen[..., at["speed"]]
         if "ahead_0" in at:  # the nearest ahead on the own lane
             count = sum(name.startswith("ahead_") for name in names)
-            column = {k: torch.stack([seen[:, at[f"{k}_{i}"]] for i in range(count)], -1) for k in NEIGHBOUR}
+            column = {k: torch.stack([seen[..., at[f"{k}_{i}"]] for i in range(count)], -1) for k in NEIGHBOUR}
             mine = (column["there"] > 0.5) & (column["left"].abs() < 0.5) & (column["ahead"] > 0.0)
             far = torch.where(mine, column["ahead"], 1e4)
             distance, which = far.min(-1)
             gap, closing = distance - 5.0, -column["speed"].gather(-1, which.unsqueeze(-1)).squeeze(-1)
             closing = torch.where(distance < 1e4, closing, 0.0)
         else:
-            gap = seen[:, at["gap"]] if "gap" in at else seen[:, at["headway"]] - 5.0
-            closing = speed - seen[:, at["lead_speed"]] if "lead_speed" in at else -seen[:, at["relative_speed"]]
+            gap = seen[..., at["gap"]] if "gap" in at else seen[..., at["headway"]] - 5.0
+            closing = speed - seen[..., at["lead_speed"]] if "lead_speed" in at else -seen[..., at["relative_speed"]]
         wish = s0 + (speed * headway + speed * closing / (2.0 * (a * b).sqrt())).clamp_min(0.0)
         accel = share * a * (1.0 - (speed / v0) ** 4 - (wish / gap.clamp_min(0.5)) ** 2)
-        return (accel / limit).clamp(-1.0, 1.0).unsqueeze(-1)
+        return (accel / limit).clamp(-1.0, 1.0)
 
     return act
 
