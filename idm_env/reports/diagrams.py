@@ -195,8 +195,7 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
     coloured = None
     stride = _stride(drawn, MOST_DRAWN)
     for axes, panel in zip(grid, drawn, strict=False):
-        began = far_from_0(_range([line.time for line in panel.lines]))
-        first = 0.0 if panel.ring_length else far_from_0(_range([line.position for line in panel.lines]))
+        (began, first), names = axes_of(panel)
         for line in panel.lines:
             line = _thinned(line, stride)
             place = line.position if panel.ring_length is None else line.position % panel.ring_length
@@ -211,8 +210,7 @@ def figure_of(drawn: Sequence[Panel], title: str = "", fastest: float | None = N
             coloured = axes.add_collection(lines)
         axes.autoscale()
         axes.margins(0.01)
-        place_name = f"{less('position', first, 'm')} (m)" if first else place_label(panel.ring_length)
-        axes.set(xlabel=f"{less('time', began, 's')} (s)", ylabel=place_name)
+        axes.set(xlabel=names[0], ylabel=names[1])
         if any(line.marked for line in panel.lines):
             axes.plot([], [], color=CONTROLLED, lw=3.0, label="controlled")
             axes.legend(loc="upper left", fontsize=8, framealpha=0.9)
@@ -235,7 +233,6 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     content = {
         "colours": COLOURS.tolist(),
         "fastest": fastest,
-        "place_label": place_label(drawn[0].ring_length if drawn else None),
         "panels": [_packed(panel, stride, fastest) for panel in drawn],
     }
     text = json.dumps(content, ensure_ascii=False).replace("<", "\\u003c")
@@ -244,6 +241,14 @@ def write_html(path: Path, drawn: Sequence[Panel], title: str) -> None:
     words = f"One line per vehicle, coloured by speed.{several}"
     thinned = f" Every {stride}th sample is drawn." if stride > 1 else ""
     page.write_page(path, title, [page.note(words + thinned), page.html(fragment)])
+
+
+def axes_of(panel: Panel) -> tuple[tuple[float, float], tuple[str, str]]:
+    """Return what is subtracted of times (s) and positions (m), so that axes begin near 0, and the axes' names."""
+    began = far_from_0(_range([line.time for line in panel.lines]))
+    first = 0.0 if panel.ring_length else far_from_0(_range([line.position for line in panel.lines]))
+    place_name = f"{less('position', first, 'm')} (m)" if first else place_label(panel.ring_length)
+    return (began, first), (f"{less('time', began, 's')} (s)", place_name)
 
 
 def far_from_0(values: tuple[float, float]) -> float:
@@ -278,7 +283,10 @@ def _packed(panel: Panel, stride: int, fastest: float) -> dict[str, Any]:
             "speed": _bits(line.speed, 0.0, fastest),
             "breaks": (np.flatnonzero(~line.whole(panel.ring_length)) + 1).tolist(),
         })  # fmt: skip
-    return {"title": panel.title, "time": time, "place": place, "vehicles": packed}
+    offsets, names = axes_of(panel)
+    return {
+        "title": panel.title, "time": time, "place": place, "vehicles": packed, "offsets": offsets, "names": names,
+    }  # fmt: skip
 
 
 def _bits(values: np.ndarray, low: float, high: float) -> str:

@@ -139,6 +139,19 @@ def test_the_interactive_page_holds_what_was_drawn_and_needs_no_network(tmp_path
     assert line["name"] == "a</script>1-2" and panel["vehicles"][1]["marked"]
 
 
+def test_pictures_and_interactive_pages_begin_near_0_and_say_what_is_subtracted(tmp_path):
+    """A clock since 1970 and a place on a motorway, by one rule; what lies near 0 is left alone."""
+    table = pl.DataFrame(rows("a", 1, 3))
+    far = panels(table.with_columns(pl.col("time_s") + 1.7e9, pl.col("position_m") + 5e4))
+    write_html(tmp_path / "x.html", far, "x")
+    (panel,) = json.loads((tmp_path / "x.html").read_text().split('id="measured">')[1].split("</script>")[0])["panels"]
+    axes = space_time(far).axes[0]
+    assert panel["names"] == [axes.get_xlabel(), axes.get_ylabel()]
+    assert panel["names"] == ["time − 1700000000 s (s)", "position − 50000 m (m)"]
+    assert panel["offsets"] == [1.7e9, 5e4] and axes.get_xlim()[0] < 1.0
+    assert space_time(panels(table)).axes[0].get_xlabel() == "time (s)"
+
+
 def test_a_table_without_speed_is_an_error():
     with pytest.raises(ValueError, match="no column 'speed_mps'"):
         space_time(pl.DataFrame({"vehicle_id": [1], "time_s": [0.0], "position_m": [0.0]}))
