@@ -239,6 +239,23 @@ def test_the_first_pages_are_short() -> None:
         assert lengths[len(lengths) // 2][0] <= 15 and lengths[-1][0] <= 35, f"{name}: {lengths[-1]}"
 
 
+def test_seven_questions_are_answered_two_clicks_from_the_readme() -> None:
+    """README leads to the first page of the site, and that to every answer, which has the words one looks for."""
+    assert "](docs/index.md)" in (ROOT / "README.md").read_text(encoding="utf-8")
+    first = (ROOT / "docs" / "index.md").read_text(encoding="utf-8").split("## Where to look")[1]
+    rows = re.findall(r"^\| (.+\?) \| \[.+\]\(([^)#]+)#?([^)]*)\) \|$", first, re.MULTILINE)
+    words = {
+        "generated/environments.md": "", "jobs/files.md": "position_m", "generated/effects.md": "",
+        "architecture.md": "## Add a task", "jobs/train.md": "train_apg.py", "limits.md": "No GPU",
+        "cards.md": "## Cite",
+    }  # fmt: skip
+    assert [page for _, page, _ in rows] == list(words)
+    for _, page, place in rows:
+        if words[page]:  # the others are made with the site, and looked at there: test_pages.py
+            text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+            assert words[page] in text and (not place or f"## {place.replace('-', ' ').capitalize()}" in text), page
+
+
 def test_every_document_has_its_place_on_the_site() -> None:
     """Sphinx takes one that has none for an error, and so does this, at once."""
     text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")

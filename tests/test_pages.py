@@ -122,13 +122,17 @@ def test_the_reference_is_divided_by_job(site: Path) -> None:
 
 
 def test_a_newcomer_finds_in_two_clicks_what_is_asked_most(site: Path) -> None:
-    """What a task's observation means, how to use one's own csv, what an effect's equation is."""
+    """Observation, one's own csv, an effect's equation, a task of one's own, training, limits, how to cite."""
     near = links(site, "index.html")
     near |= {link for first in near for link in links(site, first)}
     for place, words in (
         *((f"generated/tasks/{name}.html", make_task(name).features.names[-1]) for name in TASKS),
         ("jobs/files.html", "position_m"),
         ("generated/effects.html", "speed-dependent gap"),
+        ("architecture.html", "Add a task"),
+        ("jobs/train.html", "train_apg.py"),
+        ("limits.html", "No GPU"),
+        ("cards.html", "CITATION.cff"),
     ):
         assert place in near and words in (site / place).read_text(encoding="utf-8")
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import email
 import importlib.metadata
+import importlib.util
+import json
 import os
 import re
 import shutil
@@ -94,9 +96,32 @@ def test_versions_agree(wheel: zipfile.ZipFile) -> None:
     declared = Path(str(wheel.filename)).name.split("-")[1]
     cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert cited is not None and newest is not None
+    shown = re.search(r"Version (\S+)\.$", (ROOT / "docs" / "cards.md").read_text(), re.MULTILINE)
+    assert cited is not None and newest is not None and shown is not None
     recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text())
-    assert declared == idm_env.__version__ == cited[1] == newest[1] == recipe["package"]["version"]
+    assert declared == idm_env.__version__ == cited[1] == newest[1] == recipe["package"]["version"] == shown[1]
+
+
+def test_addresses_agree(tmp_path: Path) -> None:
+    """All files state one address or none, and the command that writes it writes all of them."""
+    spec = importlib.util.spec_from_file_location("address", ROOT / ".ci" / "address.py")
+    assert spec is not None and spec.loader is not None
+    address = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(address)
+    stated = address.addresses(ROOT)
+    assert len(set(stated.values())) == 1, stated
+    for file in stated:
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / file, tmp_path / file)
+    with pytest.raises(ValueError, match=r"example\.org is no https"):
+        address.write(tmp_path, "https://example.org")
+    assert address.addresses(tmp_path) == stated, "what is refused changes nothing"
+    if stated["CITATION.cff"] is None:
+        address.write(tmp_path, "https://github.com/owner/name")
+        assert set(address.addresses(tmp_path).values()) == {"https://github.com/owner/name"}
+        cell = "".join(json.loads((tmp_path / address.NOTEBOOK).read_text())["cells"][1]["source"])
+        assert "git+https://github.com/owner/name" in cell and "wheel" not in cell
+        compile(cell, "cell", "exec")
 
 
 def test_the_conda_recipe_asks_for_what_the_wheel_asks_for(wheel: zipfile.ZipFile) -> None:
