@@ -403,7 +403,7 @@ def commands() -> str:
 
     group: Any = get_command(app)
     lines = [
-        "# Commands", "",
+        "# Commands", "", "<style>td:first-child code { white-space: nowrap }</style>", "",
         "`idm-env COMMAND --help` says the same. `idm-env --install-completion` makes bash, zsh, fish or PowerShell "
         "complete commands and options (a new shell has it); `idm-env --show-completion` prints what it would add.", "",
     ]  # fmt: skip
