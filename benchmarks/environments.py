@@ -8,13 +8,11 @@ every task return under no command, IDM, the best rule that a search finds and a
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +22,7 @@ import idm_env  # noqa: F401
 from idm_env.effects import CANDIDATES
 from idm_env.tasks import TASKS
 
+ROOT = Path(__file__).resolve().parents[1]
 warnings.filterwarnings("ignore")
 
 
@@ -134,39 +133,14 @@ def rings(effect: str) -> bool:
 
 
 def gradients(turns: int) -> None:
-    """Print the least and the median CPU time of a step with its gradients: a 32 × 32 policy behind a failsafe.
+    """Print the least and the median CPU time of a step with its gradients."""
+    sys.path.insert(0, str(ROOT))
+    from benchmarks.bench.gradients import rows
 
-    A window of steps is a loop over ``env.step`` or one call of ``unroll``; the first of each is not counted.
-    """
-    print("\nring of 22, torch output, policy in torch, forward + backward: ms of CPU time a step, least (median)")
-    for count, steps in ((1, 600), (64, 600), (1024, 100)):
-        torch.manual_seed(0)
-        layers = (torch.nn.Linear(3, 32), torch.nn.Linear(32, 32), torch.nn.Linear(32, 1))
-        policy = torch.nn.Sequential(*(part for layer in layers for part in (layer, torch.nn.Tanh())))
-        env = gym.make_vec("DiffIDM-v0", num_envs=count, output="torch", failsafe=3.0, max_command=0.02)
-        own: Any = env.unwrapped
-
-        def loop(observation: torch.Tensor, env=env, policy=policy, steps=steps) -> torch.Tensor:
-            total = torch.zeros(())
-            for _ in range(steps):
-                observation, reward, *_ = env.step(policy(observation))
-                total = total + reward.mean()
-            return total / steps
-
-        def window(_: torch.Tensor, own=own, policy=policy, steps=steps) -> torch.Tensor:
-            return own.unroll(policy, steps).reward.mean()
-
-        found: dict[str, list[float]] = {"env.step": [], "unroll": []}
-        for turn in range(1 + turns):
-            for name, ahead in (("env.step", loop), ("unroll", window)):
-                observation, _ = env.reset(seed=turn)
-                begin = time.process_time()
-                ahead(observation).backward()
-                if turn:
-                    found[name].append((time.process_time() - begin) / steps * 1e3)
-                policy.zero_grad()
-        told = (f"{name} {min(x):7.3f} ({statistics.median(x):.3f})" for name, x in found.items())
-        print(f"  {count:5d} rings x {steps} steps   {'   '.join(told)}", flush=True)
+    print("\ntorch output, 32 x 32 policy in torch, forward + backward: ms of CPU time a step, least (median)")
+    for row in rows(turns):
+        what, way, least, median = row.values()
+        print(f"  {what:32s} {way:32s} {least:8.4f} ({median:.4f})", flush=True)
 
 
 def warmup(count: int) -> None:
@@ -198,7 +172,7 @@ RANGES = ((2.5, 40.0), (0.1, 3.0), (0.3, 6.0), (0.3, 3.0), (0.5, 4.0), (0.005, 1
 
 def returns(tasks: list[str], out: Path) -> None:
     """Write the returns of an episode of every task, a row each: zero action, IDM, best rule, best agent."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+    sys.path.insert(0, str(ROOT / "examples"))
     import train_apg
 
     rows = [line.split(",") for line in out.read_text().splitlines()[1:]] if out.exists() else []
@@ -287,7 +261,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     if options.returns is not None:
-        returns(options.returns or list(TASKS), Path(__file__).resolve().parents[1] / "docs" / "returns.csv")
+        returns(options.returns or list(TASKS), ROOT / "docs" / "returns.csv")
         return
     gradients(3 if options.quick else 7)
     if options.gradients:

@@ -27,6 +27,8 @@ def test_growth_is_the_slope():
 def test_a_small_run_writes_json_and_picture(tmp_path, monkeypatch):
     for name in ("recorded_leaders", "corrected_models", "rings", "discovery"):
         monkeypatch.setattr(bench.fits, name, lambda *_: {})
+    window = lambda: bench.gradients.of(bench.gradients.RING, 2, 3, True)  # noqa: E731
+    monkeypatch.setattr(bench.gradients, "workloads", lambda: [("ring, 2 × 3", window)])
     lines, seen = [], []
     result = bench.run(
         tmp_path, sizes=(100, 200), rounds=1, compiled=False, others=False, verbose=True, say=lines.append,
@@ -44,6 +46,8 @@ def test_a_small_run_writes_json_and_picture(tmp_path, monkeypatch):
     assert any("kernels run" in line or "kernels do not run:" in line for line in lines)
     assert any("eager" in row["path"] for row in tables.of(result)[0][1])
     assert result["gradient_error"]["kernel float64"] < 1e-10
+    assert [row["way"] for row in result["gradient_steps"]] == ["env.step", "unroll"]
+    assert any(title == "A step of environments with its gradients" for title in titles)
     if there_is_one():
         assert check.wrong([tmp_path / "report.html"]) == []
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.bench import fits, memory, peers, tables, traffic
+from benchmarks.bench import fits, gradients, memory, peers, tables, traffic
 from benchmarks.bench.measure import Case, machine, measure
 from idm_env import kernels
 from idm_env.jobs import storage
@@ -69,6 +69,7 @@ def run(
         ("fit", 6.0, lambda: fits.recorded_leaders(rounds) if numba else {}),
         ("corrected", 2.0, lambda: fits.corrected_models(rounds) if numba else {}),
         ("rings", 2.0, lambda: fits.rings() if numba else {}),
+        ("gradient_steps", 20.0, lambda: gradients.rows(rounds) if numba else []),
         ("discovery", 6.0, lambda: fits.discovery() if numba else {}),
     ]
     if others:

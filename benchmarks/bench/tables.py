@@ -35,6 +35,9 @@ def of(result: Mapping[str, Any]) -> list[tuple[str, Rows, str]]:
     others = [*_rings(result), *_peers(result)]
     if others:
         found.append(("Environments and other simulators", others, "One core; higher is faster but for µs."))
+    if result.get("gradient_steps"):
+        words = "A 32 × 32 policy in torch, torch output, one core, ms of CPU time; JAX where it is installed."
+        found.append(("A step of environments with its gradients", result["gradient_steps"], words))
     found += _fits(result)
     if result.get("gradient_error"):
         rows = [{"path": name, "largest relative error": value} for name, value in result["gradient_error"].items()]
