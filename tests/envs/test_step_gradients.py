@@ -148,6 +148,27 @@ def test_gradients_are_those_of_the_torch_path_and_of_differences(case):
             assert slope == pytest.approx(float((g * towards).sum()), rel=1e-5, abs=1e-5)
 
 
+@pytest.mark.parametrize("case", ["agents", "replay"])
+def test_gradients_after_single_agents_have_left(case):
+    """Their vehicles go back to the drivers, through whom gradients flow on; their commands count no more."""
+    results = []
+    for eager in (False, True):
+        batch = made(case, eager).batch
+        batch.seed(np.arange(3), [4, 5, 6])
+        batch.reset()
+        push = torch.zeros(3, len(batch.task.agents), dtype=torch.float64, requires_grad=True)
+        total, live = torch.zeros((), dtype=torch.float64), torch.ones(push.shape, dtype=torch.bool)
+        for t in range(12):
+            live[t % 3, -1] &= t < 5
+            told = batch.step(0.3 + push, live.clone())
+            total = total + told.observation.sum() + told.whole.reward.clamp(-20.0, 20.0).sum()
+        results.append((total.detach(), *torch.autograd.grad(total, push)))
+        assert (batch._values is None) == eager, "the other path ran"
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9 * float(theirs.abs().max() + 1.0))
+    assert results[0][1].abs().min() > 0.0
+
+
 def test_nothing_is_stepped_by_torch_and_values_are_the_same_bits_without_a_graph(monkeypatch):
     def stepped(self, *arguments):
         raise AssertionError("the torch path ran")

@@ -2,7 +2,10 @@
 
 import copy
 import gc
+import os
+import pickle
 import weakref
+from pathlib import Path
 
 import pytest
 import torch
@@ -85,6 +88,64 @@ def test_a_window_is_a_loop_over_steps_to_the_last_bit():
         assert all(torch.equal(x, y[t]) for x, y in zip(told, made_at_once[2:5], strict=True))
     assert torch.equal(seen, made_at_once.observation[30])
     assert torch.equal(window.step(act(seen))[1], loop.step(act(seen))[1])
+
+
+@pytest.mark.parametrize(("task", "keywords", "layers", "dtype"), CASES)
+def test_a_compiled_window_with_a_fixed_policy_is_the_loop_to_the_last_bit(task, keywords, layers, dtype):
+    """Resets, failsafe, memories and the past included; a policy that rounds as torch does says the same in both."""
+    window, loop = (made(task, keywords, dtype) for _ in range(2))
+    policy = nn.Linear(window.single_observation_space.shape[0], 1).to(window.settings.dtype)
+    nn.init.zeros_(policy.weight)
+    nn.init.constant_(policy.bias, 0.3)
+    window.reset(seed=3)
+    seen, _ = loop.reset(seed=3)
+    told = window.unroll(policy, 40)
+    assert "Window" in type(told.reward.grad_fn).__name__ and bool(told.truncated.any())
+    for t in range(40):
+        assert torch.equal(seen, told.observation[t])
+        seen, *rest, _ = loop.step(policy(seen))
+        assert all(torch.equal(x, y[t]) for x, y in zip(rest, told[2:5], strict=True))
+    assert torch.equal(seen, told.observation[40])
+
+
+@pytest.mark.parametrize(
+    "between",
+    [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), lambda env: env],
+    ids=["copied", "pickled", "detached"],
+)
+def test_a_copy_goes_on_without_the_graph_and_leaves_it(between):
+    """In the middle of training: between two windows of which the first is not yet differentiated."""
+    env, plain = (made("ring", CASES[0][1], "float32") for _ in range(2))
+    policy = network("tanh", env)
+    for each in (env, plain):
+        each.reset(seed=3)
+    first, wanted = env.unroll(policy, 15), plain.unroll(policy, 15)
+    other = between(env)
+    other.detach()
+    second, following = other.unroll(policy, 15), plain.unroll(policy, 15)
+    assert torch.equal(second.observation, following.observation)
+    found, one = (torch.autograd.grad(w.reward.sum(), policy.parameters()) for w in (first, wanted))
+    assert all(torch.equal(x, y) for x, y in zip(found, one, strict=True))
+    (cut,) = torch.autograd.grad(second.reward.sum(), first.action, allow_unused=True)
+    assert cut is None
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="Linux tells the memory of a process")
+def test_memory_does_not_grow_with_windows():
+    env = made("ring", {"warmup": 5, "max_episode_steps": 100}, "float32")
+    policy = network("tanh", env)
+    env.reset(seed=3)
+
+    def resident(windows):
+        for _ in range(windows):
+            env.detach()
+            env.unroll(policy, 40).reward.mean().backward()
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    before = resident(30)
+    # A window's tape is some 100 kB: a tenth of those kept would be 2 MB.
+    assert resident(200) - before < 1 << 20
 
 
 class Blind(nn.Module):
