@@ -7,9 +7,11 @@ import importlib
 from pathlib import Path
 
 import pytest
+import torch
 
-from benchmarks import lanes, named_rows
+from benchmarks import lane_tasks, lanes, named_rows
 from idm_env.jobs.progress import OnProgress
+from idm_env.tasks import make_task
 
 COMMANDS = sorted(p.stem for p in (Path(__file__).parents[1] / "benchmarks").glob("*.py") if p.stem != "__init__")
 
@@ -59,3 +61,41 @@ def test_what_would_not_be_heeded_is_refused_in_one_line(
     with pytest.raises(SystemExit, match="2"):
         lanes.main()
     assert capsys.readouterr().err.splitlines()[-1].endswith(says)
+
+
+def seen_of(task, speeds, lanes_, places):
+    """Return what agents see of themselves, all of them on the road."""
+    names = task.bounds.names
+    seen = torch.zeros(1, len(task.agents), len(names))
+    for name, values in (("speed", speeds), ("lane", lanes_), ("position", places), ("present", [1.0] * len(speeds))):
+        i = names.index(name)
+        seen[0, : len(values), i] = torch.tensor(values) / task.scales[i]
+    return seen.flatten(1)
+
+
+def test_rules_by_lane_and_place_hold_agents_to_a_speed_before_a_place():
+    task = make_task("merge", vehicles=8, controlled=3)
+    rules = torch.tensor([[[10.0, 300.0], [40.0, 300.0], [21.0, 300.0]]])
+    act = lane_tasks.by_place(task, rules, 1)
+    assert act(seen_of(task, [20.0] * 3, [0.0, 1.0, 2.0], [200.0] * 3)).tolist() == [[-1.0, 1.0, 0.25]]
+    assert act(seen_of(task, [20.0] * 3, [0.0, 1.0, 2.0], [400.0] * 3)).tolist() == [[1.0, 1.0, 1.0]]
+
+
+def test_a_signal_holds_the_first_of_the_ramp_until_the_next_may_go():
+    """At 800 vehicles an hour that is 4.5 s after the last; nobody else is held."""
+    task = make_task("merge", vehicles=3, controlled="all", inflow=2000.0, ramp_inflow=1000.0)
+    signal = lane_tasks.Alinea(task)
+    assert signal(seen_of(task, [10.0, 10.0, 30.0], [0.0, 0.0, 1.0], [345.0, 300.0, 300.0])).min() == 1.0
+    held = []
+    for second in range(6):
+        action = signal(seen_of(task, [10.0, 4.0, 30.0], [0.0, 0.0, 1.0], [360.0 + second, 346.0, 300.0]))
+        assert action[0, 0] == action[0, 2] == 1.0
+        held.append(bool(action[0, 1] < 0.0))
+    assert held == [True] * 4 + [False] * 2
+
+
+def test_a_search_keeps_what_is_best_on_other_episodes(monkeypatch):
+    monkeypatch.setattr("agents.evaluate.STEPS_OF_LANES", 300)
+    given = {"task": "bottleneck", "inflow": 720.0, "vehicles": 24, "controlled": 0.5}
+    best = lane_tasks.searched(given, torch.tensor([-1.0, 1.0, 0.0, -0.5, -2.0]), lane_tasks.constants)
+    assert best.tolist() == [1.0]
