@@ -81,7 +81,7 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     began = time.process_time()
     torch.manual_seed(arguments.seed)
     task = environments.task_of(arguments.environment)
-    times = [seconds / task.simulator.dt for seconds in arguments.history]
+    times = [seconds / task.step_time for seconds in arguments.history]
     policy, saved = common.begin(arguments, "apg", history=times, recurrent=arguments.recurrent)
     if arguments.start is not None and not saved:
         policy = common.load_for(arguments.start, task)[0]

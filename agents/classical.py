@@ -52,7 +52,7 @@ class Controller:
     def __call__(self, observation: Tensor) -> Tensor:
         """Return actions ``(n, agents)``."""
         view = seen(observation, self.task.vehicle_length, self.task.scales)
-        return self.task.action((self.wanted(view) - view.speed) / self.task.simulator.dt)
+        return self.task.action((self.wanted(view) - view.speed) / self.task.step_time)
 
     def wanted(self, view: Seen) -> Tensor:
         """Return the commanded speed (m/s)."""
@@ -97,7 +97,7 @@ class PISaturation(Controller):
     seconds: float = 38.0
 
     def __post_init__(self) -> None:
-        self._past: deque[Tensor] = deque(maxlen=round(self.seconds / self.task.simulator.dt))
+        self._past: deque[Tensor] = deque(maxlen=round(self.seconds / self.task.step_time))
         self._command: Tensor | None = None
 
     def wanted(self, view: Seen) -> Tensor:

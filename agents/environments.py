@@ -92,14 +92,13 @@ def human_driving(
     """
     env = make_env(environment, count, output="numpy")
     seen, done = [env.reset(seed=seed)[0]], []
-    hold = env.task.held * env.task.simulator.dt
     state = env.state
     for _ in range(steps):
         before = state
         observation, _, terminated, truncated, _ = env.step(None)
         seen.append(observation)
         state = env.state
-        accel = state.accel if env.task.held == 1 else (state.speed - before.speed) / hold
+        accel = state.accel if env.task.held == 1 else (state.speed - before.speed) / env.task.step_time
         # The first step of a new episode has no acceleration yet.
         over = torch.as_tensor(terminated | truncated).unsqueeze(-1).expand_as(accel)
         if state.present is not None and before.present is not None:

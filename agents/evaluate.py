@@ -79,14 +79,15 @@ def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
     time gap ≥ 0.8 s, no collision; ``cut``: share of the judged steps in which
     controlled vehicles accelerate less than commanded, as a failsafe makes them.
     """
-    last = driven.speed[-JUDGED:]
+    judged = JUDGED // start.task.held
+    last = driven.speed[-judged:]
     ratio = last.mean((0, 2)) / uniform_speed(start)
     std = last.std((0, 2), correction=0)
     gap = metrics.time_gap(start.task.pick(driven.gap), start.task.pick(driven.speed)).amin((0, 2))
     crashed = driven.gap.amin((0, 2)) <= 0.0
-    asked = start.task.command(driven.action[-JUDGED:])
+    asked = start.task.command(driven.action[-judged:])
     return {
-        "cut": float((start.task.pick(driven.accel[-JUDGED:]) < asked - 1e-3).float().mean()),
+        "cut": float((start.task.pick(driven.accel[-judged:]) < asked - 1e-3).float().mean()),
         "speed_ratio": float(ratio.min()),
         "speed_std": float(std.max()),
         "time_gap": float(gap.min()),
@@ -119,7 +120,7 @@ def evaluate_ring(
 ) -> dict[str, Any]:
     """Return the figures of a policy on ``judged_rings``, from a take-over after ``warmup`` steps on."""
     start = judged_rings(environment, lengths, warmup, draws)
-    return judge_ring(start, drive(start, act, STEPS))
+    return judge_ring(start, drive(start, act, STEPS // start.task.held))
 
 
 def solved_at(history: Sequence[Mapping[str, Any]]) -> int | None:
@@ -211,12 +212,12 @@ def evaluate_follow(
     """
     start = episodes_start(environment, count, draws=draws)
     task = start.task
-    driven = drive(start, act, task.steps)
+    driven = drive(start, act, task.steps // task.held)
     first = task.agents[0]
     speed, accel, gap = (x.double() for x in (driven.speed, driven.accel, driven.gap))
     fuel = {name: metrics.fuel(speed, accel, name) for name in metrics.FUELS}
-    energy = metrics.traction_energy(speed, accel, task.simulator.dt)
-    way = (speed * task.simulator.dt).sum(0)
+    energy = metrics.traction_energy(speed, accel, task.step_time)
+    way = (speed * task.step_time).sum(0)
 
     def litres(part: slice, model: str = "kamal") -> float:
         return float(100.0 * fuel[model][..., part].sum() / speed[..., part].sum())
@@ -328,7 +329,7 @@ def shown(
     task = task_of(environment)
     if isinstance(task, RingTask):
         # The shock comes as long after the policy has taken over as in the test.
-        chosen |= {"length": 250.0, "shock_after": task.shock_after + human * task.simulator.dt}
+        chosen |= {"length": 250.0, "shock_after": task.shock_after + human * task.step_time}
     env = DiffIDMEnv(**chosen)
     observation, _ = env.reset(seed=seed)
     past = None
@@ -346,7 +347,7 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, human: int,
 
     from idm_env.envs.render import COLOURS_DRAWN, colour
 
-    frames, every = [], round(1.0 / task_of(environment).simulator.dt)
+    frames, every = [], max(1, round(1.0 / task_of(environment).step_time))
     first = max(human - 20 * every, 0)
     # One palette for all pictures, of the colours that are drawn: a palette by frequency would drop the agent's mark.
     colours = [*COLOURS_DRAWN, *(colour(x, 39.0) for x in range(40))]
@@ -372,7 +373,7 @@ def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: i
     states = []
     for env in shown(environment, policy, human, steps, seed):
         states.append(env.state)
-    dt = env.task.simulator.dt
+    dt = env.task.step_time
     motion = Motion(*(torch.cat([getattr(s, name) for s in states]) for name in Motion._fields))
     if states[0].links is None:
         ring = float((states[0].gap + states[0].length).sum()) if env.task.name == "ring" else None

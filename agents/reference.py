@@ -90,7 +90,7 @@ def told(task: Task, view: Seen, uniform: Tensor, gain: Tensor, share: Tensor) -
 def follower_stopper(task: Task, view: Seen, uniform: Tensor, share: Tensor, each: Tensor) -> Tensor:
     """Return what reaches FollowerStopper's speed in one step; U is a share of each ring's uniform speed, or of all."""
     desired = share * torch.where(each > 0, uniform, uniform.median())
-    return (FollowerStopper(task, desired=desired).wanted(view) - view.speed) / task.simulator.dt
+    return (FollowerStopper(task, desired=desired).wanted(view) - view.speed) / task.step_time
 
 
 def random_policies(environment: Mapping[str, Any], count: int, hidden: Sequence[int]) -> list[Policy]:
@@ -173,7 +173,7 @@ def judge(
     rings = len(start.world.state.speed)
     found, at_once = [], max(1, ROWS_AT_ONCE // rings)
     for part in (chosen[i : i + at_once] for i in range(0, len(chosen), at_once)):
-        driven = drive(repeated(start, len(part)), family.acts(start, part), STEPS)
+        driven = drive(repeated(start, len(part)), family.acts(start, part), STEPS // start.task.held)
         for i in range(len(part)):
             own = Driven(*(x[:, i * rings : (i + 1) * rings] for x in driven))
             found.append(judge_ring(start, own))

@@ -139,7 +139,7 @@ def _faces(name: str) -> list[str]:
         *_returns(name),
         "## Ends", "",
         f"An episode is terminated where vehicles touch, and truncated after {task.horizon} steps of "
-        f"{task.held * task.simulator.dt:g} s.", "",
+        f"{task.step_time:g} s.", "",
     ]  # fmt: skip
 
 

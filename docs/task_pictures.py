@@ -29,8 +29,7 @@ def pictures(folder: Path = FOLDER) -> list[Path]:
         keywords: dict[str, Any] = {"warmup": 3000} if name == "ring" else {}
         env = gymnasium.make("DiffIDM-v0", task=name, render_mode="rgb_array", **keywords)
         env.reset(seed=1)
-        task = env.unwrapped.task
-        for _ in range(round(SECONDS / (task.held * task.simulator.dt))):
+        for _ in range(round(SECONDS / env.unwrapped.task.step_time)):
             _, _, terminated, truncated, _ = env.step(None)
             if terminated or truncated:
                 break

@@ -136,7 +136,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
         self.batch = Batch(made, 1)
         self.task = made.task
         agents = len(self.task.agents)
-        self.metadata = {**type(self).metadata, "render_fps": round(1.0 / self.task.simulator.dt)}
+        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.task.step_time))}
         self.observation_space = observation_box(self.task, made.dtype, agents)
         self._shape = (agents * len(self.task.commands),)
         self.action_space = action_space(self.task, agents)

@@ -204,7 +204,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         from idm_env.envs.render import Viewer
 
         if self._viewer is None:
-            self._viewer = Viewer(self.render_mode, round(1.0 / self.task.simulator.dt))
+            self._viewer = Viewer(self.render_mode, max(1, round(1.0 / self.task.step_time)))
         if not self.batch.begun:
             raise RuntimeError("there is nothing to see before reset. Call reset() first.")
         picture: np.ndarray | None = self._viewer.show(self.task, self.batch.glance().state)

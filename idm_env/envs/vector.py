@@ -56,7 +56,7 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         self.autoreset_mode = made.autoreset_mode
         self.metadata = {
             **type(self).metadata,
-            "render_fps": round(1.0 / self.task.simulator.dt),
+            "render_fps": max(1, round(1.0 / self.task.step_time)),
             "autoreset_mode": made.autoreset_mode,
         }
         agents = len(self.task.agents)

@@ -173,6 +173,11 @@ class Task(abc.ABC):
         return steps
 
     @property
+    def step_time(self) -> float:
+        """Time (s) of a step of the environment, for which an action is held."""
+        return self.held * self._behaviour.dt
+
+    @property
     def usual_steps(self) -> int:
         """Steps of Δt of an episode where nothing else is said."""
         return 3000

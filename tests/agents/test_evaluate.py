@@ -304,3 +304,14 @@ def test_a_task_keeps_the_length_of_its_episodes_and_a_test_has_its_own():
     """Agents of a record are those who are there for so long."""
     assert task_of({"task": "follow", "max_episode_steps": 70}).horizon == 70
     assert evaluate.as_judged({"task": "follow", "max_episode_steps": 70}) == {"task": "follow"}
+
+
+def test_held_actions_are_judged_over_the_same_time():
+    """Human drivers do the same whatever is held."""
+    once, held = ({**RING, "hold": hold} for hold in (0.1, 1.0))
+    one, other = (evaluate.evaluate_ring(None, e, (230.0,), warmup=750) for e in (once, held))
+    assert other["speed_ratio"] == pytest.approx(one["speed_ratio"], rel=0.02)
+    assert other["speed_std"] == pytest.approx(one["speed_std"], rel=0.05)
+    follow = [evaluate.evaluate_follow(None, {"task": "follow", "hold": hold}, 2) for hold in (0.1, 1.0)]
+    assert follow[1]["litres"] == pytest.approx(follow[0]["litres"], rel=0.05)
+    assert follow[1]["reward"] == pytest.approx(10 * follow[0]["reward"], rel=0.01)

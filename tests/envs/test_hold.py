@@ -61,3 +61,11 @@ def test_a_hold_that_is_no_whole_number_of_steps_is_one_line() -> None:
     """Value, rule and cure."""
     with pytest.raises(ValueError, match=r"^hold = 0\.25 s must be a whole number of Δt = 0\.1 s, such as 0\.2\.$"):
         make_task("ring", hold=0.25)
+
+
+@pytest.mark.parametrize(("hold", "fps"), [(None, 10), (0.5, 2), (1.0, 1), (5.0, 1)])
+def test_pictures_are_shown_as_fast_as_time_goes_by(hold: float | None, fps: int) -> None:
+    """In every face; of longer decisions one a second."""
+    single = gym.make("DiffIDM-v0", task="platoon", hold=hold)
+    vector = gym.make_vec("DiffIDM-v0", num_envs=2, task="platoon", hold=hold)
+    assert single.metadata["render_fps"] == vector.metadata["render_fps"] == fps
