@@ -19,7 +19,10 @@ def check_columns(columns: list[str], source: str) -> None:
     """Raise DataError if the table lacks a required column, or seems to misspell an optional one."""
     for name in REQUIRED:
         if name not in columns:
-            raise missing_column(name, columns, source, known=TIDY)
+            from idm_env.data.names import guessed  # which needs this module
+
+            told = missing_column(name, columns, source, known=TIDY)
+            raise DataError(f"{told} Or name it: {guessed(columns)}")
     others = [name for name in columns if name not in TIDY]
     for name in TIDY:
         guess = None if name in columns or name == "accel_mps2" else nearest(name, others, cutoff=0.85)

@@ -181,8 +181,9 @@ def test_single_implausible_values_are_counted() -> None:
     ("renamed", "words"),
     [
         ({"position_m": "positon_m"}, ("'position_m' is missing", "did you mean 'positon_m'?")),
-        ({"time_s": "Time_S"}, ("'time_s' is missing", "did you mean 'Time_S'?")),
-        ({"vehicle_id": "zzz"}, ("'vehicle_id' is missing", "the file has")),
+        ({"time_s": "Time_S"}, ("'time_s' is missing", "did you mean 'Time_S'?", "--columns time_s=Time_S")),
+        ({"vehicle_id": "zzz"}, ("'vehicle_id' is missing", "the file has", "--columns 'vehicle_id=?'")),
+        ({"vehicle_id": "car", "time_s": "t"}, ("'vehicle_id' is missing", "--columns vehicle_id=car,time_s=t")),
         ({"leader_id": "leaderid"}, ("'leader_id' is missing", "'leaderid' looks like it")),
         ({"speed_mps": "speed_mp"}, ("'speed_mps' is missing", "'speed_mp' looks like it")),
     ],
