@@ -102,6 +102,7 @@ def test_bad_paths_and_options(frame: pl.DataFrame, tmp_path: Path) -> None:
         (("fit", tmp_path / "none.csv"), "none.csv"),
         (("fit", broken), "broken.parquet"),
         (("fit", good, "--by", "vehicle_nam"), "cannot group by"),
+        (("fit", good, "--by", "drivr"), "Use driver, all, or one of run_id"),
         (("fit", good, "--held-out", "half"), "--held-out"),
         (("fit", good, "--objective", "speeed"), "Did you mean 'speed'"),
         (("fit", good, "--method", "newton"), "lm"),

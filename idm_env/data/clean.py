@@ -6,29 +6,13 @@ from dataclasses import dataclass, field
 
 import polars as pl
 
-from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
-from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TIDY, TRACK
+from idm_env.data.errors import DataError, Repair, listed
+from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TRACK
 
 LARGEST_ID = 2.0**53
 """Floats tell whole numbers apart below this only."""
 NO_LEADER = ("", "0", "-1", "nan", "none", "null", "na")
 MISSING_WORDS = ("", "na", "n/a", "nan", "null", "none", "-", "inf", "-inf", "+inf", "infinity", "-infinity")
-
-
-def check_columns(columns: list[str], source: str) -> None:
-    """Raise DataError if the table lacks a required column, or seems to misspell an optional one."""
-    for name in REQUIRED:
-        if name not in columns:
-            from idm_env.data.names import guessed  # which needs this module
-
-            told = missing_column(name, columns, source, known=TIDY)
-            raise DataError(f"{told} Or name it: {guessed(columns)}")
-    others = [name for name in columns if name not in TIDY]
-    for name in TIDY:
-        guess = None if name in columns or name == "accel_mps2" else nearest(name, others, cutoff=0.85)
-        if guess:
-            # Taking a misspelt column as an extra one would silently estimate what was measured.
-            raise DataError(f"{source}: column {name!r} is missing and {guess!r} looks like it; rename or remove it.")
 
 
 def exact(column: pl.Series, source: str) -> None:

@@ -10,7 +10,7 @@ import polars as pl
 from idm_env.data import clean, tidy
 from idm_env.data.clean import natural
 from idm_env.data.errors import DataError
-from idm_env.data.names import Columns, renamed
+from idm_env.data.names import Columns, check_columns, renamed
 from idm_env.data.trajectories import Trajectories
 
 _FILE = "idm_env_file"
@@ -57,7 +57,7 @@ def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[Share]:
         scan = _named(_scan(folder, files), columns, folder.name)
         names = [name for name in scan.collect_schema().names() if name != _FILE]
         tidy.check(names, folder.name)
-        clean.check_columns(tidy.converted(names), folder.name)
+        check_columns(tidy.converted(names), folder.name)
         if "run_id" not in names:
             return [Share(folder, tuple(files), (), 0, columns)]
         scan = scan.filter(pl.col("vehicle_id").is_not_null())

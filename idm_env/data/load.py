@@ -13,9 +13,8 @@ from typing import Any
 import polars as pl
 
 from idm_env.data import drones, folder, ngsim, openacc, tidy, ultra_av
-from idm_env.data.clean import check_columns
-from idm_env.data.errors import DataError, Repair, missing_column, nearest
-from idm_env.data.names import Columns, renamed
+from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
+from idm_env.data.names import Columns, check_columns, renamed
 from idm_env.data.schema import TIDY
 from idm_env.data.trajectories import Trajectories, parted
 
@@ -98,7 +97,8 @@ def refuse_head(
             raise missing_column(name, has, path.name)
     if by is not None and by not in has:
         guess = nearest(by, has)
-        raise DataError(f"cannot group by {by!r}: no such column.{f' Did you mean {guess!r}?' if guess else ''}")
+        cure = f"Did you mean {guess!r}?" if guess else f"Use driver, all, or one of {listed(frame.columns)}."
+        raise DataError(f"cannot group by {by!r}: no such column. {cure}")
 
 
 def read(

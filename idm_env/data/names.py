@@ -10,7 +10,7 @@ from functools import partial
 import polars as pl
 
 from idm_env.data.clean import parsed
-from idm_env.data.errors import DataError, Repair, listed, nearest
+from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
 from idm_env.data.schema import REQUIRED, TIDY
 
 LENGTHS = {"m": 1.0, "ft": 0.3048, "feet": 0.3048, "km": 1000.0, "mi": 1609.344, "cm": 0.01, "mm": 0.001}
@@ -104,6 +104,20 @@ def renamed(frame: pl.DataFrame, columns: Columns, source: str) -> tuple[pl.Data
         repairs.append(Repair("column named", 1, text))
     asked = {name for name, _ in pairs(columns)}
     return made.drop(taken - asked), repairs
+
+
+def check_columns(columns: list[str], source: str) -> None:
+    """Raise DataError if the table lacks a required column, or seems to misspell an optional one."""
+    for name in REQUIRED:
+        if name not in columns:
+            told = missing_column(name, columns, source, known=TIDY)
+            raise DataError(f"{told} Or name it: {guessed(columns)}")
+    others = [name for name in columns if name not in TIDY]
+    for name in TIDY:
+        guess = None if name in columns or name == "accel_mps2" else nearest(name, others, cutoff=0.85)
+        if guess:
+            # Taking a misspelt column as an extra one would silently estimate what was measured.
+            raise DataError(f"{source}: column {name!r} is missing and {guess!r} looks like it; rename or remove it.")
 
 
 def guessed(columns: list[str]) -> str:

@@ -6,6 +6,7 @@ import polars as pl
 
 from idm_env.data import clean, clock, directions, leaders, schema, speeds, units
 from idm_env.data.errors import DataError, Repair
+from idm_env.data.names import check_columns
 
 
 def rows(
@@ -15,7 +16,7 @@ def rows(
 
     ``filled`` counts them. DataError for what cannot be used.
     """
-    clean.check_columns(frame.columns, source)
+    check_columns(frame.columns, source)
     frame, repairs = clean.numbers(clean.identifiers(frame, source), source)
     filled.add(frame)
     frame, lost = clean.without_empty(_with_ring(frame, ring_length, source), source)
