@@ -92,12 +92,11 @@ def moments(start: Start, act: Act | None, steps: int) -> Iterator[Moment]:
 def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[World, Tensor | None, World]]:
     """Roll a policy out with its actions held; yield, of every Δt, the worlds of its decision and after it, and action.
 
-    Without a failsafe, which looks at every Δt, what lies between two decisions is one compiled rollout; of the worlds
-    in between what ``Trajectory`` keeps is theirs, and the rest that of the end.
+    Without a failsafe, which looks at every Δt, and drivers' noise what lies between two decisions is one compiled
+    rollout; of the worlds in between what ``Trajectory`` keeps is theirs, and the rest that of the end.
     """
     task, world, _, params = start
-    assert not task.simulator.draws
-    act = begun(act)
+    act, draw = begun(act), start.draw
     with torch.no_grad():
         for done in range(0, steps, task.held):
             before = world
@@ -106,9 +105,14 @@ def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[Wo
             command = None if action is None else task.command(action)
             live = task.pick(world.state.present) > 0
             count = min(task.held, steps - done)
-            if task.failsafe:
-                for _ in range(count):
-                    world = task.step(world, command, None, params, live=live, advance=task.simulator.advance)
+            if task.failsafe or task.simulator.draws:
+                normals = task.normals(draw, world.state.step, count, world.state.speed.dtype)
+                for t in range(count):
+                    now = {name: x[t] for name, x in normals.items()}
+                    given = None if command is None else task.limit(world, command)
+                    inputs = task.wishes(task.inputs(world, given, now, live), action, live)
+                    driven = task.driven(world.episode, params)
+                    world = world._replace(state=task.simulator.advance(world.state, inputs, driven))
                     yield before, action, world
                 continue
             inputs = task.wishes(task.inputs(world, command, None, live), action, live)

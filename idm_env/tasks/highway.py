@@ -27,7 +27,8 @@ class HighwayTask(LanesTask):
 
     After ``highway-v0`` of HighwayEnv (Leurent 2018, https://github.com/Farama-Foundation/HighwayEnv), on a ring, so
     that traffic stays as dense as it begins. Desired speeds differ between drivers by up to ``spread`` either way.
-    Agents act as ``LanesTask`` says.
+    Agents act as ``LanesTask`` says. It is a demonstration of lanes and commands: it pays an agent's own speed, not
+    traffic's, for which ``open_highway``, ``merge`` and ``bottleneck`` are.
 
     Observation, per agent, as HighwayEnv's kinematics: own speed and lane; then, of each of the ``seen`` nearest
     vehicles in any lane, nearest first: 1 if there is one within 200 m, how far ahead it is (m; negative behind), how

@@ -29,15 +29,17 @@ def test_in_free_traffic_what_comes_goes(short):
     assert found["outflow"] == pytest.approx(sum(found["outflows"]) / 2)
 
 
-def test_the_return_that_is_judged_is_the_environments(monkeypatch):
+@pytest.mark.parametrize("more", [{}, {"noise": 0.2}, {"failsafe": 3.0, "lane_commands": True}], ids=str)
+def test_the_return_that_is_judged_is_the_environments(monkeypatch, more):
     """A rollout between two decisions pays what the steps of an environment pay, human drivers or agents."""
     monkeypatch.setattr(evaluate, "STEPS_OF_LANES", 150)
-    chosen = {"task": "merge", "vehicles": 30}
-    for act in (None, lambda seen: -torch.ones(len(seen), 3)):
+    chosen = {"task": "merge", "vehicles": 30, **more}
+    commands = -torch.ones(2, 6 if "lane_commands" in more else 3)
+    for act in (None, lambda seen: commands):
         found = evaluate.evaluate_lanes(act, chosen, 2)
         env = make_env(chosen, 2, output="torch", autoreset_mode="Disabled")
         env.reset(seed=SEED)
-        pays = [env.step(None if act is None else -torch.ones(2, 3))[1] for _ in range(15)]
+        pays = [env.step(None if act is None else commands)[1] for _ in range(15)]
         torch.testing.assert_close(torch.tensor(found["rewards"]).float(), torch.stack(pays).sum(0), rtol=1e-4, atol=0)
 
 
