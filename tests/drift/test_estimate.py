@@ -148,6 +148,9 @@ def test_what_is_not_finite_or_at_a_limit_is_not_estimated(monkeypatch: pytest.M
         alone = replace(told, found={"accel_noise": broken}, one_of=())
         assert alone.verdict == "cannot_tell" and why in sentence(alone)
     assert replace(one, steady=replace(steady, log_likelihood=math.nan)).verdict == "cannot_tell"
+    vague = replace(right, log_error=np.where([n.endswith("memory_time") for n in right.names], 20.0, right.log_error))
+    told = sentence(replace(one, found={"wander": vague}, one_of=("wander",)))
+    assert "s (these data do not tell it)" in told and " to " in told and "e+" not in told
 
 
 def test_scores_of_a_known_normal() -> None:
