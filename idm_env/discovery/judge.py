@@ -246,7 +246,7 @@ def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarr
     rows = responses.rows
     signals, dt = rows.records.signals, rows.records.dt
     pieces = responses.change.shape[1]
-    second = round(1.0 / dt)
+    second = max(1, round(1.0 / dt))
     at = rows.start[:, None] + second * np.arange(pieces) + second // 2
     column = {name: i for i, name in enumerate(twin.COLUMNS)}
 

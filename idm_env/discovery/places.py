@@ -60,7 +60,7 @@ class Responses:
 def respond(task: Task, solution: Solution) -> Responses:
     """Return the responses at a solution."""
     rows, records = task.rows, task.rows.records
-    seconds = round(1.0 / records.dt)
+    seconds = max(1, round(1.0 / records.dt))
     pieces = max(rows.steps // seconds, 1)
     pulses = np.zeros((1 + len(WHATS) * pieces, 4))
     for w in range(len(WHATS)):

@@ -215,7 +215,8 @@ class Rows:
 def windows(records: Records, seconds: float = WINDOW_S, every_s: float = 0.5) -> Rows:
     """Return contiguous windows of ``seconds`` over every record; short or trimmed-away records give none."""
     dt = records.dt
-    steps, every = round(seconds / dt), round(every_s / dt)
+    every = max(1, round(every_s / dt))
+    steps = max(2, round(seconds / dt / every)) * every
     record, start, joined, block = [], [], [], []
     for r in range(len(records)):
         begin, end = int(records.first[r]), int(records.bounds[r + 1])
@@ -236,7 +237,7 @@ def windows(records: Records, seconds: float = WINDOW_S, every_s: float = 0.5) -
 def whole(records: Records, longest_s: float = 300.0, every_s: float = 0.5) -> Rows:
     """Return rows that cover every record from its first sample, cut where it is longer than ``longest_s``."""
     dt = records.dt
-    every = round(every_s / dt)
+    every = max(1, round(every_s / dt))
     record, start, lasts = [], [], []
     for r in range(len(records)):
         begin, end = int(records.first[r]), int(records.bounds[r + 1])

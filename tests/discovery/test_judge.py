@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
 
-from idm_env.data import episodes, synthetic
+from idm_env.data import Trajectories, episodes, synthetic
 from idm_env.discovery import calibrate, discover, judge
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Model
@@ -77,3 +78,13 @@ def test_null_addition_and_other_laws_are_calibrated_by_one_procedure(monkeypatc
     of = {id(c.prior): c.model for _, c in calibrated}
     assert all(of[id(prior)] is model for model, prior in judged), "each judged by its own population and weight"
     assert len({m.catalogue.base.kind for m, _ in judged}) == len(BASES) and any(m.terms for m, _ in judged)
+
+
+@pytest.mark.parametrize("every", [10, 20])
+def test_data_of_one_and_half_a_sample_a_second_are_judged(every: int) -> None:
+    """Windows hold at least two steps, and a second at least one."""
+    made, _ = synthetic.generate(4, runs=3, followers=2, seconds=120.0)
+    some = made.table.filter((pl.col("time_s") * 10.0).round().cast(pl.Int64) % every == 0)
+    found = discover(Trajectories.from_frame(some), effects=["drag"])
+    assert found.records.dt == pytest.approx(every / 10)
+    assert found.report["error"]["before"]["horizon_rmse_m"] > 0.0
