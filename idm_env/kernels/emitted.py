@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import builtins
 import operator
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -37,6 +38,8 @@ _OPERATORS: dict[type[ast.AST], Any] = {
     ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge, ast.Eq: operator.eq, ast.NotEq: operator.ne,
     ast.USub: operator.neg, ast.Not: operator.not_, ast.And: operator.and_, ast.Or: operator.or_,
 }  # fmt: skip
+_CONSTANT = re.compile(r"c|t\d+")
+"""Names of arrays of constants."""
 _PLAIN = {bool: types.boolean, int: types.int64, float: types.float64}
 _IN_LINE = {  # such that a NaN in x stays one
     "larger": ast.parse("y if x < y else x", mode="eval").body,
@@ -53,10 +56,11 @@ class Value(NamedTuple):
 
 
 class Pointer(NamedTuple):
-    """Numbers that lie one behind another in memory, of one type."""
+    """Numbers that lie one behind another in memory, of one type; ``name`` is that of what overlaps nothing else."""
 
     kind: Any
     ir: Any
+    name: str = ""
 
 
 class Variable(NamedTuple):
@@ -76,13 +80,19 @@ class Walk:
         self._calls: dict[Any, tuple[Any, Callable[..., Any]]] = {}
         self._taken: list[Any] = []
         self._read: list[tuple[str, Variable]] = []
+        self._scopes: dict[str, Any] = {}
+        self._accesses: list[tuple[Any, str]] = []
 
     def run(self, function: ast.FunctionDef, arguments: Sequence[tuple[Any, Any]]) -> None:
         """Emit a function whose arguments have these types and values."""
-        for name, (kind, value) in zip(function.args.args, arguments, strict=True):
+        for given, (kind, value) in zip(function.args.args, arguments, strict=True):
             is_pointer = isinstance(kind, types.CPointer)
-            self._names[name.arg] = Pointer(kind.dtype, value) if is_pointer else Value(kind, value)
+            self._names[given.arg] = Pointer(kind.dtype, value) if is_pointer else Value(kind, value)
         self._block(function.body)
+        for access, name in self._accesses:
+            others = [x for n, x in self._scopes.items() if n != name]
+            if others:
+                access.set_metadata("noalias", self._builder.module.add_metadata(others))
         for memory in self._taken:
             self._builder.call(self._outside("free", ir.VoidType(), _BYTE.as_pointer()), [memory])
 
@@ -115,11 +125,13 @@ class Walk:
     def _set(self, target: ast.expr, value: Any) -> None:
         if isinstance(target, ast.Subscript):
             to = self._place(target)
-            self._context.pack_value(self._builder, to.kind, self._cast(value, to.kind), to.ir)
+            made = self._context.data_model_manager[to.kind].as_data(self._builder, self._cast(value, to.kind))
+            self._apart(self._builder.store(made, to.ir), to.name)
             return
         assert isinstance(target, ast.Name)
         if isinstance(value, Pointer):
-            self._names[target.id] = value
+            known = value.name or _CONSTANT.fullmatch(target.id)
+            self._names[target.id] = value._replace(name=target.id if known else "given")
             return
         value = self._number(value)
         slot = self._slots.get((target.id, value.kind))
@@ -196,11 +208,24 @@ class Walk:
 
     def _subscript(self, node: ast.Subscript) -> Value:
         at = self._place(node)
-        return Value(at.kind, self._context.unpack_value(self._builder, at.kind, at.ir))
+        found = self._builder.load(at.ir)
+        self._apart(found, at.name)
+        return Value(at.kind, self._context.data_model_manager[at.kind].from_data(self._builder, found))
+
+    def _apart(self, access: Any, name: str) -> None:
+        """Note where an access is to: own memory and constants lie apart from each other and from what is given.
+
+        So LLVM need not test dozens of arrays for overlap, which it refuses to do, and then emits scalar code.
+        """
+        if name:
+            add, of = self._builder.module.add_metadata, self._scopes
+            of.setdefault(name, add([f"idm_env {name}", add(["idm_env"])]))
+            access.set_metadata("alias.scope", add([of[name]]))
+            self._accesses.append((access, name))
 
     def _place(self, node: ast.Subscript) -> Pointer:
         array, index = self._value(node.value), self._cast(self._value(node.slice), types.int64)
-        return Pointer(array.kind, self._builder.gep(array.ir, [index]))
+        return Pointer(array.kind, self._builder.gep(array.ir, [index]), array.name)
 
     def _binop(self, node: ast.BinOp) -> Any:
         return self._called(_OPERATORS[type(node.op)], [self._value(node.left), self._value(node.right)])
@@ -291,7 +316,7 @@ class Walk:
         size = ir.Constant(_WHOLE, count * self._context.get_abi_sizeof(to))
         memory = self._builder.call(self._outside("malloc", _BYTE.as_pointer(), _WHOLE), [size])
         self._taken.append(memory)
-        return Pointer(kind, self._builder.bitcast(memory, to.as_pointer()))
+        return Pointer(kind, self._builder.bitcast(memory, to.as_pointer()), "own")
 
     def _outside(self, name: str, returned: Any, taken: Any) -> Any:
         return cgutils.get_or_insert_function(self._builder.module, ir.FunctionType(returned, [taken]), name)
