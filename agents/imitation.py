@@ -43,7 +43,7 @@ from idm_env.tasks import Task
 from idm_env.tasks.follow import SEEN
 from idm_env.types import Command
 
-SCALES = SEEN.scales
+SCALES = tuple(each.scale for each in SEEN)
 """Of speed, leader's speed (m/s) and gap (m) in an observation, as in task ``follow``."""
 
 

@@ -15,10 +15,6 @@ import gallery_of
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
-UNITS = {
-    "speed": "m/s", "relative_speed": "m/s", "headway": "m", "gap": "m", "deviation": "m", "accel": "m/s²",
-    "lead_accel": "m/s²", "ends": "m", "position": "m", "next_end": "m",
-}  # fmt: skip
 JOBS = ("explain", "fit", "filter", "reconstruct", "predict", "simulate")
 MODULES = {
     "core": ("Simulate", ("simulator", "types", "parameters", "roads")),
@@ -50,7 +46,8 @@ def write(folder: Path) -> None:
     for name in ("pictures", "tasks", "api"):
         (out / name).mkdir(parents=True, exist_ok=True)
     pages = {
-        **environments(), "effects.md": effects(out / "pictures"), "commands.md": commands(), **api(),
+        **environments(), "features.md": features(), "effects.md": effects(out / "pictures"), "commands.md": commands(),
+        **api(),
     }  # fmt: skip
     for name, text in pages.items():
         path = out / name
@@ -116,7 +113,6 @@ def _faces(name: str) -> list[str]:
 
     env: Any = gymnasium.make("DiffIDM-v0", task=name)
     task = env.unwrapped.task
-    features = task.features
     lines = [
         "## Spaces", "",
         f"| | by default |\n| --- | --- |\n| observation | {_space(env.observation_space)} |\n"
@@ -125,8 +121,7 @@ def _faces(name: str) -> list[str]:
         "Of each agent. An entry is divided by its scale, unless `observation=\"raw\"`.", "",
         "| entry | unit | divided by | lowest | highest |", "| --- | --- | --- | --- | --- |",
     ]  # fmt: skip
-    for entry, scale, low, high in zip(features.names, features.scales, features.low, features.high, strict=True):
-        lines.append(f"| `{entry}` | {_unit(entry)} | {scale:g} | {low:g} | {high:g} |")
+    lines += [_feature_row(each.name, each.feature) for each in task.observed]
     actions = ", ".join(f"`{c}`" for c in task.commands)
     low, high = task.command_limits
     return [
@@ -152,6 +147,41 @@ def _space(space: Any) -> str:
     return f"`Box({bounds}{space.shape}, {space.dtype})`{told}"
 
 
+def _feature_row(name: str, feature: Any) -> str:
+    return f"| `{name}` | {feature.unit or '–'} | {feature.scale:g} | {feature.low:g} | {feature.high:g} |"
+
+
+def features() -> str:
+    """Return the page of what every task may observe, and what it may be rewarded for."""
+    from idm_env.tasks import FEATURES, REWARD_TERMS
+
+    lines = [
+        "# Features and reward terms", "",
+        "Every task takes them by keyword and in YAML. Those of one's own: "
+        "[add one](../architecture.md#add-a-feature-or-a-reward-term).", "",
+        "## Features", "",
+        '`observation={"features": ["speed", "gap"], "vehicles": 2}` takes both of the agent, and both of its leader '
+        "as `speed_ahead_1` and `gap_ahead_1`. A vehicle without a leader is its own leader there.", "",
+        "| feature | meaning | unit | divided by | lowest | highest |", "| --- | --- | --- | --- | --- | --- |",
+    ]  # fmt: skip
+    for name, each in FEATURES.items():
+        row = _feature_row(name, each).replace(" | ", f" | {_meaning(each.read)} | ", 1)
+        lines.append(row)
+    lines += [
+        "", "## Reward terms", "", '`reward={"speed": 0.2, "effort": -4.0}` pays the sum of weights times terms.', "",
+        "| term | meaning | unit | lowest | highest |", "| --- | --- | --- | --- | --- |",
+    ]  # fmt: skip
+    for name, term in REWARD_TERMS.items():
+        lines.append(f"| `{name}` | {_meaning(term.of)} | {term.unit or '–'} | {term.low:g} | {term.high:g} |")
+    return "\n".join(lines) + "\n"
+
+
+def _meaning(function: Any) -> str:
+    """Return the docstring of what reads a feature, as Markdown in a cell of a table."""
+    text = " ".join(inspect.cleandoc(function.__doc__ or "").split()).removeprefix("Return ").rstrip(".")
+    return text.replace("``", "`").replace("|", "\\|")
+
+
 def _returns(name: str) -> list[str]:
     """Return the table of returns of a task, as ``benchmarks.environments --returns`` measured them."""
     rows = [line.split(",") for line in (ROOT / "docs" / "returns.csv").read_text(encoding="utf-8").splitlines()[1:]]
@@ -171,15 +201,6 @@ def _returns(name: str) -> list[str]:
         "the parameters that a search found on other seeds. `python -m benchmarks.environments --returns`, "
         "2026-11-23, 2 cores, no GPU.", "",
     ]  # fmt: skip
-
-
-def _unit(entry: str) -> str:
-    if re.fullmatch(r"(ahead|left)_\d+", entry):
-        return "m" if entry.startswith("ahead") else "lanes"
-    known = next((unit for key, unit in UNITS.items() if entry.endswith(key)), None)
-    if known is None:
-        known = "m/s" if "speed" in entry else "m/s²" if "accel" in entry else "m" if "gap" in entry else "–"
-    return known
 
 
 def _described(cls: Any) -> tuple[str, list[str]]:

@@ -54,19 +54,28 @@ def read(where: str) -> type[Effect]:
     The file is run for that, unless this process has imported it. ValueError, in one line, where there is no such
     class, and for whatever the file raises, ``sys.exit()`` included.
     """
+    module, found = member(where, "effect")
+    if not (isinstance(found, type) and issubclass(found, Effect)):
+        mine = {k: v for k, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__}
+        able = ", ".join(k for k, v in mine.items() if issubclass(v, Effect)) or "none"
+        place, _, name = where.rpartition(":")
+        raise ValueError(f"effect {where}: {place} has no class {name} of effects. It has: {able}.")
+    return found
+
+
+def member(where: str, kind: str) -> tuple[ModuleType, object]:
+    """Return the module at ``my_file.py:name`` and what has that name there, None for nothing.
+
+    The file is run for that, unless this process has imported it. ValueError, in one line, for whatever it raises.
+    """
     place, _, name = where.rpartition(":")
     try:
         module = imported(place) or (_module_of(Path(place)) if place.endswith(".py") else import_module(place))
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise ValueError(f"effect {where}: {place} cannot be read ({_said(error)}).") from None
-    found = vars(module).get(name)  # a module's own __getattr__ may import
-    if not (isinstance(found, type) and issubclass(found, Effect)):
-        mine = {k: v for k, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__}
-        able = ", ".join(k for k, v in mine.items() if issubclass(v, Effect)) or "none"
-        raise ValueError(f"effect {where}: {place} has no class {name} of effects. It has: {able}.")
-    return found
+        raise ValueError(f"{kind} {where}: {place} cannot be read ({_said(error)}).") from None
+    return module, vars(module).get(name)  # a module's own __getattr__ may import
 
 
 def imported(place: str) -> ModuleType | None:

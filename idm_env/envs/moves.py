@@ -63,7 +63,7 @@ class Moves:
         details = self._details(after, command if commanded else None, given, terminated)
         if self._limit is not None:
             truncated = truncated | (after.state.step >= self._limit).unsqueeze(-1)
-        reward = task.reward(before, command, after, terminated)
+        reward = task.rewards(before, command, after, terminated)
         if len(task.agents) == 1:
             ends, cut = terminated[..., 0], truncated[..., 0]
         else:

@@ -9,6 +9,7 @@ from typing import Any
 from idm_env.jobs import trust
 from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import KeywordError
+from idm_env.tasks.features import FEATURES, Feature, View
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.highway import HighwayTask
 from idm_env.tasks.open_lanes import BottleneckTask, MergeTask, OpenHighwayTask
@@ -16,6 +17,7 @@ from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.replay import ReplayTask
 from idm_env.tasks.replay_lanes import ReplayLanesTask
+from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
 from idm_env.tasks.ring import RingTask
 from idm_env.validation import nearest, shown
 
@@ -59,12 +61,15 @@ def task_with(task: str, choices: Mapping[str, Any], others: Iterable[str] = ())
 
 
 __all__ = [
+    "FEATURES",
+    "REWARD_TERMS",
     "TASKS",
     "Advance",
     "BottleneckTask",
     "Bounds",
     "Draw",
     "Ended",
+    "Feature",
     "Features",
     "FollowTask",
     "HighwayTask",
@@ -75,8 +80,11 @@ __all__ = [
     "PlatoonTask",
     "ReplayLanesTask",
     "ReplayTask",
+    "RewardTerm",
     "RingTask",
     "Task",
+    "Transition",
+    "View",
     "World",
     "make_task",
     "task_with",

@@ -24,15 +24,17 @@ from idm_env.simulator import Simulator, stacked
 from idm_env.tasks.behaviour import Behaviour, behaviour
 from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges, ranges_of, whole
 from idm_env.tasks.crash import contact, lawful_cost
+from idm_env.tasks.declared import one_declared
 from idm_env.tasks.failsafe import safe_accel
+from idm_env.tasks.features import FEATURES, Feature, Observed, View, chosen
 from idm_env.tasks.random import Draw
+from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, Weighted, weighted
 from idm_env.tasks.types import Advance, Bounds, Ended, Features, Pay, World
 from idm_env.types import Command, Inputs, Params, State
-from idm_env.validation import one_of, shown
+from idm_env.validation import shown
 
 _NORMALS_AT_ONCE = 1 << 16
 _MOST_STEPS = 1_000_000_000
-OBSERVATIONS = ("scaled", "raw")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,7 +76,11 @@ class Task(abc.ABC):
         max_episode_steps: Steps of the environment after which an episode is cut off; None is the task's own number, −1
             is no limit.
         observation: ``"scaled"``: each entry over a fixed scale that the task documents, about unit size; ``"raw"``: in
-            SI units (m, m/s). Both are clipped to ``bounds``.
+            SI units (m, m/s). Both are clipped to ``bounds``. ``{"features": ["speed", "gap"], "vehicles": 3}`` takes
+            these of ``idm_env.tasks.FEATURES``, of the agent and of the two vehicles ahead of it; ``"scaling": "raw"``
+            may stand beside. A feature of one's own is a ``Feature``, or ``"my_file.py:my_feature"``.
+        reward: Weights of ``idm_env.tasks.REWARD_TERMS`` in place of the task's own reward: ``{"speed": 0.2, "effort":
+            -4.0}``. A term of one's own is ``"my_file.py:my_term"``, or a ``RewardTerm`` as a key.
         crash_cost: What a crash costs; None is the smallest that makes it worse than any survival
             (``idm_env.tasks.crash``).
 
@@ -100,7 +106,8 @@ class Task(abc.ABC):
     failsafe_time: float = 1.0
     hold: float | None = None
     max_episode_steps: int | None = None
-    observation: str = "scaled"
+    observation: str | Mapping[str, Any] = "scaled"
+    reward: Mapping[Any, float] | None = None
     crash_cost: float | None = None
 
     name: ClassVar[str]
@@ -149,7 +156,7 @@ class Task(abc.ABC):
                 f"max_episode_steps = {shown(steps)} must be a whole number of at least 1 and at most {_MOST_STEPS}, "
                 "or -1 for no limit."
             )
-        one_of("observation", self.observation, OBSERVATIONS)
+        _ = self.scaling, self.weighted
 
     # -- static facts --------------------------------------------------------------------------------------------
 
@@ -196,8 +203,18 @@ class Task(abc.ABC):
 
     @property
     @abc.abstractmethod
+    def own_pay(self) -> Pay:
+        """The lowest (at most 0) and the highest (at least 0) of the task's own reward, without a crash."""
+
+    @cached_property
     def pay(self) -> Pay:
         """The lowest (at most 0) and the highest (at least 0) reward of a Δt without a crash."""
+        return self.own_pay if self.weighted is None else self.weighted.pay
+
+    @cached_property
+    def weighted(self) -> Weighted | None:
+        """The sum that ``reward`` asks for, None for the task's own reward."""
+        return weighted(self.reward, lambda x, where: one_declared(x, RewardTerm, REWARD_TERMS, where))
 
     @cached_property
     def cost_of_crash(self) -> float:
@@ -233,13 +250,33 @@ class Task(abc.ABC):
 
     @property
     @abc.abstractmethod
+    def own_features(self) -> tuple[Feature, ...]:
+        """What one agent observes unless ``observation`` names features."""
+
+    @cached_property
+    def _observation(self) -> tuple[str, tuple[Observed, ...] | None]:
+        return chosen(self.observation, lambda x, where: one_declared(x, Feature, FEATURES, where))
+
+    @property
+    def scaling(self) -> str:
+        """``"scaled"`` or ``"raw"``."""
+        return self._observation[0]
+
+    @cached_property
+    def observed(self) -> tuple[Observed, ...]:
+        """What one agent observes, entry by entry."""
+        return self._observation[1] or tuple(Observed(each) for each in self.own_features)
+
+    @cached_property
     def features(self) -> Features:
         """What one agent observes, in SI units."""
+        each = [(x.name, x.feature.scale, x.feature.low, x.feature.high) for x in self.observed]
+        return Features(*zip(*each, strict=True))
 
     @cached_property
     def scales(self) -> tuple[float, ...]:
         """What each entry of an observation is divided by: 1 for raw ones."""
-        return self.features.scales if self.observation == "scaled" else (1.0,) * len(self.features.scales)
+        return self.features.scales if self.scaling == "scaled" else (1.0,) * len(self.features.scales)
 
     @cached_property
     def bounds(self) -> Bounds:
@@ -419,11 +456,15 @@ class Task(abc.ABC):
 
     def lead_speed(self, state: State) -> Tensor:
         """Return the speed of each agent's leader (m/s), the agent's own where there is none, shape ``(…, agents)``."""
+        return self.pick_leader(state, state.speed)
+
+    def pick_leader(self, state: State, x: Tensor, nobody: float | None = None) -> Tensor:
+        """Return each agent's leader's entry of ``x``, where there is no leader its own or ``nobody``."""
         road = self.road.view(state)
-        ahead = road.ahead(state.speed)
-        if state.present is not None:
-            there = road.leader_present(state.present, state.speed) > 0
-            ahead = torch.where(there, ahead, state.speed)
+        ahead = road.ahead(x)
+        if state.present is not None or nobody is not None:
+            there = road.leader_present(state.present, x) > 0
+            ahead = torch.where(there, ahead, x if nobody is None else nobody)
         return self.pick(ahead)
 
     def safe_command(self, world: World) -> Tensor:
@@ -491,27 +532,38 @@ class Task(abc.ABC):
         state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals, live), params)
         return world._replace(state=state)
 
-    @abc.abstractmethod
     def observe(self, world: World) -> Tensor:
         """Return what the agents observe, shape ``(…, agents, features)``, within ``bounds``."""
+        views = {k: View(self, world, k) for k in {x.ahead for x in self.observed}}
+        seen = [x.feature.read(views[x.ahead]) for x in self.observed]
+        return self.clip(seen if self._observation[1] is None else [self.there(world.state, x) for x in seen])
 
     @abc.abstractmethod
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
-        """Return the rewards of a step without a crash, within ``pay``, shape ``(…, agents)``; ``command`` in m/s²."""
+        """Return the task's own rewards of a step without a crash, within ``own_pay``, shape ``(…, agents)``.
+
+        ``command`` in m/s².
+        """
 
     def there(self, state: State, x: Tensor) -> Tensor:
         """Return what belongs to the agents, shape ``(…, agents)``, 0 for those who are not on the road."""
         return x if state.present is None else torch.where(self.pick(state.present) > 0, x, torch.zeros_like(x))
 
-    def reward(self, before: World, command: Tensor, after: World, crashed: Tensor | None = None) -> Tensor:
-        """Return the rewards of a step, shape ``(…, agents)``: what is ``earned``, or ``−cost_of_crash``.
+    def rewards(self, before: World, command: Tensor, after: World, crashed: Tensor | None = None) -> Tensor:
+        """Return the rewards of a step, shape ``(…, agents)``, or ``−cost_of_crash``.
 
         ``command`` in m/s², which costs nothing where an agent is not on the road; ``crashed``, where the caller has it
         already, is ``self.crashed(after)``.
         """
         command = self.there(after.state, command)
         crashed = self.crashed(after) if crashed is None else crashed
-        return torch.where(crashed, -self.cost_of_crash, self.earned(before, command, after))
+        return torch.where(crashed, -self.cost_of_crash, self.paid(before, command, after))
+
+    def paid(self, before: World, command: Tensor, after: World) -> Tensor:
+        """Return the rewards of a step without a crash: the task's own, or what ``reward`` asks for."""
+        if self.weighted is None:
+            return self.earned(before, command, after)
+        return self.weighted(Transition(self, before, command, after))
 
     def crashed(self, world: World) -> Tensor:
         """Return whose episodes end in a crash: those of all, where any two vehicles have touched (a gap ≤ 0)."""

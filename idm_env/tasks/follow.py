@@ -15,16 +15,17 @@ from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Ended, Features, Pay, Task, World
+from idm_env.tasks.base import Ended, Pay, Task, World
 from idm_env.tasks.checks import Range
 from idm_env.tasks.crash import floored
+from idm_env.tasks.features import FEATURES, Feature, feature
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import Leaders, head, made_up_leader, queue, recorded_leaders, starts
 from idm_env.types import Inputs, Params
 from idm_env.validation import one_of
 
 HORIZON = 1000
-SEEN = Features(("speed", "lead_speed", "gap"), (40.0, 40.0, 100.0), (0.0, 0.0, -10.0), (100.0, 100.0, 1000.0))
+SEEN = (feature("speed", 40.0, 0.0, 100.0), feature("lead_speed", 40.0, 0.0, 100.0), FEATURES["gap"])
 """What an agent behind a record observes, here and in ``replay``: speeds up to 100 m/s, gaps up to 1000 m."""
 KNEE, LOWEST, HIGHEST = -2.0, -4.0, 1.0
 """Reward from which it saturates, and what it never leaves without ``lag_weight``."""
@@ -118,12 +119,12 @@ class FollowTask(Task):
         return made_up_leader(dt) if self.leader is None else recorded_leaders(str(self.leader), dt)
 
     @property
-    def features(self) -> Features:
+    def own_features(self) -> tuple[Feature, ...]:
         """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
         return SEEN
 
     @property
-    def pay(self) -> Pay:
+    def own_pay(self) -> Pay:
         """From −4 to 1, more where an agent may catch up."""
         return Pay(LOWEST, HIGHEST + _CLOSING * self.lag_weight)
 
@@ -162,12 +163,6 @@ class FollowTask(Task):
         first = self.constant("first", lambda: np.arange(self.vehicles) == 0, state.speed.device, torch.bool)
         inputs["replay"] = head(self._motion(dict(world.episode), state.step + 1, state.speed.dtype), first)
         return inputs
-
-    def observe(self, world: World) -> Tensor:
-        """Return ``v/40, v_lead/40, gap/100`` of every agent."""
-        state = world.state
-        seen = [self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)]
-        return self.clip(seen)
 
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return ``1 − w fuel − 0.002 u² − 2 p − l clip(v_lead − v, ±20)``, saturated below −2."""

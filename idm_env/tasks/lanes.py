@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar
 
 import torch
@@ -13,8 +13,9 @@ from torch import Tensor
 
 from idm_env.effects import Control, Effect, LaneCommand
 from idm_env.roads import Lanes
-from idm_env.tasks.base import Features, Pay, Task, World
+from idm_env.tasks.base import Pay, Task, World
 from idm_env.tasks.checks import Range
+from idm_env.tasks.features import Feature, View, feature
 from idm_env.tasks.random import Draw
 from idm_env.types import Inputs, Params, State
 
@@ -152,39 +153,39 @@ class LanesTask(Task):
         return values
 
     @property
-    def own_features(self) -> tuple[tuple[str, float, float, float], ...]:
-        """What an agent observes of itself: name, scale, lowest and highest value."""
-        return ("speed", 20.0, 0.0, FASTEST), ("lane", 1.0, 0.0, float(self.road.count - 1))
+    def features_of_self(self) -> tuple[Feature, ...]:
+        """What an agent observes of itself."""
+        return feature("speed", 20.0, 0.0, FASTEST), feature("lane", 1.0, 0.0, float(self.road.count - 1))
 
     @property
-    def features(self) -> Features:
-        """What is seen of oneself, and of each vehicle nearby."""
-        n, last, own = self.seen, float(self.road.count - 1), tuple(zip(*self.own_features, strict=True))
-        each = [f"{what}_{k}" for k in range(n) for what in ("there", "ahead", "left", "speed")]
-        return Features(
-            (*own[0], *each),
-            (*own[1], *(1.0, 100.0, 1.0, 10.0) * n),
-            (*own[2], *(0.0, -FAR_AWAY, -last, -FASTEST) * n),
-            (*own[3], *(1.0, FAR_AWAY, last, FASTEST) * n),
+    def own_features(self) -> tuple[Feature, ...]:
+        """What is seen of oneself, and of each vehicle nearby: relative to the agent, 0 where there is nobody."""
+        last = float(self.road.count - 1)
+        each = (
+            ("there", "", 1.0, 0.0, 1.0), ("ahead", "m", 100.0, -FAR_AWAY, FAR_AWAY),
+            ("left", "lanes", 1.0, -last, last), ("speed", "m/s", 10.0, -FASTEST, FASTEST),
+        )  # fmt: skip
+        nearby = (
+            Feature(f"{name}_{k}", "", unit, scale, low, high, partial(_nearby, i, k))
+            for k in range(self.seen)
+            for i, (name, unit, scale, low, high) in enumerate(each)
         )
+        return (*self.features_of_self, *nearby)
 
     @property
-    def pay(self) -> Pay:
+    def own_pay(self) -> Pay:
         """Rewards of a step lie between −0.1 and 1."""
         return Pay(-0.1, 1.0)
-
-    def seen_of_self(self, state: State) -> list[Tensor]:
-        """Return ``own_features``, each ``(…, agents)``."""
-        assert state.links is not None
-        return [self.pick(state.speed), self.pick(state.links.lane.to(state.speed.dtype))]
 
     def apart(self, ahead: Tensor) -> Tensor:
         """Return differences of positions (m) as distances on this road."""
         return ahead
 
-    def observe(self, world: World) -> Tensor:
-        """Return what is seen of oneself, and of the nearest vehicles."""
-        state = world.state
+    def nearest(self, state: State) -> tuple[Tensor, ...]:
+        """Return of the ``seen`` nearest vehicles who is there, how far ahead (m), lanes to the left, relative speed.
+
+        Each ``(…, agents, seen)``, 0 for nobody.
+        """
         assert state.links is not None
         own = self.constant("agents", self.agents, state.speed.device, torch.int64)
         lane = state.links.lane.to(state.speed.dtype)
@@ -203,8 +204,11 @@ class LanesTask(Task):
 
         there = (away.gather(-1, near) <= FAR_AWAY).to(lane.dtype)
         told = [there, *(x * there for x in (ahead.gather(-1, near), beside(lane), beside(state.speed)))]
-        features = [self.there(state, x) for x in self.seen_of_self(state)]
-        nobody = torch.zeros_like(features[0])
-        for k in range(self.seen):
-            features += [x[..., k] for x in told] if k < count else [nobody] * 4
-        return self.clip(features)
+        if count < self.seen:
+            told = [torch.cat((x, x.new_zeros(*x.shape[:-1], self.seen - count)), dim=-1) for x in told]
+        return tuple(told)
+
+
+def _nearby(what: int, k: int, view: View) -> Tensor:
+    """Return one of what ``LanesTask.nearest`` says of the k-th vehicle, ``(…, agents)``."""
+    return view.nearby[what][..., k]

@@ -18,6 +18,7 @@ from idm_env.multilane import demand
 from idm_env.roads import Lanes, lane_drop, on_ramp
 from idm_env.tasks.base import Pay, World
 from idm_env.tasks.checks import Range, at_least
+from idm_env.tasks.features import Feature, View, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.types import Params, State, Trips
@@ -30,6 +31,44 @@ _STANDS = 0.5
 """Below this speed (m/s) a vehicle stands."""
 _CO2 = 2.31
 """CO₂ of a millilitre of petrol (g)."""
+
+
+def _present(view: View) -> Tensor:
+    """Return 1 for agents on the road, 0 for others."""
+    present = view.state.present
+    assert present is not None
+    return view.own(present)
+
+
+def _ends(view: View) -> Tensor:
+    """Return how far the lane goes on (m), as far as it is seen."""
+    state, road = view.state, view.task.road
+    assert state.links is not None and isinstance(road, Lanes)
+    return view.own((road.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT))
+
+
+def _next(view: View) -> tuple[Tensor, Tensor]:
+    """Return how far it is to the next end of any lane (m), as far as it is seen, and how many lanes to the left."""
+    state, task, road = view.state, view.task, view.task.road
+    assert state.links is not None and isinstance(road, Lanes)
+    own, lane = task.pick(state.position), task.pick(state.links.lane)
+    next_end, beside = torch.full_like(own, _SIGHT), torch.zeros_like(own)
+    for end in road.ends:
+        way = end.end - own
+        nearer = end.closed & (way >= 0.0) & (way < next_end)
+        next_end = torch.where(nearer, way, next_end)
+        beside = torch.where(nearer, (end.lane - lane).to(own.dtype), beside)
+    return task.there(state, next_end), task.there(state, beside)
+
+
+def _next_end(view: View) -> Tensor:
+    """Return how far it is to the next end of any lane (m)."""
+    return _next(view)[0]
+
+
+def _next_left(view: View) -> Tensor:
+    """Return how many lanes to the left the next end is."""
+    return _next(view)[1]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,26 +203,17 @@ class OpenLanesTask(LanesTask):
         )
 
     @property
-    def own_features(self) -> tuple[tuple[str, float, float, float], ...]:
+    def features_of_self(self) -> tuple[Feature, ...]:
         """As in ``LanesTask``; who is there, where, and how far it is to the end of one's lane and of any."""
         last = float(self.road.count - 1)
         return (
-            *super().own_features, ("present", 1.0, 0.0, 1.0), ("ends", 100.0, 0.0, _SIGHT),
-            ("position", 100.0, 0.0, 1e6), ("next_end", 100.0, 0.0, _SIGHT), ("next_left", 1.0, -last, last),
-        )  # fmt: skip
-
-    def seen_of_self(self, state: State) -> list[Tensor]:
-        """Return ``own_features``."""
-        assert state.links is not None and state.present is not None
-        ends = (self.road.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT)
-        own, lane = self.pick(state.position), self.pick(state.links.lane)
-        next_end, beside = torch.full_like(own, _SIGHT), torch.zeros_like(own)
-        for end in self.road.ends:
-            way = end.end - own
-            nearer = end.closed & (way >= 0.0) & (way < next_end)
-            next_end = torch.where(nearer, way, next_end)
-            beside = torch.where(nearer, (end.lane - lane).to(own.dtype), beside)
-        return [*super().seen_of_self(state), self.pick(state.present), self.pick(ends), own, next_end, beside]
+            *super().features_of_self,
+            Feature("present", "", "", 1.0, 0.0, 1.0, _present),
+            Feature("ends", "", "m", 100.0, 0.0, _SIGHT, _ends),
+            feature("position", 100.0, 0.0, 1e6),
+            Feature("next_end", "", "m", 100.0, 0.0, _SIGHT, _next_end),
+            Feature("next_left", "", "lanes", 1.0, -last, last, _next_left),
+        )
 
     def told(self, world: World) -> dict[str, Tensor]:
         """As in ``LanesTask``, and of all traffic what became of trips, who stands and what is burnt, now or so far.
@@ -219,7 +249,7 @@ class OpenLanesTask(LanesTask):
         return 2.0 * self.vehicles + sum(self.inflows.values()) * seconds / 3600.0
 
     @property
-    def pay(self) -> Pay:
+    def own_pay(self) -> Pay:
         """At most everybody who is due stands."""
         return Pay(-self._most * self.simulator.dt, 0.0)
 

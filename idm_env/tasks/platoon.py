@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -14,9 +15,10 @@ from torch import Tensor
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Features, Pay, Task, World
+from idm_env.tasks.base import Pay, Task, World
 from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
+from idm_env.tasks.features import FEATURES, Feature, View, feature, speed
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import head, queue
 from idm_env.types import Inputs, Params
@@ -74,13 +76,14 @@ class PlatoonTask(Task):
         at_least("speed", self.speed, 2.0 * self.disturbance, "m/s")
 
     @property
-    def features(self) -> Features:
-        """Speeds up to 120 m/s, gaps from an overlap to 1000 m."""
-        names, scales = ("speed", "relative_speed", "gap", "deviation"), (30.0, 10.0, 100.0, 10.0)
-        return Features(names, scales, (0.0, -100.0, -10.0, -100.0), (120.0, 100.0, 1000.0, 100.0))
+    def own_features(self) -> tuple[Feature, ...]:
+        """Speeds up to 120 m/s, gaps from an overlap to 1000 m, and ``v − v̄``."""
+        own = feature("speed", 30.0, 0.0, 120.0)
+        deviation = Feature("deviation", "v − v̄", "m/s", 10.0, -100.0, 100.0, partial(_deviation, self.speed))
+        return own, FEATURES["relative_speed"], FEATURES["gap"], deviation
 
     @property
-    def pay(self) -> Pay:
+    def own_pay(self) -> Pay:
         """Costs only."""
         return Pay(_LOWEST, 0.0)
 
@@ -131,13 +134,6 @@ class PlatoonTask(Task):
         inputs["replay"] = head(self._motion(world.episode["waves"], state.step + 1), first)
         return inputs
 
-    def observe(self, world: World) -> Tensor:
-        """Return ``v/30, (v_lead − v)/10, gap/100, (v − v̄)/10`` of every agent."""
-        state = world.state
-        speed, lead_speed = self.pick(state.speed), self.lead_speed(state)
-        gap = self.pick(state.gap)
-        return self.clip([speed, lead_speed - speed, gap, speed - self.speed])
-
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return minus the quadratic costs of speed and effort, and of time gaps out of bounds."""
         state = after.state
@@ -151,3 +147,8 @@ class PlatoonTask(Task):
             - torch.relu(time_gap / 4.0 - 1.0)
         )
         return floored(reward, _KNEE, _LOWEST)
+
+
+def _deviation(mean: float, view: View) -> Tensor:
+    """Return ``v − v̄`` (m/s)."""
+    return speed(view) - mean

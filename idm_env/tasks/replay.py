@@ -14,9 +14,10 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Ended, Features, Pay, Task, World
+from idm_env.tasks.base import Ended, Pay, Task, World
 from idm_env.tasks.checks import count_of, in_ranges
 from idm_env.tasks.crash import floored
+from idm_env.tasks.features import Feature
 from idm_env.tasks.follow import HIGHEST, KNEE, LOWEST, SEEN, headway_penalty
 from idm_env.tasks.random import Draw
 from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene
@@ -128,12 +129,12 @@ class ReplayTask(Task):
         return self.scene.ids
 
     @property
-    def features(self) -> Features:
+    def own_features(self) -> tuple[Feature, ...]:
         """Speeds up to 100 m/s, gaps from an overlap to 1000 m."""
         return SEEN
 
     @property
-    def pay(self) -> Pay:
+    def own_pay(self) -> Pay:
         """Distances are costs only; the terms of ``follow`` lie in −4 … 1."""
         return Pay(_FARTHEST, 0.0) if self.reward_terms == "imitation" else Pay(LOWEST, HIGHEST)
 
@@ -263,12 +264,6 @@ class ReplayTask(Task):
         position, speed, accel = motion.unbind(-1)
         inputs["replay"] = Record(position, speed, accel, replayed | (state.present <= 0), present)
         return inputs
-
-    def observe(self, world: World) -> Tensor:
-        """Return ``v/40, v_lead/40, gap/100`` of every agent, 0 of those who are not there."""
-        state = world.state
-        seen = [self.pick(state.speed), self.lead_speed(state), self.pick(state.gap)]
-        return self.clip([self.there(state, x) for x in seen])
 
     def earned(self, before: World, command: Tensor, after: World) -> Tensor:
         """Return minus the distance to the record (10 m), or the terms of ``follow``; 0 of those who are not there."""

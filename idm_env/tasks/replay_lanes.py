@@ -12,8 +12,9 @@ from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Control, Effect, LaneCommand, Mobil, Replay
 from idm_env.roads import End, Lanes
-from idm_env.tasks.base import Features, World
+from idm_env.tasks.base import World
 from idm_env.tasks.crash import contact
+from idm_env.tasks.features import FEATURES, Feature, feature
 from idm_env.tasks.lane_scenes import LanesScene, made_up_lanes, recorded_lanes
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.replay import ReplayTask
@@ -114,22 +115,14 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         return [bool(own) and (drivers or (self.lane_commands and agents[i])) for i, own in enumerate(self._simulated)]
 
     @property
-    def own_features(self) -> tuple[tuple[str, float, float, float], ...]:
+    def features_of_self(self) -> tuple[Feature, ...]:
         """As in ``LanesTask``, and the leader's speed and gap."""
-        return (*super().own_features, ("lead_speed", 20.0, 0.0, FASTEST), ("gap", 100.0, -10.0, 1000.0))
+        return (*super().features_of_self, feature("lead_speed", 20.0, 0.0, FASTEST), FEATURES["gap"])
 
     @property
-    def features(self) -> Features:
+    def own_features(self) -> tuple[Feature, ...]:
         """As in ``LanesTask``."""
-        return super(ReplayTask, self).features
-
-    def seen_of_self(self, state: State) -> list[Tensor]:
-        """Return ``own_features``."""
-        return [*super().seen_of_self(state), self.lead_speed(state), self.pick(state.gap)]
-
-    def observe(self, world: World) -> Tensor:
-        """Return what is seen of oneself, of the leader, and of the nearest vehicles."""
-        return super(ReplayTask, self).observe(world)
+        return super(ReplayTask, self).own_features
 
     def _behind(self, state: State) -> Tensor:
         """Return the gap of whoever follows each vehicle (m), its own where nobody does."""

@@ -14,11 +14,12 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Ring, Road
-from idm_env.tasks.base import Features, Pay, Task, World
+from idm_env.tasks.base import Pay, Task, World
 from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
+from idm_env.tasks.features import Feature, feature
 from idm_env.tasks.random import Draw
-from idm_env.types import Command, Inputs, Params
+from idm_env.types import Command, Inputs, Params, State
 from idm_env.validation import one_of
 
 STARTS = ("uniform", "wave")
@@ -135,14 +136,17 @@ class RingTask(Task):
         return next(i for i in behind if i not in self.agents)
 
     @property
-    def features(self) -> Features:
+    def own_features(self) -> tuple[Feature, ...]:
         """Own speed, that of the leader relative to it, and the headway."""
         longest = span("length", self.length, 1.0, "m")[1]
-        names = ("speed", "relative_speed", "headway")
-        return Features(names, SCALES, (0.0, -20.0, -10.0), (_FASTEST, 20.0, longest + 10.0))
+        return (
+            feature("speed", SCALES[0], 0.0, _FASTEST),
+            feature("relative_speed", SCALES[1], -20.0, 20.0),
+            feature("headway", SCALES[2], -10.0, longest + 10.0),
+        )
 
     @property
-    def pay(self) -> Pay:
+    def own_pay(self) -> Pay:
         """From full commands and every weighted term at its worst to a ring at 40 m/s."""
         return Pay(self._worst() - _FUEL * self.fuel, 0.2 * _FASTEST)
 
@@ -175,19 +179,12 @@ class RingTask(Task):
         )
         return World(state, {})
 
-    def observe(self, world: World) -> Tensor:
-        """Return speed, the leader's relative to it, and headway of every agent."""
-        state = world.state
-        speed = self.pick(state.speed)
-        lead_speed = self._pick_lead(state.speed)
-        headway = self.pick(state.gap) + self._pick_lead(state.length)
-        return self.clip([speed, lead_speed - speed, headway])
-
     @cached_property
     def _leaders(self) -> tuple[int, ...]:
         return tuple((i - 1) % self.vehicles for i in self.agents)
 
-    def _pick_lead(self, x: Tensor) -> Tensor:
+    def pick_leader(self, state: State, x: Tensor, nobody: float | None = None) -> Tensor:
+        """Return each agent's leader's entry of ``x``: on a ring there always is one, in the slot before."""
         if len(self._leaders) == 1:
             return x[..., self._leaders[0] : self._leaders[0] + 1]
         return x.index_select(-1, self.constant("leaders", self._leaders, x.device, torch.int64))
@@ -223,4 +220,4 @@ class RingTask(Task):
         if self.tailgating:
             time_gap = metrics.time_gap(self.pick(state.gap), self.pick(state.speed))
             reward = reward - self.tailgating * torch.relu(1.0 - time_gap / self.tailgating_below)
-        return floored(reward, self._worst(), self.pay.low) if self.fuel else reward
+        return floored(reward, self._worst(), self.own_pay.low) if self.fuel else reward

@@ -51,7 +51,7 @@ def test_a_driven_policy_moves_as_pure_steps_do(controlled):
         wanted = torch.stack([getattr(moment.after.state, name) for moment in slow])
         assert torch.allclose(getattr(fast, name), wanted, atol=1e-4)
     assert torch.allclose(fast.action, torch.stack([moment.action for moment in slow]), atol=1e-5)
-    rewards = torch.stack([start.task.reward(m.before, m.command, m.after) for m in slow])
+    rewards = torch.stack([start.task.rewards(m.before, m.command, m.after) for m in slow])
     assert torch.allclose(fast.reward, rewards, atol=1e-5)
     assert float(fast.accel[30, :, start.task.shocked].min()) == pytest.approx(-4.0)  # the shock is among them
 

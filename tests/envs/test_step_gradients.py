@@ -14,6 +14,7 @@ import torch
 import idm_env  # noqa: F401
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.simulator import Simulator
+from idm_env.tasks import FEATURES, REWARD_TERMS
 
 pytest.importorskip("numba")
 
@@ -24,6 +25,8 @@ def compiled_at_once(monkeypatch):
     monkeypatch.setattr("idm_env.envs.batch.EAGER_STEPS", 0)
 
 
+DECLARED = {"features": list(FEATURES), "vehicles": 2}
+WEIGHTS = dict.fromkeys(REWARD_TERMS, 0.1)
 CASES = {
     "ring": ("ring", {"start": "wave", "warmup": 20, "failsafe": 3.0}),
     "agents": (
@@ -47,7 +50,7 @@ CASES = {
         {"warmup": 5, "effects": ["delay", "memory"], "parameters": {"idm.time_gap": 1.3}, "max_episode_steps": 30},
     ),
     "follow": ("follow", {"max_episode_steps": 25, "fuel_model": "circles"}),
-    "platoon": ("platoon", {"controlled": 2, "noise": 0.1}),
+    "platoon": ("platoon", {"controlled": 2, "noise": 0.1, "observation": DECLARED, "reward": WEIGHTS}),
     "replay": ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
     "single": ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
     # Several lanes: who enters and leaves, changes, is let in, is put on a lane by a record, begins anew.

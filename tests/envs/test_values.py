@@ -15,6 +15,7 @@ from idm_env.kernels.rows import RowFunction
 from idm_env.scalar.record import Untraceable
 from idm_env.simulator import Simulator
 from tests.envs.test_step_gradients import CASES as LANES
+from tests.envs.test_step_gradients import DECLARED, WEIGHTS
 
 pytest.importorskip("numba")
 
@@ -31,7 +32,7 @@ CASES = [
     ("ring", {"warmup": 5, "controlled": 2, "shock": 4.0, "shock_after": 0.5, "max_command": [-4.5, 2.6]}),
     ("ring", {"warmup": 5, "effects": ["delay", "memory"], "parameters": {"idm.time_gap": 1.3}}),
     ("follow", {"max_episode_steps": 25, "fuel_model": "circles"}),
-    ("platoon", {"controlled": 2, "noise": 0.1}),
+    ("platoon", {"controlled": 2, "noise": 0.1, "observation": DECLARED, "reward": WEIGHTS}),
     ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
     ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
     LANES["highway"],

@@ -165,7 +165,7 @@ def test_gradients_of_the_reward_are_finite_differences() -> None:
         now, rewards = world, []
         for _ in range(60):
             after = task.step(now, task.command(push.view(1, 1)), None, params)
-            rewards.append(task.reward(now, push.view(1, 1), after))
+            rewards.append(task.rewards(now, push.view(1, 1), after))
             now = after
         return torch.stack(rewards).sum()
 

@@ -66,7 +66,7 @@ def test_follow_rewards_what_is_written(weight, lag, accel):
     slower = float(after.state.speed[0, 0]) - speed
     assert slower * accel < 0.0  # it starts as fast as its leader
     expected = 1.0 - weight * float(fuel) - 0.002 * 0.49 - 2.0 * short - lag * slower
-    assert float(task.reward(world, command, after)) == pytest.approx(expected)
+    assert float(task.rewards(world, command, after)) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("task", ["follow", "platoon", "replay"])
@@ -115,7 +115,7 @@ def test_replay_stays_on_the_record_but_for_those_handed_over():
     distance = task.distance(worlds[-1])
     torch.testing.assert_close(distance[0, 0], off[task.agents[0]])
     none = torch.zeros(1, 1, dtype=torch.float64)
-    torch.testing.assert_close(task.reward(worlds[-2], none, worlds[-1]), -0.1 * distance)
+    torch.testing.assert_close(task.rewards(worlds[-2], none, worlds[-1]), -0.1 * distance)
 
 
 @pytest.fixture

@@ -214,7 +214,7 @@ def test_gradients_are_finite_differences(road):
         now, rewards = world, []
         for _ in range(60):
             after = task.step(now, push.view(1, 1), None, params)
-            rewards.append(task.reward(now, push.view(1, 1), after) + 0.01 * task.pick(after.state.gap))
+            rewards.append(task.rewards(now, push.view(1, 1), after) + 0.01 * task.pick(after.state.gap))
             now = after
         return torch.stack(rewards).sum()
 

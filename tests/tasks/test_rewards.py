@@ -49,7 +49,7 @@ def returns(task, kind):
     for t in range(STEPS):
         command = task.command(wild(task, kind, t))
         after = task.step(world, command, {name: x[t] for name, x in normals.items()}, params)
-        total += torch.where(live, task.reward(world, command, after).mean(-1), 0.0)
+        total += torch.where(live, task.rewards(world, command, after).mean(-1), 0.0)
         live &= ~task.ended(after).terminated.any(-1)
         world = after
     return total, ~live
@@ -112,4 +112,4 @@ def test_a_cost_of_ones_own_replaces_the_lawful_one():
     gap = world.state.gap.clone()
     gap[0, 3] = -0.1
     touched = world._replace(state=world.state._replace(gap=gap))
-    assert float(task.reward(world, torch.zeros(1, 1, dtype=torch.float64), touched)) == -50.0
+    assert float(task.rewards(world, torch.zeros(1, 1, dtype=torch.float64), touched)) == -50.0

@@ -24,7 +24,7 @@ def test_the_observation_is_what_is_written_and_the_reward_flows():
     headway = float((position[leader] - position[agent]) % ring)
     expected = [float(v[agent]) / 5, float(v[leader] - v[agent]), headway / 10]
     torch.testing.assert_close(seen, torch.tensor(expected, dtype=torch.float64))
-    reward = task.reward(before, command, after)
+    reward = task.rewards(before, command, after)
     assert float(reward) == pytest.approx(4.0 * float(v.mean()) / 20.0 - 4.0 * 0.5)
 
 
@@ -162,7 +162,7 @@ def test_tailgating_and_fuel_cost(below):
     world, _ = start(plain)
     close = world._replace(state=world.state._replace(gap=torch.full_like(world.state.gap, 0.4)))
     none = torch.zeros(1, 1, dtype=torch.float64)
-    difference = plain.reward(close, none, close) - dear.reward(close, none, close)
+    difference = plain.rewards(close, none, close) - dear.rewards(close, none, close)
     fuel = float(metrics.fuel(close.state.speed, close.state.accel).mean())
     assert float(difference) == pytest.approx(
         3.0 * (1.0 - 0.4 / max(float(close.state.speed[0, 0]), 1.0) / below) + 2.0 * fuel
