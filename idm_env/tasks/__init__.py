@@ -9,7 +9,7 @@ from typing import Any
 from idm_env.jobs import trust
 from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import KeywordError
-from idm_env.tasks.features import FEATURES, Feature, View
+from idm_env.tasks.features import FEATURES, AgentView, Feature
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.highway import HighwayTask
 from idm_env.tasks.open_lanes import BottleneckTask, MergeTask, OpenHighwayTask
@@ -65,6 +65,7 @@ __all__ = [
     "REWARD_TERMS",
     "TASKS",
     "Advance",
+    "AgentView",
     "BottleneckTask",
     "Bounds",
     "Draw",
@@ -84,7 +85,6 @@ __all__ = [
     "RingTask",
     "Task",
     "Transition",
-    "View",
     "World",
     "make_task",
     "task_with",

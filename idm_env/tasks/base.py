@@ -26,7 +26,7 @@ from idm_env.tasks.checks import Range, agents_of, in_ranges, limits_of, ranges,
 from idm_env.tasks.crash import contact, lawful_cost
 from idm_env.tasks.declared import one_declared
 from idm_env.tasks.failsafe import safe_accel
-from idm_env.tasks.features import FEATURES, Feature, Observed, View, chosen
+from idm_env.tasks.features import FEATURES, AgentView, Feature, ObservedFeature, chosen
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, Weighted, weighted
 from idm_env.tasks.types import Advance, Bounds, Ended, Features, Pay, World
@@ -254,7 +254,7 @@ class Task(abc.ABC):
         """What one agent observes unless ``observation`` names features."""
 
     @cached_property
-    def _observation(self) -> tuple[str, tuple[Observed, ...] | None]:
+    def _observation(self) -> tuple[str, tuple[ObservedFeature, ...] | None]:
         return chosen(self.observation, lambda x, where: one_declared(x, Feature, FEATURES, where))
 
     @property
@@ -263,9 +263,9 @@ class Task(abc.ABC):
         return self._observation[0]
 
     @cached_property
-    def observed(self) -> tuple[Observed, ...]:
+    def observed(self) -> tuple[ObservedFeature, ...]:
         """What one agent observes, entry by entry."""
-        return self._observation[1] or tuple(Observed(each) for each in self.own_features)
+        return self._observation[1] or tuple(ObservedFeature(each) for each in self.own_features)
 
     @cached_property
     def features(self) -> Features:
@@ -534,7 +534,7 @@ class Task(abc.ABC):
 
     def observe(self, world: World) -> Tensor:
         """Return what the agents observe, shape ``(…, agents, features)``, within ``bounds``."""
-        views = {k: View(self, world, k) for k in {x.ahead for x in self.observed}}
+        views = {k: AgentView(self, world, k) for k in {x.ahead for x in self.observed}}
         seen = [x.feature.read(views[x.ahead]) for x in self.observed]
         return self.clip(seen if self._observation[1] is None else [self.there(world.state, x) for x in seen])
 

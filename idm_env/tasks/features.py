@@ -1,8 +1,8 @@
 """What agents can observe: declared features, in a catalogue that is open.
 
-A feature is a function of a ``View``; it says its unit, the scale that it is divided by, and its bounds. Tasks declare
-theirs, and ``observation={"features": [...]}`` chooses others: names of ``FEATURES``, features of one's own, or
-``"my_file.py:my_feature"``.
+A feature is a function of an ``AgentView``; it says its unit, the scale that it is divided by, and its bounds. Tasks
+declare theirs, and ``observation={"features": [...]}`` chooses others: names of ``FEATURES``, features of one's own,
+or ``"my_file.py:my_feature"``.
 """
 
 from __future__ import annotations
@@ -10,31 +10,28 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.tasks.types import World
+from idm_env.tasks.types import Agents, World
 from idm_env.types import State
 from idm_env.validation import one_of, whole
-
-if TYPE_CHECKING:
-    from idm_env.tasks.base import Task
 
 SCALINGS = ("scaled", "raw")
 MOST_AHEAD = 100
 """Most vehicles, the agent among them, whose features one agent may observe."""
 
 
-class View:
+class AgentView:
     """The traffic as every agent sees it, or as the vehicle does that is ``ahead`` vehicles ahead of it.
 
     Everything that is asked for has shape ``(…, agents)`` and is 0 for agents that are not on the road.
     """
 
-    def __init__(self, task: Task, world: World, ahead: int = 0) -> None:
+    def __init__(self, task: Agents, world: World, ahead: int = 0) -> None:
         self.task, self.world, self.ahead = task, world, ahead
 
     @property
@@ -72,7 +69,7 @@ class View:
         return found
 
 
-Read = Callable[[View], Tensor]
+Read = Callable[[AgentView], Tensor]
 """What an agent observes of a view, in SI units, shape ``(…, agents)``; differentiable where gradients are to flow."""
 
 
@@ -106,62 +103,62 @@ class Feature:
             )
 
 
-def speed(view: View) -> Tensor:
+def speed(view: AgentView) -> Tensor:
     """Return v (m/s)."""
     return view.own(view.state.speed)
 
 
-def accel(view: View) -> Tensor:
+def accel(view: AgentView) -> Tensor:
     """Return A (m/s²), that of the last step."""
     return view.own(view.state.accel)
 
 
-def position(view: View) -> Tensor:
+def position(view: AgentView) -> Tensor:
     """Return x (m), counted on over laps of a ring."""
     return view.own(view.state.position)
 
 
-def gap(view: View) -> Tensor:
+def gap(view: AgentView) -> Tensor:
     """Return s (m), between bumpers."""
     return view.own(view.state.gap)
 
 
-def headway(view: View) -> Tensor:
+def headway(view: AgentView) -> Tensor:
     """Return ``s + l_lead`` (m), from front bumper to front bumper."""
     return view.own(view.state.gap) + view.leader(view.state.length)
 
 
-def time_gap(view: View) -> Tensor:
+def time_gap(view: AgentView) -> Tensor:
     """Return ``s/max(v, 1 m/s)`` (s)."""
     return metrics.time_gap(view.own(view.state.gap), view.own(view.state.speed))
 
 
-def lead_speed(view: View) -> Tensor:
+def lead_speed(view: AgentView) -> Tensor:
     """Return v_lead (m/s)."""
     return view.leader(view.state.speed)
 
 
-def relative_speed(view: View) -> Tensor:
+def relative_speed(view: AgentView) -> Tensor:
     """Return ``v_lead − v`` (m/s)."""
     return view.leader(view.state.speed) - view.own(view.state.speed)
 
 
-def closing_speed(view: View) -> Tensor:
+def closing_speed(view: AgentView) -> Tensor:
     """Return ``v − v_lead`` (m/s)."""
     return view.own(view.state.speed) - view.leader(view.state.speed)
 
 
-def leader_accel(view: View) -> Tensor:
+def leader_accel(view: AgentView) -> Tensor:
     """Return A_lead (m/s²), 0 without a leader."""
     return view.leader(view.state.accel, nobody=0.0)
 
 
-def mean_speed(view: View) -> Tensor:
+def mean_speed(view: AgentView) -> Tensor:
     """Return the mean speed of all vehicles on the road (m/s)."""
     return view.mean(view.state.speed)
 
 
-def lane(view: View) -> Tensor:
+def lane(view: AgentView) -> Tensor:
     """Return the lane, counted from 0 at the right; 0 on a road that has one."""
     links = view.state.links
     return view.own(torch.zeros_like(view.state.speed) if links is None else links.lane.to(view.state.speed.dtype))
@@ -192,7 +189,7 @@ def feature(name: str, scale: float, low: float, high: float) -> Feature:
 
 
 @dataclass(frozen=True)
-class Observed:
+class ObservedFeature:
     """A feature as an agent observes it: its own, or that of the vehicle that is ``ahead`` vehicles ahead of it."""
 
     feature: Feature
@@ -204,7 +201,7 @@ class Observed:
         return f"{self.feature.name}_ahead_{self.ahead}" if self.ahead else self.feature.name
 
 
-def chosen(observation: Any, read: Callable[[Any, str], Any]) -> tuple[str, tuple[Observed, ...] | None]:
+def chosen(observation: Any, read: Callable[[Any, str], Any]) -> tuple[str, tuple[ObservedFeature, ...] | None]:
     """Return the scaling that ``observation`` asks for, and what is observed; None is the task's own.
 
     Args:
@@ -231,4 +228,4 @@ def chosen(observation: Any, read: Callable[[Any, str], Any]) -> tuple[str, tupl
     if len(set(names)) < len(names):
         raise ValueError(f"observation.features = {names} must name none twice.")
     vehicles = whole("observation.vehicles", observation.get("vehicles", 1), 1, MOST_AHEAD)
-    return scaling, tuple(Observed(each, k) for k in range(vehicles) for each in features)
+    return scaling, tuple(ObservedFeature(each, k) for k in range(vehicles) for each in features)

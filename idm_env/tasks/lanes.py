@@ -15,7 +15,7 @@ from idm_env.effects import Control, Effect, LaneCommand
 from idm_env.roads import Lanes
 from idm_env.tasks.base import Pay, Task, World
 from idm_env.tasks.checks import Range
-from idm_env.tasks.features import Feature, View, feature
+from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.random import Draw
 from idm_env.types import Inputs, Params, State
 
@@ -209,6 +209,6 @@ class LanesTask(Task):
         return tuple(told)
 
 
-def _nearby(what: int, k: int, view: View) -> Tensor:
+def _nearby(what: int, k: int, view: AgentView) -> Tensor:
     """Return one of what ``LanesTask.nearest`` says of the k-th vehicle, ``(…, agents)``."""
     return view.nearby[what][..., k]

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Control, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
-from idm_env.metrics import fuel
+from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
 from idm_env.roads import Lanes, lane_drop, on_ramp
 from idm_env.tasks.base import Pay, World
 from idm_env.tasks.checks import Range, at_least
-from idm_env.tasks.features import Feature, View, feature
+from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.types import Params, State, Trips
@@ -29,25 +29,23 @@ _SIGHT = 500.0
 """How far ahead an agent sees that a lane ends (m)."""
 _STANDS = 0.5
 """Below this speed (m/s) a vehicle stands."""
-_CO2 = 2.31
-"""CO₂ of a millilitre of petrol (g)."""
 
 
-def _present(view: View) -> Tensor:
+def _present(view: AgentView) -> Tensor:
     """Return 1 for agents on the road, 0 for others."""
     present = view.state.present
     assert present is not None
     return view.own(present)
 
 
-def _ends(view: View) -> Tensor:
+def _ends(view: AgentView) -> Tensor:
     """Return how far the lane goes on (m), as far as it is seen."""
     state, road = view.state, view.task.road
     assert state.links is not None and isinstance(road, Lanes)
     return view.own((road.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT))
 
 
-def _next(view: View) -> tuple[Tensor, Tensor]:
+def _next(view: AgentView) -> tuple[Tensor, Tensor]:
     """Return how far it is to the next end of any lane (m), as far as it is seen, and how many lanes to the left."""
     state, task, road = view.state, view.task, view.task.road
     assert state.links is not None and isinstance(road, Lanes)
@@ -61,12 +59,12 @@ def _next(view: View) -> tuple[Tensor, Tensor]:
     return task.there(state, next_end), task.there(state, beside)
 
 
-def _next_end(view: View) -> Tensor:
+def _next_end(view: AgentView) -> Tensor:
     """Return how far it is to the next end of any lane (m)."""
     return _next(view)[0]
 
 
-def _next_left(view: View) -> Tensor:
+def _next_left(view: AgentView) -> Tensor:
     """Return how many lanes to the left the next end is."""
     return _next(view)[1]
 
@@ -231,7 +229,7 @@ class OpenLanesTask(LanesTask):
             "queued": found.queued, "inside": found.inside, "outflow": found.left,
             "ramp": (torch.where(from_ramp, state.trips.entered, 0) - still.long()).sum(-1),
             "standing": (there & (state.speed < _STANDS)).sum(-1),
-            "co2": _CO2 * torch.where(there, fuel(state.speed, state.accel), 0.0).sum(-1),
+            "co2": CO2 * torch.where(there, fuel(state.speed, state.accel), 0.0).sum(-1),
         }  # fmt: skip
         own = {**super().told(world), "present": self.pick(there)}
         return own | {n: x.unsqueeze(-1).expand(-1, len(self.agents)).contiguous() for n, x in every.items()}

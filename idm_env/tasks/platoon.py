@@ -18,7 +18,7 @@ from idm_env.roads import Lane, Road
 from idm_env.tasks.base import Pay, Task, World
 from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
-from idm_env.tasks.features import FEATURES, Feature, View, feature, speed
+from idm_env.tasks.features import FEATURES, AgentView, Feature, feature, speed
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import head, queue
 from idm_env.types import Inputs, Params
@@ -149,6 +149,6 @@ class PlatoonTask(Task):
         return floored(reward, _KNEE, _LOWEST)
 
 
-def _deviation(mean: float, view: View) -> Tensor:
+def _deviation(mean: float, view: AgentView) -> Tensor:
     """Return ``v − v̄`` (m/s)."""
     return speed(view) - mean

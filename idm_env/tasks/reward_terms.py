@@ -9,36 +9,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.tasks.features import View
-from idm_env.tasks.types import Pay, World
+from idm_env.tasks.features import AgentView
+from idm_env.tasks.types import Agents, Pay, World
 from idm_env.validation import finite
-
-if TYPE_CHECKING:
-    from idm_env.tasks.base import Task
-
-_CO2 = 2.348
-"""Grams of CO₂ a millilitre of gasoline: 8887 g a gallon (US EPA, 40 CFR 600.113-12)."""
 
 
 @dataclass(frozen=True)
 class Transition:
     """One step: what was commanded (m/s², ``(…, agents)``, as given), and the worlds before and after it."""
 
-    task: Task
+    task: Agents
     before: World
     command: Tensor
     after: World
 
     @property
-    def view(self) -> View:
+    def view(self) -> AgentView:
         """The traffic after the step as the agents see it."""
-        return View(self.task, self.after)
+        return AgentView(self.task, self.after)
 
 
 @dataclass(frozen=True)
@@ -102,8 +96,8 @@ def fuel(step: Transition) -> Tensor:
 
 
 def co2(step: Transition) -> Tensor:
-    """Return the mean emission of CO₂ of all vehicles on the road (g/s): 2.348 g a mL of ``fuel``."""
-    return _CO2 * fuel(step)
+    """Return the mean emission of CO₂ of all vehicles on the road (g/s): of the gasoline in ``fuel``."""
+    return metrics.CO2 * fuel(step)
 
 
 def lag(step: Transition) -> Tensor:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
+from idm_env.roads import Road
 from idm_env.types import Inputs, Params, State
 
 Advance = Callable[[State, Inputs, Params], State]
@@ -24,6 +25,31 @@ class World(NamedTuple):
 
     state: State
     episode: Mapping[str, Tensor]
+
+
+class Agents(Protocol):
+    """What a feature and a reward term may ask of a task: whose vehicles agents control, and on which road."""
+
+    @property
+    def road(self) -> Road:
+        """The road."""
+
+    @property
+    def simulator(self) -> Any:
+        """The simulator, with its ``dt`` (s)."""
+
+    @property
+    def agents(self) -> tuple[int, ...]:
+        """Indices of the controlled vehicles."""
+
+    def pick(self, x: Tensor) -> Tensor:
+        """Return what belongs to the controlled vehicles, ``(…, agents)``."""
+
+    def pick_leader(self, state: State, x: Tensor, nobody: float | None = None) -> Tensor:
+        """Return what belongs to their leaders, where there is none their own or ``nobody``."""
+
+    def there(self, state: State, x: Tensor) -> Tensor:
+        """Return ``x``, 0 for agents that are not on the road."""
 
 
 class Ended(NamedTuple):
