@@ -14,7 +14,7 @@ _ACCELERATION = (0.07224, 9.681e-2, 1.075e-3)
 _GASOLINE = 0.745
 """Density (g/mL), about the middle of what EN 228 allows."""
 CO2 = 2.31
-"""CO₂ of gasoline (g/mL): 69.3 g/MJ and 44.3 MJ/kg (IPCC 2006 Guidelines, volume 2, tables 1.2 and 1.4) at 0.752 kg/L."""
+"""CO₂ of gasoline (g/mL): 69.3 g/MJ, 44.3 MJ/kg (IPCC 2006 Guidelines, volume 2, tables 1.2, 1.4), 0.752 kg/L."""
 _STANDING = (0.1, 0.01)
 """Speed (m/s) and acceleration (m/s²) below which an engine idles in the CIRCLES model."""
 

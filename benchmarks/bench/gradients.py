@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -81,10 +82,10 @@ def workloads() -> list[tuple[str, Callable[[], dict[str, Case]]]]:
     """Return what is measured: rings beside JAX, lanes, and a ring whose drivers are others."""
     found: list[tuple[str, Callable[[], dict[str, Case]]]] = []
     for count, steps in COUNTS:
-        found.append((f"ring, {count} × {steps}", lambda count=count, steps=steps: _beside_jax(count, steps)))
+        found.append((f"ring, {count} × {steps}", partial(_beside_jax, count, steps)))
     for task in ("highway", "merge"):
         for count, steps in ((1, 100), (64, 50), (1024, 5)):
-            found.append((f"{task}, {count} × {steps}", lambda t=task, c=count, s=steps: of({"task": t}, c, s, False)))
+            found.append((f"{task}, {count} × {steps}", partial(of, {"task": task}, count, steps, False)))
     found.append(("ring of other drivers, 64 × 200", _others))
     return found
 
