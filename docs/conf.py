@@ -30,6 +30,7 @@ exclude_patterns = [
     "gallery/*.py",
     "gallery/*.md5",
     "gallery/*.json",
+    "sg_execution_times*",
     "**/sg_execution_times*",
 ]
 highlight_language = "none"
