@@ -376,7 +376,8 @@ def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: i
     dt = env.task.step_time
     motion = Motion(*(torch.cat([getattr(s, name) for s in states]) for name in Motion._fields))
     if states[0].links is None:
-        ring = float((states[0].gap + states[0].length).sum()) if env.task.name == "ring" else None
+        lap = env.task.road.lap(states[0])
+        ring = None if lap is None else float(lap)
         drawn = [rollout_panel(motion, dt=dt, ring_length=ring, marked=env.task.agents)]
     else:
         lane = torch.cat([s.links.lane for s in states if s.links is not None])

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from idm_env.roads import Ring, Road
+from idm_env.roads import Road
 from idm_env.types import FAR, Links, State
 
 _MOST = 1e9
@@ -129,7 +129,7 @@ def _linked(state: State, road: Road) -> None:
 
 def _spaced(state: State, road: Road) -> None:
     """Refuse gaps that are not those of the positions; vehicles that touch are left to the task."""
-    around = (state.gap + state.length).sum(-1) if isinstance(road, Ring) else None
+    around = road.lap(state)
     view = road.view(state)
     led = view.leader_present(state.present, state.speed) > 0
     gap = torch.where(led, view.gaps(state.position, state.length, around), FAR)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from idm_env.roads.base import Road
+from idm_env.types import State
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,10 @@ class Ring(Road):
     def back(self, x: Tensor) -> Tensor:
         """Return the follower's x."""
         return torch.cat((x[..., 1:], x[..., :1]), dim=-1)
+
+    def lap(self, state: State) -> Tensor | None:
+        """Return ``Σ (gap + length)`` (m): what rings were made with, whichever each of them is."""
+        return (state.gap + state.length).sum(-1)
 
     def led(self, x: Tensor) -> Tensor:
         """Return 1 for all: on a ring everybody has a leader, be it himself."""
