@@ -116,12 +116,12 @@ def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[Wo
                     yield before, action, world
                 continue
             inputs = task.wishes(task.inputs(world, command, None, live), action, live)
-            given = {name: _repeated(x, count) for name, x in inputs.items()}
+            repeated: dict[str, Any] = {name: _repeated(x, count) for name, x in inputs.items()}
             driven = task.driven(world.episode, params)
-            state, kept = task.simulator.rollout(world.state, given, driven, count)
+            state, kept = task.simulator.rollout(world.state, repeated, driven, count)
             for t in range(count):
-                now = {name: x[t] for name, x in kept._asdict().items()}
-                world = before._replace(state=state._replace(**now, step=before.state.step + t + 1))
+                motion: dict[str, Any] = {name: x[t] for name, x in kept._asdict().items()}
+                world = before._replace(state=state._replace(**motion, step=before.state.step + t + 1))
                 yield before, action, world
             world = before._replace(state=state)
 

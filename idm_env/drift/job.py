@@ -119,9 +119,9 @@ def sentence(told: Told) -> str:
     size = next(p.unit for e in DRIFTS if e.name == told.one_of[0] for p in e.parameters if p.name == "sigma")
     for key, symbol, unit in (("sigma", "sigma", "" if size == "1" else f" {size}"), ("memory_time", "tau", " s")):
         row = rows[f"{told.one_of[0]}.{key}"]
-        known = row["high"] < UNKNOWN * row["estimate"]
-        told_as = f"{row['low']:.3g} to {row['high']:.3g}" if known else "these data do not tell it"
-        told_of.append(f"{symbol} {row['estimate']:.3g}{unit} ({told_as})")
+        estimate, low, high = (float(row[end]) for end in ("estimate", "low", "high"))
+        told_as = f"{low:.3g} to {high:.3g}" if high < UNKNOWN * estimate else "these data do not tell it"
+        told_of.append(f"{symbol} {estimate:.3g}{unit} ({told_as})")
     others = ", ".join(titles[n] for n in told.one_of[1:])
     apart = f" Not told apart from: {others}." if others else ""
     return f"Drivers drift: {titles[told.one_of[0]]}, {', '.join(told_of)}.{apart}"
