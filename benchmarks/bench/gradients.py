@@ -85,7 +85,8 @@ def workloads() -> list[tuple[str, Callable[[], dict[str, Case]]]]:
         found.append((f"ring, {count} × {steps}", partial(_beside_jax, count, steps)))
     for task in ("highway", "merge"):
         for count, steps in ((1, 100), (64, 50), (1024, 5)):
-            found.append((f"{task}, {count} × {steps}", partial(of, {"task": task}, count, steps, False)))
+            lanes = {"task": task, "hold": 0.1}  # a step of Δt
+            found.append((f"{task}, {count} × {steps}", partial(of, lanes, count, steps, False)))
     found.append(("ring of other drivers, 64 × 200", _others))
     return found
 
