@@ -245,11 +245,13 @@ def _limits(strengths: Mapping[str, Strength]) -> str:
     """Say of the effects that these data know best what is excluded, and what the least visible ones would hide."""
     if not strengths:
         return ""
-    best = sorted(strengths, key=lambda name: strengths[name].beyond / strengths[name].typical)[:SHOWN]
+    agreed = [name for name, s in strengths.items() if s.is_agreed]
+    best = sorted(agreed, key=lambda name: strengths[name].beyond / strengths[name].typical)[:SHOWN]
     worst = sorted(strengths, key=lambda name: -strengths[name].seen / strengths[name].typical)[:SHOWN]
     known = ", ".join(f"no {plain(n)} beyond {_strength(strengths[n], strengths[n].beyond)}" for n in best)
     hidden = ", ".join(f"a {plain(n)} {_below(_strength(strengths[n], strengths[n].seen))}" for n in worst)
-    return f"; there is {known} (95 %), and {hidden} would not have been seen"
+    known = f"there is {known} (95 %), and " if known else ""
+    return f"; {known}{hidden} would not have been seen"
 
 
 def _below(strength: str) -> str:
@@ -271,14 +273,14 @@ def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:
         return []
     told = [
         f"{plain(name)} beyond {number(s.low, 2)} … {amount(float(f'{s.high:.2g}'), s.parameter.unit)}"
-        for name, s in strengths.items()
-    ]
+        for name, s in strengths.items() if s.is_agreed
+    ]  # fmt: skip
     unseen = [
         f"{plain(name)} {_below(amount(float(f'{s.seen:.2g}'), s.parameter.unit) if math.isfinite(s.seen) else '')}"
         for name, s in strengths.items()
     ]
     return [
-        f"Excluded (95 %): {'; '.join(told)}.",
+        *([f"Excluded (95 %): {'; '.join(told)}."] if told else []),
         f"Would have been missed one time in five or more: {'; '.join(unseen)}, from what is without the effect.",
     ]
 

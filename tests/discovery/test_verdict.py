@@ -271,6 +271,22 @@ def test_none_says_what_is_excluded_and_what_would_not_have_been_seen() -> None:
     assert "drag of whatever strength; response lag below 0.2 s" in words.excluded(Verdict.NONE, strengths)[1]
 
 
+def test_nothing_is_excluded_by_an_interval_that_power_contradicts() -> None:
+    """A few windows near standstill made "no bias beyond 0.0026 m" of data in which 4.9 m would not have been seen."""
+    bias, lag = (ALL[n]().parameters[0] for n in ("gap_bias", "lag"))
+    strengths = {
+        "gap_bias": Strength(bias, 0.0, -0.0026, 0.0026, 4.9, 1.0),
+        "lag": Strength(lag, 0.01, -0.08, 0.12, 0.2, 0.5),
+    }
+    told = words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {}, strengths=strengths)
+    assert "there is no response lag beyond 0.12 s (95 %), and" in told and "0.0026" not in told
+    excluded, missed = words.excluded(Verdict.NONE, strengths)
+    assert "lag" in excluded and "bias" not in excluded and "below 4.9 m" in missed
+    del strengths["lag"]
+    told = words.headline(Verdict.NONE, [], Refusal(Reason.NO_GAIN), "", {}, strengths=strengths)
+    assert "; a bias" in told and "beyond" not in told and len(words.excluded(Verdict.NONE, strengths)) == 1
+
+
 def test_ceilings_are_told_with_the_smooth_function_and_the_sensors(lag: Discovery) -> None:
     """A hidden lag of 0.5 s is much of the error of IDM's predictions, so a smooth function takes much of it, too."""
     told = lag.report["ceilings"]
