@@ -287,7 +287,7 @@ class Viewer:
             self._pygame.draw.line(canvas, colour(x / width * fastest, fastest), (left + x, top), (left + x, top + 8))
         self._pygame.draw.rect(canvas, _MARK, (left + width + 110, top - 1, 20, 10))
         canvas.blit(self._small.render(f"0 to {fastest:.0f} m/s", True, _INK), (left + width + 8, top - 3))
-        told = "agent" + ("" if wider < 1.2 else f"      widths are drawn {wider:.0f} times as large")
+        told = "agent" + ("" if wider < 1.5 else f"      widths are drawn {wider:.0f} times as large")
         canvas.blit(self._small.render(told, True, _INK), (left + width + 136, top - 3))
 
     def _display(self, canvas: Any) -> None:
