@@ -120,7 +120,7 @@ def evaluate_ring(
 ) -> dict[str, Any]:
     """Return the figures of a policy on ``judged_rings``, from a take-over after ``warmup`` steps on."""
     start = judged_rings(environment, lengths, warmup, draws)
-    return judge_ring(start, drive(start, act, STEPS // start.task.held))
+    return judge_ring(start, drive(start, act, STEPS // task_of(environment).held))
 
 
 def solved_at(history: Sequence[Mapping[str, Any]]) -> int | None:

@@ -262,8 +262,8 @@ def break_losses(monkeypatch, update: int) -> None:
 
 def break_rewards(monkeypatch) -> None:
     """Make all rewards NaN."""
-    plain = RingTask.reward
-    monkeypatch.setattr(RingTask, "reward", lambda self, *given: plain(self, *given) * torch.nan)
+    plain = RingTask.rewards
+    monkeypatch.setattr(RingTask, "rewards", lambda self, *given: plain(self, *given) * torch.nan)
 
 
 @pytest.mark.parametrize("name", AGENTS)
@@ -493,8 +493,8 @@ def test_the_gain_values_last_scenes_and_cuts_gradients_at_resets(ring):
             pushes.append(torch.full((2, 1), 0.2, requires_grad=True))
             return pushes[-1]
 
-    plain = env.batch.task.reward
-    object.__setattr__(env.batch.task, "reward", lambda *x: 0.0 * plain(*x))
+    plain = env.batch.task.rewards
+    object.__setattr__(env.batch.task, "rewards", lambda *x: 0.0 * plain(*x))
     observation, window = shac.roll(env, Push(), Ends(), env.task.observe(env.batch.world).flatten(1), a)
     assert window.ended[:, 0].tolist() == [t == 5 for t in range(8)]
     expected = 0.9**6 * window.following[5] + 0.9**2 * window.following[7]
