@@ -282,7 +282,7 @@ def test_with_its_extra_the_command_runs_where_there_is_no_checkout(wheel: zipfi
     (tmp_path / "my.csv").write_text("\n".join(["vehicle_id,time_s,position_m,lane", *rows]) + "\n")
     call(command, "plot", "my.csv", "--html", "--out", "drawn.png", at=tmp_path)
     assert 'id="diagram"' in (tmp_path / "drawn.html").read_text()
-    for typed, at, wanted in (("idm-env fi", "1", ["fit", "filter"]), ("idm-env fit --held", "2", ["--held-out"])):
+    for typed, at, wanted in (("idm-env fi", "1", ["filter", "fit"]), ("idm-env fit --held", "2", ["--held-out"])):
         asked = {"_IDM_ENV_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": at}
         assert call(command, at=tmp_path, **asked).stdout.split() == wanted
     refused = call(command, "bench", at=tmp_path, code=1)

@@ -56,4 +56,4 @@ def test_long_clean_records_of_unlike_drivers_speak_for_themselves() -> None:
 
 def test_the_weight_is_told() -> None:
     told = words.weight({"alike_s": 50.0, "tried_s": (5.0, 50.0), "gap_rmse_m": (5.04, 3.82)})
-    assert "errors of 50 s count as one (5 s 5.04 m, 50 s 3.82 m)" in told
+    assert "errors within 50 s count as one (tried: 5 s 5.04 m, 50 s 3.82 m)" in told
