@@ -179,11 +179,10 @@ def returns(tasks: list[str], out: Path) -> None:
     for task in tasks:
         begin = time.process_time()
         env = gym.make("DiffIDM-v0", task=task)
-        names, limit = env.unwrapped.task.features.names, env.unwrapped.task.command_limits[1]
-        shape = env.action_space.shape
+        limit, shape = env.unwrapped.task.command_limits[1], env.action_space.shape
 
-        def of(rules: torch.Tensor, seeds: Sequence[int], task=task, names=names, limit=limit) -> torch.Tensor:
-            act = rule(rules.repeat_interleave(len(seeds), 0), names, limit)
+        def of(rules: torch.Tensor, seeds: Sequence[int], task=task, limit=limit) -> torch.Tensor:
+            act = rule(rules.repeat_interleave(len(seeds), 0), limit)
             return train_apg.returns(task, act, [*seeds] * len(rules)).view(len(rules), -1)
 
         best = searched(of)
@@ -223,33 +222,17 @@ def searched(of: Callable[[torch.Tensor, Sequence[int]], torch.Tensor]) -> torch
     return best[int(of(best, range(200, 210)).mean(1).argmax())]
 
 
-def rule(values: torch.Tensor, names: Sequence[str], limit: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return actions of IDM's formula with a row of values per environment, times a share; observations are raw."""
+def rule(values: torch.Tensor, limit: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return actions of IDM's formula with a row of values per environment, times a share; as in ``train_apg``."""
     v0, headway, s0, a, b, share = values.unsqueeze(1).unbind(-1)
-    at = {name: i for i, name in enumerate(names)}
 
     def act(seen: torch.Tensor) -> torch.Tensor:
-        seen = seen.reshape(len(values), -1, len(names))
-        speed = seen[..., at["speed"]]
-        if "ahead_0" in at:  # the nearest ahead on the own lane
-            count = sum(name.startswith("ahead_") for name in names)
-            column = {k: torch.stack([seen[..., at[f"{k}_{i}"]] for i in range(count)], -1) for k in NEIGHBOUR}
-            mine = (column["there"] > 0.5) & (column["left"].abs() < 0.5) & (column["ahead"] > 0.0)
-            far = torch.where(mine, column["ahead"], 1e4)
-            distance, which = far.min(-1)
-            gap, closing = distance - 5.0, -column["speed"].gather(-1, which.unsqueeze(-1)).squeeze(-1)
-            closing = torch.where(distance < 1e4, closing, 0.0)
-        else:
-            gap = seen[..., at["gap"]] if "gap" in at else seen[..., at["headway"]] - 5.0
-            closing = speed - seen[..., at["lead_speed"]] if "lead_speed" in at else -seen[..., at["relative_speed"]]
-        wish = s0 + (speed * headway + speed * closing / (2.0 * (a * b).sqrt())).clamp_min(0.0)
+        speed, lead, gap = seen.reshape(len(values), -1, 3).unbind(-1)
+        wish = s0 + (speed * headway + speed * (speed - lead) / (2.0 * (a * b).sqrt())).clamp_min(0.0)
         accel = share * a * (1.0 - (speed / v0) ** 4 - (wish / gap.clamp_min(0.5)) ** 2)
         return (accel / limit).clamp(-1.0, 1.0)
 
     return act
-
-
-NEIGHBOUR = ("there", "ahead", "left", "speed")
 
 
 def main() -> None:

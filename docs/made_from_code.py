@@ -186,18 +186,11 @@ def _returns(name: str) -> list[str]:
     """Return the table of returns of a task, as ``benchmarks.environments --returns`` measured them."""
     rows = [line.split(",") for line in (ROOT / "docs" / "returns.csv").read_text(encoding="utf-8").splitlines()[1:]]
     mine = [row[1:] for row in rows if row[0] == name]
-    if all(row[0] != "best agent" for row in mine):
-        mine.append(["best agent", "–", "–", "–"])
-    trained = (
-        f"The agent is `python examples/train_apg.py {name} 0`. "
-        if len(mine) == 4 and mine[-1][1] != "–"
-        else "No agent has been trained on the task as it is by default. "
-    )
     return [
         "## Returns", "",
         "| 5 episodes, seeds 0 to 4 | mean | lowest | highest |", "| --- | --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in mine), "",
-        f"{trained}IDM drives without commands, which costs nothing. The best rule is IDM's formula as commands, with "
+        f"The agent is `python examples/train_apg.py {name} 0`. IDM drives without commands, which costs nothing. The best rule is IDM's formula as commands, with "
         "the parameters that a search found on other seeds. `python -m benchmarks.environments --returns`, "
         "2026-11-23, 2 cores, no GPU.", "",
     ]  # fmt: skip
