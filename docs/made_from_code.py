@@ -190,9 +190,10 @@ def _returns(name: str) -> list[str]:
         "## Returns", "",
         "| 5 episodes, seeds 0 to 4 | mean | lowest | highest |", "| --- | --- | --- | --- |",
         *(f"| {' | '.join(row)} |" for row in mine), "",
-        f"The agent is `python examples/train_apg.py {name} 0`. IDM drives without commands, which costs nothing. The best rule is IDM's formula as commands, with "
-        "the parameters that a search found on other seeds. `python -m benchmarks.environments --returns`, "
-        "2026-11-23, 2 cores, no GPU.", "",
+        f"The agent is `python examples/train_apg.py {name} 0`, one seed. IDM drives without commands, which costs "
+        "nothing. The best rule is IDM's formula as commands, with the parameters that a search found on other seeds; "
+        "the agent begins there. Both see speed, the leader's and the gap. "
+        "`python -m benchmarks.environments --returns`, 2026-11-23, 2 cores, no GPU.", "",
     ]  # fmt: skip
 
 
