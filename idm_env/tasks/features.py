@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -33,6 +32,7 @@ class AgentView:
 
     def __init__(self, task: Agents, world: World, ahead: int = 0) -> None:
         self.task, self.world, self.ahead = task, world, ahead
+        self._known: dict[Any, tuple[Tensor, ...]] = {}
 
     @property
     def state(self) -> State:
@@ -62,11 +62,11 @@ class AgentView:
             x = road.ahead(x)
         return x
 
-    @cached_property
-    def nearby(self) -> tuple[Tensor, ...]:
-        """What ``LanesTask.nearest`` says of the vehicles nearest to each agent."""
-        found: tuple[Tensor, ...] = self.task.nearest(self.state)  # type: ignore[attr-defined]
-        return found
+    def once(self, of: Callable[[AgentView], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+        """Return what several features read a part of: worked out for the first of them."""
+        if of not in self._known:
+            self._known[of] = of(self)
+        return self._known[of]
 
 
 Read = Callable[[AgentView], Tensor]
@@ -125,12 +125,12 @@ def gap(view: AgentView) -> Tensor:
 
 def headway(view: AgentView) -> Tensor:
     """Return ``s + l_lead`` (m), from front bumper to front bumper."""
-    return view.own(view.state.gap) + view.leader(view.state.length)
+    return gap(view) + view.leader(view.state.length)
 
 
 def time_gap(view: AgentView) -> Tensor:
     """Return ``s/max(v, 1 m/s)`` (s)."""
-    return metrics.time_gap(view.own(view.state.gap), view.own(view.state.speed))
+    return metrics.time_gap(gap(view), speed(view))
 
 
 def lead_speed(view: AgentView) -> Tensor:
@@ -140,12 +140,12 @@ def lead_speed(view: AgentView) -> Tensor:
 
 def relative_speed(view: AgentView) -> Tensor:
     """Return ``v_lead − v`` (m/s)."""
-    return view.leader(view.state.speed) - view.own(view.state.speed)
+    return lead_speed(view) - speed(view)
 
 
 def closing_speed(view: AgentView) -> Tensor:
     """Return ``v − v_lead`` (m/s)."""
-    return view.own(view.state.speed) - view.leader(view.state.speed)
+    return speed(view) - lead_speed(view)
 
 
 def leader_accel(view: AgentView) -> Tensor:

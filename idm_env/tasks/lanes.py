@@ -211,4 +211,9 @@ class LanesTask(Task):
 
 def _nearby(what: int, k: int, view: AgentView) -> Tensor:
     """Return one of what ``LanesTask.nearest`` says of the k-th vehicle, ``(…, agents)``."""
-    return view.nearby[what][..., k]
+    return view.once(_nearest)[what][..., k]
+
+
+def _nearest(view: AgentView) -> tuple[Tensor, ...]:
+    assert isinstance(view.task, LanesTask)
+    return view.task.nearest(view.state)

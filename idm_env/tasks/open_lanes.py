@@ -61,12 +61,12 @@ def _next(view: AgentView) -> tuple[Tensor, Tensor]:
 
 def _next_end(view: AgentView) -> Tensor:
     """Return how far it is to the next end of any lane (m)."""
-    return _next(view)[0]
+    return view.once(_next)[0]
 
 
 def _next_left(view: AgentView) -> Tensor:
     """Return how many lanes to the left the next end is."""
-    return _next(view)[1]
+    return view.once(_next)[1]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
+from idm_env.tasks import features
 from idm_env.tasks.features import AgentView
 from idm_env.tasks.types import Agents, Pay, World
 from idm_env.validation import finite
@@ -65,12 +66,12 @@ class RewardTerm:
 
 def speed(step: Transition) -> Tensor:
     """Return the mean speed of all vehicles on the road (m/s)."""
-    return step.view.mean(step.after.state.speed)
+    return features.mean_speed(step.view)
 
 
 def own_speed(step: Transition) -> Tensor:
     """Return v (m/s)."""
-    return step.view.own(step.after.state.speed)
+    return features.speed(step.view)
 
 
 def effort(step: Transition) -> Tensor:
@@ -102,13 +103,12 @@ def co2(step: Transition) -> Tensor:
 
 def lag(step: Transition) -> Tensor:
     """Return ``v_lead − v`` (m/s): over an episode the ground that an agent has lost."""
-    return step.view.leader(step.after.state.speed) - step.view.own(step.after.state.speed)
+    return features.relative_speed(step.view)
 
 
 def tailgating(step: Transition) -> Tensor:
     """Return ``max(0, 1 − time gap/1 s)``."""
-    state = step.after.state
-    return torch.relu(1.0 - metrics.time_gap(step.view.own(state.gap), step.view.own(state.speed)))
+    return torch.relu(1.0 - features.time_gap(step.view))
 
 
 REWARD_TERMS: dict[str, RewardTerm] = {
@@ -141,10 +141,9 @@ class Weighted:
 
     def __call__(self, step: Transition) -> Tensor:
         """Return the reward of a step, ``(…, agents)``; 0 for agents that are not on the road."""
-        parts = [weight * term.of(step).clamp(term.low, term.high) for term, weight in self.terms]
         total = torch.zeros_like(step.command)
-        for part in parts:
-            total = total + part
+        for term, weight in self.terms:
+            total = total + weight * term.of(step).clamp(term.low, term.high)
         return step.task.there(step.after.state, total)
 
 
