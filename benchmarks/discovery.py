@@ -34,6 +34,7 @@ TRUE = {
     "brake_light": ("gain", 1.0), "asymmetry": ("strength", 1.0), "power_limit": ("power", 1.0),
     "drag": ("coefficient", 1.0), "speed_dependent_gap": ("extra_gap", 1.0), "memory": ("strength", 1.0),
     "speed_time_gap": ("slope", 1.0), "set_point_asymmetry": ("strength", 1.0), "relaxation": ("strength", 1.0),
+    "gap_stiffness": ("stiffness", 1.0),
     "follower": ("gain", 1.0), "dead_zone": ("threshold", 1.0), "action_point": ("threshold", 1.0),
     "speed_zone": ("factor", 1.0), "regime_shift": ("strength", 1.0), "lateral": ("gain", 1.0),
     "curve_speed": ("lateral_accel", 1.0),
@@ -146,12 +147,12 @@ def outside(base: type, kind: str) -> type:
 
 
 def oracle(found: Any, truth: Any) -> float | None:
-    """Return the lockbox gap RMSE (m) of the model that has the true effects at their true strengths.
+    """Return the gap RMSE (m) of the model that has the true effects at their true strengths, every run held out once.
 
     The drivers' own parameters are fitted as they are for the tool's models.
     """
     from idm_env.data import hidden
-    from idm_env.discovery import judge
+    from idm_env.discovery import crossed
     from idm_env.discovery import model as terms
 
     model, values = terms.Model(), []
@@ -182,9 +183,9 @@ def oracle(found: Any, truth: Any) -> float | None:
             times = {"memory": [hidden.MEMORY_TIME_S], "relaxation": [hidden.RELAXATION_TIME_S]}
             values += [TRUE[name][1] * strength, *times.get(name, [])]
         model = model.adding(term)
-    kept = found.records.of_runs(found.report["error"]["held_out_runs"])
-    prior = found.final.prior if found.report["found"] else found.null.prior
-    return float(judge.judge(kept, model, np.array(values), prior, None, True).summary()["gap_rmse_m"])
+    fold = crossed.folds_of(found.records.runs, (), 0)
+    each = np.tile(values, (1 + int(fold.max()), 1))
+    return float(crossed.crossed(found.records, model, each, fold, found.task.noise).summary()["gap_rmse_m"])
 
 
 def measure(job: Job, on_progress: object = None) -> dict[str, Any]:

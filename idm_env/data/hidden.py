@@ -56,6 +56,7 @@ EFFECTS: dict[str, HiddenStrength] = {
     "speed_time_gap": HiddenStrength("k", -0.4, -0.2),
     "set_point_asymmetry": HiddenStrength("k", 0.2, 0.1),
     "relaxation": HiddenStrength("beta", 0.7, 0.35),
+    "gap_stiffness": HiddenStrength("w", 0.5, 0.7),
     "speed_profile": HiddenStrength("depth", 0.6, 0.4),
     "curve_speed": HiddenStrength("mps2", 2.0, 3.0),
 }
@@ -126,6 +127,9 @@ def wanted(
     desired = _desired_gap(speed, closing, time_gap, drivers)
     if "speed_dependent_gap" in on:
         desired = desired + on["speed_dependent_gap"] * np.sqrt(np.maximum(speed, 0.0) / top)
+    if "gap_stiffness" in on:
+        kept = (drivers.min_gap + speed * time_gap) / np.sqrt(1 - np.clip(speed / top, 0.0, 0.95) ** 4)
+        desired = desired * np.clip(np.maximum(gap, 0.1) / kept, 0.05, 20.0) ** (1 - on["gap_stiffness"])
     interaction = (desired / np.maximum(gap, 0.1)) ** 2
     if "second_leader" in on:
         behind_two = _desired_gap(speed, speed - view.second_speed, time_gap, drivers)

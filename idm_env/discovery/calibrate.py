@@ -6,6 +6,7 @@ of that population, both from closed-loop simulation of the runs that fit, by on
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from idm_env.discovery.march import BASE
 from idm_env.discovery.model import Model
 from idm_env.discovery.records import Records, Rows
 from idm_env.discovery.solve import Prior, Solution
-from idm_env.effects import CarFollowing
+from idm_env.parameters import Parameter
 
 POPULATION = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
 WIDTH = 0.6
@@ -44,37 +45,37 @@ def calibrate(records: Records, model: Model, values: np.ndarray, start: np.ndar
     2. Their median and spread are the population, the prior of everyone.
     3. Its weight is the one that predicts best what a driver's parameters have not seen (``free.stand``).
     """
-    law = model.catalogue.base
-    task, theta = judge.unweighed(records, model, values, first_prior(law), start=start)
-    there = stand(records, model, values, population(theta, task.rows, law), theta)
+    own = model.catalogue.own
+    task, theta = judge.unweighed(records, model, values, first_prior(own), start=start)
+    there = stand(records, model, values, population(theta, task.rows, own), theta)
     return Calibrated(model, values, there.theta, there.task.prior, there)
 
 
 def judged(
     found: Calibrated, fit: Records, kept: Records | None, everybody: Records, adapt: bool
 ) -> tuple[Solution, judge.Judged | None]:
-    """Return every driver's parameters by a calibrated model, and its errors on the runs kept back.
+    """Return every driver's parameters by a calibrated model, and its errors on the runs kept back, if any are given.
 
-    With ``adapt`` drivers kept back have parameters of their own, each fitted to the time between what is scored.
+    With ``adapt`` drivers have parameters of their own, for which their own runs are needed.
     """
     model, values, prior = found.model, found.values, found.prior
     own = judge.calibrate(everybody if adapt else fit, model, values, prior, start=found.theta)
     if kept is None:
         return own, None
-    return own, judge.judge(kept, model, values, prior, None if adapt else own.theta, adapt)
+    return own, judge.judge(kept, model, values, own.theta)
 
 
-def population(theta: np.ndarray, rows: Rows, base: CarFollowing = BASE) -> Prior:
+def population(theta: np.ndarray, rows: Rows, own: Sequence[Parameter] = BASE.declared) -> Prior:
     """Return the drivers' own spread as prior: median and scaled median deviation of log θ over fitted groups."""
     seen = np.unique(rows.group)
     if len(seen) < 5:
-        return first_prior(base)
+        return first_prior(own)
     centre = np.median(theta[seen], axis=0)
     spread = 1.4826 * np.median(np.abs(theta[seen] - centre), axis=0)
     return Prior(centre, np.clip(1.5 * spread, 0.3, WIDTH))
 
 
-def first_prior(base: CarFollowing = BASE) -> Prior:
-    """Return the weak prior that a search starts from, of the parameters of a car-following law."""
-    centre = [POPULATION.get(p.name, p.default) for p in base.declared]
+def first_prior(own: Sequence[Parameter] = BASE.declared) -> Prior:
+    """Return the weak prior that a search starts from, of the drivers' own parameters."""
+    centre = [POPULATION.get(p.name, p.default if p.null is None else p.null) for p in own]
     return Prior(np.log(centre), np.full(len(centre), WIDTH))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from scipy.stats import binomtest
 from scipy.stats import t as student
 
 from idm_env.discovery.judge import Judged
@@ -29,7 +30,8 @@ class Light(str, Enum):
 class Comparison:
     """One error before and after; ``ratio`` is after / before, with its 95 % interval from ``low`` to ``high``.
 
-    ``improved`` is the share of followers whose error falls.
+    ``driver`` is the geometric mean of the followers' own ratios, in which a hopeless follower counts as one, with its
+    95 % interval; ``improved`` is the share of followers whose error falls, and ``followers`` their number.
     """
 
     before: float
@@ -38,13 +40,23 @@ class Comparison:
     low: float
     high: float
     improved: float = float("nan")
+    followers: int = 0
+    driver: tuple[float, float, float] = (float("nan"), float("-inf"), float("inf"))
 
     @property
     def light(self) -> Light:
-        """``better`` or ``worse`` where the whole interval lies on one side of 1."""
-        if self.high < 1.0:
-            return Light.BETTER
-        return Light.WORSE if self.low > 1.0 else Light.SAME
+        """``worse`` where an interval lies above 1, of the pooled errors or of the followers' ratios; so ``better``."""
+        if self.low > 1.0 or self.driver[1] > 1.0:
+            return Light.WORSE
+        return Light.BETTER if self.high < 1.0 or self.driver[2] < 1.0 else Light.SAME
+
+    @property
+    def most_worse(self) -> bool:
+        """Whether the error of the median follower rises beyond chance (sign test, 5 %)."""
+        if not self.followers or not np.isfinite(self.improved):
+            return False
+        better = round(self.improved * self.followers)
+        return bool(binomtest(better, self.followers, alternative="less").pvalue < 0.05)
 
 
 def compare(before: Judged, after: Judged, seed: int = 0) -> dict[str, Comparison]:
@@ -65,7 +77,27 @@ def compared(was: np.ndarray, now: np.ndarray, samples: float, runs: np.ndarray,
     width = _width(was, now, runs, seed) if np.isfinite(change) else float("inf")
     improved = float((now < was).mean()) if len(was) else float("nan")
     ratio, low, high = (float(np.exp(x)) for x in (change, change - width, change + width))
-    return Comparison(errors[0], errors[1], ratio, low, high, improved)
+    return Comparison(errors[0], errors[1], ratio, low, high, improved, len(was), _of_drivers(was, now, runs))
+
+
+def _of_drivers(was: np.ndarray, now: np.ndarray, runs: np.ndarray) -> tuple[float, float, float]:
+    """Return the geometric mean of followers' ratios and its 95 % interval.
+
+    Student's t over what ``sampling`` draws. Deviations of followers of one run, which depend on each other, are
+    added before they are squared.
+    """
+    told = (was > 0.0) & (now > 0.0)
+    if not told.any():
+        return float("nan"), 0.0, float("inf")
+    change = 0.5 * np.log(now[told] / was[told])
+    strata, freedom = sampling(runs[told])
+    mean = float(change.mean())
+    off = [np.array([(change[unit] - mean).sum() for unit in stratum]) for stratum in strata]
+    units = sum(len(s) for s in strata)
+    error = np.sqrt(sum(float((x**2).sum()) for x in off) * units / max(freedom, 1)) / len(change)
+    width = float(student.ppf(0.975, freedom) * error) if freedom >= 1 else float("inf")
+    middle, low, high = (float(np.exp(x)) for x in (mean, mean - width, mean + width))
+    return middle, low, high
 
 
 def _width(was: np.ndarray, now: np.ndarray, runs: np.ndarray, seed: int) -> float:

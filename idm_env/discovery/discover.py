@@ -13,15 +13,29 @@ import numpy as np
 
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import bases, calibrate, ceilings, free, judge, places, records, search, shared, summary, words
+from idm_env.discovery import (
+    bases,
+    calibrate,
+    ceilings,
+    crossed,
+    free,
+    judge,
+    places,
+    records,
+    search,
+    shared,
+    summary,
+    words,
+)
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
 from idm_env.discovery.model import Model, Term
+from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, Round, decide
 from idm_env.discovery.solve import Solution, Task
-from idm_env.discovery.verdict import Reason, Refusal, Verdict
+from idm_env.discovery.verdict import HOLDS, Reason, Refusal, Verdict
 from idm_env.effects import (
     ALL,
     CANDIDATES,
@@ -120,7 +134,7 @@ def discover(
     options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
     mark = storage.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
     saved = storage.Store(None if out is None else out / storage.UNFINISHED / "explain", mark, resume)
-    task = Task(rows, search.first_noise(rows), calibrate.first_prior(law))
+    task = Task(rows, search.first_noise(rows), calibrate.first_prior(law.declared))
     told = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
     given = [*own, *(terms.known_effect(term) for term in told)]
@@ -249,18 +263,43 @@ def _finish(
     fit_records = searching.task.rows.records
     kept = prepared.of_runs(kept_runs) if kept_runs else None
 
-    def judged(model: Model, values: np.ndarray, start: np.ndarray | None = None) -> tuple[Solution, Any]:
-        # The null, what is added and other laws go the same way: whatever is calibrated better looks better.
-        found = searching.calibrated(model, values, start)
-        return calibrate.judged(found, fit_records, kept, prepared, adapt)
+    fold = crossed.folds_of(prepared.runs, kept_runs, seed)
 
-    first, before = judged(null.model, null.values, null.theta)
+    def own(model: Model, values: np.ndarray, start: np.ndarray | None) -> tuple[Solution, judge.Judged | None]:
+        found = searching.calibrated(model, values, start)
+        return calibrate.judged(found, fit_records, None if adapt else kept, prepared, adapt)
+
+    def noise() -> Noise:
+        assert searching.task.noise is not None
+        return searching.task.noise
+
+    # The null, what is added and other laws go the same way: whatever is calibrated better looks better.
+    def judged(s: Solution, task: Task) -> tuple[Solution, judge.Judged | None]:
+        theta, errors = own(s.model, s.values, s.theta)
+        if adapt and kept is not None:
+            errors = crossed.crossed(
+                prepared, s.model, crossed.values_of(task, s, prepared.runs, fold), fold, noise(), theta.theta
+            )
+        return theta, errors
+
+    first, before = judged(null, searching.task)
     judgement, last = _judgement(searching, decided, kept, fit_records, judged, (first, before), seed)
     laws = []
+
+    def alone(model: Model) -> tuple[judge.Judged, bool]:
+        assert before is not None
+        if not adapt:
+            errors = own(model, null.values, None)[1]
+            assert errors is not None
+            return errors, False
+        best, theta = crossed.at_best(prepared, model, null.values)
+        if best.summary()["gap_rmse_m"] > HOLDS * before.summary()["gap_rmse_m"]:
+            return best, True
+        values = crossed.values_of(searching.task, null, prepared.runs, fold)
+        return crossed.crossed(prepared, model, values, fold, noise(), theta), False
+
     if before is not None:
-        laws = bases.compared(
-            null.model, (first, before), lambda model: judged(model, null.values), seed, on_law
-        )  # fmt: skip
+        laws = bases.compared(null.model, before, alone, seed, on_law)
         judgement = judgement.beside(bases.best_of(laws))
     final = judgement.compared if judgement.added and judgement.compared is not None else null
     judgement = replace(judgement, shared=shared.find(judge.everywhere(prepared, searching.task, final), seed))
@@ -277,15 +316,18 @@ def _finish(
     report["bases"] = bases.rows(laws)
     for key in ("sentence", "details", "found", "partial"):
         report[key] = words.of_law(report[key], null.model.catalogue.base.title)
+    of_law = None
     if judgement.law is not None:
-        report["sentence"] = f"{words.law_first(judgement.law, null.model.catalogue.base.title)} {report['sentence']}"
+        of_law = own(judgement.law.model, null.values, None)[0]
+        first_words = words.law_first(judgement.law, null.model.catalogue.base.title, of_law)
+        report["sentence"] = f"{first_words} {report['sentence']}"
     report["details"] += words.cautions(report["data"]["at_bounds"], len(np.unique(prepared.group)))
     # Drivers who adapt are calibrated on parts of the held-out runs too.
     seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in (prepared if adapt else fit_records).episodes])
     shown = null if judgement.compared is None else judgement.compared
     pairs = [(null, first), (shown, last)][: len(judgement.titles)]
-    if judgement.law is not None:
-        pairs.append((judgement.law.solution, judgement.law.solution))
+    if of_law is not None:
+        pairs.append((of_law, of_law))
     saved = [replace(corrected(prepared, s, theta.theta, by), fitted_on=seen) for s, theta in pairs]
     models = dict(zip(judgement.names(), saved, strict=True))
     return Discovery(
@@ -293,8 +335,8 @@ def _finish(
     )
 
 
-Calibrates = Callable[[Model, np.ndarray, np.ndarray | None], tuple[Solution, judge.Judged | None]]
-"""A model, φ and log θ to begin with → drivers' parameters, and errors on the runs kept back if there are any."""
+Calibrates = Callable[[Solution, Task], tuple[Solution, judge.Judged | None]]
+"""A model, and what its φ was fitted to → drivers' parameters, and errors by cross-fitting if there are runs for it."""
 
 
 def _judgement(
@@ -315,7 +357,7 @@ def _judgement(
             confirmed.append(s)
 
     def judged(s: Solution) -> tuple[Solution, judge.Judged | None]:
-        return calibrates(s.model, s.values, s.theta)
+        return calibrates(s, searching.task)
 
     # Where nothing was added, what came nearest is compared with the null and says what it would have done.
     added = final is not null
@@ -336,7 +378,7 @@ def _judgement(
     if compared is not None and judgement.errors and not judgement.added and added:
         # The right effect with a strength fitted in windows may be off over minutes: it is fitted by these once more.
         again, intervals = free.refitted(fit_records, compared)
-        theta, there = judged(again)
+        theta, there = calibrates(again, decided.stand.task)
         other = replace(
             judgement, compared=free.in_windows(searching.task, again), added=True, refusal=None, after=there,
             intervals=intervals,
@@ -345,7 +387,7 @@ def _judgement(
             judgement, last, after = other, theta, there
     if decided.joined is not None and before is not None:
         # What was found in free simulation takes the place of what windows found where it does better there.
-        theta, there = judged(decided.joined.solution)
+        theta, there = calibrates(decided.joined.solution, decided.stand.task)
         assert there is not None
         now = after if judgement.added and after is not None else before
         if there.summary()["gap_rmse_m"] < now.summary()["gap_rmse_m"]:
@@ -367,15 +409,16 @@ def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) ->
     middle = np.exp(np.median(theta[seen], axis=0))
     law = final.model.catalogue.base
 
-    def bounded(values: np.ndarray) -> dict[str, float]:
-        return {p.name: float(np.clip(v, p.low, p.high)) for v, p in zip(values, law.declared, strict=True)}
+    def bounded(values: np.ndarray) -> dict[str, dict[str, float]]:
+        told: dict[str, dict[str, float]] = {}
+        for v, (name, p) in zip(values, final.model.catalogue.of_driver, strict=True):
+            told.setdefault(name, {})[p.name] = float(np.clip(v, p.low, p.high))
+        return told
 
-    drivers = {}
-    for group in seen:
-        drivers[prepared.groups[group]] = {law.name: bounded(np.exp(theta[group]))}
+    drivers = {prepared.groups[group]: bounded(np.exp(theta[group])) for group in seen}
     return SavedModel(
         effects=(law, *added, Brakes()),
-        parameters={law.name: bounded(middle), **numbers},
+        parameters={**numbers, **bounded(middle)},
         dt=prepared.dt,
         integration="midpoint",
         drivers=drivers if by != "all" else {},

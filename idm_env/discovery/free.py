@@ -92,7 +92,7 @@ def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, thet
             fits[seconds] = heavier, solve(heavier, frozen, start, np.zeros(0), iterations=10, tolerance=1e-4)
             errors = heard.errors(fits[seconds][1].theta[None], frozen, np.zeros((1, 0)))
             square[seconds] = float((errors**2).sum()) / max(int(scored.sum()), 1)
-        wanted = _further(square)
+        wanted = further(square)
     alike_s = min(square, key=lambda seconds: square[seconds])
     task, fitted = fits[alike_s]
     matrix = task.per_group(np.einsum("rmi,rmj->rij", fitted.linear.by_theta, fitted.linear.by_theta))
@@ -107,7 +107,7 @@ def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, thet
     )  # fmt: skip
 
 
-def _further(square: dict[float, float]) -> Sequence[float]:
+def further(square: dict[float, float]) -> Sequence[float]:
     """Return the next weight (s) where the best of those tried is at an end and better than its neighbour, or none."""
     known = sorted(square)
     best = min(known, key=lambda seconds: square[seconds])

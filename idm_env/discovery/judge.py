@@ -72,11 +72,6 @@ class Judged:
         square, count = self.squares["gap_rmse_m"]
         return np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.nan)
 
-    def median_ratio(self, before: Judged) -> float:
-        """Return the median follower's gap RMSE over that of another model; NaN where there is none."""
-        was, now = (x.summary()["gap_rmse_median_driver_m"] for x in (before, self))
-        return now / was if was > 0.0 else float("nan")
-
     def summary(self) -> dict[str, float]:
         """Return the four errors of the report; the pooled ones weigh every sample alike."""
         pooled = {
@@ -153,7 +148,7 @@ def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> 
     """
     rows = windows(records)
     assert task.noise is not None
-    there = Task(rows, replace(task.noise, weight=np.ones(len(rows))), task.prior)
+    there = Task(rows, task.noise.alike(len(rows)), task.prior)
     squares = []
     for s in (null, final):
         start = np.tile(s.prior.centre, (there.groups, 1))
@@ -166,7 +161,7 @@ def windowed(records: Records, task: Task, solution: Solution) -> tuple[Task, So
     """Return a model in windows of all records, and its task: φ as it stands, θ fitted, the noise of ``task``."""
     assert task.noise is not None
     rows = windows(records)
-    there = Task(rows, replace(task.noise, weight=np.ones(len(rows))), replace(task.prior, free=False))
+    there = Task(rows, task.noise.alike(len(rows)), replace(task.prior, free=False))
     start = np.tile(task.prior.centre, (there.groups, 1))
     return there, solve(there, Frozen(solution.model, solution.values), start, np.zeros(0))
 
@@ -188,33 +183,12 @@ def halves(rows: Rows) -> np.ndarray:
     return scored & rows.valid
 
 
-def judge(
-    records: Records, model: Model, values: np.ndarray, prior: Prior, theta: np.ndarray | None, adapt: bool
-) -> Judged:
-    """Return the errors on held-out records.
-
-    With ``adapt`` θ of a driver comes from every second block of time (30 s, or a quarter of a shorter record), with
-    the population as prior, and the blocks between are scored; then the other way round, so that all time is. Without
-    it ``theta`` [G, P] is used.
-    """
-    rows, short = whole(records), windows(records)
-    frozen, near = Frozen(model, values), Task(short, None, prior)
-    if adapt:
-        second = halves(rows)
-        thetas = np.stack([
-            calibrate(records, model, values, prior, replace(rows, valid=part), theta).theta
-            for part in (rows.valid & ~second, second)
-        ])  # fmt: skip
-        # Of two copies, the second is scored where the first was fitted.
-        there, then = (~second).astype(int), (short.block % 2 == 0).astype(int)
-    else:
-        assert theta is not None
-        thetas, there, then = theta[None], np.zeros(rows.valid.shape, int), np.zeros(len(short), int)
-    empty = np.zeros((len(thetas), 0))
-    gap, speed = (
-        np.take_along_axis(x, there[None], 0)[0] for x in Task(rows, None, prior).predict(thetas, frozen, empty)
-    )
-    ahead = np.take_along_axis(near.errors(thetas, frozen, empty)[..., -1], then[None], 0)[0]
+def judge(records: Records, model: Model, values: np.ndarray, theta: np.ndarray) -> Judged:
+    """Return the errors of a model with log θ [G, P] and values [Q] on all of the records."""
+    rows, short, frozen, empty = whole(records), windows(records), Frozen(model, values), np.zeros((1, 0))
+    prior = Prior(theta.mean(0), np.ones(theta.shape[-1]))
+    gap, speed = (x[0] for x in Task(rows, None, prior).predict(theta[None], frozen, empty))
+    ahead = Task(short, None, prior).errors(theta[None], frozen, empty)[0][:, -1]
     return Judged(rows, gap, speed, ahead, short.record)
 
 

@@ -71,13 +71,15 @@ _BESIDE = {"distance": "signals[i, 11]", "speed": "signals[i, 12]", "present": "
 class Catalogue:
     """A car-following law and candidates as the loop has them, and how θ, φ and the flags are laid out.
 
-    θ are the law's parameters, each driver's own. ``located`` says whether there is room for what has no name; a loop
+    θ are the law's parameters, each driver's own, and the strengths of the effects ``personal``.
+    ``located`` says whether there is room for what has no name; a loop
     without it compiles in a fraction of the time.
     """
 
     effects: tuple[Effect, ...]
     base: CarFollowing = BASE
     located: bool = True
+    personal: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, effects: Sequence[Effect] = (), period: float = 0.0, base: CarFollowing = BASE) -> Catalogue:
@@ -88,7 +90,13 @@ class Catalogue:
     @property
     def own(self) -> tuple[Parameter, ...]:
         """Declarations of θ."""
-        return self.base.declared
+        return tuple(p for _, p in self.of_driver)
+
+    @cached_property
+    def of_driver(self) -> tuple[tuple[str, Parameter], ...]:
+        """Effect and declaration of every entry of θ."""
+        effects = (self.base, *(self.by_name[name] for name in self.personal))
+        return tuple((e.name, p) for e in effects for p in (e.declared if e is self.base else e.parameters))
 
     @cached_property
     def bounds(self) -> np.ndarray:
@@ -225,7 +233,7 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
                 f"effect '{name}' is sought or given as a profile and does not read it by effects.places.curve."
             )
     memories = list(made.begin)
-    driver = {f"{catalogue.base.name}.{p.name}": f"th[{i}]" for i, p in enumerate(catalogue.own)}
+    driver = {f"{name}.{p.name}": f"th[{i}]" for i, (name, p) in enumerate(catalogue.of_driver)}
     inputs = {slot_name(e.name, ""): "pulse_now" for e in _slots(PULSE)}
     for effect in catalogue.effects:
         inputs |= {slot_name(effect.name, part): text for part, text in _BESIDE.items()}

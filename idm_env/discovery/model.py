@@ -188,6 +188,11 @@ def simple(effect: str | Effect) -> Term:
     return Term(one.name, one.name, parameters, starts, what=one.changes, coordinate="state", period=period, made=one)
 
 
+def personal(effect: str | Effect) -> Term:
+    """Return the term of an effect whose strengths are each driver's own: its catalogue has them among θ."""
+    return replace(simple(effect), parameters=(), starts=((),))
+
+
 def _starts(p: Parameter) -> tuple[float, ...]:
     """Return where the search of a parameter starts: as declared; a strength else from a quarter of its default."""
     if p.starts or p.role == "threshold":

@@ -8,7 +8,7 @@ Ornstein–Uhlenbeck driver and anything between are one case. The null and ever
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -36,6 +36,10 @@ class Noise:
         rest = errors - before @ self.carry.T
         white = np.where(joined[:, None], rest @ self.later.T, rest @ self.first.T)
         return white * np.sqrt(self.weight)[:, None]
+
+    def alike(self, rows: int) -> Noise:
+        """Return the same noise for so many other rows, of which none is weighed down."""
+        return replace(self, weight=np.ones(rows))
 
 
 def estimate(errors: np.ndarray, joined: np.ndarray, rounds: int = 3) -> Noise:

@@ -203,6 +203,8 @@ def _laws(r: dict[str, Any]) -> Iterator[Block]:
         known = gap is not None and gap["high"] is not None
         row["95 % interval"] = f"{change(gap['low'])} … {change(gap['high'])}" if known else "–"
         row["verdict"] = "–" if gap is None else gap["verdict"]
+        if law["fitted_to_what_is_judged"]:
+            row["verdict"] = "worse, even fitted to these very data"
         rows.append(row)
     yield pages.table(rows)
     yield pages.note(

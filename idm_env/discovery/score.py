@@ -71,22 +71,29 @@ def per_run(task: Task, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     return gradient, matrix
 
 
-def without_own_run(task: Task, solution: Solution) -> np.ndarray:
-    """Return by how much φ changes for every run [runs, Q] when that run is left out."""
-    runs, count = len(task.rows.records.runs), len(solution.values)
-    change = np.zeros((runs, count))
+def without(task: Task, solution: Solution, part: np.ndarray, parts: int) -> np.ndarray:
+    """Return by how much φ changes [parts, Q] when the runs of a part are left out; ``part`` is that of every run."""
+    count = len(solution.values)
+    change = np.zeros((parts, count))
     if not count:
         return change
     low, high = (np.array([getattr(p, side) for p in solution.model.parameters]) for side in ("low", "high"))
     ridge = prior_of(solution.model)
     s, big = per_run(task, solution)
-    for run in range(runs):
-        rest = big.sum(0) - big[run] + np.diag(ridge)
+    for one in np.unique(part):
+        mine = part == one
+        rest = big[~mine].sum(0) + np.diag(ridge)
         rest = rest + np.diag(1e-6 * np.diag(rest) + 1e-12)
-        # At the optimum all runs together pull nowhere, so the others pull against this one.
-        step = np.linalg.solve(rest, s[run])
-        change[run] = np.clip(solution.values + step, low, high) - solution.values
+        # At the optimum all runs together pull nowhere, so the others pull against these.
+        step = np.linalg.solve(rest, s[mine].sum(0))
+        change[one] = np.clip(solution.values + step, low, high) - solution.values
     return change
+
+
+def without_own_run(task: Task, solution: Solution) -> np.ndarray:
+    """Return by how much φ changes for every run [runs, Q] when that run is left out."""
+    runs = len(task.rows.records.runs)
+    return without(task, solution, np.arange(runs), runs)
 
 
 def log_gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:

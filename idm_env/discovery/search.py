@@ -101,7 +101,7 @@ class Search:
     def _renoised(self, solution: Solution) -> Task:
         errors = self.task.errors(solution.theta[None], solution.model, solution.values[None])[0]
         noise = noises.estimate(errors, self.task.rows.joined)
-        prior = population(solution.theta, self.task.rows, solution.model.catalogue.base)
+        prior = population(solution.theta, self.task.rows, solution.model.catalogue.own)
         return replace(self.task, noise=noise, prior=replace(prior, alike_s=self.task.prior.alike_s))
 
     def round(self, solution: Solution, number: int) -> tuple[list[Scored], np.ndarray]:

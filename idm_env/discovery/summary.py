@@ -69,11 +69,16 @@ class Judgement:
         """Whether the compared model may be called better than the null."""
         if self.before is None or self.after is None:
             return False
-        return improves(self.errors, self.after.median_ratio(self.before))
+        return improves(self.errors)
 
     def beside(self, best: bases.Law) -> Judgement:
-        """Return the judgement beside the best law: where that does better than an addition, nothing is added."""
-        if not best.against or best.mean_ratio >= (self.mean_ratio if self.added else 1.0):
+        """Return the judgement beside the best law: where that is better than an addition, nothing is added.
+
+        What takes an addition's place must hold against it as it had to hold against the null.
+        """
+        if not best.against:
+            return self
+        if self.added and self.after is not None and not improves(compare(self.after, best.errors, self.seed)):
             return self
         if self.refusal is not None and self.refusal.reason is Reason.FEW_RUNS:
             return replace(self, law=best)
@@ -104,7 +109,7 @@ class Judgement:
         """
         if self.law is not None:
             files = ("model_idm.yaml", *(["model_corrected.yaml"] if self.compared is not None else []), "model.yaml")
-            return dict(zip(files, (*self.titles, self.law.law.title), strict=True))
+            return dict(zip(files, (*self.titles, self.law.title), strict=True))
         if self.compared is None:
             return {"model.yaml": self.titles[0]}
         files = ("model_idm.yaml", "model.yaml") if self.corrected_is_best else ("model.yaml", "model_corrected.yaml")
@@ -149,7 +154,6 @@ def report(
         "reason": None if refusal is None else refusal.reason.value,
         "sentence": words.headline(
             verdict, [f["clause"] for f in found], refusal, judged.tried, errors, common, others, strengths,
-            1.0 if before is None or after is None else after.median_ratio(before),
         ),
         "details": [*words.details(verdict, found, [] if judged.added else entries, left),
                     *words.excluded(verdict, strengths)],
@@ -157,7 +161,8 @@ def report(
         "known": _known(final, interval_of(final, task), base),
         "helps": {
             key: {"verdict": c.light.value, "ratio": c.ratio, "low": c.low, "high": c.high, "before": c.before,
-                  "after": c.after, "unit": words.ERRORS[key][1]}
+                  "after": c.after, "unit": words.ERRORS[key][1], "drivers_ratio": c.driver[0],
+                  "drivers_low": c.driver[1], "drivers_high": c.driver[2], "share_of_drivers_improved": c.improved}
             for key, c in errors.items()
         },
         "interval": _how(before) if errors and before is not None else None,
@@ -209,7 +214,8 @@ def _how(before: judge.Judged) -> str:
     runs = np.array([run for (run, _), n in zip(before.followers, count, strict=True) if n])
     return (
         f"95 % by bootstrap of {unit_of(runs)}, {DRAWS} draws: standard error of the logarithm of after / before, "
-        "times Student's t. Better or worse: the whole interval lies on one side of no change."
+        "times Student's t; of the followers' own ratios Student's t. Better or worse: one of both intervals lies on "
+        "one side of no change; worse goes before better."
     )
 
 

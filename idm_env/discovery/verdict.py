@@ -56,20 +56,20 @@ Beyond chance it may not rise at all; drivers' own noise alone moves it by some 
 """
 
 
-def improves(errors: Mapping[str, Comparison], median_ratio: float) -> bool:
-    """Tell whether an addition, which gained beyond chance on the runs that chose, holds on those kept back.
+def improves(errors: Mapping[str, Comparison]) -> bool:
+    """Tell whether a model may be called better than another.
 
-    No error rises beyond chance; their geometric mean falls; free simulation holds (``HOLDS``), and so does the median
-    driver.
+    An error falls beyond chance and none rises so, be it that of all or the followers' ratios; their geometric mean
+    falls; free simulation holds (``HOLDS``); and the median driver's error does not rise beyond chance.
 
     Args:
-        errors: How errors on runs kept back changed.
-        median_ratio: The median driver's gap RMSE in free simulation, after / before.
+        errors: How errors changed where neither model was calibrated.
     """
-    if any(c.light is Light.WORSE for c in errors.values()):
+    lights = [c.light for c in errors.values()]
+    if Light.WORSE in lights or Light.BETTER not in lights:
         return False
     gap = errors.get("gap_rmse_m")
-    holds = (gap is None or not gap.ratio > HOLDS) and not median_ratio > HOLDS
+    holds = gap is None or not (gap.ratio > HOLDS or gap.most_worse)
     return holds and mean_ratio(errors) < 1.0
 
 

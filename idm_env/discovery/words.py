@@ -7,11 +7,14 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from idm_env.discovery.bases import Law
 from idm_env.discovery.compare import Comparison, Light
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Strength
 from idm_env.discovery.shared import Shared
+from idm_env.discovery.solve import Solution
 from idm_env.discovery.verdict import HOLDS, Reason, Refusal, Verdict
 from idm_env.effects import ALL
 from idm_env.parameters import Parameter
@@ -133,7 +136,6 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
 def headline(
     verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison],
     shared: Shared | None = None, others: Sequence[str] = (), strengths: Mapping[str, Strength] | None = None,
-    median_ratio: float = 1.0,
 ) -> str:  # fmt: skip
     """Say in one sentence what is missing, or why nothing can be said.
 
@@ -146,7 +148,6 @@ def headline(
         shared: What vehicles of one run do alike, told where nothing was added.
         others: Effects that these data do not tell from what was added.
         strengths: What the data say of the strengths of absent effects, by name.
-        median_ratio: The median follower's gap RMSE on runs kept back, with what came nearest / without.
     """
     if refusal is not None and refusal.reason is Reason.LAW:
         nearest = f" The nearest was {tried}." if tried else ""
@@ -171,7 +172,7 @@ def headline(
     if refusal is not None and refusal.reason is Reason.HELD_OUT:
         return (
             f"Something is missing, but no candidate predicts better: {tried} was selected, and "
-            f"{_rises(errors, median_ratio)} on the test set."
+            f"{_rises(errors)} on the test set."
         )
     return f"Something is missing that no candidate explains: {reason(refusal, tried)}."
 
@@ -186,7 +187,7 @@ def common(shared: Shared) -> str:
     )
 
 
-def _rises(errors: Mapping[str, Comparison], median_ratio: float) -> str:
+def _rises(errors: Mapping[str, Comparison]) -> str:
     """Say what the errors on runs kept back have against an addition."""
     worse = [ERRORS[k][0] for k, c in errors.items() if c.light is Light.WORSE]
     if not any(c.ratio < 1.0 for c in errors.values()):
@@ -195,8 +196,10 @@ def _rises(errors: Mapping[str, Comparison], median_ratio: float) -> str:
         return f"the error of the {' and the '.join(worse)} gets worse"
     if errors["gap_rmse_m"].ratio > HOLDS:
         return f"the error of the gap in free simulation rises by {percent(errors['gap_rmse_m'].ratio)}"
-    if median_ratio > HOLDS:
-        return f"the median follower's gap in free simulation errs by {percent(median_ratio)} more"
+    if errors["gap_rmse_m"].most_worse:
+        return f"the gap in free simulation errs more for {1.0 - errors['gap_rmse_m'].improved:.0%} of followers"
+    if not any(c.light is Light.BETTER for c in errors.values()):
+        return "no error falls beyond chance"
     return "errors rise on the whole"
 
 
@@ -293,18 +296,32 @@ def cautions(at_bounds: Mapping[str, int], groups: int) -> list[str]:
     ]  # fmt: skip
 
 
-def law_first(law: Law, null: str) -> str:
-    """Say that another law predicts better than the null, and in what."""
+def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
+    """Say that another law predicts better than the null, and in what; ``drivers`` are its parameters."""
     better = [
         f"{ERRORS[key][0]} {percent(c.ratio)} (95 %: {percent(c.low)} to {percent(c.high)})"
         for key, c in law.against.items() if c.light is Light.BETTER
     ]  # fmt: skip
     same = [ERRORS[key][0] for key, c in law.against.items() if c.light is Light.SAME]
     rest = f"; {' and '.join(same)} the same beyond chance" if same else ""
+    note = f"what it lacks: explain --base {law.law.kind}"
+    if law.own and drivers is not None:
+        note = f"median driver and 10 to 90 %: {', '.join(_of_drivers(drivers))}"
     return (
-        f"{law.law.title[:1].upper()}{law.law.title[1:]} predicts better than {null} calibrated alike: "
-        f"{', '.join(better)}{rest} (what it lacks: explain --base {law.law.kind})."
+        f"{law.title[:1].upper()}{law.title[1:]} predicts better than {null} calibrated alike: "
+        f"{', '.join(better)}{rest} ({note})."
     )
+
+
+def _of_drivers(drivers: Solution) -> list[str]:
+    """Return the strengths that are each driver's own: median and the range of 80 % of the drivers."""
+    catalogue, theta = drivers.model.catalogue, np.exp(drivers.theta[np.unique(drivers.row_group)])
+    told = []
+    for i, (name, p) in enumerate(catalogue.of_driver):
+        if name in catalogue.personal:
+            low, middle, high = np.quantile(theta[:, i], [0.1, 0.5, 0.9])
+            told.append(f"{p.symbol} = {number(middle, 2)} ({number(low, 2)} to {number(high, 2)})")
+    return told
 
 
 def weight(prior: Mapping[str, Any]) -> str:

@@ -19,12 +19,11 @@ from idm_env.effects.lane_changes import GapAcceptance, LaneCommand, MandatoryCh
 from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
 from idm_env.effects.neighbours import BrakeLight, Courtesy, Follower, Lateral, LeaderAcceleration, SecondLeader
 from idm_env.effects.noise import DRIFTS, AccelNoise, Noise, PerceptionNoise, Wander
-from idm_env.effects.perception import DeadZone, Delay, GapBias, ImaginedLeader
+from idm_env.effects.perception import ClosingGain, DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
 from idm_env.effects.registry import entered, imported, is_candidate, lives, read
-from idm_env.effects.road_rules import Destination, LaneClosure, Signal, SpeedLimit
 from idm_env.effects.surroundings import Drag, Grade
-from idm_env.effects.time_gaps import Relaxation, SetPointAsymmetry, SpeedTimeGap
+from idm_env.effects.time_gaps import GapStiffness, Relaxation, SetPointAsymmetry, SpeedTimeGap
 from idm_env.validation import nearest, shown
 
 ALL: dict[str, type[Effect]] = {
@@ -52,6 +51,7 @@ ALL: dict[str, type[Effect]] = {
         SpeedTimeGap,
         SetPointAsymmetry,
         Relaxation,
+        GapStiffness,
         LongMemory,
         Follower,
         DeadZone,
@@ -63,6 +63,7 @@ ALL: dict[str, type[Effect]] = {
         RegimeShift,
         Lateral,
         Courtesy,
+        ClosingGain,
         GapBias,
         ImaginedLeader,
         Noise,
@@ -71,14 +72,10 @@ ALL: dict[str, type[Effect]] = {
         PerceptionNoise,
         Curve,
         DriverCurve,
-        SpeedLimit,
-        LaneClosure,
-        Signal,
         Mobil,
         MandatoryChange,
         GapAcceptance,
         LaneCommand,
-        Destination,
     )
 }
 
@@ -95,6 +92,7 @@ CANDIDATES: tuple[str, ...] = (
     "speed_time_gap",
     "set_point_asymmetry",
     "relaxation",
+    "gap_stiffness",
     "memory",
     "follower",
     "dead_zone",
@@ -204,6 +202,7 @@ __all__ = [
     "BrakeLight",
     "Brakes",
     "CarFollowing",
+    "ClosingGain",
     "ConstantTimeGap",
     "Control",
     "Courtesy",
@@ -211,19 +210,18 @@ __all__ = [
     "CurveSpeed",
     "DeadZone",
     "Delay",
-    "Destination",
     "Drag",
     "DriverCurve",
     "Effect",
     "Follower",
     "GapAcceptance",
     "GapBias",
+    "GapStiffness",
     "Gipps",
     "Grade",
     "IDMPlus",
     "ImaginedLeader",
     "Lag",
-    "LaneClosure",
     "LaneCommand",
     "Lateral",
     "LeaderAcceleration",
@@ -238,9 +236,7 @@ __all__ = [
     "Replay",
     "SecondLeader",
     "SetPointAsymmetry",
-    "Signal",
     "SpeedDependentGap",
-    "SpeedLimit",
     "SpeedProfile",
     "SpeedTimeGap",
     "SpeedZone",

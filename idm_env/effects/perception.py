@@ -88,6 +88,38 @@ class DeadZone(Effect):
 
 
 @dataclass(frozen=True)
+class ClosingGain(Effect):
+    """A closing speed that counts k times: Δv → k Δv, wherever there is a leader.
+
+    In IDM k² b̃ takes the place of b (b̃ = b/k²), so that within the bounds of b it is b by another name, and no
+    candidate; on laws whose answer to the closing speed is no parameter, and beyond the bounds of b, it is a gain of
+    its own, as k2 is in linear controllers of production cars (Milanés and Shladover 2014, Transp. Res. C 48, 285).
+    """
+
+    kind: ClassVar[str] = "closing_gain"
+    sources: ClassVar[tuple[str, ...]] = (references.MILANES_2014,)
+    title: ClassVar[str] = "gain on the closing speed"
+    equation: ClassVar[str] = "Δv is seen as k Δv"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers answer to closing speeds less than IDM",
+        "drivers answer to closing speeds more than IDM",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel",)
+    told_by: ClassVar[str] = "nothing within the bounds of b tells it from the comfortable deceleration"
+    changes: ClassVar[str] = "closing_speed"
+    per_driver: ClassVar[bool] = True
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("gain", "k", "1", 0.5, 0.05, 20.0, null=1.0, starts=(0.7, 1.4)),
+    )
+
+    def perceive(self, scene: Scene, p: P) -> Scene:
+        """Return the scene in which the leader is as much faster or slower as the driver takes him to be."""
+        leader = scene.leader
+        closing = (scene.speed - leader.speed) * leader.present
+        return scene._replace(leader=leader._replace(speed=leader.speed + (1.0 - p["gain"]) * closing))
+
+
+@dataclass(frozen=True)
 class GapBias(Effect):
     """A gap seen (or measured) as gap + d metres, wherever there is a leader."""
 

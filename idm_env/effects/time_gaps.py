@@ -1,4 +1,4 @@
-"""How a driver's time gap varies: with speed, with the leader's acceleration, with habit (hook ``adapt``)."""
+"""How a driver's desired gap varies: with speed, the leader's acceleration, habit, the gap itself (hook ``adapt``)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from idm_env.effects import references
 from idm_env.effects.base import Effect, P
+from idm_env.effects.idm import SMALLEST_GAP, equilibrium_gap
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
 
@@ -138,3 +139,47 @@ class Relaxation(Effect):
         level = scene.memory[self.name]
         own = driver.time_gap / (1.0 + p["strength"] * (level - 1.0))
         return level + (self._kept(scene, driver, own) - level) * -torch.expm1(-scene.dt / p["memory_time"])
+
+
+@dataclass(frozen=True)
+class GapStiffness(Effect):
+    """A pull back to one's own gap that is softer or stiffer than IDM's: in ``s*/s`` the gap s counts as s_e (s/s_e)^w.
+
+    ::
+
+        s0, T, extra_gap → r times as much,   b → b / r²,   r = (s / s_e)^(1 − w),   s_e = (s0 + v T)/√(1 − (v/v0)⁴)
+
+    so that all of s* is r times as large, and w counts how hard a driver pulls back to the gap of his equilibrium s_e,
+    which stays where it is: the acceleration changes with ln s by 2 w a (s*/s)². s/s_e counts between 1/20 and 20. IDM
+    ties this stiffness to a and T; in linear controllers of production cars it is a gain of its own, k1 (Milanés and
+    Shladover 2014, Transp. Res. C 48, 285).
+    """
+
+    kind: ClassVar[str] = "gap_stiffness"
+    sources: ClassVar[tuple[str, ...]] = (references.MILANES_2014,)
+    rank: ClassVar[int] = 3
+    title: ClassVar[str] = "stiffness of the pull to one's own gap"
+    equation: ClassVar[str] = "s* → s* (s/s_e)^(1 − w), s_e = (s0 + v T)/√(1 − (v/v0)⁴)"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers pull back to their own gap less hard than IDM",
+        "drivers pull back to their own gap harder than IDM",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("relaxation", "max_accel", "comfort_decel")
+    told_by: ClassVar[str] = "gaps far from the usual one at steady speeds, closing and opening, tell it from a and b"
+    changes: ClassVar[str] = "time_gap"
+    per_driver: ClassVar[bool] = True
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("stiffness", "w", "1", 0.5, 0.05, 4.0, null=1.0, starts=(0.7, 1.4)),
+    )
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver whose desired gap has moved towards the gap that he has."""
+        own = equilibrium_gap(driver, scene.speed)
+        ratio = (scene.leader.gap.clamp_min(SMALLEST_GAP) / own).clamp(0.05, 20.0)
+        scale = 1.0 + (ratio ** (1.0 - p["stiffness"]) - 1.0) * scene.leader.present
+        return driver._replace(
+            min_gap=driver.min_gap * scale,
+            time_gap=driver.time_gap * scale,
+            extra_gap=driver.extra_gap * scale,
+            comfort_decel=driver.comfort_decel / (scale * scale),
+        )

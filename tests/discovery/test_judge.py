@@ -9,10 +9,12 @@ import polars as pl
 import pytest
 
 from idm_env.data import Trajectories, episodes, synthetic
-from idm_env.discovery import calibrate, discover, judge
+from idm_env.discovery import crossed, discover, judge
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Model
-from idm_env.discovery.records import Records, gather, whole
+from idm_env.discovery.records import Records, gather, whole, windows
+from idm_env.discovery.search import first_noise
+from idm_env.discovery.verdict import HOLDS
 from idm_env.effects import BASES
 
 POSITION = 14
@@ -42,42 +44,51 @@ def test_what_happens_before_a_driver_has_settled_moves_no_parameter(records: Re
 
 
 def test_all_time_is_scored_and_by_parameters_that_have_not_seen_it(records: Records) -> None:
-    def gaps(of: Records) -> np.ndarray:
-        return judge.judge(of, Model(), np.zeros(0), first_prior(), None, True).gap
+    fold = np.array([0, 1])
+    noise = first_noise(windows(records))
+
+    def judged(of: Records) -> judge.Judged:
+        return crossed.crossed(of, Model(), np.zeros((2, 0)), fold, noise)
 
     rows = whole(records)
     second = judge.halves(rows)
     assert second.any(1).all() and (rows.valid & ~second).any(1).all()
     # The second block of 30 s is moved: what is simulated there stays, what it has fitted changes.
-    before, after = gaps(records), gaps(moved(records, 31.0, 59.0))
-    assert np.array_equal(before[second], after[second])
-    assert np.abs(before - after)[rows.valid & ~second].max() > 0.01
-    judged = judge.judge(records, Model(), np.zeros(0), first_prior(), None, True)
-    assert judged.squares["gap_rmse_m"][1].sum() == rows.valid.sum()
+    before, after = judged(records), judged(moved(records, 31.0, 59.0))
+    change, block = np.abs(before.gap - after.gap), windows(records).block
+    assert change[second].max() < 0.05 * change[rows.valid & ~second].max()
+    off = np.abs(before.ahead - after.ahead)
+    assert off[block == 3].max() < 0.1 * off[block % 2 == 0].max()
+    assert before.squares["gap_rmse_m"][1].sum() == rows.valid.sum()
 
 
-def test_null_addition_and_other_laws_are_calibrated_by_one_procedure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_null_addition_and_other_laws_are_judged_by_one_procedure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else the calibration, and not the effect, would decide which of them errs less."""
-    calibrated, judged = [], []
-    right, judge_right = calibrate.calibrate, judge.judge
+    models, ruled_out, alike = [], [], set()
+    right, best = crossed.crossed, crossed.at_best
 
-    def kept(records, model, values, start=None):  # type: ignore[no-untyped-def]
-        calibrated.append((len(records), right(records, model, values, start)))
-        return calibrated[-1][1]
+    def kept(records, model, values, fold, noise, start=None):  # type: ignore[no-untyped-def]
+        models.append(model)
+        alike.add((id(records), fold.tobytes(), id(noise)))
+        return right(records, model, values, fold, noise, start)
 
-    def seen(records, model, values, prior, *rest):  # type: ignore[no-untyped-def]
-        judged.append((model, prior))
-        return judge_right(records, model, values, prior, *rest)
+    def at_best(records, model, values):  # type: ignore[no-untyped-def]
+        ruled_out.append(model)
+        return best(records, model, values)
 
-    monkeypatch.setattr(calibrate, "calibrate", kept)
-    monkeypatch.setattr(judge, "judge", seen)
+    monkeypatch.setattr(crossed, "crossed", kept)
+    monkeypatch.setattr(crossed, "at_best", at_best)
     made, _ = synthetic.generate(5, runs=8, followers=2, seconds=80.0, effect="lag")
     found = discover(made, effects=["lag"])
     assert found.verdict == "named"
-    assert {size for size, _ in calibrated} == {12}, "all on the runs that fit"
-    of = {id(c.prior): c.model for _, c in calibrated}
-    assert all(of[id(prior)] is model for model, prior in judged), "each judged by its own population and weight"
-    assert len({m.catalogue.base.kind for m, _ in judged}) == len(BASES) and any(m.terms for m, _ in judged)
+    assert len(alike) == 1, "the same runs, folds and noise for all"
+    assert {m.catalogue.base.kind for m in ruled_out} == set(BASES) and models[0] is found.null.model
+    rows = {(row["base"], *row["own"]): row for row in found.report["bases"][1:]}
+    null_m = found.report["error"]["before"]["gap_rmse_m"]
+    for model in ruled_out:
+        row = rows[(model.catalogue.base.kind, *model.catalogue.personal)]
+        assert row["fitted_to_what_is_judged"] == (model not in models)
+        assert row["gap_rmse_m"] > HOLDS * null_m if row["fitted_to_what_is_judged"] else model in models
 
 
 @pytest.mark.parametrize("every", [10, 20])

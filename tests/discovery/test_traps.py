@@ -21,7 +21,7 @@ def test_a_response_at_the_same_bends_is_no_place() -> None:
 
 
 def test_nothing_is_found_on_laps_with_nothing_hidden() -> None:
-    laps, _ = synthetic.generate(2, laps=True, runs=8, followers=2, seconds=120.0, ou=0.1)
+    laps, _ = synthetic.generate(2, laps=True, runs=11, followers=2, seconds=100.0, ou=0.1)
     assert discover(laps, seed=1, place="track_s_m").verdict == "none"
 
 

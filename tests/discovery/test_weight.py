@@ -10,7 +10,7 @@ from idm_env.data import episodes, synthetic
 from idm_env.discovery import free, judge, words
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Model
-from idm_env.discovery.records import Records, gather, windows
+from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.search import first_noise
 from idm_env.discovery.solve import Solution, Task, solve
 
@@ -42,10 +42,14 @@ def test_short_noisy_records_of_like_drivers_lean_on_the_population() -> None:
     assert min(errors_m.values()) < 0.9 * errors_m[5.0]
     # Drivers that were never seen are predicted better, too.
     others, _ = fitted(60.0, ou=0.3, spread=0.05, seed=6)
-    errors = [
-        judge.judge(others, Model(), np.zeros(0), replace(null.prior, alike_s=s), None, True).summary()["gap_rmse_m"]
-        for s in (5.0, alike_s)
-    ]
+    rows, empty = whole(others), np.zeros(0)
+    second = judge.halves(rows)
+    errors = []
+    for seconds in (5.0, alike_s):
+        prior = replace(null.prior, alike_s=seconds)
+        theta = judge.calibrate(others, Model(), empty, prior, replace(rows, valid=rows.valid & ~second)).theta
+        scored = Task(replace(rows, valid=second), None, prior)
+        errors.append(np.linalg.norm(scored.errors(theta[None], Model(), empty[None])))
     assert errors[1] < 0.95 * errors[0]
 
 

@@ -1,0 +1,178 @@
+"""Errors by cross-fitting: every run is held out once, and whatever is judged there was calibrated on the others.
+
+A quarter of the runs, kept back once, leaves a handful of followers to decide, and one of them can. Here all count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from idm_env.discovery import free, judge
+from idm_env.discovery.calibrate import first_prior, population
+from idm_env.discovery.free import GRID_S, further
+from idm_env.discovery.model import Frozen, Model
+from idm_env.discovery.noise import Noise
+from idm_env.discovery.records import Records, Rows, whole, windows
+from idm_env.discovery.score import without
+from idm_env.discovery.solve import Prior, Solution, Task, solve
+
+FOLDS = 4
+POOLED_S = free.ENDS_S[1]
+"""Weight (s) of the population at which every driver is its middle."""
+EMPTY = np.zeros(0)
+
+
+def folds_of(runs: Sequence[str], kept: Sequence[str], seed: int) -> np.ndarray:
+    """Return the fold of every run: 0 of those kept back, whom no choice has seen, and up to three more."""
+    left = [i for i, run in enumerate(runs) if run not in set(kept)]
+    fold = np.zeros(len(runs), int)
+    count = min(FOLDS - 1, len(left))
+    fold[np.random.default_rng(seed).permutation(left)] = 1 + np.arange(len(left)) % max(count, 1)
+    return fold
+
+
+def values_of(task: Task, solution: Solution, runs: Sequence[str], fold: np.ndarray) -> np.ndarray:
+    """Return φ [folds, Q] without the runs of each fold; ``task`` is what φ was fitted to, ``runs`` are all."""
+    of_run = fold[[runs.index(run) for run in task.rows.records.runs]]
+    moved = without(task, solution, of_run, int(fold.max()) + 1)
+    result: np.ndarray = solution.values + moved
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Fold:
+    """Drivers of one fold, the others' population, and log θ [2, G, P] by weight, from each half of their time.
+
+    ``left`` [drivers] is what every weight leaves of the gap on the half that was not fitted (m²).
+    """
+
+    prior: Prior
+    frozen: Frozen
+    thetas: dict[float, np.ndarray]
+    left: dict[float, np.ndarray]
+
+
+def _loss(left: np.ndarray) -> float:
+    """Return what a weight costs: the mean over drivers of squares times their geometric mean.
+
+    The mean alone is that of a few hopeless followers, the geometric mean alone does not see what becomes of them.
+    """
+    return float(np.mean(left) * np.exp(np.log(left + 1e-9).mean()))
+
+
+def crossed(
+    records: Records, model: Model, values: np.ndarray, fold: np.ndarray, noise: Noise,
+    start: np.ndarray | None = None, pooled: bool = False,
+) -> judge.Judged:  # fmt: skip
+    """Return a model's errors on all runs, each judged by what the other folds say.
+
+    A driver's parameters are fitted to every second block of his time and judged between, then the other way round;
+    their population and φ come from other folds. Every error has the calibration that serves it: closed-loop
+    simulation that of closed-loop simulation, with the population's weight chosen by other folds, and predictions 5 s
+    ahead that of whitened predictions 5 s ahead, whose likelihood weighs the population by itself.
+
+    Args:
+        records: All runs.
+        model: What is judged.
+        values: φ [folds, Q] without the runs of each fold.
+        fold: Fold of every run.
+        noise: Of predictions 5 s ahead, the same for all models that are compared.
+        start: log θ [G, P] to begin with, beside the law's usual values.
+        pooled: Whether every driver is the population's middle.
+    """
+    rows, own = whole(records), model.catalogue.own
+    task, theta = judge.unweighed(records, model, values.mean(0), first_prior(own), start=start)
+    second = judge.halves(rows)
+    halves = [replace(rows, valid=part).settled() for part in (rows.valid & ~second, second)]
+    middle = Frozen(model, values.mean(0))
+    near = np.stack([
+        solve(replace(task, rows=half), middle, theta, EMPTY, iterations=10, tolerance=1e-4).theta for half in halves
+    ])  # fmt: skip
+    of_row = fold[rows.run]
+    parts: dict[int, _Fold] = {}
+    for k in np.unique(of_row):
+        prior = population(theta, rows.some(of_row != k), own)
+        mine = [half.some(of_row == k) for half in halves]
+        frozen = Frozen(model, values[k])
+        if pooled:
+            everyone = np.broadcast_to(prior.centre, near.shape)
+            parts[int(k)] = _Fold(prior, frozen, {POOLED_S: everyone}, {POOLED_S: np.ones(1)})
+        else:
+            parts[int(k)] = _weighed(mine, prior, frozen, near)
+    gap, speed = _simulated(rows, second, fold, parts)
+    short = windows(records)
+    ahead = _ahead(Task(short, noise.alike(len(short)), first_prior(own)), model, values, fold, theta, pooled)
+    return judge.Judged(rows, gap, speed, ahead, short.record)
+
+
+def at_best(records: Records, model: Model, values: np.ndarray) -> tuple[judge.Judged, np.ndarray]:
+    """Return a model's errors on the very data that it is fitted to, and log θ [G, P]; values [Q].
+
+    With parameters that did not see what is judged its gaps err more: what is too much here needs no cross-fitting.
+    """
+    theta = judge.unweighed(records, model, values, first_prior(model.catalogue.own))[1]
+    return judge.judge(records, model, values, theta), theta
+
+
+def _weighed(mine: list[Rows], prior: Prior, frozen: Frozen, near: np.ndarray) -> _Fold:
+    """Fit the drivers of a fold to each half of their time with every weight of the population."""
+    thetas: dict[float, np.ndarray] = {}
+    left: dict[float, np.ndarray] = {}
+    seen = np.unique(mine[0].group)
+    count = np.sum([Task(half, None, prior).per_group(half.valid.sum(1)) for half in mine], axis=0)
+    wanted: Sequence[float] = GRID_S[::2]
+    while wanted:
+        for seconds in wanted:
+            begin = thetas[min(thetas, key=lambda s: abs(np.log(s / seconds)))] if thetas else near
+            fitted, square = [], np.zeros(near.shape[1])
+            for i, half in enumerate(mine):
+                task = Task(half, None, replace(prior, free=False, alike_s=seconds))
+                task = judge.scaled(task, frozen, EMPTY, near[i])
+                fitted.append(solve(task, frozen, begin[i], EMPTY, iterations=10, tolerance=1e-4).theta)
+                there = replace(task, rows=mine[1 - i])
+                errors = there.errors(fitted[i][None], frozen, EMPTY[None])[0]
+                square += there.per_group((errors**2).sum(1))
+            thetas[seconds], left[seconds] = np.stack(fitted), square[seen] / np.maximum(count[seen], 1)
+        wanted = further({s: _loss(x) for s, x in left.items()})
+    return _Fold(prior, frozen, thetas, left)
+
+
+def _simulated(
+    rows: Rows, second: np.ndarray, fold: np.ndarray, parts: dict[int, _Fold]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return gaps and speeds of closed-loop simulation with the weight that the other folds choose."""
+    gap, speed = np.zeros((2, *rows.valid.shape))
+    # Of two copies, the second is scored where the first was fitted.
+    there, known = (~second).astype(int), set.intersection(*(set(p.left) for p in parts.values()))
+    for k, part in parts.items():
+        others = [p.left for j, p in parts.items() if j != k or len(parts) == 1]
+        best = min(sorted(known), key=lambda s: _loss(np.concatenate([left[s] for left in others])))
+        thetas, at = part.thetas[best], fold[rows.run] == k
+        one = Task(rows.some(at), None, part.prior).predict(thetas, part.frozen, np.zeros((2, 0)))
+        gap[at], speed[at] = (np.take_along_axis(x, there[at][None], 0)[0] for x in one)
+    return gap, speed
+
+
+def _ahead(
+    task: Task, model: Model, values: np.ndarray, fold: np.ndarray, theta: np.ndarray, pooled: bool
+) -> np.ndarray:
+    """Return errors of the gap 5 s ahead [windows], drivers calibrated on such predictions of their other blocks."""
+    # The window before the first of a block is in the other half.
+    rows = replace(task.rows, joined=task.rows.joined & (task.rows.block == np.roll(task.rows.block, 1)))
+    free = replace(task, rows=rows, prior=replace(task.prior, free=False))
+    whole_time = solve(free, Frozen(model, values.mean(0)), theta, EMPTY, iterations=15, tolerance=1e-3).theta
+    ahead, second = np.zeros(len(rows)), rows.block % 2 == 1
+    for k in np.unique(fold[rows.run]):
+        mine, frozen = fold[rows.run] == k, Frozen(model, values[k])
+        prior = replace(population(whole_time, rows.some(~mine), model.catalogue.own), free=False)
+        for half in (second, ~second):
+            own = replace(free, prior=prior).of_rows(mine & ~half)
+            fitted = np.broadcast_to(prior.centre, theta.shape)
+            if not pooled:
+                fitted = solve(own, frozen, whole_time, EMPTY, iterations=10, tolerance=1e-3).theta
+            scored = Task(rows.some(mine & half), None, prior)
+            ahead[mine & half] = scored.errors(fitted[None], frozen, EMPTY[None])[0][:, -1]
+    return ahead
