@@ -17,18 +17,21 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from agents import common, environments
 from agents.monitor import Monitor
 from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.tasks.features import AgentView, Feature, ObservedFeature
 
 
 @dataclass
@@ -65,14 +68,65 @@ class Arguments(common.Arguments):
     explore: float = 0.02
 
 
-def scene(env: DiffIDMVectorEnv, observation: Tensor) -> Tensor:
-    """Return what the critic sees: the observation, and mean and deviation of all speeds (15 m/s) and gaps (15 m)."""
-    state = env.state
-    columns = []
-    for x in (state.speed / 15.0, state.gap.clamp_max(150.0) / 15.0):
-        mean = x.mean(-1, keepdim=True)
-        columns += [mean, ((x - mean).square().mean(-1, keepdim=True) + 1e-6).sqrt()]
-    return torch.cat((observation, *columns), dim=-1)
+_FAR = 150.0
+"""Gap (m) beyond which a free road is no wider to the critic."""
+
+
+def _speeds(view: AgentView) -> Tensor:
+    return view.state.speed
+
+
+def _gaps(view: AgentView) -> Tensor:
+    return view.state.gap.clamp_max(_FAR)
+
+
+def _mean(of: Callable[[AgentView], Tensor], view: AgentView) -> Tensor:
+    return view.mean(of(view))
+
+
+def _deviation(of: Callable[[AgentView], Tensor], view: AgentView) -> Tensor:
+    x = of(view)
+    return (view.mean((x - x.mean(-1, keepdim=True)).square()) + 2.25e-4).sqrt()
+
+
+ROAD = tuple(
+    Feature(f"{what}_of_all_{name}", symbol, unit, 15.0, -1e4, 1e4, partial(how, of))
+    for name, unit, of in (("speeds", "m/s", _speeds), ("gaps", "m", _gaps))
+    for what, symbol, how in (("mean", "⟨x⟩", _mean), ("deviation", "σ(x)", _deviation))
+)
+"""What the critic sees of the road: mean and deviation of all speeds (15 m/s) and gaps (15 m, at most 150 m)."""
+
+
+def _ahead(each: ObservedFeature, view: AgentView) -> Tensor:
+    return each.feature.read(AgentView(view.task, view.world, each.ahead))
+
+
+def with_road(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the environment in which every agent observes what it did, and ``ROAD`` behind that."""
+    task = environments.task_of(environment)
+    own = [replace(each.feature, name=each.name, read=partial(_ahead, each)) for each in task.observed]
+    return {**environment, "observation": {"features": [*own, *ROAD], "scaling": task.scaling}}
+
+
+class Sighted(nn.Module):
+    """A policy among observations that have ``ROAD`` behind them, which it does not look at."""
+
+    def __init__(self, policy: nn.Module, agents: int) -> None:
+        super().__init__()
+        self.policy, self.agents = policy, agents
+
+    def own(self, observation: Tensor) -> Tensor:
+        """Return what the policy observes."""
+        return observation.unflatten(-1, (self.agents, -1))[..., : -len(ROAD)].flatten(-2)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the policy's actions."""
+        action: Tensor = self.policy(self.own(observation))
+        return action
+
+    def scene(self, observation: Tensor) -> Tensor:
+        """Return what the critic sees: what all agents observe, and the road once."""
+        return torch.cat((self.own(observation), observation[..., -len(ROAD) :]), dim=-1)
 
 
 class Critic(nn.Module):
@@ -99,13 +153,13 @@ class Critic(nn.Module):
 
 def human_scenes(environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 1500) -> Tensor:
     """Return what the critic sees, every tenth step, while human drivers keep the wheel."""
-    env = environments.make_env(environment, count, output="numpy")
-    seen = [scene(env, torch.as_tensor(env.reset(seed=seed)[0]))]
+    env = environments.make_env(with_road(environment), count, output="numpy")
+    seen = [env.reset(seed=seed)[0]]
     for step in range(steps):
         observation = env.step(None)[0]
         if step % 10 == 0:
-            seen.append(scene(env, torch.as_tensor(observation)))
-    return torch.cat(seen)
+            seen.append(observation)
+    return Sighted(nn.Identity(), len(env.task.agents)).scene(torch.as_tensor(np.concatenate(seen)))
 
 
 @dataclass
@@ -119,29 +173,21 @@ class Window:
     gain: Tensor
 
 
-def roll(
-    env: DiffIDMVectorEnv, policy: nn.Module, target: nn.Module, observation: Tensor, a: Arguments
-) -> tuple[Tensor, Window]:
-    """Drive one window; return the observation after it and the window, its gain with the graph."""
-    n = env.num_envs
-    discount, gain = torch.ones(n), torch.zeros(n)
-    push = a.explore * torch.randn(n, 1)
-    kept: list[tuple[Tensor, ...]] = []
-    for t in range(a.window):
-        before = scene(env, observation).detach()
-        observation, reward, terminated, truncated, _ = env.step(policy(observation) + push)
-        gain = gain + (1.0 - a.gamma) * discount * reward
-        ended = terminated | truncated
-        value = torch.where(terminated, 0.0, target(scene(env, observation)))
-        discount = discount * a.gamma
-        last = torch.ones_like(ended) if t == a.window - 1 else ended
-        gain = gain + torch.where(last, discount * value, 0.0)
-        discount = torch.where(ended, 1.0, discount)
-        kept.append((before, reward.detach(), value.detach(), ended))
-        if bool(ended.any()):
-            observation = env.reset(options={"reset_mask": ended})[0]
-    scenes, rewards, following, ends = (torch.stack(column) for column in zip(*kept, strict=True))
-    return observation, Window(scenes, rewards, following, ends, gain)
+def roll(env: DiffIDMVectorEnv, sighted: Sighted, target: nn.Module, a: Arguments) -> Window:
+    """Drive one window and return it, its gain with the graph; ``env`` is one of ``with_road``."""
+    push = a.explore * torch.randn(env.num_envs, 1)
+    told = env.unroll(sighted, a.window, push)
+    ended = told.terminated | told.truncated
+    value = torch.where(told.terminated, 0.0, target(sighted.scene(told.final)))
+    # How many steps of its episode have gone before, within the window.
+    step = torch.arange(a.window).unsqueeze(-1)
+    begun = torch.where(ended, step + 1, 0).cummax(0).values.roll(1, 0)
+    begun[0] = 0
+    discount = a.gamma ** (step - begun).to(told.reward.dtype)
+    last = ended | (step == a.window - 1)
+    gains = (1.0 - a.gamma) * discount * told.reward + torch.where(last, a.gamma * discount * value, 0.0)
+    scenes = sighted.scene(told.observation[:-1]).detach()
+    return Window(scenes, told.reward.detach(), value.detach(), ended, gains.sum(0))
 
 
 def returns(window: Window, gamma: float, lam: float) -> Tensor:
@@ -175,10 +221,11 @@ def train(a: Arguments) -> list[dict[str, Any]]:
     """Train a policy; return the evaluations. ValueError and DivergedError say what went wrong, in one line."""
     began = time.process_time()
     torch.manual_seed(a.seed)
-    env = environments.make_env(a.trained_in, a.count, output="torch", autoreset_mode="Disabled")
+    env = environments.make_env(with_road(a.trained_in), a.count, output="torch")
     env.reset(seed=environments.first_seed(a.seed, a.count))
     policy, saved = common.begin(a, "shac")
-    observation = environments.restore(env, saved["episodes"]) if saved else environments.desynchronise(env)
+    sighted = Sighted(policy, len(env.task.agents))
+    _ = environments.restore(env, saved["episodes"]) if saved else environments.desynchronise(env)
     critic = Critic(human_scenes(a.trained_in, environments.first_seed(a.seed, 0)), a.critic_hidden)
     target = deepcopy(critic)
     target.requires_grad_(False)
@@ -200,7 +247,7 @@ def train(a: Arguments) -> list[dict[str, Any]]:
             rate = common.fall(a.learning_rate, update, a.updates)
             actor_steps.param_groups[0]["lr"] = rate
             env.detach()
-            observation, window = roll(env, policy, target, observation.detach(), a)
+            window = roll(env, sighted, target, a)
             # The gain of a window is a few steps' share of an average reward: per step it has the size of a reward.
             loss = -window.gain.mean() / ((1.0 - a.gamma) * a.window)
             norm = 0.0

@@ -34,8 +34,9 @@ from torch import Tensor
 from agents.common import load
 from agents.evaluate import judge_lanes
 from agents.rollout import Act, episodes_start
-from benchmarks.environments import rule
+from idm_env.effects.idm import interaction
 from idm_env.tasks.open_lanes import OpenLanesTask
+from idm_env.types import Driver
 
 DEMANDS: dict[str, dict[str, Any]] = {
     "merge 2400 + 500": {"task": "merge", "inflow": 2400.0, "ramp_inflow": 500.0},
@@ -65,6 +66,20 @@ class Seen:
         column = {name: parts[..., i] * scale for i, (name, scale) in enumerate(zip(names, scales, strict=True))}
         self.speed, self.lane, self.position = column["speed"], column["lane"].round().long(), column["position"]
         self.present, self.limit = column["present"] > 0.5, task.command_limits[1]
+        self._nearby = [
+            [column[f"{what}_{k}"] for k in range(task.seen)] for what in ("there", "ahead", "left", "speed")
+        ]
+        self._length = task.vehicle_length
+
+    def idm(self, v0: Tensor, headway: Tensor, s0: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """Return the action of IDM drivers with these numbers, behind whom they see ahead on their lane."""
+        there, ahead, left, faster = (torch.stack(each, -1) for each in self._nearby)
+        way = torch.where((there > 0.5) & (left.round() == 0) & (ahead > 0.0), ahead, torch.inf)
+        gap, first = way.min(-1)
+        closing = torch.where(gap.isfinite(), -faster.gather(-1, first.unsqueeze(-1)).squeeze(-1), 0.0)
+        driver = Driver(a, b, headway, s0, v0)
+        kept = interaction(driver, self.speed, gap - self._length, self.speed - closing)
+        return (a * (1.0 - (self.speed / v0) ** 4 - kept) / self.limit).clamp(-1.0, 1.0)
 
     def towards(self, target: Tensor) -> Tensor:
         """Return the action that reaches a speed (m/s) within 2 s."""
@@ -91,10 +106,8 @@ def constants(task: OpenLanesTask, values: Tensor, episodes: int) -> Act:
 
 def drivers(task: OpenLanesTask, values: Tensor, episodes: int) -> Act:
     """Return agents who drive by IDM with other numbers."""
-    shares = torch.cat((values, torch.ones(len(values), 1)), -1).repeat_interleave(episodes, 0)
-    names, scales = task.bounds.names, torch.tensor(task.scales)
-    act = rule(shares, names, task.command_limits[1])
-    return lambda seen: act(seen.reshape(len(seen), -1, len(names)) * scales)
+    each = values.repeat_interleave(episodes, 0).unsqueeze(1).unbind(-1)
+    return lambda seen: Seen(task, seen).idm(*each)
 
 
 class Alinea:

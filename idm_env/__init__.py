@@ -40,7 +40,7 @@ _LAZY = {
 
 _MOVED = {
     "config": "model_file", "diagrams": "reports.diagrams", "executor": "jobs.executor", "keep": "jobs.storage",
-    "parts": "jobs.shards", "plot": "reports.plot", "population": "multilane.demand", "progress": "jobs.progress",
+    "parts": "jobs.shards", "population": "multilane.demand", "progress": "jobs.progress",
     "report": "reports.page", "trust": "jobs.trust",
 }  # fmt: skip
 """Modules that documents of 0.1 named, and where they are now; the old names work for one version."""
@@ -140,6 +140,8 @@ backends.enter("idm_env.kernels.dispatch:rollout")
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return getattr(importlib.import_module(_LAZY[name]), name)
+    if name == "plot":
+        return importlib.import_module("idm_env.plot")
     if name in _MOVED:
         return sys.modules[f"idm_env.{name}"]
     raise AttributeError(f"module 'idm_env' has no attribute '{name}'")

@@ -127,6 +127,16 @@ class Stepping:
         """Whether drivers look at who signals beside them."""
         return "merger" in self._needs
 
+    @property
+    def sees_lanes(self) -> bool:
+        """Whether drivers look at which lane they are on."""
+        return "lane" in self._needs
+
+    @cached_property
+    def rooms(self) -> tuple[Effect, ...]:
+        """Effects that say how far drivers can go on, or want to, on a lane."""
+        return tuple(e for e in self.effects if type(e).room is not Effect.room)
+
     @cached_property
     def decides_after(self) -> int:
         """Steps between two decisions about lanes."""
@@ -249,6 +259,9 @@ class Stepping:
                 memory[effect.name] = normals(f"{effect.name} at the start", seed or 0, held) if drawn else held
         if self.looks_back:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
+        if self.sees_lanes:
+            on_one = torch.zeros_like(state.speed)
+            memory[merging.LANE] = on_one if state.links is None else state.links.lane.to(state.speed.dtype)
         return {**memory, **merging.nobody(state.speed)} if self.sees_mergers else memory
 
     def scene(self, state: State, inputs: Inputs) -> Scene:
@@ -272,6 +285,7 @@ class Stepping:
             memory=state.memory,
             history=self._history(state),
             merger=merging.merger(state.memory, state.speed) if self.sees_mergers else None,
+            lane=state.memory.get(merging.LANE) if self.sees_lanes else None,
         )
         return half_ahead(scene) if self.integration == "midpoint" else scene
 
@@ -343,6 +357,8 @@ class Stepping:
         gap, links = self._gaps(state, motion), state.links
         if motion.lane is not None:
             gap, links = self.road.view(state).placed(state, motion, gap)
+            if merging.LANE in memory and links is not None:
+                memory[merging.LANE] = links.lane.to(motion.speed.dtype)
         return state._replace(
             position=motion.position,
             speed=motion.speed,

@@ -190,10 +190,10 @@ class PastScenes(Protocol):
 class Scene(NamedTuple):
     """What one step looks like to every vehicle; effects read this and know no topology.
 
-    ``second_leader``, ``behind`` and ``merger`` (who signals from a lane beside that he wants to be the leader) are
-    filled only where an effect of the simulator needs them, ``here``, ``left`` and
-    ``right`` only for the hook ``change``; ``inputs`` and ``memory`` are keyed by effect name, ``time`` is in seconds,
-    ``euler`` tells how speeds will be integrated.
+    ``second_leader``, ``behind``, ``merger`` (who signals from a lane beside that he wants to be the leader) and
+    ``lane`` (0 on the right, 0 on a road of one) are filled only where an effect of the simulator needs them, ``here``,
+    ``left`` and ``right`` only for the hook ``change``; ``inputs`` and ``memory`` are keyed by effect name, ``time`` is
+    in seconds, ``euler`` tells how speeds will be integrated.
     """
 
     position: Tensor
@@ -212,6 +212,7 @@ class Scene(NamedTuple):
     left: Beside | None = None
     right: Beside | None = None
     merger: Neighbour | None = None
+    lane: Tensor | None = None
 
     def past(self, seconds: Tensor) -> Scene:
         """Return the scene of some seconds ago, interpolated between steps; ``seconds`` broadcasts over vehicles.

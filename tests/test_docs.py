@@ -279,13 +279,9 @@ def test_pages_of_tasks_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_example_has_a_picture_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """No grey placeholder in the gallery: of all examples, run there or not."""
     monkeypatch.syspath_prepend(ROOT / "docs")
-    figures = importlib.import_module("gallery_of").FIGURES
-    assert set(figures) == {path.stem for path in (ROOT / "examples").glob("*.py")}
-    ran = re.search(r'"filename_pattern": r"(.*?)",$', (ROOT / "docs" / "conf.py").read_text("utf-8"), re.MULTILINE)
-    assert ran is not None
-    for name, (picture, more) in figures.items():
-        assert picture.startswith("generated/") or (ROOT / "docs" / picture).exists(), picture
-        assert bool(re.search(ran[1], f"/{name}.py")) == ("\n" in more), f"{name}: code draws where it runs"
+    names = {path.stem for path in (ROOT / "examples").glob("*.py")}
+    assert set(importlib.import_module("gallery_of").FIGURES) == names
+    assert {path.stem for path in (ROOT / "docs" / "examples").glob("*.png")} == names
 
 
 def test_every_task_has_its_returns() -> None:

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from idm_env.data import synthetic
+from idm_env.plot import animate, edie, fundamental_diagram
 from idm_env.reports.diagrams import Panel, VehicleLine
-from idm_env.reports.plot import animate, edie, fundamental_diagram
 
 
 def uniform(vehicles: int, speed: float, ring: float | None = 200.0) -> Panel:

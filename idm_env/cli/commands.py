@@ -596,7 +596,6 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
     from idm_env.envs.gym import DiffIDMEnv
     from idm_env.model_file import load_environment
     from idm_env.reports.diagrams import lane_panels, rollout_panel
-    from idm_env.roads import Lanes
     from idm_env.simulator import Trajectory
 
     _work_begins()
@@ -616,13 +615,13 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
         report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
         if terminated or truncated:
             break
-    lap = env.task.road.lap(state)
     states = Trajectory(*(torch.stack(column) for column in zip(*kept, strict=True)))
-    road = env.task.simulator.road
-    if isinstance(road, Lanes):
+    lap = env.task.road.lap(state)
+    ring = None if lap is None else float(lap.reshape(-1)[0])
+    if lanes:
         lane, present = torch.stack(lanes), torch.stack(there)
-        return lane_panels(states, lane, present, dt=dt, ring_length=road.ring, marked=env.task.agents)
-    return [rollout_panel(states, dt=dt, ring_length=None if lap is None else float(lap[0]), marked=env.task.agents)]
+        return lane_panels(states, lane, present, dt=dt, ring_length=ring, marked=env.task.agents)
+    return [rollout_panel(states, dt=dt, ring_length=ring, marked=env.task.agents)]
 
 
 @app.command("filter")

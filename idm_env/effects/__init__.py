@@ -22,6 +22,7 @@ from idm_env.effects.noise import DRIFTS, AccelNoise, Noise, PerceptionNoise, Wa
 from idm_env.effects.perception import ClosingGain, DeadZone, Delay, GapBias, ImaginedLeader
 from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
 from idm_env.effects.registry import entered, imported, is_candidate, lives, read
+from idm_env.effects.road_rules import Destination, LaneClosure, Signal, SpeedLimit
 from idm_env.effects.surroundings import Drag, Grade
 from idm_env.effects.time_gaps import GapStiffness, Relaxation, SetPointAsymmetry, SpeedTimeGap
 from idm_env.validation import nearest, shown
@@ -72,10 +73,14 @@ ALL: dict[str, type[Effect]] = {
         PerceptionNoise,
         Curve,
         DriverCurve,
+        SpeedLimit,
+        LaneClosure,
+        Signal,
         Mobil,
         MandatoryChange,
         GapAcceptance,
         LaneCommand,
+        Destination,
     )
 }
 
@@ -210,6 +215,7 @@ __all__ = [
     "CurveSpeed",
     "DeadZone",
     "Delay",
+    "Destination",
     "Drag",
     "DriverCurve",
     "Effect",
@@ -222,6 +228,7 @@ __all__ = [
     "IDMPlus",
     "ImaginedLeader",
     "Lag",
+    "LaneClosure",
     "LaneCommand",
     "Lateral",
     "LeaderAcceleration",
@@ -236,7 +243,9 @@ __all__ = [
     "Replay",
     "SecondLeader",
     "SetPointAsymmetry",
+    "Signal",
     "SpeedDependentGap",
+    "SpeedLimit",
     "SpeedProfile",
     "SpeedTimeGap",
     "SpeedZone",

@@ -23,7 +23,7 @@ because a column of the file gives the profile."""
 Neighbour = Literal["leader", "second leader", "vehicle behind", "vehicle in an adjacent lane"]
 """Whom a record must show for the effect to be seen in it."""
 
-NEEDED = frozenset({"second_leader", "behind", "merger"})
+NEEDED = frozenset({"second_leader", "behind", "merger", "lane"})
 """Neighbours that a scene has where an effect ``needs`` them."""
 
 P = dict[str, Tensor]
@@ -196,6 +196,14 @@ class Effect:
         """Return what speaks for a change to either side; ``scene.here``, ``left`` and ``right`` are there."""
         none = torch.zeros_like(scene.speed)
         return Wish(none, none, none, none)
+
+    def room(self, scene: Scene, p: P) -> Tensor | None:
+        """Return how far each driver can go on, or wants to, on the lane ``scene.lane`` (m), None for any way.
+
+        Drivers ask this of their own lane and of those beside when they decide: one without room is not entered. It
+        is no hook, and goes with one; the effect ``needs`` the lane.
+        """
+        return None
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:
         """Return the memory before the first step, or None for an effect without one."""

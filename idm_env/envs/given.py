@@ -129,7 +129,7 @@ def _linked(state: State, road: Road) -> None:
 
 def _spaced(state: State, road: Road) -> None:
     """Refuse gaps that are not those of the positions; vehicles that touch are left to the task."""
-    around = road.lap(state)
+    around = road.lap(state) if state.links is None else None  # links know their own
     view = road.view(state)
     led = view.leader_present(state.present, state.speed) > 0
     gap = torch.where(led, view.gaps(state.position, state.length, around), FAR)

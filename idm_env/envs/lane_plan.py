@@ -50,7 +50,7 @@ from idm_env.kernels.operands import operand, table
 from idm_env.kernels.rows import RowFunction, adjoint, storage
 from idm_env.kernels.world_loop import workspaces
 from idm_env.multilane.demand import turned
-from idm_env.multilane.incentives import seen_merging
+from idm_env.multilane.incentives import on_lanes, seen_merging
 from idm_env.roads import Lanes
 from idm_env.roads.linked import Linked
 from idm_env.scalar.record import Form, Unordered, Untraceable
@@ -373,10 +373,10 @@ class LanePlan(Plan):
         view = self.road.view(state)
         assert isinstance(view, Linked)
         gap = torch.where(leaves["fresh"], view.gaps(state.position, state.length), state.gap)
-        if "merger" not in leaves:
-            return {"state_gap": gap}
-        due = torch.ones_like(gap, dtype=torch.bool) if state.present is None else state.present > 0
-        after = seen_merging(view, state, leaves["merger"], due)
+        after = on_lanes(state)
+        if "merger" in leaves:
+            due = torch.ones_like(gap, dtype=torch.bool) if state.present is None else state.present > 0
+            after = seen_merging(view, after, leaves["merger"], due)
         held = {f"memory_{n}": x for n, x in after.memory.items() if x is not state.memory[n]}
         return {"state_gap": gap, **held}
 

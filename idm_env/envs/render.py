@@ -142,7 +142,7 @@ class Viewer:
 
     def show(self, task: Task, state: State, row: int = 0) -> np.ndarray | None:
         """Return the picture of one row of a state as ``(height, width, 3)`` uint8, or show it in the window."""
-        ring = task.road.lap(state) is not None
+        ring = state.links is None and task.road.lap(state) is not None
         lane, lanes = np.array(task.lanes), min(max(task.lanes) + 1, _MOST_LANES)
         if isinstance(task.road, Lanes) and state.links is not None:
             # The left lane is on top, as seen by drivers who go to the right.

@@ -34,7 +34,7 @@ class Driver:
         ValueError: For one that does not take these observations, or gives no actions.
     """
 
-    def __init__(self, policy: nn.Module, width: int, actions: int, dtype: torch.dtype) -> None:
+    def __init__(self, policy: nn.Module, rows: int, width: int, actions: int, dtype: torch.dtype) -> None:
         own = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
         self.names = dict(zip(own, (f"w{i}" for i in range(len(own))), strict=True))
         self.learned = [self.names[n] for n, _ in policy.named_parameters()]
@@ -44,11 +44,11 @@ class Driver:
 
         try:
             with torch.no_grad():
-                done = policy(torch.zeros(2, width, dtype=dtype))
+                done = policy(torch.zeros(rows, width, dtype=dtype))
         except RuntimeError as error:
             why = str(error).splitlines()[0]
             raise ValueError(f"policy does not take observations of shape (n, {width}): {why}.") from None
-        if not isinstance(done, Tensor) or done.shape != (2, actions):
+        if not isinstance(done, Tensor) or done.shape != (rows, actions):
             shape = tuple(done.shape[1:]) if isinstance(done, Tensor) else type(done).__name__
             raise ValueError(f"policy gives {shape} for each observation, and {actions} actions are needed.")
 
@@ -58,7 +58,10 @@ class Driver:
             return {"action": done + given["push"]}
 
         leaves = {"seen": torch.zeros(_MANY, width, dtype=dtype), "push": torch.zeros(_MANY, actions, dtype=dtype)}
-        self.forward: PolicyRows = PolicyRows(act, {**leaves, **sample}, _MANY, list(sample))
+        try:
+            self.forward: PolicyRows = PolicyRows(act, {**leaves, **sample}, _MANY, list(sample))
+        except RuntimeError as error:  # it takes as many rows as there are environments, no more
+            raise Untraceable(str(error)) from error
         back = adjoint(act, ["action"], ["seen", *self.learned])
 
         def pulled(**given: Tensor) -> dict[str, Tensor]:
@@ -76,15 +79,15 @@ class Driver:
 _DRIVERS: weakref.WeakKeyDictionary[nn.Module, dict[Any, Driver | None]] = weakref.WeakKeyDictionary()
 
 
-def driver_of(policy: Any, width: int, actions: int, dtype: torch.dtype) -> Driver | None:
+def driver_of(policy: Any, seen: Tensor, actions: int) -> Driver | None:
     """Return a policy as compiled loops, recorded once; None where it runs by torch between the steps."""
     if not isinstance(policy, nn.Module):
         return None
-    kept = _DRIVERS.setdefault(policy, {})
+    kept, (rows, width), dtype = _DRIVERS.setdefault(policy, {}), seen.shape, seen.dtype
     key = (width, actions, dtype, policy.training, tuple((n, x.shape) for n, x in policy.state_dict().items()))
     if key not in kept:
         try:
-            kept[key] = Driver(policy, width, actions, dtype)
+            kept[key] = Driver(policy, rows, width, actions, dtype)
         except Untraceable:
             kept[key] = None
     return kept[key]
@@ -301,7 +304,7 @@ class _Window(torch.autograd.Function):
 def compiled(batch: Batch, values: Values, policy: Any, steps: int, push: Tensor) -> tuple[Tensor, ...] | None:
     """Return the fields of a window whose policy runs inside the loops, or None where it cannot."""
     seen = batch.seen()
-    driver = driver_of(policy, seen[0].numel(), push.shape[-1], seen.dtype)
+    driver = driver_of(policy, seen, push.shape[-1])
     if driver is None:
         return None
     plan = values.plan((False, True), batch.task.simulator.draws)

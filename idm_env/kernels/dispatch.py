@@ -61,6 +61,13 @@ def rollout(
     """Return what ``Simulator.rollout`` returns, by a kernel; None where there is none for this call."""
     if not simulator.kernels:
         return None
+    short = not (inputs or every or keep)
+    if short and surroundings() is None:
+        from idm_env.kernels import repeated
+
+        after = repeated.again(simulator, state, params, steps)
+        if after is not None:
+            return after, None
     kernel = found(simulator, state, inputs, params)
     if isinstance(kernel, str):
         return None
@@ -71,7 +78,10 @@ def rollout(
     from idm_env.kernels import lanes
 
     block = min(every or lanes.BLOCK, 4 * lanes.BLOCK)
-    return lanes.rollout(kernel, simulator, state, inputs, params, steps, block=block, keep=keep)
+    plan, sources = lanes.planned(kernel, simulator, state, inputs, params, steps, block, keep, None)
+    if short:
+        repeated.keep(plan)
+    return lanes.run(plan, sources)
 
 
 def refusal(simulator: Simulator, state: State, inputs: Inputs, params: Params) -> str | None:

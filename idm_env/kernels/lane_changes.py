@@ -16,7 +16,7 @@ from idm_env.kernels.operands import dense, operand
 from idm_env.kernels.printed import HEADER, printed
 from idm_env.kernels.tiles import ROW, Array
 from idm_env.multilane.demand import turnover
-from idm_env.multilane.incentives import seen_merging
+from idm_env.multilane.incentives import on_lanes, seen_merging
 from idm_env.multilane.lane_change import decided
 from idm_env.roads import Lanes
 from idm_env.roads.chains import Places
@@ -166,7 +166,7 @@ class Traffic:
             gap = Linked(self.road, links, state.position).gaps_of(which, state.position, state.length)
             full = state.gap.expand(self.shape).reshape(-1)
             state = state._replace(gap=full.index_put((which,), gap).view(self.shape))
-        state = state._replace(links=links)
+        state = on_lanes(state._replace(links=links))
         if not sees:
             return state
         due = torch.ones((), dtype=torch.bool) if state.present is None else state.present > 0

@@ -37,7 +37,7 @@ BLOCK = 16
 
 
 @dataclass(frozen=True, eq=False)
-class _Plan:
+class RolloutPlan:
     """Everything about a rollout that is not differentiated."""
 
     kernel: TileKernel
@@ -55,18 +55,22 @@ class _Plan:
 
     @cached_property
     def shape(self) -> tuple[int, ...]:
+        """``(*batch, vehicles)``."""
         return tuple(self.state.speed.shape)
 
     @cached_property
     def rows(self) -> int:
+        """Batch rows."""
         return math.prod(self.shape[:-1])
 
     @cached_property
     def count(self) -> int:
+        """Vehicles of all rows."""
         return math.prod(self.shape)
 
     @cached_property
     def kind(self) -> np.dtype[Any]:
+        """Precision."""
         return np.dtype(np.float32 if self.state.speed.dtype == torch.float32 else np.float64)
 
     @cached_property
@@ -173,10 +177,11 @@ def past_tensor(rows: Array, slots: int, shape: tuple[int, ...]) -> Tensor:
     return torch.from_numpy(rows).view(slots, -1, *shape).movedim((0, 1), (-2, -1))
 
 
-def _plan(
+def planned(
     kernel: TileKernel, simulator: Stepping, state: State, inputs: Inputs, params: Params, steps: int, block: int,
     keep: bool, threads: int | None,
-) -> tuple[_Plan, list[Tensor]]:  # fmt: skip
+) -> tuple[RolloutPlan, list[Tensor]]:  # fmt: skip
+    """Return what ``run`` takes."""
     *batch, size = state.speed.shape
     program = kernel.program
     given = [static_of(simulator, state, params, n) for n in (*program.statics, *program.parameters)]
@@ -189,7 +194,7 @@ def _plan(
     if torch.is_grad_enabled():
         differentiated = _differentiated(program.moving, state, given[len(program.statics) :], numbers, kernel.signals)
     tape = any(x.requires_grad for x in differentiated)
-    plan = _Plan(
+    plan = RolloutPlan(
         kernel, simulator, state, inputs, params, steps, min(block, steps), keep, tape,
         tuple(a for a, _ in made), strides, threads,
     )  # fmt: skip
@@ -204,7 +209,7 @@ def _differentiated(
 
 
 def _forward(
-    plan: _Plan, start: list[Array], past: Array
+    plan: RolloutPlan, start: list[Array], past: Array
 ) -> tuple[list[Array | None], Array, Array, list[tuple[list[Array | None], Array]]]:
     """Return the last states, the last past, what is kept of every step, and the tape: states at every block."""
     states = range(len(plan.kernel.program.states))
@@ -234,7 +239,7 @@ def _forward(
     return now, before, kept, tape
 
 
-def _ran(plan: _Plan) -> tuple[list[Tensor], list[tuple[list[Array | None], Array]]]:
+def _ran(plan: RolloutPlan) -> tuple[list[Tensor], list[tuple[list[Array | None], Array]]]:
     """Return the last states, the last past and what is kept, without a graph; and the tape."""
     start = [dense(x.to(plan.state.speed.dtype), plan.shape) for x in starts(plan.state, plan.kernel.program.states)]
     past = past_rows(plan.state.memory[PAST], plan.shape) if plan.slots else plan.past()
@@ -249,7 +254,7 @@ def _ran(plan: _Plan) -> tuple[list[Tensor], list[tuple[list[Array | None], Arra
 
 class _Rollout(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, plan: _Plan, *sources: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, plan: RolloutPlan, *sources: Tensor) -> tuple[Tensor, ...]:
         program = plan.kernel.program
         out, tape = _ran(plan)
         ctx.plan, ctx.tape = plan, tape
@@ -261,7 +266,7 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *seeds: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        plan: _Plan = ctx.plan
+        plan: RolloutPlan = ctx.plan
         saved = ctx.saved_tensors
         if torch.is_grad_enabled():
             return (None, *_differentiable(plan, saved, seeds))
@@ -269,7 +274,11 @@ class _Rollout(torch.autograd.Function):
 
 
 def _backward(
-    plan: _Plan, tape: list[Any], saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...], needed: tuple[bool, ...]
+    plan: RolloutPlan,
+    tape: list[Any],
+    saved: tuple[Tensor, ...],
+    seeds: tuple[Tensor | None, ...],
+    needed: tuple[bool, ...],
 ) -> list[Tensor | None]:
     kernel = plan.kernel
     program = kernel.program
@@ -311,7 +320,7 @@ def _backward(
     ]
 
 
-def _gradient(plan: _Plan, i: int, gradient: Array, like: Tensor, begin_of: int, parameters: int) -> Tensor:
+def _gradient(plan: RolloutPlan, i: int, gradient: Array, like: Tensor, begin_of: int, parameters: int) -> Tensor:
     """Return a gradient in the shape of the tensor that it belongs to."""
     if plan.slots and i == begin_of - 1:
         return past_tensor(gradient, plan.slots, plan.shape).sum_to_size(like.shape)
@@ -320,7 +329,7 @@ def _gradient(plan: _Plan, i: int, gradient: Array, like: Tensor, begin_of: int,
     return _timed(gradient, plan, like)
 
 
-def _timed(gradient: Array, plan: _Plan, like: Tensor) -> Tensor:
+def _timed(gradient: Array, plan: RolloutPlan, like: Tensor) -> Tensor:
     """Return an input's gradient in its own shape; steps beyond the rollout have none."""
     shape = (plan.steps, *[1] * (len(plan.shape) + 1 - like.dim()), *like.shape[1:])
     part = torch.from_numpy(gradient).view(plan.steps, *plan.shape).sum_to_size(shape).view(plan.steps, *like.shape[1:])
@@ -329,7 +338,9 @@ def _timed(gradient: Array, plan: _Plan, like: Tensor) -> Tensor:
     return torch.cat((part, like.new_zeros(len(like) - plan.steps, *like.shape[1:])))
 
 
-def _differentiable(plan: _Plan, saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...]) -> list[Tensor | None]:
+def _differentiable(
+    plan: RolloutPlan, saved: tuple[Tensor, ...], seeds: tuple[Tensor | None, ...]
+) -> list[Tensor | None]:
     """Return the gradients with a graph of their own, for second derivatives, from the torch path."""
     program = plan.kernel.program
     given = dict(zip(program.moving, saved, strict=False))
@@ -365,11 +376,15 @@ def rollout(
 
     Returns the last state and, where ``keep`` is set, position, speed, acceleration and gap of every step.
     """
-    plan, sources = _plan(kernel, simulator, state, inputs, params, steps, block, keep, threads)
-    program = kernel.program
+    return run(*planned(kernel, simulator, state, inputs, params, steps, block, keep, threads))
+
+
+def run(plan: RolloutPlan, sources: Sequence[Tensor]) -> tuple[State, tuple[Tensor, ...] | None]:
+    """Return what ``rollout`` does of a plan, differentiated by ``sources`` where it has a tape."""
+    program = plan.kernel.program
     out = _Rollout.apply(plan, *sources) if plan.tape else tuple(_ran(plan)[0])
     kept = out[len(program.states) + bool(plan.slots) :]
-    return state_after(program, state, out, steps), tuple(kept) if keep else None
+    return state_after(program, plan.state, out, plan.steps), tuple(kept) if plan.keep else None
 
 
 def state_after(program: Program, state: State, out: Sequence[Tensor], steps: int) -> State:

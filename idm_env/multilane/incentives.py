@@ -15,7 +15,7 @@ from torch import Tensor
 
 from idm_env.roads.adjacent import Side, Sideways
 from idm_env.roads.linked import Linked
-from idm_env.roads.merging import MERGER_GAP, MERGER_SPEED, merger
+from idm_env.roads.merging import LANE, MERGER_GAP, MERGER_SPEED, merger
 from idm_env.step import Stepping
 from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish
 
@@ -40,6 +40,15 @@ def seen_merging(view: Linked, state: State, who: Tensor, due: Tensor) -> State:
     fresh = {MERGER_GAP: torch.where(some, gap, FAR), MERGER_SPEED: torch.where(some, speed, 0.0)}
     memory = {name: torch.where(due, x, state.memory[name]) for name, x in fresh.items()}
     return state._replace(memory={**state.memory, **memory})
+
+
+def on_lanes(state: State) -> State:
+    """Return the state in which drivers remember on which lanes they are, where some effect looks at that."""
+    if LANE not in state.memory:
+        return state
+    assert state.links is not None
+    lane = state.links.lane.to(state.speed.dtype).expand(state.speed.shape)
+    return state._replace(memory={**state.memory, LANE: lane})
 
 
 def wished(stepping: Stepping, scene: Scene, params: Params) -> Wish:
@@ -73,6 +82,11 @@ def wished(stepping: Stepping, scene: Scene, params: Params) -> Wish:
             left=total.left + total.left_must * (total.left_most - total.left),
             right=total.right + total.right_must * (total.right_most - total.right),
         )
+    if stepping.rooms:  # no lane is entered on which one could not go on
+        assert scene.left is not None and scene.right is not None
+        left, right = (
+            torch.where(side.exists > 0, margin, -FAR) for side, margin in ((scene.left, left), (scene.right, right))
+        )
     return total._replace(left_margin=left, right_margin=right)
 
 
@@ -101,10 +115,27 @@ def beside(
         wanted=now,
         with_me=view.back(now) * follower.present,
         without_me=view.back(without) * follower.present,
-        ends=view.goes_on(),
+        ends=_room(stepping, scene, view.goes_on(), params),
     )
-    left, right = (_one_side(stepping, view, side, state, scene, now, params) for side in sides)
+    left, right = (
+        _one_side(stepping, view, side, state, _beside(scene, step), now, params)
+        for side, step in zip(sides, (1.0, -1.0), strict=True)
+    )
     return scene._replace(here=here, left=left, right=right)
+
+
+def _beside(scene: Scene, step: float) -> Scene:
+    """Return the scene as it would be on the lane ``step`` to the left."""
+    return scene if scene.lane is None else scene._replace(lane=scene.lane + step)
+
+
+def _room(stepping: Stepping, scene: Scene, ends: Tensor, params: Params) -> Tensor:
+    """Return how far drivers can go on on the lane of a scene (m): to its end, or as far as effects let them."""
+    for effect in stepping.rooms:
+        room = effect.room(scene, dict(params[effect.name]))
+        assert room is not None
+        ends = torch.minimum(ends, room)
+    return ends
 
 
 def _one_side(
@@ -125,6 +156,9 @@ def _one_side(
     )
     own = scene._replace(leader=nearest, second_leader=scene.second_leader and second, behind=scene.behind and behind)
     wanted = stepping.wanted(own, params)[0]
+    exists, ends = side.exists.to(scene.speed.dtype), _room(stepping, own, side.ends, params)
+    if stepping.rooms:
+        exists = torch.where(ends > 0, exists, 0.0)
     me = Neighbour(side.back_gap, scene.speed, scene.accel, torch.ones_like(scene.speed))
     mine = Neighbour(
         torch.where(nearest.present > 0, side.back_gap + state.length + nearest.gap, FAR),
@@ -133,15 +167,17 @@ def _one_side(
         nearest.present,
     )
     follower = _of(view, scene, n)._replace(leader=me, second_leader=scene.second_leader and mine)
+    if scene.lane is not None:  # he is on it already
+        follower = follower._replace(lane=view.at(state.memory[LANE], n))
     with_me = stepping.wanted(follower, _of(view, dict(params), n))[0]
     return Beside(
-        exists=side.exists.to(scene.speed.dtype),
+        exists=exists,
         leader=nearest,
         follower=behind,
         wanted=wanted,
         with_me=with_me * behind.present,
         without_me=view.at(now, n) * behind.present,
-        ends=side.ends,
+        ends=ends,
     )
 
 
@@ -156,4 +192,4 @@ def _of(view: Sideways, tree: Any, slots: Any) -> Any:
     return tree
 
 
-__all__ = ["NOW", "beside", "seen_merging", "wished"]
+__all__ = ["NOW", "beside", "on_lanes", "seen_merging", "wished"]

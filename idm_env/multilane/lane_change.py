@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 
-from idm_env.multilane.incentives import beside, seen_merging, wished
+from idm_env.multilane.incentives import beside, on_lanes, seen_merging, wished
 from idm_env.roads.adjacent import preferred
 from idm_env.roads.linked import Linked, still_changing, without_absent
 from idm_env.step import Stepping
@@ -37,7 +37,7 @@ def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) ->
         after = view.on_the_way(state, after, claim, round(view.road.duration / stepping.dt))
     if stepping.sees_mergers:
         after = seen_merging(view, after, view.mergers(state, sides, claim), due)
-    return after
+    return on_lanes(after)
 
 
 __all__ = ["decided"]

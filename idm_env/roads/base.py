@@ -46,7 +46,7 @@ class Road(abc.ABC):
         raise ValueError(f"a {type(self).__name__} has one lane, and a record says lanes. Use Lanes(count).")
 
     def lap(self, state: State) -> Tensor | None:
-        """Return the circumference (m) of a ring of one lane in every row of a state, None on any other road."""
+        """Return the circumference (m) of a ring in every row of a state, None on any other road."""
         return None
 
     @property

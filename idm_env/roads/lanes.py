@@ -154,6 +154,10 @@ class Lanes(Road):
         """Whether a lane of this road ends."""
         return any(end.closed for end in self.ends)
 
+    def lap(self, state: State) -> Tensor | None:
+        """Return the circumference (m) in every row of a state, None where lanes go straight on."""
+        return None if self.ring is None else torch.full_like(state.speed[..., 0], self.ring)
+
     @property
     def leaving(self) -> bool:
         """Whether vehicles leave this road."""

@@ -1,4 +1,4 @@
-"""Whoever signals from a lane beside: what drivers remember of him from one decision about lanes to the next."""
+"""What drivers remember from one decision about lanes to the next: their lane, and who signals from one beside."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ MERGER_GAP, MERGER_SPEED = "merger_gap", "merger_speed"
 
 Until they decide again he is taken to drive on at that speed.
 """
+
+LANE = "on_lane"
+"""Memory of the lane on which a vehicle drives, where some effect looks at that."""
 
 
 def nobody(like: Tensor) -> dict[str, Tensor]:
@@ -31,11 +34,13 @@ def merger(memory: Memory, speed: Tensor) -> Neighbour:
 
 
 def driven_on(memory: Memory, displacement: Tensor, dt: float) -> dict[str, Tensor]:
-    """Return the memories of whoever signals a step later, if there are any."""
+    """Return these memories a step later, if there are any."""
+    held = {LANE: memory[LANE]} if LANE in memory else {}
     if MERGER_GAP not in memory:
-        return {}
+        return held
     gap, speed = memory[MERGER_GAP], memory[MERGER_SPEED]
-    return {MERGER_GAP: torch.where(gap < 0.5 * FAR, gap + speed * dt - displacement, gap), MERGER_SPEED: speed}
+    gap = torch.where(gap < 0.5 * FAR, gap + speed * dt - displacement, gap)
+    return {**held, MERGER_GAP: gap, MERGER_SPEED: speed}
 
 
-__all__ = ["MERGER_GAP", "MERGER_SPEED", "driven_on", "merger", "nobody"]
+__all__ = ["LANE", "MERGER_GAP", "MERGER_SPEED", "driven_on", "merger", "nobody"]

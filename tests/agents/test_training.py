@@ -17,6 +17,7 @@ import torch
 from agents import apg, common, environments, ppo, shac
 from agents.common import DivergedError
 from agents.policy import Policy
+from idm_env.envs.window import driver_of
 from idm_env.tasks.ring import RingTask
 from tests.agents.conftest import PASSED
 
@@ -480,10 +481,74 @@ class Ends(torch.nn.Module):
         return 1.0 + scenes[..., 0]
 
 
+def stepwise(env, policy, target, a):
+    """Return the gain of a window that is driven step by step, and the scenes before its steps."""
+    push, discount, gain, scenes = a.explore * torch.randn(env.num_envs, 1), 1.0, 0.0, []
+    for t in range(a.window):
+        observation = env.task.observe(env.batch.world).flatten(1)
+        scenes.append(policy.scene(observation).detach())
+        observation, reward, terminated, truncated, _ = env.step(policy(observation) + push)
+        gain = gain + (1.0 - a.gamma) * discount * reward
+        ended = terminated | truncated
+        discount = discount * a.gamma
+        last = torch.ones_like(ended) if t == a.window - 1 else ended
+        gain = gain + torch.where(last & ~terminated, discount * target(policy.scene(observation)), 0.0)
+        discount = torch.where(ended, 1.0, discount)
+        if bool(ended.any()):
+            env.reset(options={"reset_mask": ended})
+    return gain, torch.stack(scenes)
+
+
+@pytest.mark.parametrize("controlled", [1, 2])
+def test_a_window_of_shac_is_its_steps_one_by_one(ring, controlled):
+    """With the same draws; episodes end within the window, some of them in a collision."""
+    more = {"vehicles": 10, "controlled": controlled, "length": [80.0, 90.0]} if controlled > 1 else {}
+    ring |= {"max_episode_steps": 40, "warmup_pool": 0, "failsafe": 0.0, **more}
+    a = shac.Arguments(window=60, gamma=0.9, explore=0.05)
+    torch.manual_seed(1)
+    policy = shac.Sighted(Policy(3, (4,)), controlled)
+    critic = torch.nn.Sequential(torch.nn.Linear(3 * controlled + 4, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1))
+    target = torch.nn.Sequential(critic, torch.nn.Flatten(-2))
+    with torch.no_grad():
+        policy.policy.body[-1].bias.fill_(0.7)  # who drives on so touches somebody
+    results = []
+    for mode in ("SameStep", "Disabled"):
+        env = environments.make_env(shac.with_road(ring), 6, output="torch", autoreset_mode=mode)
+        env.reset(seed=0)
+        environments.desynchronise(env)
+        torch.manual_seed(2)
+        if mode == "SameStep":
+            window = shac.roll(env, policy, target, a)
+            assert bool(window.ended[:-1].any()), "no episode ends within the window"
+            seen = env.task.observe(env.batch.world).flatten(1)
+            compiled = driver_of(policy, seen, controlled) is not None
+            assert compiled == (controlled == 1), "the policy of one agent runs within the window"
+            gain, scenes = window.gain, window.scenes
+        else:
+            gain, scenes = stepwise(env, policy, target, a)
+        results.append((gain, scenes, torch.autograd.grad(gain.sum(), list(policy.parameters()))))
+    (gain, scenes, found), (wanted_gain, wanted_scenes, wanted) = results
+    torch.testing.assert_close(gain, wanted_gain, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(scenes, wanted_scenes, rtol=1e-4, atol=1e-4)
+    for x, y in zip(found, wanted, strict=True):
+        torch.testing.assert_close(x, y, rtol=0.0, atol=1e-4 * float(y.abs().max()))
+
+
+def test_the_critic_sees_the_observation_and_the_road(ring):
+    env = environments.make_env(shac.with_road(ring), 3, output="torch")
+    observation, state = env.reset(seed=0)[0], env.state
+    plain = environments.make_env(ring, 3, output="torch").reset(seed=0)[0]
+    columns = []
+    for x in (state.speed / 15.0, state.gap.clamp_max(150.0) / 15.0):
+        columns += [x.mean(-1), x.std(-1, correction=0)]
+    expected = torch.cat((plain, torch.stack(columns, -1)), -1)
+    torch.testing.assert_close(shac.Sighted(Policy(3, (4,)), 1).scene(observation), expected, rtol=0.0, atol=1e-3)
+
+
 def test_the_gain_values_last_scenes_and_cuts_gradients_at_resets(ring):
     """With zero rewards the gain is γ^k V'(last scene) of every episode in the window, truncated ones included."""
     ring |= {"max_episode_steps": 6, "warmup_pool": 0}
-    env = environments.make_env(ring, 2, output="torch", autoreset_mode="Disabled")
+    env = environments.make_env(shac.with_road(ring), 2, output="torch")
     env.reset(seed=0)
     a = shac.Arguments(window=8, gamma=0.9, explore=0.0)
     pushes = []
@@ -495,27 +560,29 @@ def test_the_gain_values_last_scenes_and_cuts_gradients_at_resets(ring):
 
     plain = env.batch.task.rewards
     object.__setattr__(env.batch.task, "rewards", lambda *x: 0.0 * plain(*x))
-    observation, window = shac.roll(env, Push(), Ends(), env.task.observe(env.batch.world).flatten(1), a)
+
+    window = shac.roll(env, shac.Sighted(Push(), 1), Ends(), a)
     assert window.ended[:, 0].tolist() == [t == 5 for t in range(8)]
     expected = 0.9**6 * window.following[5] + 0.9**2 * window.following[7]
     assert torch.allclose(window.gain, expected)
     assert not torch.allclose(window.following[5], window.following[7])
-    before, after = torch.autograd.grad(window.gain.sum(), [pushes[0], pushes[7]], retain_graph=True)
+    first, last = pushes[-8], pushes[-1]
+    before, after = torch.autograd.grad(window.gain.sum(), [first, last], retain_graph=True)
     assert bool((before != 0).all()) and bool((after != 0).all())
-    # What came before the reset has no influence on the observation after it.
-    assert torch.autograd.grad(observation.sum(), pushes[0], allow_unused=True)[0] is None
+    # What came before the reset has no influence on what is observed after it.
+    seen = env.task.observe(env.batch.world)
+    assert torch.autograd.grad(seen.sum(), first, allow_unused=True)[0] is None
 
 
 def test_a_collision_is_worth_nothing(ring):
-    env = environments.make_env(ring, 2, output="torch", autoreset_mode="Disabled")
+    env = environments.make_env(shac.with_road(ring), 2, output="torch")
     env.reset(seed=0)
     world = env.batch.world
     gap = world.state.gap.clone()
     gap[1, 0] = -1.0
     env.batch.world = world._replace(state=world.state._replace(gap=gap))
     a = shac.Arguments(window=1, gamma=0.9, explore=0.0)
-    policy = Policy(3, (4,))
-    _, window = shac.roll(env, policy, Ends(), env.task.observe(env.batch.world).flatten(1), a)
+    window = shac.roll(env, shac.Sighted(Policy(3, (4,)), 1), Ends(), a)
     assert window.ended[0].tolist() == [False, True]
     assert float(window.following[0, 0]) > 1.0 and float(window.following[0, 1]) == 0.0
 

@@ -108,6 +108,24 @@ def test_a_compiled_window_with_a_fixed_policy_is_the_loop_to_the_last_bit(task,
     assert torch.equal(seen, told.observation[40])
 
 
+class ForFive(nn.Linear):
+    """A policy with an offset for each of five environments."""
+
+    def forward(self, seen):
+        return super().forward(seen) + 0.01 * torch.arange(5.0).unsqueeze(-1)
+
+
+def test_a_policy_of_so_many_environments_runs_between_steps():
+    env, loop = (made("ring", CASES[0][1], "float32") for _ in range(2))
+    policy = ForFive(env.single_observation_space.shape[0], 1)
+    env.reset(seed=3)
+    seen, _ = loop.reset(seed=3)
+    told = env.unroll(policy, 15)
+    for t in range(15):
+        assert torch.equal(seen, told.observation[t])
+        seen = loop.step(policy(seen))[0]
+
+
 @pytest.mark.parametrize(
     "between",
     [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), lambda env: env],

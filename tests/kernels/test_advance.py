@@ -80,3 +80,96 @@ def test_memories_and_the_past_are_carried_over_many_calls(road):
         now, slow = simulator.advance(now, {}, params), simulator.step(slow, {}, params)
     equal(now, simulator.rollout(state, {}, params, 50, keep=None)[0])
     same(now, slow, 1e-11)
+
+
+def plain(road=None, dtype=torch.float32, vehicles=6):
+    simulator = Simulator(road or Lane(), (IDM(), Brakes()))
+    params = simulator.defaults(dtype=dtype)
+    position = -20.0 * torch.arange(vehicles, dtype=dtype)
+    return simulator, simulator.state(position, torch.full_like(position, 8.0), params), params
+
+
+def written(state, params):
+    params["idm"]["time_gap"] += 0.5
+
+
+def replaced(state, params):
+    params["idm"]["desired_speed"] = torch.full((6,), 12.0)
+
+
+def differentiated(state, params):
+    params["idm"]["time_gap"].requires_grad_()
+
+
+def with_a_graph(state, params):
+    return state._replace(speed=(2.0 * state.speed).requires_grad_())
+
+
+def of_two_rows(state, params):
+    return state._replace(
+        **{name: getattr(state, name).repeat(2, 1) for name in (*MOVING, "length")}, step=state.step.repeat(2)
+    )
+
+
+def strided(state, params):
+    return state._replace(speed=torch.linspace(3.0, 8.0, 12)[::2])
+
+
+def of_longer_vehicles(state, params):
+    return state._replace(length=state.length + 2.0, gap=state.gap - 2.0)
+
+
+def half_there(state, params):
+    return state._replace(present=torch.tensor([1.0, 1.0, 0.0, 1.0, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [written, replaced, differentiated, with_a_graph, of_two_rows, strided, of_longer_vehicles, half_there],
+    ids=lambda change: change.__name__,
+)
+def test_what_changes_between_calls_is_seen(change):
+    simulator, state, params = plain()
+    for _ in range(3):
+        state = simulator.advance(state, {}, params)
+    state = change(state, params) or state
+    for _ in range(2):  # the second call may rest on the first
+        mine, other = simulator.advance(state, {}, params), simulator.step(state, {}, params)
+        same(mine, other, 1e-6)
+        assert mine.speed.requires_grad == other.speed.requires_grad
+        with torch.no_grad():
+            same(simulator.advance(state, {}, params), other, 1e-6)
+
+
+def test_a_call_leaves_the_states_of_earlier_calls_alone():
+    simulator, state, params = plain()
+    kept, copies = [], []
+    for _ in range(5):
+        state = simulator.advance(state, {}, params)
+        kept.append(state)
+        copies.append([getattr(state, name).clone() for name in MOVING])
+    for one, copy in zip(kept, copies, strict=True):
+        assert all(torch.equal(getattr(one, name), x) for name, x in zip(MOVING, copy, strict=True))
+
+
+def test_what_is_kept_between_calls_goes_with_its_simulator():
+    from idm_env.kernels import repeated
+
+    simulator, state, params = plain()
+    before = set(repeated._kept)
+    simulator.advance(state, {}, params)
+    (key,) = set(repeated._kept) - before
+    del simulator
+    assert key not in repeated._kept
+
+
+def test_a_step_that_is_switched_off_is_not_compiled(monkeypatch):
+    simulator, state, params = plain()
+    simulator.advance(state, {}, params)
+    from idm_env.kernels import repeated
+
+    monkeypatch.setattr(repeated, "again", lambda *call: pytest.fail("a compiled step ran"))
+    with dispatch.off():
+        simulator.advance(state, {}, params)
+    monkeypatch.setenv("IDM_ENV_KERNELS", "0")
+    simulator.advance(state, {}, params)

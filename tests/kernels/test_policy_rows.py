@@ -25,7 +25,7 @@ def called(loops, rows, arrays):
 def test_values_and_gradients_are_those_of_torch(dtype):
     torch.manual_seed(1)
     policy = nn.Sequential(nn.Linear(3, 7), nn.Tanh(), nn.Linear(7, 37), nn.ReLU(), nn.Linear(37, 2)).to(dtype)
-    driver = Driver(policy, 3, 2, dtype)
+    driver = Driver(policy, 2, 3, 2, dtype)
     weights = {n: x.detach().numpy() for n, x in driver.weights(policy).items()}
     close = 2e-5 if dtype == torch.float32 else 1e-12
     for rows in (1, 33, 64, 100):
@@ -58,5 +58,5 @@ def test_a_tensor_whose_place_is_noted_lives_while_loops_are_recorded(monkeypatc
 
     monkeypatch.setattr(RowFunction, "_enter", watched)
     policy = nn.Sequential(nn.Linear(3, 7), nn.Tanh(), nn.Linear(7, 37), nn.ReLU(), nn.Linear(37, 2))
-    Driver(policy.to(torch.float64), 3, 2, torch.float64)
+    Driver(policy.to(torch.float64), 2, 3, 2, torch.float64)
     assert len(noted) > 10

@@ -1,0 +1,186 @@
+"""What the road tells its drivers: speed limits, lanes that are closed, signals, and where they must be to leave it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects import references
+from idm_env.effects.base import Effect, P
+from idm_env.effects.idm import interaction
+from idm_env.parameters import Parameter
+from idm_env.types import FAR, Driver, Scene, Wish
+
+EVERY_LANE = -1
+"""Stands for all lanes of a road."""
+_PER_LANE = 150.0
+"""Way (m) that a driver allows for each lane that he has to change."""
+
+
+def _rows(kind: str, rows: Sequence[Sequence[float]], names: Sequence[str]) -> None:
+    """Raise ValueError for rows of another length, of no numbers, without a lane, or that end before they begin."""
+    for row in rows:
+        if len(row) != len(names) or any(math.isnan(x) for x in row):
+            raise ValueError(f"{kind}: {tuple(row)} must give {', '.join(names)}.")
+        if row[0] != int(row[0]) or row[0] < EVERY_LANE:
+            raise ValueError(f"{kind}: lane = {row[0]:g} must be a whole number from 0 on, or {EVERY_LANE} for all.")
+        if not row[1] < row[2]:
+            raise ValueError(f"{kind} from {row[1]:g} m to {row[2]:g} m must end behind its beginning.")
+
+
+def _on(scene: Scene, lane: float) -> Tensor:
+    """Return who is on a lane (bool)."""
+    assert scene.lane is not None
+    return (scene.lane - lane).abs() < (0.5 if lane != EVERY_LANE else math.inf)
+
+
+def _before(room: Tensor, scene: Scene, driver: Driver) -> Tensor:
+    """Return what IDM brakes more for somebody who stands ``room`` metres ahead than for the leader (m/s², ≤ 0)."""
+    leader = interaction(driver, scene.speed, scene.leader.gap, scene.leader.speed) * scene.leader.present
+    more = torch.relu(interaction(driver, scene.speed, room, torch.zeros_like(room)) - leader)
+    return torch.where(room < FAR, -driver.max_accel * more, 0.0)
+
+
+@dataclass(frozen=True)
+class SpeedLimit(Effect):
+    """Speed limits by lane and place: ``v0 → v0 + c (min(v0, v_lim) − v0)`` between two places of a lane.
+
+    ``zones`` are rows of lane (−1: all), beginning (m), end (m) and limit v_lim (m/s); where several hold, the lowest
+    does. c is the share of the difference that drivers obey, 0 nobody.
+
+    ValueError for a limit of 0 or below, or a zone that ends before it begins.
+    """
+
+    kind: ClassVar[str] = "speed_limit"
+    needs: ClassVar[frozenset[str]] = frozenset({"lane"})
+    changes: ClassVar[str] = "desired_speed"
+    title: ClassVar[str] = "speed limits"
+    equation: ClassVar[str] = "v0 → v0 + c (min(v0, v_lim) − v0)"
+    rank: ClassVar[int] = 2
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("compliance", "c", "1", 1.0, 0.0, 1.0, null=0.0, role="shape"),
+    )
+    zones: tuple[tuple[float, ...], ...] = ((-1.0, 100.0, 1000.0, 8.0),)
+
+    def __post_init__(self) -> None:
+        _rows("speed limit", self.zones, ("lane", "beginning (m)", "end (m)", "limit (m/s)"))
+        for zone in self.zones:
+            if not 0.0 < zone[3] < math.inf:
+                raise ValueError(f"speed limit = {zone[3]:g} m/s must be above 0. Close the lane to keep it empty.")
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the desired speed that is left."""
+        speed = driver.desired_speed
+        for lane, begin, end, limit in self.zones:
+            here = _on(scene, lane) & (scene.position >= begin) & (scene.position < end)
+            speed = torch.where(here, torch.clamp(speed, max=limit), speed)
+        return driver._replace(desired_speed=driver.desired_speed + p["compliance"] * (speed - driver.desired_speed))
+
+
+@dataclass(frozen=True)
+class LaneClosure(Effect):
+    """Lanes that are closed over a stretch, for a time: somebody stands at the beginning, and nobody changes in.
+
+    ``closures`` are rows of lane, beginning (m), end (m), and from when until when (s). Who is in the stretch when it
+    closes drives on; from before it one has to change, as from a lane that ends, or brakes as ``Signal`` says. Without
+    rows it is absent.
+    """
+
+    kind: ClassVar[str] = "lane_closure"
+    needs: ClassVar[frozenset[str]] = frozenset({"lane"})
+    adds: ClassVar[bool] = False
+    title: ClassVar[str] = "closed lanes"
+    closures: tuple[tuple[float, ...], ...] = ((0.0, 400.0, 600.0, 0.0, 600.0),)
+
+    def __post_init__(self) -> None:
+        _rows("closure", self.closures, ("lane", "beginning (m)", "end (m)", "since (s)", "until (s)"))
+        for row in self.closures:
+            if row[0] == EVERY_LANE or not row[3] < row[4]:
+                raise ValueError(
+                    f"closure of lane {row[0]:g} from {row[3]:g} s to {row[4]:g} s: name one lane, and rise."
+                )
+
+    def room(self, scene: Scene, p: P) -> Tensor:
+        """Return how far it is to the beginning of a stretch ahead; 0 in a stretch."""
+        return self._room(scene, 0.0)
+
+    def _room(self, scene: Scene, inside: float) -> Tensor:
+        room = torch.full_like(scene.position, FAR)
+        for lane, begin, end, since, until in self.closures:
+            now = _on(scene, lane) & (scene.time >= since) & (scene.time < until)
+            ahead, between = scene.position <= begin, scene.position < end
+            way = torch.where(ahead, begin - scene.position, torch.where(between, room * 0.0 + inside, FAR))
+            room = torch.where(now, torch.minimum(room, way), room)
+        return room
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return what drivers brake for somebody who stands where the lane is closed (m/s²)."""
+        return _before(self._room(scene, FAR), scene, driver)
+
+
+@dataclass(frozen=True)
+class Signal(Effect):
+    """A signal with a fixed cycle, on all lanes: red in the last r seconds of each cycle of C seconds.
+
+    ::
+
+        red where (t − φ) mod C ≥ C − r;   who is before the line x_s and can stop, v² ≤ 2 b_m (x_s − x), stops there:
+    A += −a max(0, (s*/s)²_line − (s*/s)²_leader),   that of somebody who stands at the line
+
+    Amber is in b_m: who would have to brake harder drives on. Absent at r = 0.
+    """
+
+    kind: ClassVar[str] = "signal"
+    adds: ClassVar[bool] = False
+    title: ClassVar[str] = "signal"
+    equation: ClassVar[str] = "red where (t − φ) mod C ≥ C − r"
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("place", "x_s", "m", 400.0, -1e6, 1e6, role="place"),
+        Parameter("cycle", "C", "s", 60.0, 1.0, 3600.0, role="shape"),
+        Parameter("red", "r", "s", 30.0, 0.0, 3600.0, null=0.0, role="threshold"),
+        Parameter("offset", "φ", "s", 0.0, -3600.0, 3600.0, role="shape"),
+        Parameter("most_decel", "b_m", "m/s²", 3.0, 0.5, 9.0, role="threshold"),
+    )
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return what drivers brake for somebody who stands at the line while it is red (m/s²)."""
+        phase = torch.remainder(scene.time - p["offset"], p["cycle"])
+        way = p["place"] - scene.position
+        can = (way >= 0) & (scene.speed * scene.speed <= 2.0 * p["most_decel"] * way)
+        return _before(torch.where((phase >= p["cycle"] - p["red"]) & can, way, FAR), scene, driver)
+
+
+@dataclass(frozen=True)
+class Destination(Effect):
+    """Where a driver must be to leave as he wants: on lanes ``first`` to ``last`` before a place x_d.
+
+    A lane that is n lanes away goes on for him as far as ``x_d − n · 150 m``, so he leaves it as one that ends
+    (``MandatoryChange``, ``GapAcceptance``), but does not stand there: who has missed his exit drives on. After the
+    route incentive of LMRS (Schakel, Knoop, van Arem 2012). Absent where the place is behind everybody.
+    """
+
+    kind: ClassVar[str] = "destination"
+    sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2012,)
+    needs: ClassVar[frozenset[str]] = frozenset({"lane"})
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("first", "k_1", "1", 0.0, 0.0, 1000.0, role="shape"),
+        Parameter("last", "k_2", "1", 1000.0, 0.0, 1000.0, role="shape"),
+        Parameter("place", "x_d", "m", 1000.0, -1e9, 1e6, null=-1e9, role="place"),
+    )
+
+    def room(self, scene: Scene, p: P) -> Tensor:
+        """Return how far the lane goes on for whom it does not lead where he wants to."""
+        assert scene.lane is not None
+        away = torch.relu(p["first"] - scene.lane) + torch.relu(scene.lane - p["last"])
+        way = torch.clamp(p["place"] - _PER_LANE * (away - 1.0) - scene.position, min=1.0)
+        return torch.where((away > 0.5) & (scene.position < p["place"]), way, FAR)
+
+    def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
+        """Return no wish of its own, and nothing against one."""
+        none = torch.zeros_like(scene.speed)
+        return Wish(none, none, none + FAR, none + FAR)

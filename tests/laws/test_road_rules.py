@@ -1,0 +1,156 @@
+"""What a road tells its drivers: absent at its null, the same compiled, and obeyed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from idm_env.effects import (
+    IDM,
+    Brakes,
+    Destination,
+    Effect,
+    GapAcceptance,
+    LaneClosure,
+    MandatoryChange,
+    Mobil,
+    Signal,
+    SpeedLimit,
+)
+from idm_env.kernels import dispatch
+from idm_env.multilane import demand
+from idm_env.roads import Lanes, off_ramp
+from idm_env.simulator import Simulator
+from idm_env.types import State
+
+DTYPE = torch.float64
+ROAD = Lanes(3, length=900.0, ends=(off_ramp(0, begin=0.0, end=600.0, leaves=900.0),))
+RULES: tuple[Effect, ...] = (
+    SpeedLimit(zones=((2.0, 200.0, 500.0, 15.0), (-1.0, 700.0, 900.0, 20.0))),
+    LaneClosure(closures=((1.0, 300.0, 450.0, 20.0, 60.0),)),
+    Signal(),
+    Destination(),
+)
+Params = dict[str, dict[str, Tensor]]
+
+
+def begun(*rules: Effect, per_hour: float = 700.0, seconds: float = 60.0) -> tuple[Simulator, State, Params]:
+    """Return an empty road for which drivers of different desired speeds wait."""
+    simulator = Simulator(ROAD, (IDM(), Mobil(), MandatoryChange(), GapAcceptance(), *rules, Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    trips = demand.trips(dict.fromkeys(range(3), per_hour), seconds, dtype=DTYPE)
+    n = len(trips.departs)
+    params["idm"]["desired_speed"] = 18.0 + 12.0 * torch.arange(n, dtype=DTYPE).mul(0.618).remainder(1.0)
+    if "destination" in params:
+        first = torch.arange(n).remainder(3) > 0
+        params["destination"] |= {"first": first.to(DTYPE), "last": torch.where(first, 1000.0, 0.0).to(DTYPE)}
+        params["destination"]["place"] = torch.full((n,), 600.0, dtype=DTYPE)
+    return simulator, demand.waiting(simulator, trips, params), params
+
+
+def test_rules_at_their_nulls_are_absent_to_the_last_bit() -> None:
+    """Every rule at once, beside a simulator that has none."""
+    never = LaneClosure(closures=())
+    simulator, state, params = begun(SpeedLimit(), never, Signal(), Destination())
+    params["speed_limit"]["compliance"] = torch.tensor(0.0, dtype=DTYPE)
+    params["signal"]["red"] = torch.tensor(0.0, dtype=DTYPE)
+    params["destination"]["place"] = torch.tensor(-1e9, dtype=DTYPE)
+    plain, other, own = begun()
+    with dispatch.off():
+        for _ in range(600):
+            state, other = simulator.step(state, {}, params), plain.step(other, {}, own)
+    assert torch.equal(state.position, other.position) and torch.equal(state.gap, other.gap)
+    assert state.links is not None and other.links is not None and int(state.links.changed.sum()) > 0
+    assert all(torch.equal(a, b) for a, b in zip(state.links, other.links, strict=True))
+
+
+def test_compiled_rules_are_those_of_the_torch_path() -> None:
+    """Decision after decision from the same states: links, and where everybody is."""
+    pytest.importorskip("numba")
+    simulator, state, params = begun(*RULES)
+    params["signal"]["place"] = torch.tensor(650.0, dtype=DTYPE)
+    for _ in range(70):
+        with dispatch.off():
+            expected, _ = simulator.rollout(state, {}, params, 10, keep=None)
+        state, _ = simulator.rollout(state, {}, params, 10, keep=None)
+        assert state.links is not None and expected.links is not None
+        assert all(torch.equal(a, b) for a, b in zip(expected.links, state.links, strict=True))
+        assert torch.allclose(expected.position, state.position, rtol=0, atol=1e-9)
+    assert int(state.links.changed.sum()) > 10
+
+
+@pytest.mark.parametrize("lane", [0, 1])
+def test_a_limit_holds_on_its_lane_and_between_its_places(lane: int) -> None:
+    """A vehicle that wants 30 m/s drives 15 m/s there, and 30 m/s on the lane beside."""
+    simulator = Simulator(Lanes(2), (IDM(), SpeedLimit(zones=((0.0, 500.0, 2000.0, 15.0),)), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    params["idm"]["desired_speed"] = torch.tensor(30.0, dtype=DTYPE)
+    start = torch.tensor([0.0], dtype=DTYPE)
+    _, kept = simulator.rollout(simulator.state(start, start + 30.0, params, lane=lane), {}, params, 1200)
+    inside = (kept.position > 1500.0) & (kept.position < 2000.0)
+    expected = 15.0 if lane == 0 else 30.0
+    assert torch.allclose(kept.speed[inside], torch.tensor(expected, dtype=DTYPE), atol=0.2)
+    assert int(inside.sum()) > 100
+
+
+def test_a_closed_lane_is_left_for_a_time_and_used_again() -> None:
+    """While it is closed nobody comes into the stretch who was not there; nobody touches anybody, all get out."""
+    simulator, state, params = begun(RULES[1], per_hour=500.0)
+    entered, used, gap = 0, 0, 1e9
+    inside = torch.zeros_like(state.speed, dtype=torch.bool)
+    for _ in range(1800):
+        before, state = inside, simulator.step(state, {}, params)
+        assert state.links is not None and state.present is not None
+        there = (state.present > 0) & (state.links.lane == 1)
+        inside = there & (state.position > 300.0) & (state.position < 450.0)
+        time = float(simulator.time(state))
+        entered += int((inside & ~before).sum()) if 20.2 < time < 60.0 else 0
+        used += int(inside.sum()) if time >= 60.0 else 0
+        gap = min(gap, float(state.gap.min()))
+    found = demand.counts(simulator, state)
+    assert entered == 0 and used > 0 and gap > 0.0
+    assert int(found.left) == int(found.due) == 24
+
+
+def test_a_signal_stops_who_can_stop_and_lets_go_in_green() -> None:
+    """Who crosses the line in red would have had to brake harder than b_m when it became red."""
+    simulator, state, params = begun(Signal())
+    crossed = {True: 0, False: 0}
+    for _ in range(1500):
+        before, state = state, simulator.step(state, {}, params)
+        over = (before.position < 400.0) & (state.position >= 400.0)
+        since = float(simulator.time(before)) % 60.0 - 30.0
+        crossed[since >= 0.0] += int(over.sum())
+        if since > 10.0:  # who could not stop from 30 m/s is over by then
+            assert not bool(over.any()), since
+    assert crossed[False] > 20 and crossed[True] < 5
+    assert bool((state.position[state.present > 0] > 400.0).all()) if state.present is not None else False
+
+
+def test_drivers_leave_where_they_want_to() -> None:
+    """Whose destination is the exit leaves on lane 0, everybody else on the others."""
+    simulator, state, params = begun(Destination(), per_hour=500.0)
+    for _ in range(1200):
+        state = simulator.step(state, {}, params)
+    assert state.links is not None and state.trips is not None
+    left, exits = state.trips.left > 0, params["destination"]["last"] == 0.0
+    right = (state.links.lane == 0) == exits
+    assert int(left.sum()) == 24 and int((left & right).sum()) >= 23
+
+
+BAD = {
+    "speed limit = 0 m/s must be above 0": lambda: SpeedLimit(zones=((0.0, 0.0, 10.0, 0.0),)),
+    "must end behind its beginning": lambda: LaneClosure(closures=((0.0, 20.0, 10.0, 0.0, 1.0),)),
+    "name one lane, and rise": lambda: LaneClosure(closures=((0.0, 0.0, 10.0, 5.0, 1.0),)),
+    "lane = 0.5 must be a whole number": lambda: SpeedLimit(zones=((0.5, 0.0, 10.0, 10.0),)),
+    "must give lane, beginning": lambda: SpeedLimit(zones=((0.0, 10.0, 10.0),)),
+}
+
+
+@pytest.mark.parametrize("says", BAD)
+def test_rules_that_cannot_be_are_told_in_one_line(says: str) -> None:
+    """The value and the rule."""
+    with pytest.raises(ValueError, match=says) as error:
+        BAD[says]()
+    assert "\n" not in str(error.value)
