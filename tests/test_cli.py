@@ -87,7 +87,7 @@ def test_options_that_go_together_are_in_every_command_of_their_kind() -> None:
     assert (
         {name for name, options in commands.items() if options & job}
         == {name for name, options in commands.items() if job <= options}
-        == {"fit", "explain", "filter", "reconstruct", "predict"}
+        == {"fit", "explain", "filter", "reconstruct", "predict", "drift"}
     )
     assert {name for name, options in commands.items() if file <= options} == {"fit", "explain", "simulate", "drift"}
 

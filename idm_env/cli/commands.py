@@ -441,6 +441,7 @@ def drift(
     max_gap: MaxGap = 80.0,
     min_seconds: MinSeconds = 20.0,
     dt: Step = None,
+    job: JobOptions,
 ) -> None:
     """Estimate how unsteady drivers are: which quantity wanders, by how much (sigma), with which memory time (tau).
 
@@ -452,10 +453,18 @@ def drift(
 
         _work_begins()
         source = Source(data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, **dataclasses.asdict(file))
-        result = drift_file(source, out, drivers=drivers, on_progress=report)
+        with job.workers() as workers:
+            result = drift_file(
+                source, out, drivers=drivers, resume=job.resume, executor=workers, on_progress=report
+            )  # fmt: skip
     names = {"log_likelihood": "gain in log-likelihood", "tau_s": "tau (s)"}
     rows = [{names.get(name, name): x for name, x in row.items()} for row in result["sorts"]]
     _show("Every sort of drift against drivers who do not drift", rows)
+    if scores := result["kept_back"]["scores"]:
+        titles = {"model": "model", "ahead_s": "ahead (s)", "gap_rmse_m": "RMSE (m)", "gap_crps_m": "CRPS (m)",
+                  "in_90_percent": "in the 90 % band (%)"}  # fmt: skip
+        drawn = [{title: row[name] for name, title in titles.items()} for row in scores]
+        _show(f"Forecasts of the gap of {result['kept_back']['drivers']} drivers kept back", drawn)
     console.print(result["sentence"], soft_wrap=True, highlight=False)
     console.print(result["data"]["account"], soft_wrap=True, highlight=False)
     _told("Model", out / "model.yaml")

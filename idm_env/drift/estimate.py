@@ -10,11 +10,12 @@ drift, and what it bent would count as drift again. Noise of measurement is take
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
+import torch
 from scipy.optimize import minimize
 from scipy.stats import t as student
 
@@ -125,6 +126,24 @@ class Estimate:
                     return f"{symbol} is at the end of what is searched, {math.exp(packed[i]):.3g}"
         return ""
 
+    def kept(self) -> dict[str, torch.Tensor]:
+        """Return the numbers as a store takes them; ``of_kept`` makes the estimate of them again."""
+        s, path = self.settings, self.path
+        arrays = {
+            "sigma": s.sigma, "memory_time": s.memory_time, "noise": s.noise, "jitter": s.jitter, "spread": s.spread,
+            "log_error": self.log_error, "log_likelihood": self.log_likelihood,
+            **{f.name: getattr(path, f.name) for f in fields(path)},
+        }  # fmt: skip
+        return {name: torch.as_tensor(np.asarray(value, float)) for name, value in arrays.items()}
+
+    @classmethod
+    def of_kept(cls, drivers: MeasuredDrivers, kept: Mapping[str, torch.Tensor]) -> Estimate:
+        """Return the estimate of which ``kept`` holds the numbers, on the same drivers."""
+        x = {name: value.numpy() for name, value in kept.items()}
+        settings = DriftSettings(x["sigma"], x["memory_time"], x["noise"], float(x["jitter"]), x["spread"])
+        path = Path(**{f.name: x[f.name] for f in fields(Path)})
+        return cls(drivers, settings, _names(drivers), x["log_error"], float(x["log_likelihood"]), path)
+
     @property
     def theta(self) -> np.ndarray:
         """Every driver's most likely own log θ [rows, p]."""
@@ -216,10 +235,14 @@ def estimate(
         settings = _maximised(around, settings, limits)
         on_progress("drift", number + 1, rounds, around(settings))
         path = _path(around, settings)
-    names = [f"{n}.{p}" for p in ("sigma", "memory_time") for n in drivers.drifts]
-    names += ["gap_noise_m", "speed_noise_mps", "jitter"]
-    error = _errors(around, settings, limits)
-    return Estimate(drivers, settings, tuple(names), error, around(settings), path)
+    return Estimate(
+        drivers, settings, _names(drivers), _errors(around, settings, limits), around(settings), path
+    )  # fmt: skip
+
+
+def _names(drivers: MeasuredDrivers) -> tuple[str, ...]:
+    own = (f"{n}.{p}" for p in ("sigma", "memory_time") for n in drivers.drifts)
+    return (*own, "gap_noise_m", "speed_noise_mps", "jitter")
 
 
 def _limits(drivers: MeasuredDrivers, noise: tuple[float, float] | None) -> np.ndarray:

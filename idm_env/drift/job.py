@@ -11,11 +11,13 @@ import numpy as np
 from idm_env.data import Trajectories
 from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import fitted_on
+from idm_env.drift import held_out
 from idm_env.drift.estimate import Estimate
 from idm_env.drift.kinds import Told, tell
 from idm_env.effects import DRIFTS, Replay
 from idm_env.fitting.options import Source
 from idm_env.jobs import storage
+from idm_env.jobs.executor import Executor
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.model_file import Model, Numbers, nested, save_model
 from idm_env.reports import page
@@ -27,13 +29,6 @@ UNKNOWN = 100.0
 """An interval that reaches so many times as far as its estimate is none."""
 DRIVERS = 60
 """Drivers at most on whom drift is estimated."""
-
-
-def evenly(count: int, most: int = DRIVERS) -> np.ndarray:
-    """Return the places of at most so many of ``count``, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
-
-
 STEP_S = 0.5
 """Time between two samples that are used: drift lasts seconds, and a file of 10 Hz takes five times as long."""
 
@@ -46,41 +41,57 @@ def step_of(trajectories: Trajectories) -> float | None:
 
 
 def drift_file(
-    source: Source, out: Path, *, drivers: int = DRIVERS, on_progress: OnProgress | None = None
+    source: Source,
+    out: Path,
+    *,
+    drivers: int = DRIVERS,
+    resume: bool = False,
+    executor: Executor | None = None,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Say how the drivers of a file drift, and return the report; write it and ``model.yaml``.
 
-    ``drivers`` are taken at most, evenly spread over the file. DataError and ValueError for what cannot be read.
+    ``drivers`` are taken at most, evenly spread over the file; every fourth driver is kept back, and forecasts of those
+    are scored. ``executor`` estimates the sorts. ``resume`` goes on with the estimates of an interrupted run.
+    DataError and ValueError for what cannot be read.
     """
     with storage.results(out, WRITTEN, (source.path,)):
         progress = on_progress or silent
         progress("reading", 0, 0, source.path.name)
         trajectories = source.trajectories()
         thinned = replace(source, dt=source.dt or step_of(trajectories))
-        smooth, measured = (replace(thinned, smooth=x).episodes(trajectories) for x in (True, False))
-        chosen = evenly(len(smooth), drivers)
-        pair = [[found[i] for i in chosen] for found in (smooth, measured)]
-        told = tell(*pair, on_progress=lambda name, done, total, _: progress(name, done, total, ""))
+        both = [replace(thinned, smooth=x).episodes(trajectories) for x in (True, False)]
+        taken, kept = held_out.split(len(both[0]), drivers)
+        fitted, back = ([[found[i] for i in places] for found in both] for places in (taken, kept))
+        mark = storage.fingerprint(source.path, replace(thinned, path=Path()), drivers)
+        store = storage.Store(out / storage.UNFINISHED / "drift", mark, resume)
+        told = tell(*fitted, store=store, executor=executor, on_progress=progress)
         best = told.found[told.one_of[0]] if told.one_of else told.steady
-        marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in pair[0]])
+        progress("kept back", 0, 0, f"{len(kept)} drivers")
+        sorts = {"no drift": told.steady} | {name: e for name, e in told.found.items() if not e.why_not}
+        scores = held_out.scores(sorts, back[0], back[1]) if len(kept) and told.verdict != "cannot_tell" else []
+        foreseen = held_out.sentence(scores, next(iter(told.one_of), None), len(kept))
+        marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fitted[0]])
         save_model(out / "model.yaml", replace(model_of(best), fitted_on=marked))
         result = {
             "schema": 1,
             "command": page.command_line(),
             "verdict": told.verdict,
             "one_of": list(told.one_of),
-            "sentence": sentence(told),
+            "sentence": f"{sentence(told)} {foreseen}".rstrip(),
             "sorts": _sorts(told),
+            "kept_back": {"drivers": len(kept), "scores": scores},
             "estimates": {
                 name: [] if e.why_not else e.table() for name, e in {"none": told.steady, **told.found}.items()
             },
             "data": {
-                **trajectories.summary(), "episodes": len(smooth), "taken": len(chosen), "dt": best.drivers.batch.dt,
-                "account": page.account(by_kind(trajectories.repairs), by_kind(smooth.left_out)),
+                **trajectories.summary(), "episodes": len(both[0]), "taken": len(taken), "dt": best.drivers.batch.dt,
+                "account": page.account(by_kind(trajectories.repairs), by_kind(both[0].left_out)),
             },
             "versions": page.versions(),
         }  # fmt: skip
         storage.write_json(out / "report.json", result)
+        store.remove()
         return result
 
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from idm_env.data import Episode
 from idm_env.drift.estimate import Estimate, estimate, usual
+from idm_env.drift.linear import MeasuredDrivers
 from idm_env.effects import DRIFTS, IDM, Brakes, Effect, Replay
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.problem import IDM_NAMES
+from idm_env.jobs.executor import Executor, Serial
 from idm_env.jobs.progress import OnProgress, silent
+from idm_env.jobs.storage import Store
 from idm_env.parameters import catalogue
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
@@ -53,12 +58,37 @@ def behind_a_record(dt: float, *drifts: Effect) -> Simulator:
     return Simulator(Lane(), (IDM(), *drifts, Replay(), Brakes()), dt=dt, integration="midpoint")
 
 
+@dataclass(frozen=True, eq=False)
+class _Sort:
+    """A sort of drift, or none, to be estimated."""
+
+    kind: Effect | None
+    smooth: Sequence[Episode]
+    measured: Sequence[Episode]
+    noise: tuple[float, float] | None
+
+    def __str__(self) -> str:
+        return "no drift" if self.kind is None else self.kind.name
+
+    @property
+    def simulator(self) -> Simulator:
+        return behind_a_record(self.smooth[0].dt, *(() if self.kind is None else (self.kind,)))
+
+
+def _estimated(sort: _Sort, progress: OnProgress) -> dict[str, Tensor]:
+    batch, raw = (Batch.of(x, substeps=1) for x in (sort.smooth, sort.measured))
+    found = estimate(sort.simulator, batch, IDM_NAMES, usual(IDM_NAMES), measured=raw, noise=sort.noise)
+    return found.kept()
+
+
 def tell(
     smooth: Sequence[Episode],
     measured: Sequence[Episode],
     kinds: Sequence[Effect] = DRIFTS,
     *,
     noise: tuple[float, float] | None = None,
+    store: Store | None = None,
+    executor: Executor | None = None,
     on_progress: OnProgress = silent,
 ) -> Told:
     """Estimate every sort of drift on episodes, smoothed and as measured, and say which one it is.
@@ -68,18 +98,21 @@ def tell(
         measured: The same as measured.
         kinds: Drifting effects.
         noise: Noise of measured gap (m) and speed (m/s), where it is known.
+        store: Keeps every estimate, and has those that an interrupted run left.
+        executor: Whoever estimates the sorts, a part each.
         on_progress: Called with the name, done, total and the log-likelihood.
     """
+    sorts = [_Sort(kind, smooth, measured, noise) for kind in (None, *kinds)]
+    kept = {} if store is None else {s: x for s in sorts if (x := store.get(str(s))) is not None}
+    missing = [s for s in sorts if s not in kept]
+    for place, numbers in (executor or Serial()).map(_estimated, missing):
+        kept[missing[place]] = numbers
+        if store is not None:
+            store.put(str(missing[place]), numbers)
+        on_progress(str(missing[place]), len(kept), len(sorts), float(numbers["log_likelihood"]))
     batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
-    theta, dt = usual(IDM_NAMES), smooth[0].dt
-
-    def one(i: int, *drifts: Effect) -> Estimate:
-        found = estimate(behind_a_record(dt, *drifts), batch, IDM_NAMES, theta, measured=raw, noise=noise)
-        on_progress(drifts[0].name if drifts else "no drift", i + 1, 1 + len(kinds), found.log_likelihood)
-        return found
-
-    steady = one(0)
-    found = {kind.name: one(i + 1, kind) for i, kind in enumerate(kinds)}
+    steady, *others = (Estimate.of_kept(MeasuredDrivers(s.simulator, batch, raw, IDM_NAMES), kept[s]) for s in sorts)
+    found = {kind.name: estimate for kind, estimate in zip(kinds, others, strict=True)}
     told = Told(steady, found, ())
     order = sorted((n for n in found if not found[n].why_not), key=lambda name: -told.gain[name])
     if told.verdict == "cannot_tell":

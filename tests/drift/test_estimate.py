@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import pathlib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -17,7 +19,7 @@ from idm_env.drift import forecast, kinds
 from idm_env.drift.estimate import Estimate, estimate, usual
 from idm_env.drift.job import _sorts, drift_file, sentence
 from idm_env.drift.kinds import tell
-from idm_env.effects import IDM, AccelNoise, Brakes, Delay, Effect, Replay, Wander
+from idm_env.effects import DRIFTS, IDM, AccelNoise, Brakes, Delay, Effect, Replay, Wander
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.options import Source
 from idm_env.fitting.problem import IDM_NAMES
@@ -126,6 +128,37 @@ def test_the_model_of_a_file_drifts(tmp_path) -> None:
     assert report["one_of"][0] in report["sentence"] and "tau" in report["sentence"]
     rows = {r["sort"]: r for r in report["sorts"]}
     assert model.parameters["wander"]["sigma"] == pytest.approx(rows["wander"]["sigma"])
+
+
+def test_drivers_kept_back_are_foreseen_and_an_interrupted_run_goes_on(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forecasts with the true drift beat those without, in bands that hold; a resumed run writes the same report."""
+    file = tmp_path / "made.csv"
+    names = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m", "gap_m")
+    driven(Wander(), 0.25, 8.0).table.select(names).write_csv(file)
+    whole = drift_file(Source(file), tmp_path / "whole")
+    rows = {(row["model"], row["ahead_s"]): row for row in whole["kept_back"]["scores"]}
+    assert whole["kept_back"]["drivers"] == DRIVERS // 4 and whole["data"]["taken"] == DRIVERS - DRIVERS // 4
+    told, steady = rows["wander", 10.0], rows["no drift", 10.0]
+    assert told["gap_crps_m"] < 0.9 * steady["gap_crps_m"] and 80.0 < told["in_90_percent"] < 98.0
+    assert f"{told['gap_crps_m']:.2f} m with wander" in whole["sentence"]
+
+    out, estimates = tmp_path / "out", []
+
+    def interrupted(*given: Any, **more: Any) -> Estimate:
+        if len(estimates) == 2:
+            raise KeyboardInterrupt
+        estimates.append(estimate(*given, **more))
+        return estimates[-1]
+
+    monkeypatch.setattr(kinds, "estimate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        drift_file(Source(file), out)
+    monkeypatch.setattr(kinds, "estimate", lambda *given, **more: estimates.append(None) or estimate(*given, **more))
+    resumed = drift_file(Source(file), out, resume=True)
+    assert len(estimates) == 1 + len(DRIFTS) and {**resumed, "command": ""} == {**whole, "command": ""}
+    assert (out / "model.yaml").read_bytes() == (tmp_path / "whole" / "model.yaml").read_bytes()
 
 
 def test_what_is_not_finite_or_at_a_limit_is_not_estimated(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,86 @@
+"""How well drivers who were kept back are foreseen: with drift as estimated on others, and without any."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from idm_env.data import Episode
+from idm_env.drift import forecast
+from idm_env.drift.estimate import Estimate
+from idm_env.drift.linear import MeasuredDrivers
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.problem import IDM_NAMES
+
+HORIZONS_S = (1.0, 5.0, 10.0)
+EVERY_S, FIRST_S = 5.0, 10.0
+"""A forecast begins so often (s), after the driver has been followed for so long."""
+DRAWS = 100
+MOST = 20
+"""Drivers at most who are kept back."""
+LEAST = 8
+"""Drivers below which none is kept back."""
+
+
+def split(count: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places of drivers to estimate on, and of every fourth, kept back; none of fewer than ``LEAST``."""
+    kept = np.arange(count)[3::4] if count >= LEAST else np.zeros(0, int)
+    return evenly(np.setdiff1d(np.arange(count), kept), most), evenly(kept, MOST)
+
+
+def evenly(places: np.ndarray, most: int) -> np.ndarray:
+    """Return at most so many places, evenly spread."""
+    return places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).astype(int))]
+
+
+def scores(
+    estimates: Mapping[str, Estimate], smooth: Sequence[Episode], measured: Sequence[Episode], seed: int = 0
+) -> list[dict[str, Any]]:
+    """Return the errors of forecasts of the gap, a row for every model and horizon.
+
+    A driver's own parameters and his drift are known from his past alone, about the median of the drivers of the
+    estimate. He is followed on what was measured; a forecast begins every 5 s behind the recorded leader. A row has
+    ``model``, ``ahead_s``, ``forecasts``, ``gap_rmse_m`` of the mean, ``gap_crps_m`` (Gneiting, Raftery 2007) and how
+    many percent of true gaps the central 50 and 90 % of the draws hold.
+    """
+    batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
+    dt, longest = smooth[0].dt, HORIZONS_S[-1]
+    begins = [np.arange(FIRST_S, (len(e) - 1) * dt - longest, EVERY_S) for e in smooth]
+    starts = [(r, round(t / dt)) for r, times in enumerate(begins) for t in times]
+    rows: list[dict[str, Any]] = []
+    for name, found in estimates.items() if starts else ():
+        drivers = MeasuredDrivers(found.drivers.simulator, batch, raw, IDM_NAMES)
+        theta = np.broadcast_to(np.median(found.theta, 0), (len(smooth), len(IDM_NAMES))).copy()
+        levels = forecast.followed(drivers, found.settings, theta)
+        gap, _ = forecast.drawn(drivers, found.settings, theta, levels, starts, longest, DRAWS, seed)
+        for ahead in HORIZONS_S:
+            steps = round(ahead / dt)
+            truth = np.array([measured[r].gap_m[t + steps] for r, t in starts])
+            drawn = gap[steps - 1]
+            able = np.isfinite(truth) & np.isfinite(drawn).all(0)
+            truth, drawn = truth[able], drawn[:, able]
+            rows.append({
+                "model": name, "ahead_s": ahead, "forecasts": int(able.sum()),
+                "gap_rmse_m": float(np.sqrt(np.mean((drawn.mean(0) - truth) ** 2))),
+                "gap_crps_m": float(forecast.crps(drawn, truth).mean()),
+                "in_50_percent": 100.0 * float(forecast.covers(drawn, truth, 0.5)[0].mean()),
+                "in_90_percent": 100.0 * float(forecast.covers(drawn, truth, 0.9)[0].mean()),
+            })  # fmt: skip
+    return rows
+
+
+def sentence(rows: Sequence[Mapping[str, Any]], name: str | None, drivers: int) -> str:
+    """Return what the longest forecasts of the model ``name`` and of no drift score, "" where there are none."""
+    last = {row["model"]: row for row in rows if row["ahead_s"] == HORIZONS_S[-1]}
+    if not last:
+        return ""
+    steady, own = last["no drift"], last[name or "no drift"]
+    with_drift = f"{own['gap_crps_m']:.2f} m with {name} and " if name else ""
+    least = min(last.values(), key=lambda row: row["gap_crps_m"])
+    better = f" {least['model']} forecasts better, {least['gap_crps_m']:.2f} m." if least is not own else ""
+    return (
+        f"On {drivers} drivers kept back the CRPS of the gap {HORIZONS_S[-1]:.0f} s ahead is {with_drift}"
+        f"{steady['gap_crps_m']:.2f} m without drift; the 90 % band holds {own['in_90_percent']:.0f} %.{better}"
+    )
