@@ -59,6 +59,10 @@ def run(begin, end, at):
 {around}'''
 
 
+_AT_ONCE = 16
+"""Numbers that a sort compares at once."""
+
+
 class Place(NamedTuple):
     """Where a recorded tensor lies: ``array[start + Σ index · stride]``, or a local name without strides."""
 
@@ -548,13 +552,25 @@ class RowFunction:
             def put(to: Place, k: str) -> str:
                 return index(to, [*at, k])
 
+            def insert(j: str, k: str) -> list[str]:
+                return [
+                    f"s = {self._at(x, [*at, j])}", f"k = {k}", f"while k > 0 and s < {put(first, '(k - 1)')}:",
+                    f"    {put(first, 'k')} = {put(first, '(k - 1)')}",
+                    f"    {put(second, 'k')} = {put(second, '(k - 1)')}", "    k -= 1",
+                    f"{put(first, 'k')} = s", f"{put(second, 'k')} = {j}",
+                ]  # fmt: skip
+
+            def deeper(lines: list[str], by: int) -> list[str]:
+                return ["    " * by + x for x in lines]
+
+            # Hardly any belongs to the first: many are compared at once, and looked at only where one does.
+            sooner = f"{self._at(x, [*at, 'j'])} < {put(first, str(most - 1))}"
+            some = f"for j in range(h, min(h + {_AT_ONCE}, {count})):"
             return [
-                "m = 0", f"for j in range({count}):", f"    s = {self._at(x, [*at, 'j'])}",
-                f"    if m < {most} or s < {put(first, str(most - 1))}:", f"        k = min(m, {most - 1})",
-                f"        while k > 0 and s < {put(first, '(k - 1)')}:",
-                f"            {put(first, 'k')} = {put(first, '(k - 1)')}",
-                f"            {put(second, 'k')} = {put(second, '(k - 1)')}", "            k -= 1",
-                f"        {put(first, 'k')} = s", f"        {put(second, 'k')} = j", f"        m = min(m + 1, {most})",
+                f"for j in range({most}):", *deeper(insert("j", "j"), 1),
+                f"for h in range({most}, {count}, {_AT_ONCE}):", "    n = 0", f"    {some}",
+                f"        n = n + np.int64({sooner})", "    if n > 0:", f"        {some}", f"            if {sooner}:",
+                *deeper(insert("j", str(most - 1)), 4),
             ]  # fmt: skip
 
         return self._loops(x.shape[1:-1], line)

@@ -184,34 +184,36 @@ class LanesTask(Task):
     def nearest(self, state: State) -> tuple[Tensor, ...]:
         """Return of the ``seen`` nearest vehicles who is there, how far ahead (m), lanes to the left, relative speed.
 
-        Each ``(…, agents, seen)``, 0 for nobody.
+        Each ``(…, seen, agents)``, 0 for nobody.
         """
         assert state.links is not None
+        agents, count = len(self.agents), min(self.seen, self.vehicles - 1)
         own = self.constant("agents", self.agents, state.speed.device, torch.int64)
-        lane = state.links.lane.to(state.speed.dtype)
-        ahead = self.apart(state.position.unsqueeze(-2) - self.pick(state.position).unsqueeze(-1))
-        away = ahead.detach().abs()
+        lane, position = state.links.lane.to(state.speed.dtype), state.position.detach()
+        away = self.apart(position.unsqueeze(-2) - self.pick(position).unsqueeze(-1)).abs()
         if state.present is not None:
             both = state.present.unsqueeze(-2) * self.pick(state.present).unsqueeze(-1)
             away = torch.where(both > 0, away, torch.inf)
         away = away.scatter(-1, own.view(-1, 1).expand(*away.shape[:-1], 1), torch.inf)
-        count = min(self.seen, self.vehicles - 1)
         # Of two that are equally near the one in the first slot comes first, however that is computed.
         near = away.sort(dim=-1, stable=True).indices[..., :count]
+        # Vehicles are picked from the state itself: gradients then flow to them, and to no matrix of all pairs.
+        which = torch.cat([near[..., k] for k in range(count)], -1)
 
         def beside(x: Tensor) -> Tensor:
-            return x.unsqueeze(-2).expand(away.shape).gather(-1, near) - self.pick(x).unsqueeze(-1)
+            return x.gather(-1, which).unflatten(-1, (count, agents)) - self.pick(x).unsqueeze(-2)
 
-        there = (away.gather(-1, near) <= FAR_AWAY).to(lane.dtype)
-        told = [there, *(x * there for x in (ahead.gather(-1, near), beside(lane), beside(state.speed)))]
+        found = away.gather(-1, near) <= FAR_AWAY
+        there = torch.stack([found[..., k] for k in range(count)], -2).to(lane.dtype)
+        told = [there, *(x * there for x in (self.apart(beside(state.position)), beside(lane), beside(state.speed)))]
         if count < self.seen:
-            told = [torch.cat((x, x.new_zeros(*x.shape[:-1], self.seen - count)), dim=-1) for x in told]
+            told = [torch.cat((x, x.new_zeros(*x.shape[:-2], self.seen - count, agents)), dim=-2) for x in told]
         return tuple(told)
 
 
 def _nearby(what: int, k: int, view: AgentView) -> Tensor:
     """Return one of what ``LanesTask.nearest`` says of the k-th vehicle, ``(…, agents)``."""
-    return view.once(_nearest)[what][..., k]
+    return view.once(_nearest)[what][..., k, :]
 
 
 def _nearest(view: AgentView) -> tuple[Tensor, ...]:
