@@ -40,6 +40,12 @@ ratio = [row["estimate"] / drivers[row["group"]][row["parameter"].split(".")[1]]
 axes.plot(ratio, [row["parameter"].split(".")[1] for row in rows], "o", alpha=0.6)
 axes.axvline(1.0, color="black", lw=0.7), axes.set(xlabel="estimate / truth")
 """,
+    "motorway": """
+_, axes = plt.subplots(figsize=(7, 2.8), layout="constrained")
+axes.plot(flow["inside"], label="on the road"), axes.plot(flow["travel"], label="travel time at the speed of now (s)")
+axes.axvspan(300.0, 420.0, color="silver", alpha=0.5, label="the left lane is closed")
+axes.set(xlabel="time (s)"), axes.legend()
+""",
     "ring_gradient": """
 _, axes = plt.subplots(figsize=(7, 2.8), layout="constrained")
 axes.plot(returns, "o-"), axes.set(xlabel="update", ylabel="return of 200 steps", xticks=range(len(returns)))

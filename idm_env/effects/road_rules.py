@@ -18,8 +18,8 @@ from idm_env.types import FAR, Driver, Scene, Wish
 
 EVERY_LANE = -1
 """Stands for all lanes of a road."""
-_PER_LANE = 150.0
-"""Way (m) that a driver allows for each lane that he has to change."""
+_PER_LANE = 300.0
+"""Way (m) that a driver allows for each lane that he has to change; LMRS has 295."""
 
 
 def _rows(kind: str, rows: Sequence[Sequence[float]], names: Sequence[str]) -> None:
@@ -159,9 +159,10 @@ class Signal(Effect):
 class Destination(Effect):
     """Where a driver must be to leave as he wants: on lanes ``first`` to ``last`` before a place x_d.
 
-    A lane that is n lanes away goes on for him as far as ``x_d − n · 150 m``, so he leaves it as one that ends
-    (``MandatoryChange``, ``GapAcceptance``), but does not stand there: who has missed his exit drives on. After the
-    route incentive of LMRS (Schakel, Knoop, van Arem 2012). Absent where the place is behind everybody.
+    A lane that is n lanes away goes on for him as far as ``x_d − (n − 1) · 300 m``, so he leaves it as one that
+    ends (``MandatoryChange``, ``GapAcceptance``), but does not stand there: who has missed his exit drives on. Within D
+    before that he does not change to where it goes on less far. After the route incentive of LMRS (Schakel, Knoop, van
+    Arem 2012). Absent where the place is behind everybody.
     """
 
     kind: ClassVar[str] = "destination"
@@ -171,6 +172,7 @@ class Destination(Effect):
         Parameter("first", "k_1", "1", 0.0, 0.0, 1000.0, role="shape"),
         Parameter("last", "k_2", "1", 1000.0, 0.0, 1000.0, role="shape"),
         Parameter("place", "x_d", "m", 1000.0, -1e9, 1e6, null=-1e9, role="place"),
+        Parameter("reach", "D", "m", 1000.0, 1.0, 1e5, role="shape"),
     )
 
     def room(self, scene: Scene, p: P) -> Tensor:
@@ -181,6 +183,13 @@ class Destination(Effect):
         return torch.where((away > 0.5) & (scene.position < p["place"]), way, FAR)
 
     def change(self, scene: Scene, driver: Driver, p: P) -> Wish:
-        """Return no wish of its own, and nothing against one."""
-        none = torch.zeros_like(scene.speed)
-        return Wish(none, none, none + FAR, none + FAR)
+        """Return no wish of its own, and no margin for changes away from where the driver wants to be."""
+        lane = scene.lane
+        assert lane is not None
+        none, own = torch.zeros_like(scene.speed), self.room(scene, p)
+
+        def margin(step: float) -> Tensor:
+            other = self.room(scene._replace(lane=lane + step), p)
+            return torch.where((other < own) & (other < p["reach"]), none - FAR, none + FAR)
+
+        return Wish(none, none, margin(1.0), margin(-1.0))

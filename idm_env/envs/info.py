@@ -24,6 +24,8 @@
     How many vehicles have left the road in this episode, and how many of those who enter on lane 0 have left it.
 ``standing``, ``co2``
     How many vehicles are below 0.5 m/s now, and what all emit now (g/s, by Kamal's fuel).
+``travel``
+    Time (s) over the length of the road at the mean speed of now.
 
 ``info="none"``, or some of these names, leaves the rest out. With torch output accelerations are tensors, with their
 graph.

@@ -21,7 +21,7 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 RENDER_MODES = ("rgb_array", "human")
 INFO = (
     "accel", "command", "failsafe", "crash", "vehicle_id", "lane_changes", "lane_refusals", "present",
-    "queued", "inside", "outflow", "ramp", "standing", "co2",
+    "queued", "inside", "outflow", "ramp", "standing", "co2", "travel",
 )  # fmt: skip
 KEYWORDS = (
     "task",

@@ -145,12 +145,15 @@ class LanesTask(Task):
         own = values[base]
         if not self.spread or "desired_speed" not in own:
             return values
-        # Multiples of the golden ratio: evenly spread, whatever their number, and neighbours differ.
-        share = (0.618033988749895 * torch.arange(self.vehicles, dtype=torch.float64)) % 1.0
-        factor = (1.0 + self.spread * (2.0 * share - 1.0)).to(dtype=dtype, device=device)
-        values = {**values, base: {**own, "desired_speed": own["desired_speed"] * factor}}
+        values = {**values, base: {**own, "desired_speed": own["desired_speed"] * self.spread_factor(dtype, device)}}
         self.simulator.check(values)
         return values
+
+    def spread_factor(self, dtype: torch.dtype, device: torch.device | str) -> Tensor:
+        """Return by how much every driver's desired speed differs from that of all."""
+        # Multiples of the golden ratio: evenly spread, whatever their number, and neighbours differ.
+        share = (0.618033988749895 * torch.arange(self.vehicles, dtype=torch.float64)) % 1.0
+        return (1.0 + self.spread * (2.0 * share - 1.0)).to(dtype=dtype, device=device)
 
     @property
     def features_of_self(self) -> tuple[Feature, ...]:

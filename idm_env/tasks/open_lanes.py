@@ -7,21 +7,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Control, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
+from idm_env.effects import IDM, Brakes, Control, Courtesy, Destination, Effect, GapAcceptance, MandatoryChange, Mobil
 from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
-from idm_env.roads import Lanes, lane_drop, on_ramp
+from idm_env.multilane.table import SECOND, Table, read, spread
+from idm_env.multilane.table import table as made
+from idm_env.roads import End, Lanes, lane_drop, on_ramp
 from idm_env.tasks.base import Pay, World
-from idm_env.tasks.checks import Range, at_least
+from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
+from idm_env.tasks.said_roads import DriverClass, classes_of, lengths, rules_of, with_classes
 from idm_env.types import Params, State, Trips
+from idm_env.validation import nearest, one_of, shown
 
 _PLACE_STREAM = 37
 _FLOW = Range(0.0, 1e5, "vehicles an hour")
@@ -95,6 +99,15 @@ class OpenLanesTask(LanesTask):
     Args:
         entry_speed: Speed at which vehicles ask to enter (m/s).
         careful: Whether a command counts only as far as the driver himself would go: ``min(command, driver)``.
+        classes: Drivers who are not as all others: ``{"truck": {"share": 0.2, "length": 12.0, "parameters":
+            {"idm.desired_speed": 24.0}}}``, shares of those who enter, length in metres.
+        trips: Who departs when, in place of the inflow: a table, rows or a CSV file with the columns of
+            ``idm_env.multilane.table``, or what its ``table`` takes: ``{"per_hour": {1: 1500, 2: [[0, 800], [300,
+            1600]]}, "seconds": 600, "classes": {"truck": 0.2}}``. The same in every episode; ``vehicles`` is then its
+            number of rows, and nobody is on the road when an episode begins.
+        limits: Speed limits: ``[{"speed": 25.0, "begin": 0.0, "end": 500.0, "lane": 1}]`` (m/s, m); without a lane on
+            all of them.
+        closures: Closed lanes: ``[{"lane": 1, "begin": 300.0, "end": 500.0, "since": 60.0, "until": 240.0}]`` (m, s).
     """
 
     own_effects: ClassVar[tuple[Effect, ...]] = (
@@ -114,9 +127,18 @@ class OpenLanesTask(LanesTask):
     max_command: float | Sequence[float] = 2.0
     entry_speed: float = 20.0
     careful: bool = True
+    classes: Mapping[str, Any] | None = None
+    trips: Any = None
+    limits: Sequence[Mapping[str, Any]] = ()
+    closures: Sequence[Mapping[str, Any]] = ()
 
     def __post_init__(self) -> None:
+        if self.table is not None:
+            object.__setattr__(self, "vehicles", len(self.table.depart))
         super().__post_init__()
+        if self.table is not None:
+            self._check_table(self.table)
+            return
         flows = self.inflows
         total = sum(flows.values())
         for lane, flow in flows.items():
@@ -137,6 +159,64 @@ class OpenLanesTask(LanesTask):
     def filled(self) -> float:
         """Up to where vehicles are when an episode begins (m)."""
 
+    def _check_table(self, given: Table) -> None:
+        """Raise ValueError for trips of this task that nobody could make."""
+        horizon = self.steps * self.simulator.dt
+        for i, (depart, lane, destination) in enumerate(zip(given.depart, given.lane, given.destination, strict=True)):
+            where = f"trips: row {i}, in the order of departure,"
+            if depart > horizon:
+                raise ValueError(f"{where} departs at {depart:g} s, after the end of the episode at {horizon:g} s.")
+            if lane >= self.road.count:
+                raise ValueError(f"{where} enters on lane {lane}: this road has lanes 0 to {self.road.count - 1}.")
+            if destination and destination not in self.exits:
+                raise ValueError(f"{where} has destination {shown(destination)}.{nearest(destination, self.exits)}")
+
+    @cached_property
+    def table(self) -> Table | None:
+        """The trips that are given, None for those at random."""
+        if self.trips is None:
+            return None
+        if isinstance(self.trips, Mapping) and "per_hour" in self.trips:
+            for key in self.trips:
+                one_of("trips", key, ("per_hour", "seconds", "seed", "speed", "classes", "destinations"))
+            return read(made(**{"seconds": 600.0, **self.trips}))
+        return read(self.trips)
+
+    @property
+    def exits(self) -> Mapping[str, float]:
+        """Names of destinations beside the end of the road, and up to where one must have changed for them (m)."""
+        return {}
+
+    @cached_property
+    def _classes(self) -> dict[str, DriverClass]:
+        return classes_of(self.classes, self.vehicle_length)
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """The class of every slot's driver, '' for a plain one."""
+        if self.table is None:
+            return tuple(spread("classes", {name: x.share for name, x in self._classes.items()}, self.vehicles))
+        for kind in self.table.kind:
+            if kind and kind not in self._classes:
+                raise ValueError(f"trips: class {shown(kind)} is unknown.{nearest(kind, self._classes)}")
+        return self.table.kind
+
+    @cached_property
+    def rules(self) -> tuple[Effect, ...]:
+        """What the road tells its drivers."""
+        return rules_of(self.limits, self.closures, self.road.count)
+
+    def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
+        """Return checked parameters as tensors, those of classes in the slots of theirs."""
+        values = super().params(dtype, device)
+        if not self._classes:
+            return values
+        base = self.simulator.base.name
+        factors = {(base, "desired_speed"): self.spread_factor(dtype, device)} if self.spread else {}
+        values = with_classes(values, self.kinds, self._classes, factors)
+        self.simulator.check(values)
+        return values
+
     @property
     def usual_steps(self) -> int:
         """Those of 600 s."""
@@ -145,7 +225,7 @@ class OpenLanesTask(LanesTask):
     @property
     def machinery(self) -> tuple[Effect, ...]:  # type: ignore[override]
         """Effects through which agents act."""
-        return (Control(careful=self.careful), *super().machinery[1:])
+        return (Control(careful=self.careful), *super().machinery[1:], *self.rules)
 
     @cached_property
     def _slots(self) -> tuple[tuple[float, float], ...]:
@@ -160,6 +240,9 @@ class OpenLanesTask(LanesTask):
     def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
         """Return trips at random headways, of which the first began before the episode did, in the order of time."""
         device = draw.key.device
+        if self.table is not None:
+            given = self.table.trips(dtype)
+            return Trips(*(x.to(device).expand(len(draw.key), -1).contiguous() for x in given))
         lane, mean = (torch.tensor(x, dtype=torch.float64, device=device) for x in zip(*self._slots, strict=True))
         some = mean.isfinite()
         shape = (len(draw.key), self.vehicles)
@@ -189,8 +272,9 @@ class OpenLanesTask(LanesTask):
         begins = self.road.at_lane(trips.lane, trips.departs, "begins")
         place = torch.where(inside, begins - trips.departs * self.entry_speed, begins)
         inside = inside & (place < self.filled)
+        length = self.constant("lengths", self._lengths, like.device, like.dtype)
         state = self.simulator.state(
-            torch.where(inside, place, begins), trips.speed, params, length=self.vehicle_length,
+            torch.where(inside, place, begins), trips.speed, params, length=length,
             present=inside.to(like.dtype), lane=trips.lane,
             step=torch.full((len(place),), -self.warmup, device=like.device),
         )  # fmt: skip
@@ -199,6 +283,9 @@ class OpenLanesTask(LanesTask):
             state._replace(trips=trips._replace(entered=inside.long())),
             {"free_speed": free.to(place.dtype).expand_as(place).contiguous()},
         )
+
+    def _lengths(self) -> list[float]:
+        return lengths(self.kinds, self._classes, self.vehicle_length)
 
     @property
     def features_of_self(self) -> tuple[Feature, ...]:
@@ -218,7 +305,8 @@ class OpenLanesTask(LanesTask):
 
         ``present``: agents that are there; ``queued``: vehicles that wait at the entries, a queue that grows is an
         inflow beyond capacity; ``inside``; ``outflow``: vehicles that have left; ``ramp``: of those who enter on lane 0
-        how many have left it; ``standing``: vehicles below 0.5 m/s; ``co2``: g/s of all on the road (Kamal's fuel).
+        how many have left it; ``standing``: vehicles below 0.5 m/s; ``co2``: g/s of all on the road (Kamal's fuel);
+        ``travel``: time (s) over the length of the road at the mean speed of now, at least 0.5 m/s.
         """
         state = world.state
         assert state.present is not None and state.trips is not None and state.links is not None
@@ -231,18 +319,24 @@ class OpenLanesTask(LanesTask):
             "standing": (there & (state.speed < _STANDS)).sum(-1),
             "co2": CO2 * torch.where(there, fuel(state.speed, state.accel), 0.0).sum(-1),
         }  # fmt: skip
+        speeds = torch.where(there, state.speed, 0.0).sum(-1) / found.inside.clamp_min(1)
+        every["travel"] = (self.road.length or 0.0) / speeds.clamp_min(_STANDS)
         own = {**super().told(world), "present": self.pick(there)}
         return own | {n: x.unsqueeze(-1).expand(-1, len(self.agents)).contiguous() for n, x in every.items()}
 
     @property
     def journeys(self) -> int:
         """One that began before the episode, one that is due at once, and one for every time that a slot's are due."""
+        if self.table is not None:
+            return 1
         cycle = min(sum(mean for k, mean in self._slots if k == lane) for lane in self.inflows)
         return 2 + math.ceil((self.steps * self.simulator.dt + self.filled / self.entry_speed) / cycle)
 
     @cached_property
     def _most(self) -> float:
         """No more trips are due in an episode."""
+        if self.table is not None:
+            return float(self.vehicles)
         seconds = (self.steps + 10) * self.simulator.dt + self.filled / self.entry_speed
         return 2.0 * self.vehicles + sum(self.inflows.values()) * seconds / 3600.0
 
@@ -288,10 +382,17 @@ class OpenLanesTask(LanesTask):
 class OpenHighwayTask(OpenLanesTask):
     """Several lanes, none of which ends: ``highway`` with vehicles that come and go, as in HighwayEnv's.
 
+    With a ramp lane 0 is that of the ramps, and the others are the road's. The on-ramp begins 300 m before one may
+    leave it, and ends where one may not; the off-ramp is left 200 m behind that.
+
     Args:
-        lanes_count: Number of lanes.
+        lanes_count: Number of lanes, ramps not counted.
         length: Length of the road (m).
         inflow: Vehicles an hour on all lanes together.
+        on_ramp: Where one may merge from the on-ramp: ``[begin, end]`` (m); None is no such ramp.
+        off_ramp: Where one may change to the off-ramp: ``[begin, end]`` (m), behind the on-ramp.
+        ramp_inflow: Vehicles an hour on the on-ramp.
+        exits_share: Share of drivers who leave by the off-ramp; of a table those whose destination is ``exit``.
     """
 
     name: ClassVar[str] = "open_highway"
@@ -299,21 +400,76 @@ class OpenHighwayTask(OpenLanesTask):
     ranges: ClassVar[Mapping[str, Range]] = {
         "lanes_count": Range(2, 100, whole=True),
         "length": Range(100.0, 1e6, "m"),
+        "ramp_inflow": _FLOW,
+        "exits_share": Range(0.0, 1.0),
     }
 
     lanes_count: int = 4
     length: float = 1000.0
     inflow: float = 5000.0
+    on_ramp: Sequence[float] | None = None
+    off_ramp: Sequence[float] | None = None
+    ramp_inflow: float = 500.0
+    exits_share: float = 0.15
+
+    @cached_property
+    def _ramps(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
+        on, off = (
+            None if x is None else span(name, x, 0.0, "m", self.length)
+            for name, x in (("on_ramp", self.on_ramp), ("off_ramp", self.off_ramp))
+        )
+        if on and off and off[0] <= on[1]:
+            raise ValueError(f"off_ramp = {list(off)} must begin behind the end of the on-ramp at {on[1]:g} m.")
+        return on, off
 
     @cached_property
     def road(self) -> Lanes:  # type: ignore[override]
         """The road."""
-        return Lanes(self.lanes_count, length=float(self.length))
+        on, off = self._ramps
+        ends: tuple[End, ...] = ()
+        if off:
+            leaves = min(off[1] + 200.0, float(self.length))
+            begin = max(on[0] - 300.0, 0.0) if on else off[0]
+            ends = (End(0, begin, leaves, closed=False, opens=on[0] if on else off[0], closes=off[1]),)
+        elif on:
+            ends = (on_ramp(0, *on, entry=max(on[0] - 300.0, 0.0)),)
+        return Lanes(self.lanes_count + bool(ends), length=float(self.length), ends=ends)
+
+    @cached_property
+    def rules(self) -> tuple[Effect, ...]:
+        """What the road tells its drivers; between the ramps there is no lane 0."""
+        on, off = self._ramps
+        between = ({"lane": 0, "begin": on[1], "end": off[0]},) if on and off else ()
+        told = rules_of(self.limits, (*self.closures, *between), self.road.count)
+        return (*told, Destination()) if off else told
+
+    @property
+    def exits(self) -> Mapping[str, float]:
+        """The off-ramp."""
+        off = self._ramps[1]
+        return {"exit": off[1]} if off else {}
+
+    def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
+        """Return checked parameters as tensors, with who wants to leave by the off-ramp."""
+        values, off = super().params(dtype, device), self._ramps[1]
+        if not off:
+            return values
+        drawn = tuple(spread("exits_share", {"exit": self.exits_share}, self.vehicles, SECOND))
+        wanted = drawn if self.table is None else self.table.destination
+        leaves = torch.tensor([x == "exit" for x in wanted], device=device)
+        own = {
+            "first": torch.where(leaves, 0.0, 1.0), "last": torch.where(leaves, 0.0, 1000.0),
+            "place": torch.full((self.vehicles,), off[1], device=device),
+        }  # fmt: skip
+        mine = {name: x.to(dtype) for name, x in own.items()}
+        return {**values, "destination": {**values["destination"], **mine}}
 
     @property
     def inflows(self) -> Mapping[int, float]:
-        """The same for each lane."""
-        return dict.fromkeys(range(self.lanes_count), self.inflow / self.lanes_count)
+        """The same for each lane, and the on-ramp's."""
+        first = self.road.count - self.lanes_count
+        own = dict.fromkeys(range(first, self.road.count), self.inflow / self.lanes_count)
+        return {0: self.ramp_inflow, **own} if self._ramps[0] else own
 
     @property
     def filled(self) -> float:

@@ -1,0 +1,181 @@
+"""Trips as a table: who departs when, on which lane, how fast, of which class of drivers, and where to.
+
+A table is anything with columns (a ``DataFrame``, or a mapping of sequences), rows, or the path of a CSV file:
+
+===============  =======================================================================================================
+``depart``       when the trip begins (s), from 0 on; of one lane in any order
+``lane``         lane on which it enters, 0 on the right
+``speed``        speed that it asks for at the entry (m/s); 20 where the column is missing
+``class``        name of its class of drivers; empty, or without the column: a plain one
+``destination``  name of where it leaves; empty, or without the column: at the end of the road
+===============  =======================================================================================================
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from idm_env.types import Trips
+from idm_env.validation import finite, nearest, shown
+
+COLUMNS = ("depart", "lane", "speed", "class", "destination")
+USUAL_SPEED = 20.0
+FIRST, SECOND = 0.7548776662466927, 0.5698402909980532
+"""Multiples of each are evenly spread, and go neither with each other nor with those by which desired speeds are."""
+
+
+class Table(NamedTuple):
+    """A checked table of trips, in the order of departure."""
+
+    depart: tuple[float, ...]
+    lane: tuple[int, ...]
+    speed: tuple[float, ...]
+    kind: tuple[str, ...]
+    destination: tuple[str, ...]
+
+    def trips(self, dtype: torch.dtype = torch.float32) -> Trips:
+        """Return the trips, a slot each."""
+        none = torch.zeros(len(self.depart), dtype=torch.int64)
+        return Trips(
+            torch.tensor(self.depart, dtype=dtype), torch.full((len(self.depart),), math.inf, dtype=dtype),
+            torch.tensor(self.lane), torch.tensor(self.speed, dtype=dtype), none, none.clone(),
+        )  # fmt: skip
+
+
+def read(given: Any) -> Table:
+    """Return a table from columns, rows or a CSV file; ValueError, in one line, for what is none."""
+    columns = _columns(given)
+    for name in columns:
+        if name not in COLUMNS:
+            raise ValueError(f"trips: column {shown(name)} is unknown.{nearest(str(name), COLUMNS)}")
+    for name in ("depart", "lane"):
+        if name not in columns:
+            raise ValueError(f"trips need a column '{name}'. Columns: {', '.join(COLUMNS)}.")
+    count = len(columns["depart"])
+    if not count or any(len(x) != count for x in columns.values()):
+        raise ValueError("trips: every column must have a value for each trip, and at least one.")
+    depart = [_number("depart", x, i, 0.0) for i, x in enumerate(columns["depart"])]
+    lane = [_number("lane", x, i, 0.0) for i, x in enumerate(columns["lane"])]
+    speed = [_number("speed", x, i, 1.0) for i, x in enumerate(columns.get("speed", [USUAL_SPEED] * count))]
+    if (bad := next((i for i, x in enumerate(lane) if x != int(x)), None)) is not None:
+        raise ValueError(f"trips: lane = {lane[bad]:g} of row {bad} must be a whole number.")
+    kind, destination = ([_name(x) for x in columns.get(n, [""] * count)] for n in ("class", "destination"))
+    rows = sorted(zip(depart, map(int, lane), speed, kind, destination, strict=True), key=lambda row: row[0])
+    return Table(*(tuple(column) for column in zip(*rows, strict=True)))
+
+
+def from_table(frame: Any, dtype: torch.dtype = torch.float32) -> Trips:
+    """Return the trips of a table, a slot each, in the order of departure; ValueError, in one line, for what is none.
+
+    Classes and destinations are the drivers', and stay in the table.
+    """
+    return read(frame).trips(dtype)
+
+
+def _columns(given: Any) -> dict[str, list[Any]]:
+    if isinstance(given, (str, Path)):
+        with open(given, newline="", encoding="utf-8") as file:
+            given = list(csv.DictReader(file))
+    if isinstance(given, Sequence) and not isinstance(given, str):
+        if not given or not all(isinstance(row, Mapping) for row in given):
+            raise ValueError(f"trips = {shown(given)} must be rows of {', '.join(COLUMNS)}, columns, or a CSV file.")
+        names = dict.fromkeys(name for row in given for name in row)
+        return {str(name): [row.get(name) for row in given] for name in names}
+    try:
+        return {str(name): list(given[name]) for name in given}
+    except (TypeError, KeyError, IndexError):
+        raise ValueError(f"trips = {shown(given)} must be a table, rows of it, or a CSV file.") from None
+
+
+def _number(name: str, value: Any, row: int, least: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not least <= number < math.inf:
+        raise ValueError(f"trips: {name} = {shown(value)} of row {row} must be a number of at least {least:g}.")
+    return number
+
+
+def _name(value: Any) -> str:
+    return "" if value is None or value != value else str(value)
+
+
+def table(
+    per_hour: Mapping[int, Any], seconds: float, *, seed: int = 0, speed: float = USUAL_SPEED,
+    classes: Mapping[str, float] | None = None, destinations: Mapping[str, float] | None = None,
+) -> dict[str, list[Any]]:  # fmt: skip
+    """Return a table of trips, as columns, with demand by lane and time.
+
+    ``per_hour`` gives for every lane that is entered vehicles an hour, one number or ``[[from_s, number], …]``;
+    headways are half of the mean, and an exponential half. ``classes`` and ``destinations`` are shares of names.
+    ValueError, in one line, for what is no number of at least 0, or for shares above 1.
+    """
+    finite("seconds", seconds, "s")
+    generator = torch.Generator().manual_seed(seed)
+    rows = []
+    for key, flow in sorted(per_hour.items(), key=lambda x: int(x[0])):
+        steps = [[0.0, flow]] if isinstance(flow, (int, float)) else [list(x) for x in flow]
+        for begin, number in steps:
+            if not (math.isfinite(begin) and 0.0 <= number <= 1e5):
+                raise ValueError(f"per_hour = {shown(number)} of lane {key} must be from 0 to 100000 vehicles an hour.")
+        time = 0.0
+        while True:
+            now = next((x for begin, x in reversed(steps) if begin <= time), 0.0)
+            if now <= 0.0:
+                time = next((begin for begin, x in steps if begin > time and x > 0.0), math.inf)
+                if time > seconds:
+                    break
+                continue
+            wait = float(torch.empty(()).exponential_(generator=generator))
+            time += 3600.0 / now * 0.5 * (1.0 + wait)
+            if time > seconds:
+                break
+            rows.append((time, int(key)))
+    if not rows:
+        raise ValueError(f"per_hour = {shown(dict(per_hour))} lets nobody depart within {seconds:g} s.")
+    rows.sort()
+    who = torch.rand(2, len(rows), generator=generator).tolist()
+    return {
+        "depart": [time for time, _ in rows], "lane": [lane for _, lane in rows], "speed": [speed] * len(rows),
+        "class": _of_shares("classes", classes or {}, who[0]),
+        "destination": _of_shares("destinations", destinations or {}, who[1]),
+    }  # fmt: skip
+
+
+def shares(name: str, given: Mapping[str, float]) -> None:
+    """Raise ValueError for shares below 0, or above 1 in all."""
+    for key, share in given.items():
+        if not 0.0 <= finite(f"{name}.{key}", share) <= 1.0:
+            raise ValueError(f"{name}.{key} = {share:g} must be a share from 0 to 1.")
+    if sum(given.values()) > 1.0 + 1e-9:
+        raise ValueError(f"{name}: shares of {sum(given.values()):g} in all must not exceed 1.")
+
+
+def _of_shares(name: str, given: Mapping[str, float], at: Sequence[float]) -> list[str]:
+    """Return the names that numbers from 0 to 1 mean, '' for what is left."""
+    shares(name, given)
+    found = []
+    for x in at:
+        chosen = ""
+        for key, share in given.items():
+            if x < share:
+                chosen = key
+                break
+            x -= share
+        found.append(chosen)
+    return found
+
+
+def spread(name: str, given: Mapping[str, float], count: int, by: float = FIRST) -> list[str]:
+    """Return the names of so many slots, evenly spread by their shares."""
+    return _of_shares(name, given, [(by * (i + 1)) % 1.0 for i in range(count)])
+
+
+__all__ = ["COLUMNS", "SECOND", "Table", "from_table", "read", "spread", "table"]

@@ -1,0 +1,131 @@
+"""Roads that a user says: tables of trips, classes, limits, closed lanes, ramps; what cannot be is one line."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from idm_env.multilane import demand, table
+from idm_env.tasks import Draw, Task, make_task
+from idm_env.types import Command
+
+ROWS = [
+    {"depart": 30.0, "lane": 1, "class": "truck", "destination": "exit"},
+    {"depart": 5.0, "lane": 0, "speed": 22.0},
+    {"depart": 12.0, "lane": 2, "speed": 25.0, "class": ""},
+]
+TRUCK = {"truck": {"length": 12.0, "share": 0.25, "parameters": {"idm.desired_speed": 20.0, "idm": {"max_accel": 0.6}}}}
+RAMPS: dict[str, Any] = {"lanes_count": 2, "length": 1500.0, "on_ramp": [400.0, 600.0], "off_ramp": [900.0, 1100.0]}
+
+
+def begun(task: Task, rows: int = 1) -> Any:
+    """Return the first states of a task and its parameters."""
+    params = task.params(torch.float64, "cpu")
+    return task.reset(Draw.of(torch.arange(rows), torch.zeros(rows, dtype=torch.int64)), params).state, params
+
+
+def test_a_table_is_rows_columns_or_a_file(tmp_path: Path) -> None:
+    """The same trips, in the order of departure; speeds that are not said are 20 m/s."""
+    pandas = pytest.importorskip("pandas")
+    path = tmp_path / "trips.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["depart", "lane", "speed", "class", "destination"])
+        writer.writeheader()
+        writer.writerows([{"speed": 20.0, **row} for row in ROWS])
+    full = [{"speed": 20.0, **row} for row in ROWS]
+    tables = [table.read(x) for x in (full, pandas.DataFrame(full), path, str(path))]
+    assert all(x == tables[0] for x in tables)
+    trips = table.from_table(full, torch.float64)
+    assert trips.departs.tolist() == [5.0, 12.0, 30.0] and trips.lane.tolist() == [0, 2, 1]
+    assert trips.speed.tolist() == [22.0, 25.0, 20.0] and bool(trips.again.isinf().all())
+    assert tables[0].kind == ("", "", "truck") and tables[0].destination == ("", "", "exit")
+
+
+def test_everybody_departs_when_and_as_his_row_says() -> None:
+    """Length and parameters are those of the class, and all three are out in the end."""
+    rows = [{"speed": 20.0, **row} for row in ROWS]
+    task = make_task("open_highway", **RAMPS, trips=rows, classes=TRUCK, controlled=1, spread=0.0)
+    state, params = begun(task)
+    assert task.vehicles == 3 and state.length.tolist() == [[5.0, 5.0, 12.0]]
+    assert params["idm"]["desired_speed"].tolist() == [30.0, 30.0, 20.0]
+    assert params["idm"]["max_accel"].tolist() == [1.5, 1.5, 0.6]
+    entered = torch.full((3,), -1.0)
+    lane = torch.zeros(3, dtype=torch.int64)
+    for _ in range(2000):
+        state = task.simulator.advance(state, {"control": _nobody(state)}, params)
+        now = float(task.simulator.time(state))
+        fresh = (state.trips.entered[0] > 0) & (entered < 0)
+        entered[fresh] = now
+        lane = torch.where(state.present[0] > 0, state.links.lane[0], lane)
+    assert torch.allclose(entered, torch.tensor([5.0, 12.0, 30.0]), atol=1.2)
+    assert int(demand.counts(task.simulator, state).left) == 3 and lane.tolist()[2] == 0 and lane.tolist()[0] > 0
+
+
+def _nobody(state: Any) -> Command:
+    return Command(state.speed.new_zeros(()), torch.zeros(state.speed.shape[-1], dtype=torch.bool))
+
+
+def test_demand_by_time_is_a_table() -> None:
+    """As many as asked for in each part, the same with the same seed, nobody where there is none."""
+    given = {"per_hour": {1: [[0, 1800], [600, 0], [1200, 900]], 2: 1200}, "seconds": 1800.0, "seed": 3}
+    made = table.table(**given, classes={"truck": 0.2})
+    assert made == table.table(**given, classes={"truck": 0.2}) != table.table(**{**given, "seed": 4})
+    first = [t for t, lane in zip(made["depart"], made["lane"], strict=True) if lane == 1]
+    assert 270 < sum(t < 600 for t in first) < 330 and 120 < sum(t > 1200 for t in first) < 180
+    assert not any(610 < t < 1200 for t in first)
+    assert 0.15 < made["class"].count("truck") / len(made["class"]) < 0.25
+
+
+def test_what_is_not_said_leaves_no_trace() -> None:
+    """Classes without a share, limits that nobody reaches and closures later on: states to the last bit."""
+    plain = make_task("merge", vehicles=24)
+    said = make_task(
+        "merge", vehicles=24, classes={"truck": {"share": 0.0, "length": 12.0}}, limits=[{"speed": 99.0}],
+        closures=[{"lane": 1, "begin": 100.0, "end": 200.0, "since": 900.0}],
+    )  # fmt: skip
+    (one, params), (other, own) = begun(plain), begun(said)
+    for _ in range(400):
+        one = plain.simulator.step(one, {"control": _nobody(one)}, params)
+        other = said.simulator.step(other, {"control": _nobody(other)}, own)
+    assert torch.equal(one.position, other.position) and torch.equal(one.links.lane, other.links.lane)
+
+
+ROW = {"depart": 5.0, "lane": 1}
+BAD: dict[str, tuple[str, dict[str, Any]]] = {
+    "departs at 700 s, after the end of the episode at 600 s": ("merge", {"trips": [{**ROW, "depart": 700.0}]}),
+    "enters on lane 7": ("merge", {"trips": [{**ROW, "lane": 7}]}),
+    "destination 'exit'": ("merge", {"trips": [{**ROW, "destination": "exit"}]}),
+    "depart = 'soon' of row 0": ("merge", {"trips": [{**ROW, "depart": "soon"}]}),
+    "depart = -1": ("merge", {"trips": [{**ROW, "depart": -1.0}]}),
+    "lane = 0.5 of row 0": ("merge", {"trips": [{**ROW, "lane": 0.5}]}),
+    "column 'departs' is unknown. Did you mean 'depart'": ("merge", {"trips": [{"departs": 1.0, "lane": 1}]}),
+    "class 'bus' is unknown": ("merge", {"trips": [{**ROW, "class": "bus"}], "classes": TRUCK}),
+    "classes.truck = -0.1 must be a share": ("merge", {"classes": {"truck": {"share": -0.1}}}),
+    "shares of 1.2 in all": ("merge", {"classes": {"a": {"share": 0.7}, "b": {"share": 0.5}}}),
+    "parameter 'idm.speed' does not exist": ("merge", {"classes": {"a": {"parameters": {"idm.speed": 3.0}}}}),
+    "limits[0].speed = 0": ("merge", {"limits": [{"speed": 0.0}]}),
+    "limits[0].lane = 3 does not exist": ("merge", {"limits": [{"speed": 20.0, "lane": 3}]}),
+    "must end behind its beginning": ("merge", {"closures": [{"lane": 1, "begin": 300.0, "end": 200.0}]}),
+    "all 3 lanes are closed at 120 m at 30 s": (
+        "merge",
+        {"closures": [{"lane": k, "begin": 100.0 + 10 * k, "end": 200.0, "since": 15.0 * k} for k in range(3)]},
+    ),
+    "off_ramp = [500.0, 700.0] must begin behind the end of the on-ramp": (
+        "open_highway", {"on_ramp": [400.0, 600.0], "off_ramp": [500.0, 700.0]}),
+    "lets nobody depart": ("merge", {"trips": {"per_hour": {1: 0}}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("says", BAD)
+def test_what_cannot_be_is_one_line_with_its_name(says: str) -> None:
+    """Before anything starts."""
+    task, given = BAD[says]
+    with pytest.raises(ValueError) as error:
+        make_task(task, **given)
+    text = str(error.value)
+    assert "\n" not in text
+    assert says in text, text
