@@ -15,8 +15,6 @@ from torch import Tensor
 from idm_env.effects import IDM, Brakes, Control, Courtesy, Destination, Effect, GapAcceptance, MandatoryChange, Mobil
 from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
-from idm_env.multilane.table import SECOND, Table, read, spread
-from idm_env.multilane.table import table as made
 from idm_env.roads import End, Lanes, lane_drop, on_ramp
 from idm_env.tasks.base import Pay, World
 from idm_env.tasks.checks import Range, at_least, span
@@ -24,6 +22,8 @@ from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.said_roads import DriverClass, classes_of, lengths, rules_of, with_classes
+from idm_env.tasks.trip_table import SECOND, Table, read, spread
+from idm_env.tasks.trip_table import table as made
 from idm_env.types import Params, State, Trips
 from idm_env.validation import nearest, one_of, shown
 
@@ -102,7 +102,7 @@ class OpenLanesTask(LanesTask):
         classes: Drivers who are not as all others: ``{"truck": {"share": 0.2, "length": 12.0, "parameters":
             {"idm.desired_speed": 24.0}}}``, shares of those who enter, length in metres.
         trips: Who departs when, in place of the inflow: a table, rows or a CSV file with the columns of
-            ``idm_env.multilane.table``, or what its ``table`` takes: ``{"per_hour": {1: 1500, 2: [[0, 800], [300,
+            ``idm_env.tasks.trip_table``, or what its ``table`` takes: ``{"per_hour": {1: 1500, 2: [[0, 800], [300,
             1600]]}, "seconds": 600, "classes": {"truck": 0.2}}``. The same in every episode; ``vehicles`` is then its
             number of rows, and nobody is on the road when an episode begins.
         limits: Speed limits: ``[{"speed": 25.0, "begin": 0.0, "end": 500.0, "lane": 1}]`` (m/s, m); without a lane on

@@ -11,7 +11,7 @@ from torch import Tensor
 from idm_env.effects import Effect, LaneClosure, SpeedLimit
 from idm_env.effects.road_rules import EVERY_LANE
 from idm_env.model_file import nested
-from idm_env.multilane import table
+from idm_env.tasks import trip_table as table
 from idm_env.tasks.checks import at_least
 from idm_env.validation import one_of, shown
 

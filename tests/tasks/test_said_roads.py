@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 import torch
 
-from idm_env.multilane import demand, table
+from idm_env.multilane import demand
 from idm_env.tasks import Draw, Task, make_task
+from idm_env.tasks import trip_table as table
 from idm_env.types import Command
 
 ROWS = [
