@@ -22,7 +22,7 @@ from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.said_roads import DriverClass, classes_of, lengths, rules_of, with_classes
-from idm_env.tasks.trip_table import SECOND, Table, read, spread
+from idm_env.tasks.trip_table import SECOND, TripTable, read, spread
 from idm_env.tasks.trip_table import table as made
 from idm_env.types import Params, State, Trips
 from idm_env.validation import nearest, one_of, shown
@@ -159,7 +159,7 @@ class OpenLanesTask(LanesTask):
     def filled(self) -> float:
         """Up to where vehicles are when an episode begins (m)."""
 
-    def _check_table(self, given: Table) -> None:
+    def _check_table(self, given: TripTable) -> None:
         """Raise ValueError for trips of this task that nobody could make."""
         horizon = self.steps * self.simulator.dt
         for i, (depart, lane, destination) in enumerate(zip(given.depart, given.lane, given.destination, strict=True)):
@@ -172,7 +172,7 @@ class OpenLanesTask(LanesTask):
                 raise ValueError(f"{where} has destination {shown(destination)}.{nearest(destination, self.exits)}")
 
     @cached_property
-    def table(self) -> Table | None:
+    def table(self) -> TripTable | None:
         """The trips that are given, None for those at random."""
         if self.trips is None:
             return None

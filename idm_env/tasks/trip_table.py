@@ -30,7 +30,7 @@ FIRST, SECOND = 0.7548776662466927, 0.5698402909980532
 """Multiples of each are evenly spread, and go neither with each other nor with those by which desired speeds are."""
 
 
-class Table(NamedTuple):
+class TripTable(NamedTuple):
     """A checked table of trips, in the order of departure."""
 
     depart: tuple[float, ...]
@@ -48,7 +48,7 @@ class Table(NamedTuple):
         )  # fmt: skip
 
 
-def read(given: Any) -> Table:
+def read(given: Any) -> TripTable:
     """Return a table from columns, rows or a CSV file; ValueError, in one line, for what is none."""
     columns = _columns(given)
     for name in columns:
@@ -67,7 +67,7 @@ def read(given: Any) -> Table:
         raise ValueError(f"trips: lane = {lane[bad]:g} of row {bad} must be a whole number.")
     kind, destination = ([_name(x) for x in columns.get(n, [""] * count)] for n in ("class", "destination"))
     rows = sorted(zip(depart, map(int, lane), speed, kind, destination, strict=True), key=lambda row: row[0])
-    return Table(*(tuple(column) for column in zip(*rows, strict=True)))
+    return TripTable(*(tuple(column) for column in zip(*rows, strict=True)))
 
 
 def from_table(frame: Any, dtype: torch.dtype = torch.float32) -> Trips:
@@ -178,4 +178,4 @@ def spread(name: str, given: Mapping[str, float], count: int, by: float = FIRST)
     return _of_shares(name, given, [(by * (i + 1)) % 1.0 for i in range(count)])
 
 
-__all__ = ["COLUMNS", "SECOND", "Table", "from_table", "read", "spread", "table"]
+__all__ = ["COLUMNS", "SECOND", "TripTable", "from_table", "read", "spread", "table"]
