@@ -435,25 +435,16 @@ class LanePlan(Plan):
         assert isinstance(bound, LaneBound) and isinstance(lanes, Crossing)
         moment.now, moment.later = now.data_ptr(), later.data_ptr()
         between, there = self.between.take() if tape else self._reused
-        moment.asked = between
-        given = {**there, **self._named(lanes.whole, ""), "state_step": address(moment.clock)}
-        if moment.action is not None:
-            given["action"] = address(moment.action)
-        if moment.live is not None:
-            given["live"] = address(moment.live)
-        all_rows(made.before.call, self.rows, bound.laid.ask.filled(moment.now, 0, given))
-        for name, (other, _) in made.before.same.items():
-            there = {**there, name: there[other]}
-        before = there | self._drawn(moment)
+        clock, whole = np.empty_like(moment.clock), self._named(lanes.whole, "")
+        given = self._given(moment, between, there, clock)
+        all_rows(made.before.call, self.rows, bound.laid.ask.filled(moment.now, 0, given | whole))
+        before = given | self._drawn(moment)
         self._decide(moment, now, before, tape)
         assert lanes.mid is not None and lanes.whole_mid is not None and lanes.chain is not None
         mid, chain = lanes.mid.data_ptr(), lanes.chain
         lanes.whole_later = lanes.whole_mid.copy() if self.said else lanes.whole_mid
         told, where = self.told.take()
-        where |= {n: there[n] for n in ("command", "given") if n in there}
-        clock = np.empty_like(moment.clock)
-        where |= self._named(lanes.whole, "") | self._named(lanes.whole_later, "later_")
-        where["state_step"], where["later_state_step"] = given["state_step"], address(clock)
+        where |= given | whole | self._named(lanes.whole_later, "later_")
         tells = bound.laid.tell.filled(moment.now, moment.later, where)
         copies = bound._moving
         position, was, present = (self._view(x, n) for x, n in (
@@ -464,7 +455,7 @@ class LanePlan(Plan):
             later[i].copy_(lanes.mid[i])
         if self.said and self.place is not None:
             said, settle = between[self.said].reshape(-1), self.place.loops.call
-            known = {"fresh": address(lanes.placed), "state_step": address(clock)}
+            known = {"fresh": address(lanes.placed), "state_step": given["later_state_step"]}
             settled = self._stage(bound, self.place.loops, moment.later, lanes.whole_later, known, moment.later, None)
         places = self._operands(bound, before)
 
@@ -534,7 +525,7 @@ class LanePlan(Plan):
             mid = self._mid = torch.empty_like(now) if self._mid is None else self._mid
             mid.copy_(now.detach())
         lanes.mid, lanes.whole_mid = mid, lanes.whole.copy()
-        step = {"state_step": address(moment.clock)}
+        step = {"state_step": moment.given["state_step"]}
         if self.turn is not None and len(lanes.turned):
             known = {n: address(x) for n, x in bound.turn_params.items()} | step
             stage = self._stage(bound, self.turn.loops, moment.now, lanes.whole, known, mid.data_ptr(), lanes.whole_mid)
@@ -617,9 +608,8 @@ class LanePlan(Plan):
         assert isinstance(bound, LaneBound) and isinstance(lanes, Crossing) and isinstance(room, LaneScratch)
         assert lanes.mid is not None and lanes.chain is not None
         assert lanes.whole_mid is not None and lanes.whole_later is not None
-        clock = moment.clock + 1
         whole = self._named(lanes.whole, "") | self._named(lanes.whole_later, "later_")
-        on_now, on_action, given, between = self._seeded(moment, on_told, on_later, clock, room)
+        on_now, on_action, given = self._seeded(moment, on_told, on_later, room)
         on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
         given |= whole
         flow = room.flows
@@ -628,10 +618,10 @@ class LanePlan(Plan):
         before, after = made.backward
         all_rows(after.call, self.rows, tables[1].filled(moment.now, moment.later, given))
         if self.place is not None and self.said and lanes.placed is not None:
-            known = {"fresh": address(lanes.placed), "state_step": address(clock)}
+            known = {"fresh": address(lanes.placed), "state_step": given["later_state_step"]}
             self._through(bound, self.place, np.arange(self.rows), moment.later, lanes.whole_later, known, flow, None)
         mid, chain, n = lanes.mid.data_ptr(), lanes.chain, self.size
-        drawn = between | self._drawn(moment)
+        drawn = moment.given | self._drawn(moment)
         bound._moving.copy(np.arange(self.rows), chain, self, mid, drawn)
         bound.forget()
         bound.to_places(np.arange(self.rows), chain, self, mid)
@@ -648,11 +638,11 @@ class LanePlan(Plan):
             known = {
                 "fresh": address(lanes.fresh),
                 "merger": address(lanes.merger),
-                "state_step": address(moment.clock),
+                "state_step": given["state_step"],
             }
             self._through(bound, self.settle, lanes.decided, mid, lanes.whole_mid, known, flow, None)
         if self.turn is not None and len(lanes.turned):
-            known = {n: address(x) for n, x in bound.turn_params.items()} | {"state_step": address(moment.clock)}
+            known = {n: address(x) for n, x in bound.turn_params.items()} | {"state_step": given["state_step"]}
             self._through(bound, self.turn, lanes.turned, moment.now, lanes.whole, known, flow, on_parameters)
         given |= {f"carried_{n}": x for n, x in zip(self.moving, flow.now(), strict=True)}
         all_rows(before.call, self.rows, tables[0].filled(moment.now, moment.later, given))

@@ -89,7 +89,10 @@ class Moment:
     bound: Bound | None = None
     lanes: Any = None
     """What becomes of links (``lane_plan.Crossing``) on a road of several lanes."""
-    asked: dict[str, Array] = field(default_factory=dict)
+    held: Any = None
+    """The arrays whose addresses ``given`` are, but those above."""
+    given: dict[str, int] = field(default_factory=dict)
+    """The addresses of what the step's loops were given beside its worlds."""
 
 
 class _Table:
@@ -278,18 +281,11 @@ class Plan:
         moment.now, moment.later = now.data_ptr(), later.data_ptr()
         assert bound is not None
         between, there = self.between.take() if tape else self._reused
-        moment.asked = between
-        given = dict(there)
-        if moment.action is not None:
-            given["action"] = address(moment.action)
-        if moment.live is not None:
-            given["live"] = address(moment.live)
-        given["state_step"] = address(moment.clock)
-        told, where = self.told.take()
-        where |= {n: there[n] for n in _GIVEN if n in there}
-        where |= {n: there[o] for n, (o, _) in self.recorded.before.same.items() if n in _GIVEN}
         clock = np.empty_like(moment.clock)
-        where["state_step"], where["later_state_step"] = given["state_step"], address(clock)
+        given = self._given(moment, between, there, clock)
+        told, where = self.told.take()
+        where |= {n: given[n] for n in _GIVEN if n in given}
+        where["state_step"], where["later_state_step"] = given["state_step"], given["later_state_step"]
         asks, tells = (
             bound.laid.ask.filled(moment.now, moment.later, given),
             bound.laid.tell.filled(moment.now, moment.later, where),
@@ -311,6 +307,17 @@ class Plan:
         for i in self._carried:
             later[i].copy_(now[i])
         return self._finished(later, told, clock, bound)
+
+    def _given(self, moment: Moment, between: Any, there: Mapping[str, int], clock: Array) -> dict[str, int]:
+        """Return the addresses of all that a step is given, and note them: its adjoint is given the same."""
+        given = {**there, "state_step": address(moment.clock), "later_state_step": address(clock)}
+        if moment.action is not None:
+            given["action"] = address(moment.action)
+        if moment.live is not None:
+            given["live"] = address(moment.live)
+        given |= {n: given[other] for n, (other, _) in self.recorded.before.same.items()}
+        moment.held, moment.given = (between, clock), given
+        return given
 
     def _finished(self, later: Tensor, told: dict[str, Array], clock: Array, bound: Bound) -> dict[str, Array]:
         """Return all that is told; Untraceable where an effect of the user's own returned NaN."""
@@ -364,8 +371,7 @@ class Plan:
         bound, room = moment.bound, self.scratch
         assert bound is not None
         asks, tells = bound.laid.back
-        clock = moment.clock + 1
-        on_now, on_action, given, between = self._seeded(moment, on_told, on_later, clock, room)
+        on_now, on_action, given = self._seeded(moment, on_told, on_later, room)
         on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
         before, after = self.recorded.backward
         signals = self.slots * self.kernel.signals
@@ -373,7 +379,7 @@ class Plan:
         past = np.empty((signals, self.count), self.real)
         retreat_worlds(
             after.call, tells.filled(moment.now, moment.later, given),
-            before.call, asks.filled(moment.now, moment.later, given), self._places(moment, between),
+            before.call, asks.filled(moment.now, moment.later, given), self._places(moment, moment.given),
             bound.strides, *room.work, moment.past, moment.newest, room.ends, room.begins, on_past.ctypes.data,
             past.ctypes.data, on_parameters.ctypes.data, room.on_inputs.ctypes.data, *room.loops, moment.at, 0,
             self.groups,
@@ -381,9 +387,9 @@ class Plan:
         return on_now, on_action, on_parameters, past
 
     def _seeded(
-        self, moment: Moment, on_told: Mapping[str, Array | None], on_later: Array | None, clock: Array, room: Scratch
-    ) -> tuple[Array, Array | None, dict[str, int], dict[str, int]]:
-        """Return what falls on blocks and on actions, to be filled, and addresses: of all, and of what is between."""
+        self, moment: Moment, on_told: Mapping[str, Array | None], on_later: Array | None, room: Scratch
+    ) -> tuple[Array, Array | None, dict[str, int]]:
+        """Return what falls on blocks and on actions, to be filled, and the addresses of all."""
         assert moment.bound is not None
         layout = moment.bound.laid.layout
         on_now = np.zeros((len(layout.blocks), self.count), self.real)
@@ -397,16 +403,10 @@ class Plan:
         if on_later is not None:
             for i in self._carried:
                 on_now[i] = on_later.reshape(on_now.shape)[i]
-        given["state_step"] = address(moment.clock)
-        given["later_state_step"] = address(clock)
-        if moment.action is not None:
-            given["action"], given["on_action"] = address(moment.action), address(on_action)
-        if moment.live is not None:
-            given["live"] = address(moment.live)
-        between = {n: address(x) for n, x in moment.asked.items()}
-        given |= {n: between[n] for n in _GIVEN if n in between}
-        given |= {n: between[o] for n, (o, _) in self.recorded.before.same.items() if n in _GIVEN}
-        return on_now, on_action, given, between
+        given |= moment.given
+        if on_action is not None:
+            given["on_action"] = address(on_action)
+        return on_now, on_action, given
 
 
 class Scratch:
