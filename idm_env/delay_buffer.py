@@ -1,4 +1,7 @@
-"""What every driver saw in the last steps: the buffer that a simulator keeps where an effect looks back."""
+"""What every driver saw in the last steps: the buffer that a simulator keeps where an effect looks back.
+
+Shapes: a signal is ``[..., n]``, in its own SI unit; the buffer is ``(..., vehicles, slots, signals)``.
+"""
 
 from __future__ import annotations
 

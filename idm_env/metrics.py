@@ -1,4 +1,7 @@
-"""Figures of traffic: time gaps, fuel and energy, string stability. Pure, differentiable, SI units."""
+"""Figures of traffic: time gaps, fuel and energy, string stability. Pure, differentiable, SI units.
+
+Shapes: rates are elementwise over ``[..., n]``; sums over time run along the first dimension.
+"""
 
 from __future__ import annotations
 

@@ -106,7 +106,10 @@ class Model:
     def params(
         self, driver: str | None = None, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> dict[str, dict[str, Tensor]]:
-        """Return the parameters as scalar tensors, those of one driver where he is named."""
+        """Return the parameters as scalar tensors, those of one driver where he is named.
+
+        ValueError for a driver who is not in the model.
+        """
         if driver is not None and driver not in self.drivers:
             raise ValueError(f"driver {shown(driver)} is not in this model.{nearest(driver, self.drivers)}")
         values = parameters.defaults(self.effects, dtype=dtype, device=device)
@@ -214,7 +217,10 @@ def describe(effect: Effect) -> str | dict[str, Any]:
 
 
 def make_effects(descriptions: Iterable[str | Mapping[str, Any] | Effect]) -> tuple[Effect, ...]:
-    """Return effects from names, mappings ``{effect: name, choice: value}``, or effects as they are."""
+    """Return effects from names, mappings ``{effect: name, choice: value}``, or effects as they are.
+
+    ValueError for anything else.
+    """
     if isinstance(descriptions, (str, Mapping)) or not isinstance(descriptions, Iterable):
         raise ValueError(f"effects = {shown(descriptions)} must be a list, such as [idm, brakes].")
     made = []
@@ -240,7 +246,10 @@ def numbers(values: Mapping[str, Any]) -> Numbers:
 
 
 def nested(values: Mapping[str, Any], of: str = "parameters") -> dict[str, dict[str, Any]]:
-    """Return parameters as effect → parameter → value, from that or from full names with a dot; ``of`` is the key."""
+    """Return parameters as effect → parameter → value, from that or from full names with a dot; ``of`` is the key.
+
+    ValueError for anything else, and for a parameter given twice.
+    """
     result: dict[str, dict[str, Any]] = {}
     for key, value in _mapping(of, values).items():
         if isinstance(value, Mapping):
@@ -258,7 +267,7 @@ def nested(values: Mapping[str, Any], of: str = "parameters") -> dict[str, dict[
 
 
 def number(name: str, value: Any) -> float:
-    """Return a finite float; YAML reads 1e-3 as text, which is accepted."""
+    """Return a finite float; YAML reads 1e-3 as text, which is accepted. ValueError for anything else."""
     try:
         result = float(value)
     except (TypeError, ValueError):

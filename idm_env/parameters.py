@@ -3,6 +3,8 @@
 A ``Parameter`` says what a number means and where it may lie. Everything else here turns a tuple of effects into
 tensors (``defaults``, ``sample``, ``null``), moves tensors in and out of their bounds (``constrain``,
 ``unconstrain``) or says in one line what is wrong with them (``check``).
+
+Shapes: every parameter is a scalar ``[]`` or one number per vehicle ``[..., n]``, in the unit it declares.
 """
 
 from __future__ import annotations

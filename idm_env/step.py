@@ -2,6 +2,8 @@
 
 ``step`` is a function of tensors, and of whatever behaves like tensors: ``scalar`` records it on numbers that remember
 where they came from, and prints compiled code from that.
+
+Shapes: what belongs to vehicles is ``[..., n]``, in SI units; parameters are scalars or ``[..., n]``.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def one_of(name: str, value: Any, known: Iterable[str]) -> str:
-    """Return a value that is one of some words."""
+    """Return a value that is one of some words. ValueError for any other."""
     known = list(known)
     if not isinstance(value, str) or value not in known:
         raise ValueError(f"{name} = {shown(value)} is unknown.{nearest(str(shown(value)).strip(chr(39)), known)}")
@@ -49,7 +49,7 @@ def one_of(name: str, value: Any, known: Iterable[str]) -> str:
 
 
 def whole(name: str, value: Any, low: int, high: int | None = None) -> int:
-    """Return a whole number of at least ``low``, and at most ``high``."""
+    """Return a whole number of at least ``low``, and at most ``high``. ValueError for any other."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise ValueError(f"{name} = {shown(value)} must be a whole number.")
     number = int(value)
@@ -61,7 +61,7 @@ def whole(name: str, value: Any, low: int, high: int | None = None) -> int:
 
 
 def finite(name: str, value: Any, unit: str = "") -> float:
-    """Return a finite number."""
+    """Return a finite number. ValueError for any other."""
     try:
         if not isinstance(value, bool) and isinstance(value, numbers.Real) and math.isfinite(value):
             return float(value)
@@ -71,7 +71,7 @@ def finite(name: str, value: Any, unit: str = "") -> float:
 
 
 def at_least(name: str, value: Any, low: float, unit: str = "", high: float = math.inf) -> float:
-    """Return a finite number of at least ``low``, and at most ``high``."""
+    """Return a finite number of at least ``low``, and at most ``high``. ValueError for any other."""
     number = finite(name, value, unit)
     if not low <= number <= high:
         bound = f"at least {low:g}" if number < low else f"at most {high:g}"
@@ -80,7 +80,10 @@ def at_least(name: str, value: Any, low: float, unit: str = "", high: float = ma
 
 
 def within(name: str, value: Any, low: float, high: float, unit: str = "") -> float:
-    """Return a number in ``[low, high]``; only a bound that is infinite lets an infinite number through."""
+    """Return a number in ``[low, high]``; only a bound that is infinite lets an infinite number through.
+
+    ValueError for any other.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         unit = f" {unit}" if unit else ""
         told = f"{value:g}" if isinstance(value, float) else shown(value)

@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from datetime import date
 from functools import cache
 from pathlib import Path
@@ -354,3 +354,61 @@ def test_the_suite_has_one_profile_of_hypothesis() -> None:
     own = [keyword.arg for path in tests for node in ast.walk(ast.parse(path.read_text()))
            if isinstance(node, ast.Call) for keyword in node.keywords]  # fmt: skip
     assert len(own) > 1000 and not {"deadline", "suppress_health_check"} & set(own)
+
+
+def contracts() -> Iterator[tuple[str, ast.FunctionDef, str]]:
+    """Yield every public function with its place and all that is said of it: by itself, its classes and its module."""
+    trees = {path: ast.parse(path.read_text()) for path in FILES}
+    classes = {node.name: node for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef)}
+
+    def lineage(cls: ast.ClassDef) -> Iterator[ast.ClassDef]:
+        yield cls
+        for base in cls.bases:
+            above = classes.get(ast.unparse(base).split("[")[0].split(".")[-1])
+            if above is not None and above is not cls:
+                yield from lineage(above)
+
+    for path, tree in trees.items():
+        place, said = str(path.relative_to(PACKAGE)), ast.get_docstring(tree) or ""
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+                yield place, node, f"{ast.get_docstring(node) or ''} {said}"
+            elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                for method in (m for m in node.body if isinstance(m, ast.FunctionDef) and not m.name.startswith("_")):
+                    above = [
+                        ast.get_docstring(each) or "" for cls in lineage(node)
+                        for each in (cls, *(m for m in cls.body if getattr(m, "name", "") == method.name))
+                        if isinstance(each, (ast.ClassDef, ast.FunctionDef))
+                    ]  # fmt: skip
+                    yield place, method, f"{ast.get_docstring(method) or ''} {' '.join(above)} {said}"
+
+
+def test_a_public_function_that_raises_says_what() -> None:
+    """A command's docstring is its help, and its errors are lines for users; a hook without a body is abstract."""
+    silent = []
+    for place, function, said in contracts():
+        raised = {
+            ast.unparse(node.exc.func if isinstance(node.exc, ast.Call) else node.exc)
+            for node in ast.walk(function) if isinstance(node, ast.Raise) and node.exc is not None
+        }  # fmt: skip
+        raised = {name for name in raised if name[:1].isupper()} - {"NotImplementedError"}
+        if raised and not place.startswith("cli/") and not any(name in said for name in raised):
+            silent.append((place, function.name, raised))
+    assert not silent
+
+
+SHAPE = r"\[[^\]]*\]|``\([^)]*\)``|[Ss]hape|elementwise|\beach vehicle|\b(?:per|one for|one per) (?:vehicle|row|driver)"
+WITHOUT_SHAPES = 63
+"""Public functions with tensors or arrays of which nothing says a shape; the number may be lowered, and not raised."""
+
+
+def test_public_functions_with_tensors_say_their_shapes() -> None:
+    """In their docstring, that of their class or one above it, or once for a module."""
+    silent = [
+        (place, function.name) for place, function, said in contracts()
+        if re.search(r"\b(?:Tensor|ndarray)\b", " ".join(
+            ast.unparse(x) for x in (*(a.annotation for a in (*function.args.args, *function.args.kwonlyargs)),
+                                     function.returns) if x
+        )) and not re.search(SHAPE, said)
+    ]  # fmt: skip
+    assert len(silent) <= WITHOUT_SHAPES, silent

@@ -58,7 +58,7 @@ def _single(column: pl.Series, source: str) -> None:
 def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     """Return the frame with its numeric columns as Float64 and everything not finite as null, counted.
 
-    A number beyond `LARGEST` is as little a measurement as an infinite one.
+    A number beyond `LARGEST` is as little a measurement as an infinite one. DataError for a lane between two lanes.
     """
     repairs: list[Repair] = []
     for name in [*NUMBERS, "lane"]:

@@ -1,4 +1,7 @@
-"""The columns of a table that no model knows: numbers on the episode's clock, and labels that groups can be made by."""
+"""The columns of a table that no model knows: numbers on the episode's clock, and labels that groups can be made by.
+
+Shapes: a column of one vehicle is ``[samples]``.
+"""
 
 from __future__ import annotations
 

@@ -89,7 +89,10 @@ def exid(frame: pl.DataFrame, source: str) -> Read:
 
 
 def pneuma(path: Path) -> Read:
-    """Return the tidy table of a pNEUMA file: the way of every vehicle, without leaders."""
+    """Return the tidy table of a pNEUMA file: the way of every vehicle, without leaders.
+
+    DataError where no line holds a track.
+    """
     parts, broken, assumed = [], 0, 0
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
         cells = [cell.strip() for cell in line.strip().rstrip(";").split(";")]
@@ -119,7 +122,10 @@ def pneuma(path: Path) -> Read:
 
 
 def i24(path: Path) -> Read:
-    """Return the tidy table of an I-24 MOTION file; each direction is a run, its vehicles driving towards larger x."""
+    """Return the tidy table of an I-24 MOTION file; each direction is a run, its vehicles driving towards larger x.
+
+    DataError for what is no JSON, and where no document holds a track.
+    """
     try:
         documents = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:

@@ -67,6 +67,7 @@ def place(name: str, told: str, there: list[str], source: str) -> tuple[str, flo
     """Return the column of a file that ``told`` names for ``name``, and the factor of its unit; None without one.
 
     A name that is there with its brackets is that column, and the brackets are its unit where they hold one.
+    DataError for a column that is not there, and for an unknown unit.
     """
     column, unit = told, None
     if found := re.fullmatch(r"(.+?)\s*[\[(]([^\[\]()]+)[\])]", told):

@@ -186,7 +186,10 @@ def _plain(effect: Effect) -> bool:
 
 
 def prepare(trajectories: Trajectories, by: str, place: str | None = None) -> Records:
-    """Return the flat records of smoothed episodes, thinned where there are more than can be rolled out in time."""
+    """Return the flat records of smoothed episodes, thinned where there are more than can be rolled out in time.
+
+    ValueError for a place column that is missing.
+    """
     if place is not None:
         if place not in trajectories.table.columns:
             raise ValueError(f"place column '{place}' is missing.{nearest(place, trajectories.table.columns)}")

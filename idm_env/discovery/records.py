@@ -213,7 +213,10 @@ class Rows:
 
 
 def windows(records: Records, seconds: float = WINDOW_S, every_s: float = 0.5) -> Rows:
-    """Return contiguous windows of ``seconds`` over every record; short or trimmed-away records give none."""
+    """Return contiguous windows of ``seconds`` over every record; short or trimmed-away records give none.
+
+    DataError where no record is long enough.
+    """
     dt = records.dt
     every = max(1, round(every_s / dt))
     steps = max(2, round(seconds / dt / every)) * every

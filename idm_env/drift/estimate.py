@@ -5,6 +5,8 @@ integrates out in closed form: the innovations of a Kalman filter give the likel
 measurement, and the path itself, and the two alternate. Every driver's own parameters are levels that stay, log-normal
 about what is known before, and integrate out with the rest: a calibration in free simulation bends them towards his
 drift, and what it bent would count as drift again. Noise of measurement is taken as white and normal.
+
+Shapes: log θ is ``[rows, p]``, levels are ``[T, rows, p + k]``, k drifts.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Forecasts of drivers who drift: how they are is followed on the past, the future is drawn, and both are scored."""
+"""Forecasts of drivers who drift: how they are is followed on the past, the future is drawn, and both are scored.
+
+Shapes: levels are ``[T, rows, p + k]``, drawn futures ``[steps, draws, starts]``.
+"""
 
 from __future__ import annotations
 

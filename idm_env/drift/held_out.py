@@ -1,4 +1,7 @@
-"""How well drivers who were kept back are foreseen: with drift as estimated on others, and without any."""
+"""How well drivers who were kept back are foreseen: with drift as estimated on others, and without any.
+
+Shapes: places of drivers are ``[k]``.
+"""
 
 from __future__ import annotations
 

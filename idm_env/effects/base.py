@@ -1,4 +1,7 @@
-"""What an effect is: one hook of six, parameters of its own, and static choices that are never tensors."""
+"""What an effect is: one hook of six, parameters of its own, and static choices that are never tensors.
+
+Shapes: what belongs to vehicles is ``[..., n]``, in SI units; parameters are scalars or ``[..., n]``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The Intelligent Driver Model, with its bounds kept exactly, and in the published smooth form."""
+"""The Intelligent Driver Model, with its bounds kept exactly, and in the published smooth form.
+
+Shapes: everything is elementwise over vehicles, ``[..., n]``, in SI units.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Shapes over a coordinate, shared by effects that act at a place or time: hats, steps and windows."""
+"""Shapes over a coordinate, shared by effects that act at a place or time: hats, steps and windows.
+
+Shapes: the result of a coordinate ``[..., n]`` (m or s) is ``[..., n]``, without a unit.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@
 Gradients are cut in three ways, all here: an episode begins from constants (the warm-up builds no graph), a reset
 replaces the rows that ended, so that nothing flows back into another episode, and ``detach`` cuts the whole batch for
 truncated back-propagation.
+
+Shapes: rows are environments: states ``[rows, n]``, actions ``[rows, agents, …]``; indices of rows are ``[k]``.
 """
 
 from __future__ import annotations
@@ -310,7 +312,10 @@ class Batch:
         self._beginnings.forget()
 
     def unroll(self, policy: Callable[[Tensor], Tensor], steps: int, push: Tensor | None) -> Unrolled:
-        """Return a window of steps with a policy between them; see ``Face.unroll``."""
+        """Return a window of steps with a policy between them; see ``Face.unroll``.
+
+        ValueError for a policy whose actions have another shape.
+        """
         shape = (self.count, len(self.task.agents) * len(self.task.commands))
         extra = torch.zeros(shape, dtype=self.settings.dtype) if push is None else push.expand(shape).contiguous()
         values = self._values

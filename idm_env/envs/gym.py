@@ -55,7 +55,10 @@ class Face:
 
     @property
     def state(self) -> State:
-        """A copy of the state of the traffic, with its graph, one row per environment."""
+        """A copy of the state of the traffic, with its graph, one row per environment.
+
+        RuntimeError before ``reset``.
+        """
         world = self.batch.world
         if world is None:
             raise RuntimeError("there is no state before reset. Call reset() first.")
@@ -156,7 +159,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
         return self._out(observation), begun(self.batch)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Advance by Δt; return observation, reward, terminated, truncated and info."""
+        """Advance by Δt; return observation, reward, terminated, truncated and info. RuntimeError before ``reset``."""
         if not self.batch.begun:
             raise RuntimeError("step was called before reset. Call reset() first.")
         given = None if action is None else action_of(action, self._shape, self.settings)[None]

@@ -381,7 +381,10 @@ class LanePlan(Plan):
         return {"state_gap": gap, **held}
 
     def decides(self, bound: LaneBound) -> Any:
-        """Return the plan of what drivers wish, and what in it moves: blocks, what is given, and who is led."""
+        """Return the plan of what drivers wish, and what in it moves: blocks, what is given, and who is led.
+
+        Untraceable for wishes that look at what no plan has.
+        """
         if self.found is None:
             return None
         blocks, given, led = [], [], []

@@ -1,4 +1,7 @@
-"""What a step of an environment is: pure functions of torch, which compiled loops are recorded from."""
+"""What a step of an environment is: pure functions of torch, which compiled loops are recorded from.
+
+Shapes: rows are environments: states ``[rows, n]``, actions and commands ``[rows, agents, …]``.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 ``parallel_env(**keywords)`` steps all agents at once; ``env(**keywords)`` and ``raw_env(**keywords)`` are the same
 turn by turn. Keywords are those of ``gym.make("DiffIDM-v0", …)``, with ``max_cycles`` for the number of steps.
+
+Shapes: an agent observes ``[features]``; the state of the traffic is one row, ``[features of all]``.
 """
 
 from __future__ import annotations
@@ -187,7 +189,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         return {agent: values[i] for i, agent in enumerate(self._slots) if agent in self.agents}
 
     def state(self) -> np.ndarray:
-        """Return the whole traffic, within ``state_space``."""
+        """Return the whole traffic, within ``state_space``. RuntimeError before ``reset``."""
         world = self.batch.world
         if world is None:
             raise RuntimeError("there is no state before reset. Call reset() first.")
@@ -197,7 +199,7 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         return np.clip(seen, self.state_space.low, self.state_space.high)
 
     def render(self) -> np.ndarray | None:
-        """Return a picture (``rgb_array``), or show it (``human``)."""
+        """Return a picture (``rgb_array``), or show it (``human``). RuntimeError before ``reset``."""
         if self.render_mode is None:
             gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array'.")
             return None

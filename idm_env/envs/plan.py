@@ -2,6 +2,8 @@
 
 The task's own functions are recorded (``kernels.rows``), and so is what torch's autograd makes of them: nothing of
 theirs is written twice. Everything that holds for many steps is laid out once; a call hands over addresses.
+
+Shapes: worlds are blocks ``[rows · vehicles]`` of every leaf, commands ``[rows, agents]``.
 """
 
 from __future__ import annotations

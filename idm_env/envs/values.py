@@ -2,6 +2,8 @@
 
 A step is one node of autograd: its forward pass and its vector-Jacobian product are the plan's. Between steps the graph
 goes through the blocks of the world, one tensor, and a token that stands for the past.
+
+Shapes: worlds are blocks ``[rows · vehicles]`` of every leaf, what is told has rows first: ``[rows, …]``.
 """
 
 from __future__ import annotations
@@ -52,7 +54,10 @@ class Values:
     # -- worlds --------------------------------------------------------------------------------------------------
 
     def load(self, world: World) -> None:
-        """Take over worlds; they are copied, with the graph of what steps change."""
+        """Take over worlds; they are copied, with the graph of what steps change.
+
+        Untraceable where something carries a graph that no step changes.
+        """
         leaves = named(world)
         key = (world.state.speed.shape, world.state.speed.dtype, tuple(world.state.memory), tuple(world.episode))
         blocks = tuple(n for n in leaves if n in _DYNAMIC or n.startswith("memory_"))

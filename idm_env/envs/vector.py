@@ -131,7 +131,10 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         return [first + i for i in range(self.num_envs)]
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Advance all environments by Δt; ``None`` as actions leaves all vehicles to their drivers."""
+        """Advance all environments by Δt; ``None`` as actions leaves all vehicles to their drivers.
+
+        RuntimeError before ``reset``, and for environments that have ended.
+        """
         if not self.batch.begun:
             raise RuntimeError("step was called before reset. Call reset() first.")
         mode = self.autoreset_mode

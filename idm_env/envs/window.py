@@ -1,4 +1,7 @@
-"""A window of an environment in one call: policy and steps compiled together, one node of autograd for all of it."""
+"""A window of an environment in one call: policy and steps compiled together, one node of autograd for all of it.
+
+Shapes: a window has time first: ``[steps, rows, …]``.
+"""
 
 from __future__ import annotations
 

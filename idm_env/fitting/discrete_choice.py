@@ -9,6 +9,8 @@ as the simulator does; for τ → 0 this is the simulator's rule, a change where
 share of decisions at which drivers think of another lane at all; the lapse λ is the probability of a change for
 reasons that effects know nothing of. Without these two, a driver who stays where he could gain, or one who leaves,
 would outweigh all others.
+
+Shapes: what belongs to decisions is ``[decisions]`` or ``[decisions, 2]`` (left, right), θ is ``[p]``.
 """
 
 from __future__ import annotations
@@ -217,7 +219,7 @@ def fit_choice(
     Standard errors are the larger of two: those of the curvature of the likelihood, and those that allow for what
     decisions of one driver have in common (clustered by vehicle). A parameter on its bound, or one of which the 95 %
     interval is wider than half of its bounds, is not identified. ``starts`` replaces the
-    model's own; ``errors`` False leaves standard errors out.
+    model's own; ``errors`` False leaves standard errors out. DataError where nobody changes lanes.
     """
     if decisions.changes == 0:
         raise DataError("nobody changes lanes, and nothing can be fitted to that. Check the column 'lane'.")

@@ -311,7 +311,7 @@ def simulate_file(
     Instead of a model, ``base`` names a car-following law, which is taken with its defaults.
 
     A driver takes the parameters of ``drivers`` whose key is his, by the model's ``by``, otherwise the model's own.
-    Noise is drawn with ``seed``.
+    Noise is drawn with ``seed``. ValueError for a model and a law, or neither.
     """
     if (model_path is None) == (base is None):
         raise ValueError("simulate takes either a model (--model) or a car-following law (--base). Give one of them.")

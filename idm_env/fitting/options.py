@@ -80,6 +80,7 @@ class Options:
         """Return what is calibrated and the parameters that stay.
 
         That is the car-following law ``base`` (None: IDM), or a saved model, whose effects are kept.
+        ValueError for a law beside a model that has one.
         """
         if self.model is None:
             return base_simulator(base=base_named(self.base or "idm"), integration=self.integration), {}

@@ -5,6 +5,8 @@ beforehand. Every group has its own damping and is accepted or refused by itself
 that the gradient pushes out of its bounds is held there (an active set), so a bound never stalls the others. Shared
 parameters follow variable projection (Golub and Pereyra 1973): their step comes from the normal equations with the own
 parameters eliminated, so it already knows how these will follow.
+
+Shapes: θ is ``[groups, p]``, φ ``[q]``, costs are ``[groups]``; units are those of the problem.
 """
 
 from __future__ import annotations
@@ -166,7 +168,7 @@ def minimise(
     Without shared parameters a group has converged when an accepted step lowers its cost by less than ``tolerance`` of
     it, when a refused step promised no more than that, or when no damping up to 1e8 finds a lower one; the search ends
     when all have. With shared ones, of which there must be one start, it ends when a step gains less of the total.
-    ``on_step`` is called after every iteration.
+    ``on_step`` is called after every iteration. ValueError for several starts with shared parameters.
     """
     together = bool(progress.shared.shape[-1])
     if together and len(progress.own) != 1:

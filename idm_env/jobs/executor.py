@@ -116,7 +116,7 @@ class Processes:
     def map(
         self, function: Work[P, R], parts: Sequence[P], on_progress: OnProgress = silent
     ) -> Iterator[tuple[int, R]]:
-        """See ``Executor``."""
+        """See ``Executor``. ValueError for fewer than one process."""
         if self.jobs < 1:
             raise ValueError(f"jobs = {self.jobs} is below 1. Give the number of processes.")
         yield from _flow(_Team(min(self.jobs, max(1, len(parts)))), function, parts, pickle.dumps)

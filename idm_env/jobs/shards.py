@@ -33,7 +33,10 @@ class Parts:
         storage.write(self.path(number, name), table.write_parquet, shared=True)
 
     def done(self, number: int) -> bool:
-        """Tell whether a part is finished, with its tables as they were written."""
+        """Tell whether a part is finished, with its tables as they were written.
+
+        ValueError for a table that is not what was written.
+        """
         found = self.store.get_json(f"{number:06d}")
         if found is None:
             return False

@@ -2,6 +2,8 @@
 
 The tape is the part of the state that the adjoint reads, at every ``block`` steps; a tile recomputes what lies between
 while it is in cache. Blocks are cut alike with and without a graph, so values are too.
+
+Shapes: what belongs to vehicles is ``[rows, n]``, in SI units; kept trajectories have time first.
 """
 
 from __future__ import annotations
@@ -140,7 +142,7 @@ def static_of(simulator: Stepping, state: State, params: Params, name: str) -> T
 
 
 def part_of(inputs: Inputs, name: str) -> Tensor:
-    """Return the input, or the part of one, that a slot stands for."""
+    """Return the input, or the part of one, that a slot stands for. KeyError for a slot of no input."""
     for effect, value in inputs.items():
         for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
             if slot_name(effect, part) == name:

@@ -2,6 +2,8 @@
 
 One slot per trip, or, where a trip is made ``again``, one slot for many of them in turn. Nobody vanishes and nobody is
 moved: at any time ``due = inside + left + queued``, and a queue that grows is an inflow beyond capacity.
+
+Shapes: what belongs to slots is ``[..., n]``; times in s, positions in m.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Lanes as a graph: which follow which, where an agent is on them, and the routes that lie ahead."""
+"""Lanes as a graph: which follow which, where an agent is on them, and the routes that lie ahead.
+
+Shapes: points are ``[k, 2]`` (m), arc lengths and headings ``[k]`` (m, rad).
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 What stands here is arithmetic of one vehicle and its neighbours. ``roads.linked`` runs it on tensors and gathers;
 ``scalar.wishes`` records it, with places in lanes instead of slots, and prints it.
+
+Shapes: everything is of one vehicle, ``[]`` in a recording and ``[..., n]`` in tensors, in SI units.
 """
 
 from __future__ import annotations

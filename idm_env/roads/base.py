@@ -1,4 +1,7 @@
-"""What a road is: who leads whom, and how gaps follow from displacements. Roads know no drivers."""
+"""What a road is: who leads whom, and how gaps follow from displacements. Roads know no drivers.
+
+Shapes: what belongs to vehicles is ``[..., n]``, in SI units.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Ends of lanes: a standing leader without a length, wherever it is nearer than the real one."""
+"""Ends of lanes: a standing leader without a length, wherever it is nearer than the real one.
+
+Shapes: what belongs to vehicles is ``[..., n]``, in SI units.
+"""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class Lane(Road):
         return (torch.arange(x.shape[-1], device=x.device) > 0).to(x.dtype)
 
     def gaps(self, position: Tensor, length: Tensor, circumference: Tensor | float | None = None) -> Tensor:
-        """Return ``position[i−1] − length[i−1] − position[i]`` (m)."""
+        """Return ``position[i−1] − length[i−1] − position[i]`` (m). ValueError for a circumference."""
         if circumference is not None:
             raise ValueError(f"an open lane has no circumference, and {circumference} was given. Use Ring().")
         gap = self.ahead(position) - self.ahead(length) - position

@@ -1,4 +1,7 @@
-"""Lanes as they are in one state: neighbours by its links, and the changes that a decision makes."""
+"""Lanes as they are in one state: neighbours by its links, and the changes that a decision makes.
+
+Shapes: what belongs to vehicles is ``[..., n]``; slots are indices into the last dimension, laps are counts.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What drivers remember from one decision about lanes to the next: their lane, and who signals from one beside."""
+"""What drivers remember from one decision about lanes to the next: their lane, and who signals from one beside.
+
+Shapes: what belongs to drivers is ``[..., n]``; slots are indices into the last dimension.
+"""
 
 from __future__ import annotations
 

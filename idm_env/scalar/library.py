@@ -103,7 +103,7 @@ class MachineCode:
         return None if place is None else place / f"{name}.nbc"
 
     def load(self, name: str, reader: Callable[[bytes], Loaded]) -> Loaded | None:
-        """Return what ``reader`` makes of a content; None, in one line, where it is not what was written."""
+        """Return what ``reader`` makes of a content; None and a line for a ValueError: it is not what was written."""
         path = self.path(name)
         try:
             sealed = path.read_bytes() if path is not None else None

@@ -114,7 +114,7 @@ class SeenRoad(Ending):
         return ends - Scalar(self.graph, self.graph.input("position"))
 
     def gaps(self, position: Any, length: Any, circumference: Any = None) -> Any:
-        """Return gaps from positions."""
+        """Return gaps from positions. Untraceable for vehicles that come and go on a ring."""
         if isinstance(self.road, Ring):
             raise Untraceable("vehicles that come and go on a ring")
         return type(self.road).gaps(self, position, length)  # type: ignore[arg-type]

@@ -44,7 +44,10 @@ class Regions(Graph):
 
     @contextmanager
     def within(self, flag: str) -> Iterator[int]:
-        """Put all nodes that are made inside into a new region, which is computed where the flag is not 0."""
+        """Put all nodes that are made inside into a new region, which is computed where the flag is not 0.
+
+        ValueError inside another region.
+        """
         if len(self._scopes) > 1:
             raise ValueError("regions do not nest.")
         self.guards.append(self.input(flag, level=STATIC))

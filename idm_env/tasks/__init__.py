@@ -49,7 +49,10 @@ def make_task(task: str = "ring", *, trusted: bool = False, **choices: Any) -> T
 
 
 def task_with(task: str, choices: Mapping[str, Any], others: Iterable[str] = ()) -> Task:
-    """Return what ``make_task`` does; ``others``, keywords that the caller takes himself, are suggested too."""
+    """Return what ``make_task`` does; ``others``, keywords that the caller takes himself, are suggested too.
+
+    ValueError for an unknown task, KeywordError for an unknown keyword.
+    """
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), TASKS)}")
     known = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]

@@ -65,6 +65,7 @@ def behaviour(
     ``required`` effects are the task's machinery (control, replay, noise). ``effects`` is a list to add to ``own``,
     or the path of a model file, which replaces ``own`` and its parameters and gives dt and integration unless they
     are given. So does ``drivers``, the path of a model file with single drivers, of whom these are kept.
+    ValueError where both are given.
     """
     values, single = own_parameters, dict[tuple[str, str], tuple[float, ...]]()
     if drivers is not None and effects:

@@ -61,7 +61,7 @@ class KeywordError(TypeError, ValueError):
 
 
 def span(name: str, value: Any, low: float, unit: str, high: float = math.inf) -> tuple[float, float]:
-    """Return a range from one number or from ``[lowest, highest]``."""
+    """Return a range from one number or from ``[lowest, highest]``. ValueError for anything else."""
     ends = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value, value]
     told = f" ({unit})" if unit else ""
     if len(ends) != 2:
@@ -73,7 +73,7 @@ def span(name: str, value: Any, low: float, unit: str, high: float = math.inf) -
 
 
 def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return what episodes draw parameters from, by effect and name."""
+    """Return what episodes draw parameters from, by effect and name. ValueError for what is no range."""
     found = {}
     for effect, part in nested(randomise or {}, "randomise").items():
         for name, value in part.items():
@@ -84,7 +84,10 @@ def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tupl
 
 
 def limits_of(max_command: Any) -> tuple[float, float]:
-    """Return the accelerations (m/s²) that actions of −1 and 1 command, from one number or from both."""
+    """Return the accelerations (m/s²) that actions of −1 and 1 command, from one number or from both.
+
+    ValueError for limits that do not hold 0.
+    """
     if isinstance(max_command, Sequence) and not isinstance(max_command, str):
         ends = [finite("max_command", x, "m/s²") for x in max_command]
         if len(ends) != 2 or not (-_STRONGEST <= ends[0] <= -_WEAKEST and _WEAKEST <= ends[1] <= _STRONGEST):
@@ -99,7 +102,10 @@ def limits_of(max_command: Any) -> tuple[float, float]:
 
 
 def count_of(controlled: Any, free: int) -> int:
-    """Return how many of ``free`` vehicles ``"all"``, a fraction (0 to 1, at least one vehicle) or a number means."""
+    """Return how many of ``free`` vehicles ``"all"``, a fraction (0 to 1, at least one vehicle) or a number means.
+
+    ValueError for anything else.
+    """
     if controlled == "all":
         return max(1, free)
     if isinstance(controlled, float):
@@ -112,7 +118,10 @@ def count_of(controlled: Any, free: int) -> int:
 
 
 def agents_of(controlled: Any, vehicles: int, first: int) -> tuple[int, ...]:
-    """Return the indices of the controlled vehicles: spread evenly for what ``count_of`` takes, as given for a list."""
+    """Return the indices of the controlled vehicles: spread evenly for what ``count_of`` takes, as given for a list.
+
+    ValueError for vehicles that cannot be controlled, none, or one given twice.
+    """
     free = vehicles - first
     if isinstance(controlled, Sequence) and not isinstance(controlled, str):
         chosen = tuple(sorted(whole("controlled", i, 0) for i in controlled))

@@ -153,7 +153,10 @@ class ReplayTask(Task):
 
     @cached_property
     def agents(self) -> tuple[int, ...]:
-        """Slots of the controlled vehicles."""
+        """Slots of the controlled vehicles.
+
+        ValueError for none, and for more than follow recorded leaders at one time.
+        """
         if isinstance(self.controlled, Sequence) and not isinstance(self.controlled, str):
             chosen = tuple(sorted({self._slot(i) for i in self.controlled}))
             if not chosen:

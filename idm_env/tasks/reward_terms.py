@@ -3,6 +3,8 @@
 A term is a function of a step; it says its unit and its bounds, from which follows what a crash must cost. Tasks have
 rewards of their own, and ``reward={"speed": 0.2, "effort": -4.0}`` is ``Σ weight · term`` in their place: names of
 ``REWARD_TERMS``, or ``"my_file.py:my_term"``.
+
+Shapes: the value of a term is ``(..., agents)``, or ``(..., 1)`` where it is the same for all.
 """
 
 from __future__ import annotations

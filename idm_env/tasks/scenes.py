@@ -63,7 +63,10 @@ def recorded_scene(path: str, dt: float, runs: tuple[str, ...] | None) -> Scene:
 
 
 def recorded_tracks(path: str, dt: float, runs: tuple[str, ...] | None) -> list[Track]:
-    """Return the tracks of the chosen runs of a file, on a clock of ``dt``; errors as in ``recorded_scene``."""
+    """Return the tracks of the chosen runs of a file, on a clock of ``dt``; errors as in ``recorded_scene``.
+
+    ValueError for a run that is not there, or a ``dt`` that does not divide.
+    """
     from idm_env.data import load
 
     trajectories = load(path)

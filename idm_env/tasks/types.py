@@ -1,4 +1,7 @@
-"""Words of tasks: what a step carries over, how episodes end, what agents see, and who advances a state."""
+"""Words of tasks: what a step carries over, how episodes end, what agents see, and who advances a state.
+
+Shapes: what belongs to agents is ``(…, agents)``, what belongs to vehicles ``[..., n]``.
+"""
 
 from __future__ import annotations
 

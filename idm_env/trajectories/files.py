@@ -102,7 +102,7 @@ def reconstruct_file(
 ) -> dict[str, Any]:
     """Reconstruct dense tracks of step ``dt`` (s) from sparse ones; holes are bridged. Else as ``filter_file``.
 
-    The published recipe keeps its own step of 1 s.
+    The published recipe keeps its own step of 1 s. DataError for a step outside [0.01, 2] s.
     """
     if not 0.01 <= dt <= 2.0:
         raise DataError(f"dt = {dt:g} s is outside [0.01, 2] s; 0.1 s suits vehicles.")
@@ -121,7 +121,7 @@ def run(
     executor: Executor | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
-    """Do what ``filter_file`` and ``reconstruct_file`` say."""
+    """Do what ``filter_file`` and ``reconstruct_file`` say. DataError for an unknown recipe."""
     if settings.recipe not in OURS:
         raise DataError(f"recipe = {settings.recipe!r} is unknown; use 'default' or 'paper'.")
     progress = on_progress or silent

@@ -2,6 +2,8 @@
 
 White and correlated noise of positions and the liveliness of the driving have different spectra, so dense data tell
 them apart; data sparser than the correlation of the noise do not, and get white noise only.
+
+Shapes: times and positions of a track are ``[samples]`` (s, m).
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The default recipe: noise fitted to the file, imagined inputs fitted to every track, exact bounds, no overlaps."""
+"""The default recipe: noise fitted to the file, imagined inputs fitted to every track, exact bounds, no overlaps.
+
+Shapes: a track has ``[samples]`` (s, m).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What is reported of trajectories: the paper's three metrics, and errors against a truth where there is one."""
+"""What is reported of trajectories: the paper's three metrics, and errors against a truth where there is one.
+
+Shapes: everything of a trajectory is ``[samples]``, in SI units.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ class RegularMotion:
 
 
 def from_positions(time_s: np.ndarray, position_m: np.ndarray) -> RegularMotion:
-    """Return the motion of positions on a regular clock: speed and acceleration are central differences."""
+    """Return the motion of positions on a regular clock: speed and acceleration are central differences.
+
+    ValueError for a single position.
+    """
     if len(time_s) < 2:
         raise ValueError(f"{len(time_s)} position has no speed. Give at least two.")
     speed = np.gradient(position_m, time_s)

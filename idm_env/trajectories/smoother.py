@@ -5,6 +5,8 @@ The unknowns of a track are the accelerations of ballistic steps, which the imag
 how lively the driving is (Student-t jerk). The measured positions carry white and correlated noise, and outliers.
 With the step's dynamics linear in the accelerations, every Gauss–Newton step is a Kalman smoother, in time linear in
 the length of the track; reweighting and the active set of bounds repeat it.
+
+Shapes: a track has ``[samples]`` on its clock (s, m, m/s, m/s²).
 """
 
 from __future__ import annotations

@@ -96,7 +96,10 @@ class ParameterFitting:
         return {name: constrain(self._declared[name], leaf) for name, leaf in self._leaves.items()}
 
     def set_values(self, values: Mapping[str, Any]) -> None:
-        """Write free parameters (numbers or one per group) into the leaves, in place; all gradients are cleared."""
+        """Write free parameters (numbers or one per group) into the leaves, in place; all gradients are cleared.
+
+        ValueError for a parameter that is not free.
+        """
         for name in values:
             if name not in self.free:
                 raise ValueError(f"parameter '{name}' is not free here. Free: {', '.join(self.free)}.")
@@ -153,7 +156,10 @@ class ParameterFitting:
         return result
 
     def apply(self, group: int = 0) -> None:
-        """Put the values of one group into the environment; they hold from its next step on."""
+        """Put the values of one group into the environment; they hold from its next step on.
+
+        ValueError for an environment without parameters.
+        """
         owner = getattr(self.env, "unwrapped", self.env)
         if not hasattr(owner, "params"):
             raise ValueError("this environment has no parameters to set. Wrap a Gymnasium environment of this package.")
