@@ -100,7 +100,10 @@ def with_classes(
     values: dict[str, dict[str, Tensor]], kinds: Sequence[str], classes: Mapping[str, DriverClass],
     factors: Mapping[tuple[str, str], Tensor],
 ) -> dict[str, dict[str, Tensor]]:  # fmt: skip
-    """Return the parameters in which those of a class have its numbers, times a factor for each vehicle, if any."""
+    """Return the parameters in which those of a class have its numbers, times a factor for each vehicle, if any.
+
+    ValueError for a parameter that is not there.
+    """
     made = {effect: dict(part) for effect, part in values.items()}
     for name, of in classes.items():
         mine = torch.tensor([kind == name for kind in kinds])
