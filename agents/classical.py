@@ -36,11 +36,11 @@ class Seen(NamedTuple):
     gap: Tensor
 
 
-def seen(observation: Tensor, vehicle_length: float, scales: Sequence[float]) -> Seen:
-    """Return what ``RingTask.observe`` packs into an observation ``(n, agents · 3)``, over ``RingTask.scales``."""
-    own = observation.unflatten(-1, (-1, len(scales))) * observation.new_tensor(scales)
-    speed, relative, headway = own.unbind(-1)
-    return Seen(speed, speed + relative, headway - vehicle_length)
+def seen(observation: Tensor, task: Task) -> Seen:
+    """Return an observation ``(n, agents · features)`` of the ring."""
+    found = task.by_name(observation)
+    speed = found["speed"]
+    return Seen(speed, speed + found["relative_speed"], found["headway"] - task.vehicle_length)
 
 
 @dataclass
@@ -51,7 +51,7 @@ class Controller:
 
     def __call__(self, observation: Tensor) -> Tensor:
         """Return actions ``(n, agents)``."""
-        view = seen(observation, self.task.vehicle_length, self.task.scales)
+        view = seen(observation, self.task)
         return self.task.action((self.wanted(view) - view.speed) / self.task.step_time)
 
     def wanted(self, view: Seen) -> Tensor:

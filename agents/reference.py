@@ -49,7 +49,7 @@ def rules(names: Sequence[str], columns: Sequence[Sequence[float]], wanted: Call
         uniform = uniform_speed(start).unsqueeze(-1)
 
         def act(observation: Tensor) -> Tensor:
-            view = seen(observation, task.vehicle_length, task.scales)
+            view = seen(observation, task)
             view = Seen(*(x.view(len(chosen), -1, 1) for x in view))
             accel = wanted(task, view, uniform, *numbers).expand_as(view.speed)
             return task.action(accel).reshape(-1, 1)

@@ -61,9 +61,7 @@ class Seen:
     """What agents observe of themselves, in SI units, ``(n, agents)``."""
 
     def __init__(self, task: OpenLanesTask, seen: Tensor) -> None:
-        names, scales = task.bounds.names, task.scales
-        parts = seen.reshape(len(seen), len(task.agents), len(names))
-        column = {name: parts[..., i] * scale for i, (name, scale) in enumerate(zip(names, scales, strict=True))}
+        column = task.by_name(seen.flatten(1))
         self.speed, self.lane, self.position = column["speed"], column["lane"].round().long(), column["position"]
         self.present, self.limit = column["present"] > 0.5, task.command_limits[1]
         self._nearby = [

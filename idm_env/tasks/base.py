@@ -284,6 +284,11 @@ class Task(abc.ABC):
         low, high = (tuple(x / scale for x, scale in zip(ends, self.scales, strict=True)) for ends in self.features[2:])
         return Bounds(self.features.names, low, high)
 
+    def by_name(self, observation: Tensor) -> dict[str, Tensor]:
+        """Return an observation ``(…, agents · features)`` by the name of each feature: ``(…, agents)`` in SI units."""
+        each = observation.unflatten(-1, (-1, len(self.scales))).unbind(-1)
+        return {name: x * scale for name, scale, x in zip(self.bounds.names, self.scales, each, strict=True)}
+
     @cached_property
     def _behaviour(self) -> Behaviour:
         extra = self.machinery

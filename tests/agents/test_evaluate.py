@@ -114,7 +114,7 @@ def test_humans_make_waves_and_pi_with_saturation_dissolves_young_ones():
 
 def test_observations_of_the_ring_are_unpacked():
     start = ring_start(RING, (240.0,))
-    view, state = seen(start.task.observe(start.world).flatten(1), 5.0, start.task.scales), start.world.state
+    view, state = seen(start.task.observe(start.world).flatten(1), start.task), start.world.state
     assert torch.allclose(view.speed, state.speed[:, :1], atol=1e-4)
     assert torch.allclose(view.lead_speed, state.speed[:, -1:], atol=1e-4)
     assert torch.allclose(view.gap, state.gap[:, :1], atol=1e-3)
