@@ -111,12 +111,12 @@ class Rows:
         info: dict[str, Any] = {}
         if not rows.any():
             return info
-        every = bool(rows.all())
+        every, ended = bool(rows.all()), None
         for name, value in outcome.details.items():
-            whole = value.any(-1) if name == "crash" else value
-            self._put(info, name, _out(self.batch, whole), rows, every)
-        if "crash" in outcome.details:
-            ended = outcome.terminated.any(-1)
+            if name == "crash":
+                value = ended = value.any(-1)
+            self._put(info, name, _out(self.batch, value), rows, every)
+        if ended is not None:
             crashed = (ended.cpu().numpy() if isinstance(ended, Tensor) else ended) & rows
             if crashed.any():
                 reasons = np.full(self.batch.count, None, dtype=object)

@@ -604,9 +604,12 @@ class LanePlan(Plan):
         return LaneScratch(self)
 
     def back(
-        self, moment: Moment, on_told: Mapping[str, Array | None], on_later: Array | None, on_past: Array | None
+        self, moment: Moment, on_told: Mapping[str, Tensor | None], on_later: Tensor | None, on_past: Array | None
     ) -> tuple[Array, Array | None, Array, Array]:
-        """Return what falls on the world's blocks, on actions and on parameters, as ``Plan.back``."""
+        """Return what falls on the world's blocks, on actions and on parameters ``(parameters, vehicles)``.
+
+        The rest is as in ``Plan.back``.
+        """
         bound, lanes, room = moment.bound, moment.lanes, self.scratch
         assert isinstance(bound, LaneBound) and isinstance(lanes, Crossing) and isinstance(room, LaneScratch)
         assert lanes.mid is not None and lanes.chain is not None

@@ -363,7 +363,7 @@ class Plan:
         return Scratch(self)
 
     def back(
-        self, moment: Moment, on_told: Mapping[str, Array | None], on_later: Array | None, on_past: Array | None
+        self, moment: Moment, on_told: Mapping[str, Tensor | None], on_later: Tensor | None, on_past: Array | None
     ) -> tuple[Array, Array | None, Array, Array]:
         """Return what falls on the world's blocks, on actions, on parameters (parameters, vehicles) and on the past.
 
@@ -382,29 +382,30 @@ class Plan:
         retreat_worlds(
             after.call, tells.filled(moment.now, moment.later, given),
             before.call, asks.filled(moment.now, moment.later, given), self._places(moment, moment.given),
-            bound.strides, *room.work, moment.past, moment.newest, room.ends, room.begins, on_past.ctypes.data,
-            past.ctypes.data, on_parameters.ctypes.data, room.on_inputs.ctypes.data, *room.loops, moment.at, 0,
+            bound.strides, *room.work, moment.past, moment.newest, room.ends, room.begins, address(on_past),
+            address(past), address(on_parameters), room.inputs_at, *room.loops, moment.at, 0,
             self.groups,
         )  # fmt: skip
         return on_now, on_action, on_parameters, past
 
     def _seeded(
-        self, moment: Moment, on_told: Mapping[str, Array | None], on_later: Array | None, room: Scratch
+        self, moment: Moment, on_told: Mapping[str, Tensor | None], on_later: Tensor | None, room: Scratch
     ) -> tuple[Array, Array | None, dict[str, int]]:
         """Return what falls on blocks and on actions, to be filled, and the addresses of all."""
         assert moment.bound is not None
         layout = moment.bound.laid.layout
         on_now = np.zeros((len(layout.blocks), self.count), self.real)
         on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
-        seeded, begun = room.zeros if on_later is None else address(on_later), address(on_now)
-        given = {**room.there, **{f"on_{n}": room.zeros if x is None else address(x) for n, x in on_told.items()}}
+        seeded, begun = room.zeros if on_later is None else on_later.data_ptr(), address(on_now)
+        given = {**room.there, **{f"on_{n}": room.zeros if x is None else x.data_ptr() for n, x in on_told.items()}}
         for i, name in enumerate(layout.blocks):
             step = i * self.pitch
             given[f"seed_{name}"] = room.zeros if on_later is None else seeded + step
             given[f"begin_{name}"] = begun + step
-        if on_later is not None:
+        if on_later is not None and self._carried:
+            later = on_later.numpy().reshape(on_now.shape)
             for i in self._carried:
-                on_now[i] = on_later.reshape(on_now.shape)[i]
+                on_now[i] = later[i]
         given |= moment.given
         if on_action is not None:
             given["on_action"] = address(on_action)
@@ -421,6 +422,7 @@ class Scratch:
         shapes = {**dict.fromkeys(named, (plan.count,)), "on_command": (plan.count,), "on_given": (plan.count,)}
         self._made, self.there = _Room(shapes, dict.fromkeys(shapes, real)).take()
         self.on_inputs = np.zeros((len(kernel.numbers), plan.count), real)
+        self.inputs_at = address(self.on_inputs)
         self.there |= {f"on_{_plain(n)}": address(x) for n, x in zip(kernel.numbers, self.on_inputs, strict=True)}
         self.ends, self.begins = (np.array([self.there[f"{k}_{n}"] for n in moving]) for k in ("end", "carried"))
         told = plan.recorded.after

@@ -147,6 +147,8 @@ class Values:
         plan = self.plan((action is None, live is None), tuple(normals or ()))
         bound = plan.of(self.layout, params)
         given = action.detach().numpy() if isinstance(action, Tensor) else action
+        if given is not None and not given.flags.c_contiguous:
+            given = np.ascontiguousarray(given)  # loops read row after row
         if self.past.slots:
             self.past.make_room()
         moment = Moment(
@@ -245,8 +247,8 @@ class _Step(torch.autograd.Function):
         if torch.is_grad_enabled():
             return (None,) * 3 + _twice(ctx, blocks, action, token, wanted, (on_later, on_past, *on_told))
         names = plan.recorded.flowing
-        seeds = {n: None if x is None else x.contiguous().numpy() for n, x in zip(names, on_told, strict=True)}
-        later = None if on_later is None else on_later.contiguous().numpy()
+        seeds = {n: None if x is None else x.contiguous() for n, x in zip(names, on_told, strict=True)}
+        later = None if on_later is None else on_later.contiguous()
         past = None if on_past is None else on_past.contiguous().numpy()
         on_now, on_action, on_parameters, before = plan.back(moment, seeds, later, past)
         shape = blocks.shape

@@ -144,6 +144,24 @@ def test_what_was_told_and_shown_before_does_not_change_with_the_next_step():
         np.testing.assert_array_equal(before, after)
 
 
+@pytest.mark.parametrize("output", ["torch", "numpy"])
+def test_actions_may_lie_in_any_order(output):
+    """A transposed array has its numbers column by column."""
+    column_by_column = torch.rand(2, 5, generator=torch.Generator().manual_seed(0)).T
+    found = []
+    for action in (column_by_column, column_by_column.contiguous()):
+        env = gym.make_vec("DiffIDM-v0", num_envs=5, task="ring", controlled=2, warmup=0, output=output)
+        env.reset(seed=0)
+        given = action.requires_grad_() if output == "torch" else action.numpy()
+        told = [env.step(given) for _ in range(3)][-1]
+        if output == "torch":
+            told[1].sum().backward()
+            found.append((told[0].detach(), given.grad))
+        else:
+            found.append(tuple(map(torch.as_tensor, told[:2])))
+    assert all(torch.equal(x, y) for x, y in zip(*found, strict=True))
+
+
 def test_parameters_and_states_that_change_are_noticed():
     env = gym.make("DiffIDM-v0", warmup=1, noise=0.0)
     env.reset(seed=0)
