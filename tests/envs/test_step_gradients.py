@@ -14,7 +14,7 @@ import torch
 import idm_env  # noqa: F401
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.simulator import Simulator
-from idm_env.tasks import FEATURES, REWARD_TERMS
+from idm_env.tasks import FEATURES, REWARD_TERMS, TASKS
 
 pytest.importorskip("numba")
 
@@ -69,12 +69,29 @@ CASES = {
             "max_episode_steps": 33,
         },
     ),
+    "open_highway": (
+        "open_highway",
+        {
+            "vehicles": 12,
+            "lanes_count": 2,
+            "length": 150.0,
+            "controlled": 2,
+            "failsafe": 4.5,
+            "hold": 0.1,
+            "max_episode_steps": 30,
+        },
+    ),
+    "bottleneck": ("bottleneck", {"vehicles": 14, "controlled": 2, "hold": 0.1, "noise": 0.1}),
     "replay_lanes": (
         "replay_lanes",
         {"controlled": 2, "lane_changes": "drivers", "lane_commands": True, "max_episode_steps": 20},
     ),
 }
 PARAMETERS = ("time_gap", "max_accel")
+
+
+def test_every_task_has_a_case():
+    assert {task for task, _ in CASES.values()} == set(TASKS)
 
 
 def made(case, eager, **more):
