@@ -22,6 +22,8 @@ from idm_env.discovery.solve import Prior, Solution, Task, solve
 FOLDS = 4
 POOLED_S = free.ENDS_S[1]
 """Weight (s) of the population at which every driver is its middle."""
+CLEARLY = 1.1
+"""Ratio of errors beyond which whitened predictions do not serve: on short records they do not tell a set-point."""
 EMPTY = np.zeros(0)
 
 
@@ -65,14 +67,14 @@ def _loss(left: np.ndarray) -> float:
 
 def crossed(
     records: Records, model: Model, values: np.ndarray, fold: np.ndarray, noise: Noise,
-    start: np.ndarray | None = None, pooled: bool = False,
+    start: np.ndarray | None = None, pooled: bool = False, whitened: bool | None = None,
 ) -> judge.Judged:  # fmt: skip
     """Return a model's errors on all runs, each judged by what the other folds say.
 
     A driver's parameters are fitted to every second block of his time and judged between, then the other way round;
     their population and φ come from other folds. Every error has the calibration that serves it: closed-loop
-    simulation that of closed-loop simulation, with the population's weight chosen by other folds, and predictions 5 s
-    ahead that of whitened predictions 5 s ahead, whose likelihood weighs the population by itself.
+    simulation that of closed-loop simulation, with the weight of the population that other folds choose; predictions
+    5 s ahead the same, or that of whitened predictions 5 s ahead, whose likelihood weighs the population by itself.
 
     Args:
         records: All runs.
@@ -82,6 +84,9 @@ def crossed(
         noise: Of predictions 5 s ahead, the same for all models that are compared.
         start: log θ [G, P] to begin with, beside the law's usual values.
         pooled: Whether every driver is the population's middle.
+        whitened: Which calibration serves predictions 5 s ahead, the same for all models that are compared. None, for
+            the null, takes that of whitened ones, against which drivers' noise weighs least, if it leaves not
+            ``CLEARLY`` more.
     """
     rows, own = whole(records), model.catalogue.own
     task, theta = judge.unweighed(records, model, values.mean(0), first_prior(own), start=start)
@@ -102,10 +107,16 @@ def crossed(
             parts[int(k)] = _Fold(prior, frozen, {POOLED_S: everyone}, {POOLED_S: np.ones(1)})
         else:
             parts[int(k)] = _weighed(mine, prior, frozen, near)
-    gap, speed = _simulated(rows, second, fold, parts)
+    gap, speed, thetas = _simulated(rows, second, fold, parts)
     short = windows(records)
-    ahead = _ahead(Task(short, noise.alike(len(short)), first_prior(own)), model, values, fold, theta, pooled)
-    return judge.Judged(rows, gap, speed, ahead, short.record)
+    task = Task(short, noise.alike(len(short)), first_prior(own))
+    ahead = _predicted(task, model, values, fold, thetas)
+    if whitened or (whitened is None and not pooled):
+        other = _predicted(task, model, values, fold, _whitened(task, model, values, fold, theta))
+        left = [_loss(np.bincount(short.group, x**2)[np.unique(short.group)]) ** 0.25 for x in (ahead, other)]
+        whitened = bool(whitened or left[1] < CLEARLY * left[0])
+        ahead = other if whitened else ahead
+    return judge.Judged(rows, gap, speed, ahead, short.record, bool(whitened))
 
 
 def at_best(records: Records, model: Model, values: np.ndarray) -> tuple[judge.Judged, np.ndarray]:
@@ -142,37 +153,49 @@ def _weighed(mine: list[Rows], prior: Prior, frozen: Frozen, near: np.ndarray) -
 
 def _simulated(
     rows: Rows, second: np.ndarray, fold: np.ndarray, parts: dict[int, _Fold]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return gaps and speeds of closed-loop simulation with the weight that the other folds choose."""
-    gap, speed = np.zeros((2, *rows.valid.shape))
+) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
+    """Return gaps and speeds of closed-loop simulation with the weight that the other folds choose, and log θ there."""
+    (gap, speed), chosen = np.zeros((2, *rows.valid.shape)), {}
     # Of two copies, the second is scored where the first was fitted.
     there, known = (~second).astype(int), set.intersection(*(set(p.left) for p in parts.values()))
     for k, part in parts.items():
         others = [p.left for j, p in parts.items() if j != k or len(parts) == 1]
         best = min(sorted(known), key=lambda s: _loss(np.concatenate([left[s] for left in others])))
-        thetas, at = part.thetas[best], fold[rows.run] == k
-        one = Task(rows.some(at), None, part.prior).predict(thetas, part.frozen, np.zeros((2, 0)))
+        chosen[k], at = part.thetas[best], fold[rows.run] == k
+        one = Task(rows.some(at), None, part.prior).predict(chosen[k], part.frozen, np.zeros((2, 0)))
         gap[at], speed[at] = (np.take_along_axis(x, there[at][None], 0)[0] for x in one)
-    return gap, speed
+    return gap, speed, chosen
 
 
-def _ahead(
-    task: Task, model: Model, values: np.ndarray, fold: np.ndarray, theta: np.ndarray, pooled: bool
-) -> np.ndarray:
-    """Return errors of the gap 5 s ahead [windows], drivers calibrated on such predictions of their other blocks."""
+def _whitened(
+    task: Task, model: Model, values: np.ndarray, fold: np.ndarray, theta: np.ndarray
+) -> dict[int, np.ndarray]:
+    """Return log θ [2, G, P] of every fold, from whitened predictions 5 s ahead of each half of the drivers' blocks."""
     # The window before the first of a block is in the other half.
     rows = replace(task.rows, joined=task.rows.joined & (task.rows.block == np.roll(task.rows.block, 1)))
-    free = replace(task, rows=rows, prior=replace(task.prior, free=False))
-    whole_time = solve(free, Frozen(model, values.mean(0)), theta, EMPTY, iterations=15, tolerance=1e-3).theta
-    ahead, second = np.zeros(len(rows)), rows.block % 2 == 1
+    free, second = replace(task, rows=rows, prior=replace(task.prior, free=False)), rows.block % 2 == 1
+    all_time = solve(free, Frozen(model, values.mean(0)), theta, EMPTY, iterations=15, tolerance=1e-3).theta
+    found = {}
     for k in np.unique(fold[rows.run]):
-        mine, frozen = fold[rows.run] == k, Frozen(model, values[k])
-        prior = replace(population(whole_time, rows.some(~mine), model.catalogue.own), free=False)
-        for half in (second, ~second):
-            own = replace(free, prior=prior).of_rows(mine & ~half)
-            fitted = np.broadcast_to(prior.centre, theta.shape)
-            if not pooled:
-                fitted = solve(own, frozen, whole_time, EMPTY, iterations=10, tolerance=1e-3).theta
-            scored = Task(rows.some(mine & half), None, prior)
-            ahead[mine & half] = scored.errors(fitted[None], frozen, EMPTY[None])[0][:, -1]
+        mine = fold[rows.run] == k
+        prior = replace(population(all_time, rows.some(~mine), model.catalogue.own), free=False)
+        own = replace(free, prior=prior)
+        found[int(k)] = np.stack([
+            solve(own.of_rows(mine & half), Frozen(model, values[k]), all_time, EMPTY, iterations=10).theta
+            for half in (~second, second)
+        ])  # fmt: skip
+    return found
+
+
+def _predicted(
+    task: Task, model: Model, values: np.ndarray, fold: np.ndarray, thetas: dict[int, np.ndarray]
+) -> np.ndarray:
+    """Return errors of the gap 5 s ahead [windows] with log θ [2, G, P] of every fold, from the half not scored."""
+    rows, ahead = task.rows, np.zeros(len(task.rows))
+    there = (rows.block % 2 == 0).astype(int)
+    for k, theta in thetas.items():
+        mine = fold[rows.run] == k
+        if mine.any():
+            both = Task(rows.some(mine), None, task.prior).errors(theta, Frozen(model, values[k]), np.zeros((2, 0)))
+            ahead[mine] = np.take_along_axis(both[..., -1], there[mine][None], 0)[0]
     return ahead

@@ -277,16 +277,22 @@ def _finish(
         return searching.task.noise
 
     # The null, what is added and other laws go the same way: whatever is calibrated better looks better.
-    def judged(s: Solution, task: Task) -> tuple[Solution, judge.Judged | None]:
+    def judged(
+        s: Solution, task: Task, whitened: bool | None = None, pooled: bool = False
+    ) -> tuple[Solution, judge.Judged | None]:
         theta, errors = own(s.model, s.values, s.theta)
         if adapt and kept is not None:
-            errors = crossed.crossed(
-                prepared, s.model, crossed.values_of(task, s, prepared.runs, fold), fold, noise(), theta.theta
-            )
+            values = crossed.values_of(task, s, prepared.runs, fold)
+            errors = crossed.crossed(prepared, s.model, values, fold, noise(), theta.theta, pooled, whitened)
         return theta, errors
 
     first, before = judged(null, searching.task)
-    judgement, last = _judgement(searching, decided, kept, fit_records, judged, (first, before), seed)
+    whitened = before is not None and before.whitened
+
+    def alike(s: Solution, task: Task) -> tuple[Solution, judge.Judged | None]:
+        return judged(s, task, whitened)
+
+    judgement, last = _judgement(searching, decided, kept, fit_records, alike, (first, before), seed)
     laws = []
 
     def alone(model: Model) -> tuple[judge.Judged, bool]:
@@ -299,13 +305,18 @@ def _finish(
         if best.summary()["gap_rmse_m"] > HOLDS * before.summary()["gap_rmse_m"]:
             return best, True
         values = crossed.values_of(searching.task, null, prepared.runs, fold)
-        return crossed.crossed(prepared, model, values, fold, noise(), theta), False
+        return crossed.crossed(prepared, model, values, fold, noise(), theta, whitened=whitened), False
 
     if before is not None:
         laws = bases.compared(null.model, before, alone, seed, on_law)
         judgement = judgement.beside(bases.best_of(laws))
     final = judgement.compared if judgement.added and judgement.compared is not None else null
     judgement = replace(judgement, shared=shared.find(judge.everywhere(prepared, searching.task, final), seed))
+    scored = prepared if kept is None else kept
+    floor = ceilings.floor(scored, ceilings.drift(trajectories))
+    if adapt and before is not None:
+        pooled = judged(null, searching.task, whitened, True)[1]
+        judgement = replace(judgement, ladder=judgement.climbed(prepared, pooled, floor["horizon_rmse_m"]))
     report = summary.report(
         trajectories, prepared, fit_runs, kept_runs, searching.task, judgement, rounds, refused, [first, last], by
     )
@@ -313,9 +324,8 @@ def _finish(
         "alike_s": decided.stand.task.prior.alike_s, "tried_s": list(decided.stand.rmse_m),
         "gap_rmse_m": list(decided.stand.rmse_m.values()),
     }  # fmt: skip
-    scored = prepared if kept is None else kept
     report["ceilings"] = ceilings.told(decided.stand, scored, decided.null, rounds[0].left)
-    report["error"]["floor"] = ceilings.floor(scored, ceilings.drift(trajectories))
+    report["error"]["floor"] = floor
     report["bases"] = bases.rows(laws)
     for key in ("sentence", "details", "found", "partial"):
         report[key] = words.of_law(report[key], null.model.catalogue.base.title)

@@ -30,6 +30,8 @@ class Judged:
     speed: np.ndarray
     ahead: np.ndarray
     ahead_record: np.ndarray
+    whitened: bool = False
+    """Whether predictions 5 s ahead have drivers calibrated on whitened predictions, and not on the simulation."""
 
     @cached_property
     def gap_error(self) -> np.ndarray:

@@ -81,6 +81,7 @@ def blocks(d: Discovery) -> Iterator[Block]:
     law = d.null.model.catalogue.base.title
     yield pages.lead(r["sentence"])
     yield from _lights(r, law)
+    yield from _ladder(r)
     yield from _first_picture(d)
     yield pages.heading("How sure is that")
     yield pages.bullets(r["details"])
@@ -114,6 +115,24 @@ def _lights(r: dict[str, Any], law: str) -> Iterator[Block]:
         )
         for key, h in r["helps"].items()
     )
+
+
+def _ladder(r: dict[str, Any]) -> Iterator[Block]:
+    """Return the parts of the squared error 5 s ahead as one bar, and the rungs that they come from."""
+    ladder = r["ladder"]
+    if ladder is None:
+        return
+    parts = ladder["parts"]
+    bar = "".join(
+        f'<span style="display:inline-block;overflow:hidden;white-space:nowrap;height:1.6em;width:{100 * share:.2f}%;'
+        f'background:{colour}" title="{name} {share:.0%}">&nbsp;{name if share > 0.15 else ""}</span>'
+        for (name, share), colour in zip(parts.items(), ("#bbbbbb", "#8fb8de", "#7bc47f", "#e39b6f"), strict=True)
+    )
+    told = " · ".join(f"{name} {percent(share)}" for name, share in parts.items())
+    yield pages.html(f'<div role="img" aria-label="{told}" style="line-height:1.6em">{bar}</div>')
+    yield pages.note(f"Squared error of the gap 5 s ahead, every run held out once: {told}.")
+    rungs = " → ".join(f"{name} {number(m)}" for name, m in ladder["rungs_m"].items())
+    yield pages.note(f"Root mean square (m): {rungs}.")
 
 
 def known_instead(r: dict[str, Any], law: str) -> list[tuple[str, str]]:

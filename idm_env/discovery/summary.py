@@ -10,7 +10,9 @@ import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import bases, judge, words
+from idm_env.discovery import ladder as ladders
 from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
+from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Bar, Strength, powerful, strength_of
 from idm_env.discovery.records import Records
@@ -46,6 +48,8 @@ class Judgement:
     """What vehicles of one run do alike, beyond the model."""
     law: bases.Law | None = None
     """A law that predicts better than the null, and than what was added to it."""
+    ladder: Ladder | None = None
+    """What is left of predictions 5 s ahead, rung by rung, where every run is held out once."""
 
     @cached_property
     def errors(self) -> dict[str, Comparison]:
@@ -83,6 +87,17 @@ class Judgement:
         if self.refusal is not None and self.refusal.reason is Reason.FEW_RUNS:
             return replace(self, law=best)
         return replace(self, law=best, added=False, refusal=Refusal(Reason.LAW))
+
+    def climbed(self, records: Records, pooled: judge.Judged | None, floor_m: float) -> Ladder:
+        """Return the ladder, from the ``pooled`` null to what sensors alone leave 5 s ahead (m)."""
+        assert self.before is not None and pooled is not None
+        models = {"one set of parameters for all": pooled, (own := "parameters of every driver"): self.before}
+        last = own
+        if self.law is not None:
+            models[last := self.law.title] = self.law.errors
+        elif self.added and self.after is not None:
+            models[last := f"with {self.tried}"] = self.after
+        return ladders.climb(records, models, own, last, floor_m, self.seed)
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -137,13 +152,23 @@ def report(
     power = len(fit_runs) >= MANY_RUNS or powerful(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest
     )
-    refusal = judged.refusal
+    refusal, ladder = judged.refusal, judged.ladder
+    unnamed = ladder is not None and ladder.is_structured
+    structured = structured or unnamed
     common = judged.shared
     others = [name for f in found if f["effect"] for name in f["equivalent"] if name in ALL]
     verdict = conclude(
         bool(found), any(f["effect"] for f in found), refusal, structured, first.left, power, common is not None,
         apart=not others,
     )  # fmt: skip
+    if (
+        verdict is Verdict.UNEXPLAINED
+        and ladder is not None
+        and unnamed
+        and refusal is not None
+        and refusal.reason is Reason.NO_GAIN
+    ):
+        refusal = Refusal(Reason.STRUCTURE, ladder.structure[0])
     if verdict is Verdict.CANNOT_TELL and not power and (refusal is None or refusal.reason is Reason.NO_GAIN):
         refusal = Refusal(Reason.NO_POWER, len(fit_runs))
     errors = judged.errors
@@ -164,6 +189,11 @@ def report(
                   "after": c.after, "unit": words.ERRORS[key][1], "drivers_ratio": c.driver[0],
                   "drivers_low": c.driver[1], "drivers_high": c.driver[2], "share_of_drivers_improved": c.improved}
             for key, c in errors.items()
+        },
+        "ladder": None if ladder is None else {
+            "rungs_m": ladder.rungs, "parts": ladder.parts, "structure": dict(
+                zip(("share", "low", "high"), ladder.structure, strict=True)
+            ),
         },
         "interval": _how(before) if errors and before is not None else None,
         "models": judged.names(),

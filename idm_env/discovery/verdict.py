@@ -39,6 +39,7 @@ class Reason(str, Enum):
     LOCKBOX = "lockbox"
     HELD_OUT = "held_out"
     LAW = "law"
+    STRUCTURE = "structure"
 
 
 @dataclass(frozen=True)

@@ -129,6 +129,10 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
         Reason.FREE_SIMULATION: f"{tried} makes free simulation worse",
         Reason.LOCKBOX: f"the test set does not confirm {tried}",
         Reason.HELD_OUT: f"predictions of the test set get no better with {tried}",
+        Reason.STRUCTURE: (
+            f"a smooth function of the scene takes {refusal.figure:.0%} off the squared error 5 s ahead, "
+            "and no candidate does"
+        ),
         Reason.LAW: "another law predicts better than all that was added to IDM",
     }[refusal.reason]  # fmt: skip
 

@@ -25,7 +25,8 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
     sentence = f"{trajectories.source} is one recording, so no run can be held out as a test set. {cure}"
     found: dict[str, Any] = {
         "verdict": "cannot_tell", "reason": "few_runs", "sentence": sentence, "details": [cure], "found": [],
-        "known": [], "helps": {}, "interval": None, "models": {}, "partial": None, "candidates": [], "shared": None,
+        "known": [], "helps": {}, "ladder": None, "interval": None, "models": {}, "partial": None, "candidates": [],
+        "shared": None,
         "error": {"held_out_runs": [], "held_out_drivers": [], "before": None, "after": None}, "excluded": [],
         "parameters": [], "data": trajectories.summary(), "prior": None, "bases": [], "versions": page.versions(),
     }  # fmt: skip

@@ -67,10 +67,11 @@ def test_null_addition_and_other_laws_are_judged_by_one_procedure(monkeypatch: p
     models, ruled_out, alike = [], [], set()
     right, best = crossed.crossed, crossed.at_best
 
-    def kept(records, model, values, fold, noise, start=None):  # type: ignore[no-untyped-def]
+    def kept(records, model, values, fold, noise, *rest, **named):  # type: ignore[no-untyped-def]
         models.append(model)
-        alike.add((id(records), fold.tobytes(), id(noise)))
-        return right(records, model, values, fold, noise, start)
+        found = right(records, model, values, fold, noise, *rest, **named)
+        alike.add((id(records), fold.tobytes(), id(noise), found.whitened))
+        return found
 
     def at_best(records, model, values):  # type: ignore[no-untyped-def]
         ruled_out.append(model)
@@ -81,7 +82,7 @@ def test_null_addition_and_other_laws_are_judged_by_one_procedure(monkeypatch: p
     made, _ = synthetic.generate(5, runs=8, followers=2, seconds=80.0, effect="lag")
     found = discover(made, effects=["lag"])
     assert found.verdict == "named"
-    assert len(alike) == 1, "the same runs, folds and noise for all"
+    assert len(alike) == 1, "the same runs, folds, noise and calibration for all"
     assert {m.catalogue.base.kind for m in ruled_out} == set(BASES) and models[0] is found.null.model
     rows = {(row["base"], *row["own"]): row for row in found.report["bases"][1:]}
     null_m = found.report["error"]["before"]["gap_rmse_m"]

@@ -215,8 +215,8 @@ def test_what_makes_every_error_worse_is_not_named(monkeypatch: pytest.MonkeyPat
     """The decision on the runs that choose stands, the judgement by cross-fitting goes against it."""
     right = crossed.crossed
 
-    def contrary(records, model, *rest):  # type: ignore[no-untyped-def]
-        judged = right(records, model, *rest)
+    def contrary(records, model, *rest, **named):  # type: ignore[no-untyped-def]
+        judged = right(records, model, *rest, **named)
         if not model.terms:
             return judged
         return replace(judged, gap=judged.gap + 3.0, speed=judged.speed + 1.0, ahead=np.abs(judged.ahead) + 2.0)

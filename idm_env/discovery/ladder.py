@@ -1,0 +1,200 @@
+"""What is left of predictions 5 s ahead, rung by rung: whose parameters, what drifts, what is named, what has no name.
+
+Every rung is judged where it was not fitted: models by ``crossed``, corrections of their errors by leaving out runs. A
+correction by a driver's last errors follows his drift; a smooth function of the scene, beside it, is a ceiling of what
+an effect could add: structure, named or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from idm_env.discovery.judge import Judged
+from idm_env.discovery.march import COLUMNS
+from idm_env.discovery.records import Records, Rows, windows
+
+FEATURES = 200
+"""Random features of the smooth ceiling, or an eighth of the windows where these are few."""
+RIDGES = (1e-2, 1e-1, 1.0, 10.0, 100.0)
+"""Weights of the ridge per window, of which other runs choose."""
+FOLDS = 5
+FURTHEST = 3.0
+"""A coordinate counts at most so many standard deviations: beyond what was seen nothing is added."""
+PAST_S = (1.0, 3.0)
+STRUCTURED = 0.02
+"""Share of the squared error that a smooth function of the scene takes, beside drift, from which it is structure.
+
+The scene tells a part of drivers' noise, too: of six sets without an effect, noise of 0 to 0.2 m/s², up to 0.01.
+"""
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Errors 5 s ahead (m) by rung, the squared error's parts, and the share that is structure with its 95 % interval.
+
+    Parts add up to 1, that is to the squared error of drivers with their own parameters.
+    """
+
+    rungs: dict[str, float]
+    parts: dict[str, float]
+    structure: tuple[float, float, float]
+
+    @property
+    def is_structured(self) -> bool:
+        """Whether something is left that the scene tells, beyond chance and beyond what drivers' noise looks like."""
+        share, low, _ = self.structure
+        return share > STRUCTURED and low > 0.0
+
+
+def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, floor_m: float, seed: int) -> Ladder:
+    """Return the ladder.
+
+    Args:
+        records: All runs.
+        models: By name, in the order of the rungs; errors of windows of 5 s by cross-fitting.
+        own: The model with drivers' own parameters and nothing more.
+        last: The model with all that was added, or ``own``.
+        floor_m: What sensors alone leave (m).
+        seed: Of random features.
+    """
+    rows = windows(records)
+    error = models[last].ahead
+    drift, scene, past = _drift(rows, error), _scene(rows), _past(rows)
+    rest = error - corrected(rows, error, drift, None, seed)
+    left = {
+        "drift followed": rest,
+        "smooth function of the scene": rest - corrected(rows, rest, scene[:, :0], scene, seed),
+        "smooth function of scene and past": rest - corrected(rows, rest, scene[:, :0], np.hstack([scene, past]), seed),
+    }
+    rungs = {name: _rmse(judged.ahead) for name, judged in models.items()}
+    rungs |= {name: _rmse(what) for name, what in left.items()} | {"sensors alone": floor_m}
+    structure = _share(rows, left["drift followed"], left["smooth function of the scene"], error)
+    total = _rmse(models[own].ahead) ** 2
+    named = max(1.0 - _rmse(error) ** 2 / total, 0.0)
+    sensors = min(floor_m**2 / total, 1.0)
+    unnamed = min(max(structure[0], 0.0) * _rmse(error) ** 2 / total, max(1.0 - sensors - named, 0.0))
+    parts = {"sensors": sensors, "drift": max(1.0 - sensors - named - unnamed, 0.0), "named": named}
+    return Ladder(rungs, parts | {"structure without a name": unnamed}, structure)
+
+
+def corrected(rows: Rows, error: np.ndarray, plain: np.ndarray, smooth: np.ndarray | None, seed: int) -> np.ndarray:
+    """Return the errors [W] that a ridge on ``plain`` and random features of ``smooth`` predicts, runs left out."""
+    basis = plain
+    if smooth is not None:
+        scaled = np.clip((smooth - smooth.mean(0)) / (smooth.std(0) + 1e-9), -FURTHEST, FURTHEST)
+        count = int(np.clip(len(rows) // 8, 20, FEATURES))
+        random = np.random.default_rng(seed)
+        turned = scaled @ (random.standard_normal((scaled.shape[1], count)) / np.sqrt(scaled.shape[1]))
+        waves = np.cos(turned + random.uniform(0.0, 2.0 * np.pi, count))
+        basis = np.hstack([plain, scaled, waves])
+    basis = np.hstack([np.ones((len(rows), 1)), basis])
+    basis[:, 1:] = (basis[:, 1:] - basis[:, 1:].mean(0)) / (basis[:, 1:].std(0) + 1e-9)
+    weight = _weight(rows, error)
+    unit = rows.run if len(np.unique(rows.run)) >= FOLDS else rows.group
+    fold = np.searchsorted(np.unique(unit), unit) % FOLDS
+    found = np.zeros(len(rows))
+    for k in np.unique(fold):
+        mine, inner = fold == k, (fold + k) % FOLDS % 2 == 0
+        first, second = ~mine & inner, ~mine & ~inner
+        loss = np.zeros(len(RIDGES))
+        for one, other in ((first, second), (second, first)):
+            told = basis[other] @ _ridges(basis[one], error[one], weight[one])
+            loss += ((error[other, None] - told) ** 2 * weight[other, None]).sum(0)
+        found[mine] = basis[mine] @ _ridges(basis[~mine], error[~mine], weight[~mine])[:, loss.argmin()]
+    return found
+
+
+def _ridges(basis: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return coefficients [features, ridges]."""
+    value, vector = np.linalg.eigh((basis * weight[:, None]).T @ basis)
+    push = vector.T @ (basis.T @ (weight * error))
+    scale = value[:, None] + np.array(RIDGES) * weight.sum()
+    result: np.ndarray = vector @ (push[:, None] / scale)
+    return result
+
+
+def _weight(rows: Rows, error: np.ndarray) -> np.ndarray:
+    """Return what a window counts: one over its driver's mean square plus the usual one."""
+    square = _by_group(rows, error**2)
+    usual = max(float(np.median(square)), 1e-9)
+    weight: np.ndarray = usual / (square + usual)
+    return weight
+
+
+def _by_group(rows: Rows, values: np.ndarray) -> np.ndarray:
+    """Return the mean over the driver's windows of every window."""
+    count = np.bincount(rows.group)
+    result: np.ndarray = (np.bincount(rows.group, values) / np.maximum(count, 1))[rows.group]
+    return result
+
+
+def _drift(rows: Rows, error: np.ndarray) -> np.ndarray:
+    """Return what a driver's other errors tell of his drift [W, 3]: the last two, and the other blocks' mean."""
+    one = np.append(0.0, error[:-1]) * rows.joined
+    two = np.append(0.0, one[:-1]) * rows.joined
+    half = rows.block % 2
+    other = np.zeros(len(rows))
+    for part in (0, 1):
+        total = np.bincount(rows.group, error * (half == part))
+        count = np.bincount(rows.group, (half == part).astype(float))
+        mean = (total / np.maximum(count, 1.0))[rows.group]
+        other = np.where(half == 1 - part, mean, other)
+    return np.stack([one, two, other], axis=1)
+
+
+def _scene(rows: Rows) -> np.ndarray:
+    """Return the scene where a window begins [W, 9]: its state, the driver's usual gap, and the leader's next 5 s."""
+    signals, at = rows.records.signals, rows.start
+    speed, lead, gap = _column(signals, at, "speed"), _column(signals, at, "lead_speed"), _gap(signals, at)
+    headway = np.log(np.maximum(gap, 0.5) / (np.maximum(speed, 0.0) + 2.0))
+    ahead = [_column(signals, at + round(share * rows.steps), "lead_speed") - lead for share in (0.2, 0.5, 1.0)]
+    usual = headway - _by_group(rows, headway)
+    return np.stack([speed, headway, usual, speed - lead, _column(signals, at, "lead_accel"), np.log1p(gap.clip(0)),
+                     *ahead], axis=1)  # fmt: skip
+
+
+def _past(rows: Rows) -> np.ndarray:
+    """Return how speed, gap and the leader's speed came about [W, 6]: their changes over ``PAST_S``."""
+    signals, at = rows.records.signals, rows.start
+    told = []
+    for seconds in PAST_S:
+        then = np.maximum(at - round(seconds / rows.records.dt), rows.records.bounds[rows.record])
+        told += [_column(signals, at, name) - _column(signals, then, name) for name in ("speed", "lead_speed")]
+        told.append(_gap(signals, at) - _gap(signals, then))
+    return np.stack(told, axis=1)
+
+
+def _column(signals: np.ndarray, at: np.ndarray, name: str) -> np.ndarray:
+    result: np.ndarray = signals[np.minimum(at, len(signals) - 1), COLUMNS.index(name)]
+    return result
+
+
+def _gap(signals: np.ndarray, at: np.ndarray) -> np.ndarray:
+    result: np.ndarray = _column(signals, at, "lead_rear") - _column(signals, at, "position")
+    return result
+
+
+def _share(rows: Rows, before: np.ndarray, after: np.ndarray, whole: np.ndarray) -> tuple[float, float, float]:
+    """Return the share of the squared error ``whole`` that goes from ``before`` to ``after``, with its 95 % interval.
+
+    Every driver counts by ``_weight``; the interval is Student's t over runs, or over drivers of few runs.
+    """
+    weight, unit = _weight(rows, whole), rows.run if len(np.unique(rows.run)) >= FOLDS else rows.group
+    gained, total = weight * (before**2 - after**2), weight * whole**2
+    share = float(gained.sum() / total.sum())
+    each = np.bincount(unit, gained - share * total)[np.unique(unit)]
+    count = len(each)
+    width = (
+        student.ppf(0.975, count - 1) * np.sqrt((each**2).sum() * count / (count - 1)) / total.sum()
+        if count > 1
+        else np.inf
+    )
+    return share, float(share - width), float(share + width)
+
+
+def _rmse(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(error**2)))

@@ -1,0 +1,79 @@
+"""What is left of predictions is drift, or structure that has no name: errors made up on small generated records."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from idm_env.data import episodes, hidden, synthetic
+from idm_env.discovery import discover, ladder
+from idm_env.discovery.judge import Judged
+from idm_env.discovery.records import Records, gather, whole, windows
+from idm_env.discovery.verdict import Verdict
+
+
+@pytest.fixture(scope="module")
+def records() -> Records:
+    made, _ = synthetic.generate(4, runs=8, followers=3, seconds=120.0)
+    return gather(list(episodes(made, smooth=True, min_seconds=12.0)))
+
+
+def climbed(records: Records, error: np.ndarray) -> ladder.Ladder:
+    rows = whole(records)
+    nothing = np.zeros(rows.valid.shape)
+    models = {
+        name: Judged(rows, nothing, nothing, x, windows(records).record)
+        for name, x in (("all", 2.0 * error), ("own", error))
+    }
+    return ladder.climb(records, models, "own", "own", 0.05, 0)
+
+
+def noise(records: Records, carry: float) -> np.ndarray:
+    """Return errors of windows that last: each is ``carry`` of the one before, and new."""
+    rows, random = windows(records), np.random.default_rng(2)
+    error = random.normal(0.0, 0.5, len(rows))
+    for i in np.flatnonzero(rows.joined):
+        error[i] += carry * error[i - 1]
+    return error
+
+
+def closing(records: Records) -> np.ndarray:
+    """Return the part of a closing speed above 0.5 m/s where windows begin."""
+    rows = windows(records)
+    speed, lead = (records.signals[rows.start, c] for c in (15, 1))
+    return np.maximum(speed - lead - 0.5, 0.0)
+
+
+@pytest.mark.parametrize("carry", [0.0, 0.6])
+def test_what_lasts_in_a_driver_is_drift_and_no_structure(records: Records, carry: float) -> None:
+    found = climbed(records, noise(records, carry))
+    assert not found.is_structured and found.parts["structure without a name"] < 0.02
+    assert sum(found.parts.values()) == pytest.approx(1.0)
+    assert (found.rungs["drift followed"] < 0.95 * found.rungs["own"]) == (carry > 0.0)
+    assert next(iter(found.rungs)) == "all" and list(found.rungs)[-1] == "sensors alone"
+
+
+def test_what_the_scene_tells_is_structure(records: Records) -> None:
+    """A deterministic part of the size of the noise is most of what the ceiling finds, and not more."""
+    part = closing(records)
+    part *= 0.5 / part.std()
+    found = climbed(records, noise(records, 0.3) + part)
+    assert found.is_structured and 0.2 < found.structure[0] < 0.6
+    assert found.parts["structure without a name"] == pytest.approx(found.structure[0], abs=1e-6)
+
+
+def test_nothing_is_not_said_of_an_effect_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Closing speeds count double above 2 m/s: no candidate has that shape, and something is missing."""
+    usual = hidden._desired_gap
+
+    def doubled(speed, closing, time_gap, drivers):  # type: ignore[no-untyped-def]
+        return usual(speed, np.where(closing > 2.0, 2.0 * closing - 2.0, closing), time_gap, drivers)
+
+    monkeypatch.setattr(hidden, "_desired_gap", doubled)
+    made, _ = synthetic.generate(83)
+    monkeypatch.undo()
+    found = discover(made, effects=["drag"])
+    told = found.report["ladder"]
+    assert found.verdict is Verdict.UNEXPLAINED, found.report["sentence"]
+    assert told["structure"]["low"] > 0.0 and told["rungs_m"]["sensors alone"] < 0.1
+    assert "smooth function of the scene" in found.report["sentence"]
