@@ -53,6 +53,7 @@ TEST: dict[str, dict[str, Any]] = {
     "open_highway": {},
     "merge": {},
     "bottleneck": {},
+    "approach": {},
 }
 """Keywords of the environment in which policies of a task are judged, over those in which they are trained."""
 
@@ -265,7 +266,7 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
     steps = min(task.steps, STEPS_OF_LANES)
     rows, dt = len(like), task.simulator.dt
     crashed = torch.zeros(rows, dtype=torch.bool)
-    lost, spent, stood, burnt = (torch.zeros(rows, dtype=torch.float64) for _ in range(4))
+    lost, spent, waited, stood, burnt = (torch.zeros(rows, dtype=torch.float64) for _ in range(5))
     for _, _, world in held_moments(start, act, steps):
         state = world.state
         assert state.present is not None
@@ -274,12 +275,14 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
         lost += dt * task.delay(world)
         spent += dt * there.sum(-1)
         stood += dt * (there & (state.speed < 0.5)).sum(-1)
-        burnt += dt * task.told(world)["co2"][:, 0]
+        infos = task.told(world)
+        burnt += dt * infos["co2"][:, 0]
+        waited += dt * infos["queued"][:, 0]
     told = task.told(world)
     hourly, left = 3600.0 / (steps * dt), told["outflow"][:, 0].double()
     columns = {
         "reward": -lost, "outflow": left * hourly, "ramp": told["ramp"][:, 0].double() * hourly,
-        "queued": told["queued"][:, 0].double(), "travel": (spent + lost) / left.clamp_min(1.0),
+        "queued": told["queued"][:, 0].double(), "travel": (spent + waited) / left.clamp_min(1.0),
         "standing": stood / spent.clamp_min(1.0), "co2": burnt / left.clamp_min(1.0),
     }  # fmt: skip
     parts = {name: x.view(policies, -1) for name, x in columns.items()}
@@ -305,7 +308,7 @@ def evaluate(act: Act | None, environment: Mapping[str, Any], **options: Any) ->
     """
     tests: dict[str, Callable[..., dict[str, Any]]] = {
         "ring": evaluate_ring, "follow": evaluate_follow, "open_highway": evaluate_lanes,
-        "merge": evaluate_lanes, "bottleneck": evaluate_lanes,
+        "merge": evaluate_lanes, "bottleneck": evaluate_lanes, "approach": evaluate_lanes,
     }  # fmt: skip
     return tests[environment.get("task", "ring")](act, environment, **options)
 

@@ -8,6 +8,7 @@ learns nothing; a policy that is said to learn must beat the last of them.
 * *IDM with other numbers*: the best of ``DRAWS`` drivers, numbers drawn evenly in their logarithms.
 * *ALINEA* (Papageorgiou, Hadj-Salem, Blosseville 1991, Transp. Res. Rec. 1320), where there is a ramp: a signal on the
   ramp that every vehicle there obeys, ``r ← r + K (ô − o)``, o being the density behind the merge. It is no agent.
+* *green-wave speed advice* (GLOSA), where there is a signal: agents drive as fast as one may to arrive in green.
 * *speed by lane and place*: the best of ``DRAWS`` rules, each of which holds every agent to a speed on each lane before
   a place of its own, drawn evenly.
 * *the same, all vehicles*: that rule where everybody is an agent.
@@ -43,12 +44,15 @@ DEMANDS: dict[str, dict[str, Any]] = {
     "merge 3000 + 800": {"task": "merge"},
     "bottleneck 1900": {"task": "bottleneck"},
     "open_highway 5000": {"task": "open_highway"},
+    "approach 1200": {"task": "approach"},
 }
 DRAWS, JUDGED_ON = 24, 32
 CONSTANT = (-1.0, -0.5, 0.0, 0.1, 0.25, 0.5, 1.0)
 """Accelerations (m/s²); from 1.5 m/s² on a command is what the driver does."""
 IDM_NUMBERS = (5.0, 0.5, 1.0, 0.3, 0.5), (35.0, 3.0, 6.0, 2.0, 4.0)
 """Least and most v0 (m/s), T (s), s0 (m), a and b (m/s²)."""
+LEAST = 5.0
+"""Speed (m/s) below which green-wave advice does not go."""
 GREEN, LINE, SENSOR = 30.0, 350.0, (500.0, 700.0)
 """Seconds between two rates of the signal, its place, and where density is measured (m)."""
 DENSITY, GAIN = 25.0, 40.0
@@ -68,6 +72,7 @@ class Seen:
             [column[f"{what}_{k}"] for k in range(task.seen)] for what in ("there", "ahead", "left", "speed")
         ]
         self._length = task.vehicle_length
+        self.signal = tuple(column[name] for name in ("line", "red", "until") if name in column)
 
     def idm(self, v0: Tensor, headway: Tensor, s0: Tensor, a: Tensor, b: Tensor) -> Tensor:
         """Return the action of IDM drivers with these numbers, behind whom they see ahead on their lane."""
@@ -106,6 +111,26 @@ def drivers(task: OpenLanesTask, values: Tensor, episodes: int) -> Act:
     """Return agents who drive by IDM with other numbers."""
     each = values.repeat_interleave(episodes, 0).unsqueeze(1).unbind(-1)
     return lambda seen: Seen(task, seen).idm(*each)
+
+
+def glosa(task: OpenLanesTask) -> Act:
+    """Return agents who follow green-wave speed advice: as fast as one may to arrive when it becomes green.
+
+    Who would arrive in green drives on; nobody is advised to drive below ``LEAST``.
+    """
+    signal = task.own_parameters["signal"]
+    red, v0 = float(signal["red"]), float(task.own_parameters["idm"]["desired_speed"])
+
+    def act(seen: Tensor) -> Tensor:
+        own = Seen(task, seen)
+        way, stops, until = own.signal
+        green = torch.where(stops > 0.5, until, until + red)  # when it becomes green (s)
+        catches = (stops < 0.5) & (way / v0 < until)
+        late = (stops > 0.5) & (way / v0 > until)
+        advice = (way / green.clamp_min(0.1)).clamp_min(LEAST)
+        return own.towards(torch.where((way > 0.0) & ~catches & ~late, advice, 40.0))
+
+    return act
 
 
 class Alinea:
@@ -176,6 +201,9 @@ def rows_of(given: Mapping[str, Any], policies: list[Path]) -> dict[str, Found]:
     row("IDM with other numbers", judged(given, lambda task, n: drivers(task, chosen, n)))
     if given["task"] == "merge":
         row("ALINEA (no agent)", judged({**given, "controlled": "all"}, lambda task, n: Alinea(task)))
+    if given["task"] == "approach":
+        row("green-wave speed advice", judged(given, lambda task, n: glosa(task)))
+        row("that advice, all vehicles", judged({**given, "controlled": "all"}, lambda task, n: glosa(task)))
     task = episodes_start(given, 1).task
     assert isinstance(task, OpenLanesTask)
     drawn = torch.rand(DRAWS, task.road.count, 2, generator=generator)

@@ -46,7 +46,7 @@ _MOVED = {
 """Modules that documents of 0.1 named, and where they are now; the old names work for one version."""
 
 _TASKS = (
-    "follow", "platoon", "replay", "ring", "highway", "open_highway", "merge", "bottleneck", "replay_lanes",
+    "follow", "platoon", "replay", "ring", "highway", "open_highway", "merge", "bottleneck", "replay_lanes", "approach",
 )  # fmt: skip
 """The keys of ``idm_env.tasks.TASKS``, which needs torch."""
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from idm_env.jobs import trust
+from idm_env.tasks.approach import ApproachTask
 from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.features import FEATURES, AgentView, Feature
@@ -33,6 +34,7 @@ TASKS: dict[str, type[Task]] = {
         OpenHighwayTask,
         MergeTask,
         BottleneckTask,
+        ApproachTask,
     )
 }
 
@@ -69,6 +71,7 @@ __all__ = [
     "TASKS",
     "Advance",
     "AgentView",
+    "ApproachTask",
     "BottleneckTask",
     "Bounds",
     "Draw",

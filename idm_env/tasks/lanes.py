@@ -158,12 +158,12 @@ class LanesTask(Task):
     @property
     def features_of_self(self) -> tuple[Feature, ...]:
         """What an agent observes of itself."""
-        return feature("speed", 20.0, 0.0, FASTEST), feature("lane", 1.0, 0.0, float(self.road.count - 1))
+        return feature("speed", 20.0, 0.0, FASTEST), feature("lane", 1.0, 0.0, float(max(self.road.count - 1, 1)))
 
     @property
     def own_features(self) -> tuple[Feature, ...]:
         """What is seen of oneself, and of each vehicle nearby: relative to the agent, 0 where there is nobody."""
-        last = float(self.road.count - 1)
+        last = float(max(self.road.count - 1, 1))
         each = (
             ("there", "", 1.0, 0.0, 1.0), ("ahead", "m", 100.0, -FAR_AWAY, FAR_AWAY),
             ("left", "lanes", 1.0, -last, last), ("speed", "m/s", 10.0, -FASTEST, FASTEST),

@@ -290,7 +290,7 @@ class OpenLanesTask(LanesTask):
     @property
     def features_of_self(self) -> tuple[Feature, ...]:
         """As in ``LanesTask``; who is there, where, and how far it is to the end of one's lane and of any."""
-        last = float(self.road.count - 1)
+        last = float(max(self.road.count - 1, 1))
         return (
             *super().features_of_self,
             Feature("present", "", "", 1.0, 0.0, 1.0, _present),

@@ -17,8 +17,8 @@ from idm_env.tasks import TASKS
 from idm_env.types import Moving, State, mapped
 
 QUICK: dict[str, dict[str, Any]] = {"ring": {"warmup": 0, "start": "wave"}, "replay": {"effects": ["delay"]}}
-SEVERAL = [name for name in TASKS if "highway" in name or name in ("merge", "bottleneck", "replay_lanes")]
-OPEN = ("open_highway", "merge", "bottleneck")
+SEVERAL = [name for name in TASKS if "highway" in name or name in ("merge", "bottleneck", "replay_lanes", "approach")]
+OPEN = ("open_highway", "merge", "bottleneck", "approach")
 
 
 def begun(name: str, face: str = "single") -> tuple[Any, State]:

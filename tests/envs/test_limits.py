@@ -20,6 +20,7 @@ USUAL = {
     "open_highway": 600,
     "merge": 600,
     "bottleneck": 600,
+    "approach": 600,
 }
 QUICK = {"ring": {"warmup": 3}}
 

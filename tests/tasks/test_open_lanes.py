@@ -15,7 +15,7 @@ from idm_env.kernels import dispatch
 from idm_env.multilane import demand
 from idm_env.tasks import BottleneckTask, Draw, MergeTask, make_task
 
-OPEN = ("merge", "bottleneck", "open_highway")
+OPEN = ("merge", "bottleneck", "open_highway", "approach")
 
 
 @pytest.mark.parametrize("name", OPEN)

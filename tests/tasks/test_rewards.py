@@ -23,6 +23,7 @@ CASES = {
     "open highway": {"task": "open_highway", "vehicles": 40, "max_command": 4.0, "controlled": 3, "careful": False},
     "merge": {"task": "merge", "vehicles": 40, "max_command": 4.0, "controlled": 3, "careful": False},
     "bottleneck": {"task": "bottleneck", "vehicles": 40, "max_command": 4.0, "controlled": 12, "careful": False},
+    "approach": {"task": "approach", "vehicles": 40, "max_command": 4.0, "controlled": 8, "careful": False},
     "replay, follow": {"task": "replay", "controlled": 3, "reward_terms": "follow"},
 }
 STEPS, COUNT = 150, 24

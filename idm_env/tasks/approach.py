@@ -1,0 +1,178 @@
+"""Task ``approach``: eco-driving over the last 500 m before a signal, among drivers who come in platoons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from idm_env.effects import IDM, Brakes, Effect, Signal
+from idm_env.metrics import fuel
+from idm_env.roads import Lanes
+from idm_env.tasks.base import Pay, World
+from idm_env.tasks.checks import Range
+from idm_env.tasks.features import AgentView, Feature
+from idm_env.tasks.open_lanes import OpenLanesTask
+from idm_env.tasks.random import Draw
+from idm_env.types import Params, State, Trips
+
+LINE, LENGTH = 500.0, 600.0
+"""Place of the signal, and where vehicles leave (m)."""
+_MOST_FUEL = 10.0
+"""A vehicle burns no more than this (mL/s)."""
+_SAID = ("offset", "cycle", "red")
+
+
+def _line(view: AgentView) -> Tensor:
+    """Return how far it is to the signal (m), 0 behind it."""
+    return view.own((LINE - view.state.position).clamp_min(0.0))
+
+
+def _signal(view: AgentView) -> tuple[Tensor, Tensor]:
+    """Return 1 where it is red, and the time to the next change (s)."""
+    offset, cycle, red = (view.world.episode[f"signal_{name}"] for name in _SAID)
+    phase = torch.remainder(view.task.simulator.time(view.state) - offset, cycle)
+    now = phase >= cycle - red
+    until = torch.where(now, cycle - phase, cycle - red - phase)
+    return view.own(now.to(phase.dtype)), view.own(until)
+
+
+def _red(view: AgentView) -> Tensor:
+    """Return 1 where the signal is red."""
+    return view.once(_signal)[0]
+
+
+def _until(view: AgentView) -> Tensor:
+    """Return the time to the signal's next change (s)."""
+    return view.once(_signal)[1]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ApproachTask(OpenLanesTask):
+    """The last 500 m before a signal with a fixed cycle, and 100 m behind it; a third of the vehicles are agents.
+
+    Vehicles come in platoons, as from a signal upstream with the same cycle. Episodes begin at any phase of it. After
+    the tasks of eco-driving at signals of IntersectionZoo (Jayawardana et al. 2024, arXiv 2410.15221), on one approach.
+    Who comes, goes and acts is as in the other open tasks.
+
+    Observation: as there; before the nearest vehicles the way to the signal (m), 1 if it is red, and the time to its
+    next change (s). Reward, the same for all agents: minus the delay of all in this step, and minus what all burn (mL,
+    Kamal's fuel) times ``fuel_weight``: ``−Δt (Σ (1 − min(v/v0, 1)) + queued + w Σ F)``.
+
+    Args:
+        lanes_count: Number of lanes, from 1 to 3.
+        inflow: Vehicles an hour on all lanes together.
+        cycle: Time from one green to the next (s).
+        green: Time of a cycle for which it is green (s).
+        platoon: Share of a cycle in which vehicles come; 1 is no platoons.
+        fuel_weight: What a millilitre costs (vehicle-seconds).
+    """
+
+    name: ClassVar[str] = "approach"
+    ranges: ClassVar[Mapping[str, Range]] = {
+        "lanes_count": Range(1, 3, whole=True),
+        "cycle": Range(10.0, 600.0, "s"),
+        "green": Range(1.0, 600.0, "s"),
+        "platoon": Range(0.1, 1.0),
+        "fuel_weight": Range(0.0, 1e3, "vehicle-seconds"),
+    }
+
+    controlled: int | float | str | tuple[int, ...] = 1.0 / 3.0  # type: ignore[assignment]
+    entry_speed: float = 14.0
+    lanes_count: int = 2
+    inflow: float = 1200.0
+    cycle: float = 60.0
+    green: float = 30.0
+    platoon: float = 0.5
+    fuel_weight: float = 0.6
+
+    def __post_init__(self) -> None:
+        if self.green > self.cycle:
+            raise ValueError(f"green = {self.green:g} s must not exceed the cycle of {self.cycle:g} s.")
+        super().__post_init__()
+
+    @property
+    def own_effects(self) -> tuple[Effect, ...]:  # type: ignore[override]
+        """Those of the open tasks; on one lane nobody changes."""
+        return super().own_effects if self.lanes_count > 1 else (IDM(), Brakes())
+
+    @property
+    def own_parameters(self) -> Mapping[str, Mapping[str, float]]:  # type: ignore[override]
+        """Drivers of a town, and the signal."""
+        known = super().own_parameters
+        signal = {"place": LINE, "cycle": self.cycle, "red": self.cycle - self.green}
+        return {**known, "idm": {**known["idm"], "desired_speed": 15.0}, "signal": signal}
+
+    @cached_property
+    def road(self) -> Lanes:  # type: ignore[override]
+        """The road."""
+        return Lanes(self.lanes_count, length=LENGTH)
+
+    @cached_property
+    def rules(self) -> tuple[Effect, ...]:
+        """What the road tells its drivers."""
+        return (*super().rules, Signal())
+
+    @cached_property
+    def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
+        return {("signal", "offset"): (0.0, self.cycle), **super()._ranges}
+
+    @property
+    def inflows(self) -> Mapping[int, float]:
+        """The same for each lane."""
+        return dict.fromkeys(range(self.lanes_count), self.inflow / self.lanes_count)
+
+    @property
+    def filled(self) -> float:
+        """Up to where vehicles are when an episode begins (m)."""
+        return 300.0
+
+    def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
+        """Return trips of which those of a cycle come in its first part, at a rhythm that every later trip keeps."""
+        given = super()._trips(draw, dtype)
+        if self.table is not None:
+            return given
+        begun = (given.departs / self.cycle).floor() * self.cycle
+        departs = begun + self.platoon * (given.departs - begun)
+        return given._replace(departs=departs, again=(given.again / self.cycle).ceil() * self.cycle)
+
+    def begin(self, draw: Draw, params: Params) -> World:
+        """As in the other open tasks, with what the signal does in these episodes."""
+        world = super().begin(draw, params)
+        speed = world.state.speed
+        said = {
+            f"signal_{name}": params["signal"][name].detach().to(speed.dtype).expand_as(speed).contiguous()
+            for name in _SAID
+        }
+        return world._replace(episode={**world.episode, **said})
+
+    @property
+    def features_of_self(self) -> tuple[Feature, ...]:
+        """As in the other open tasks; then the signal."""
+        return (
+            *super().features_of_self,
+            Feature("line", "", "m", 100.0, 0.0, LINE, _line),
+            Feature("red", "", "", 1.0, 0.0, 1.0, _red),
+            Feature("until", "", "s", 10.0, 0.0, 3600.0, _until),
+        )
+
+    @property
+    def own_pay(self) -> Pay:
+        """At most everybody who is due stands, and burns all that can be burnt."""
+        return Pay(-self._most * self.simulator.dt * (1.0 + self.fuel_weight * _MOST_FUEL), 0.0)
+
+    def burnt(self, state: State) -> Tensor:
+        """Return what all on the road burn (mL/s)."""
+        assert state.present is not None
+        return (fuel(state.speed, state.accel).clamp(0.0, _MOST_FUEL) * state.present).sum(-1)
+
+    def delay(self, world: World) -> Tensor:
+        """Return how many vehicles' time is lost, fuel reckoned as time."""
+        return super().delay(world) + self.fuel_weight * self.burnt(world.state)
+
+
+__all__ = ["LINE", "ApproachTask"]
