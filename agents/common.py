@@ -321,6 +321,7 @@ def begin(arguments: Arguments, agent: str, **made: Any) -> tuple[Policy, dict[s
                 )
         return policy, content["training"]
     policy = Policy(len(task.bounds.names), arguments.hidden, **made)
+    policy.starts_with(task.as_driver)
     observations, actions = human_driving(arguments.trained_in, first_seed(arguments.seed, 0))
     policy.mean.copy_(observations.mean(0))
     policy.scale.copy_(observations.std(0).clamp_min(1e-3))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -68,6 +69,14 @@ class Policy(nn.Module):
             # A policy begins by commanding almost nothing.
             last.weight.mul_(0.01)
             last.bias.zero_()
+
+    def starts_with(self, action: float) -> None:
+        """Begin by an action that is almost the same whatever is observed: that of the driver, where a task has one."""
+        last = self.body[-1]
+        assert isinstance(last, nn.Linear)
+        inner = min(action, 0.99)
+        with torch.no_grad():
+            last.bias.fill_(math.atanh(inner) if self.made["squash"] == "tanh" else inner)
 
     @property
     def remembers(self) -> bool:

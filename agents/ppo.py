@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import RolloutBufferSamples
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
@@ -188,6 +188,10 @@ def present_in(task: Task) -> int | None:
     return names.index("present") if "present" in names else None
 
 
+_DRAWS = 100
+"""Draws of a batch before SAC takes what it finds."""
+
+
 class OnTheRoad(RolloutBuffer):
     """PPO's samples, of which those count whose agent is on the road: its observation's ``present`` is above 0."""
 
@@ -201,6 +205,42 @@ class OnTheRoad(RolloutBuffer):
             there = samples.observations[:, self.present] > 0.0
             if int(there.sum()) > 1:
                 yield RolloutBufferSamples(*(part[there] for part in samples))
+
+
+class RoadReplay(ReplayBuffer):
+    """SAC's memory, of which those samples are drawn whose agent was on the road."""
+
+    def __init__(self, *given: Any, present: int, **keywords: Any) -> None:
+        self.present = present
+        super().__init__(*given, **keywords)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """Draw until so many are found; whoever is away at all draws of a memory that holds nobody else is taken."""
+        parts, found = [], 0
+        for _ in range(_DRAWS):
+            drawn = super().sample(batch_size, env)
+            there = drawn.observations[:, self.present] > 0.0
+            parts.append([None if x is None else x[there] for x in drawn])
+            found += int(there.sum())
+            if found >= batch_size:
+                columns = zip(*parts, strict=True)
+                return ReplayBufferSamples(*(None if x[0] is None else torch.cat(x)[:batch_size] for x in columns))
+        return drawn
+
+
+class RoadRewards(VecNormalize):
+    """Rewards over the running deviation of returns, of agents that are on the road."""
+
+    def __init__(self, vector: VecEnv, present: int | None, gamma: float) -> None:
+        super().__init__(vector, norm_obs=False, gamma=gamma)
+        self._present = present
+
+    def _update_reward(self, reward: np.ndarray) -> None:
+        """Count the returns of those who are there after a step."""
+        self.returns = self.returns * self.gamma + reward
+        there = ... if self._present is None else self.old_obs[:, self._present] > 0.0  # type: ignore[index]
+        if np.size(self.returns[there]):
+            self.ret_rms.update(self.returns[there])
 
 
 def make_model(arguments: Arguments, env: VecEnv, policy: Policy, present: int | None = None) -> BaseAlgorithm:
@@ -217,6 +257,8 @@ def make_model(arguments: Arguments, env: VecEnv, policy: Policy, present: int |
     }  # fmt: skip
     entropy: Any = arguments.ent_coef if arguments.ent_coef.startswith("auto") else float(arguments.ent_coef)
     if arguments.algorithm == "sac":
+        if present is not None:
+            same |= {"replay_buffer_class": RoadReplay, "replay_buffer_kwargs": {"present": present}}
         return SAC(
             "MlpPolicy", env, policy_kwargs=net, ent_coef=entropy, gradient_steps=arguments.gradient_steps,
             learning_starts=arguments.learning_starts, **same,
@@ -319,11 +361,11 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     alone = len(made.task.agents) == 1 and present is None
     vector = (Desynchronised if alone else Shared)(made, arguments.hold)
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
-    env = VecNormalize(vector, norm_obs=False, gamma=arguments.gamma)
+    env = RoadRewards(vector, present, arguments.gamma)
     file, model = arguments.out / "learner.pt", make_model(arguments, env, policy, present)
     if saved:
         storage.read(file, lambda path: goes_on(model, env, torch.load(path, weights_only=True)), storage.AFRESH)
-    elif arguments.clone:
+    elif arguments.clone or made.task.as_driver:
         for mine, other in layers(model, policy):
             other.load_state_dict(mine.state_dict())
     chunk = arguments.n_steps * vector.num_envs

@@ -234,6 +234,11 @@ class Task(abc.ABC):
         return 0
 
     @property
+    def as_driver(self) -> float:
+        """Action by which a vehicle does as its driver would; 0 where there is none, and 0 commands 0 m/s²."""
+        return 0.0
+
+    @property
     def commands(self) -> tuple[str, ...]:
         """What an agent commands: an action holds the first of all agents, then the second of all, and so on."""
         return ("accel",)

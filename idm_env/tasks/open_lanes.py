@@ -218,6 +218,12 @@ class OpenLanesTask(LanesTask):
         return values
 
     @property
+    def as_driver(self) -> float:
+        """A careful command of the driver's own maximum, which never holds him back."""
+        most = self.params(torch.float64, "cpu")[self.simulator.base.name].get("max_accel")
+        return min(1.0, float(most.max()) / self.command_limits[1]) if self.careful and most is not None else 0.0
+
+    @property
     def usual_steps(self) -> int:
         """Those of 600 s."""
         return round(600.0 / self._behaviour.dt)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -145,3 +146,36 @@ def test_ppo_learns_one_policy_for_all_agents_of_an_environment(quick, monkeypat
     assert [row["steps"] for row in history] == [0, 20, 40]
     policy, _ = common.load(quick["out"] / "last.pt")
     assert all(bool(torch.isfinite(x).all()) for x in policy.parameters())
+
+
+@pytest.mark.parametrize("squash", ["tanh", "clip"])
+def test_a_new_policy_does_as_the_driver_where_a_task_has_such_an_action(monkeypatch, squash):
+    """Training begins at humans: the same return in the same episodes."""
+    monkeypatch.setattr(evaluate, "STEPS_OF_LANES", 600)
+    chosen = {"task": "merge", "vehicles": 30}
+    task = task_of(chosen)
+    policy = Policy(len(task.bounds.names), squash=squash)
+    policy.starts_with(task.as_driver)
+    policy.scale.copy_(torch.full_like(policy.scale, 30.0))
+    humans, new = (evaluate.evaluate_lanes(act, chosen, 2)["rewards"] for act in (None, policy))
+    torch.testing.assert_close(torch.tensor(new), torch.tensor(humans), rtol=2e-3, atol=0)
+    assert task_of({**chosen, "careful": False}).as_driver == 0.0
+
+
+def test_sac_draws_nobody_who_is_away_and_rewards_are_scaled_by_those_who_are_there():
+    """Of a memory in which one of four samples was on the road, and of returns that are huge where nobody is."""
+    space = gymnasium.spaces.Box(-10.0, 10.0, (2,), np.float32)
+    memory = ppo.RoadReplay(40, space, gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32), n_envs=4, present=1)
+    for step in range(10):
+        seen = np.array([[step, float(i == 0)] for i in range(4)], np.float32)
+        memory.add(seen, seen, np.zeros((4, 1)), np.zeros(4), np.zeros(4), [{}] * 4)
+    drawn = memory.sample(64)
+    assert drawn.observations.shape == (64, 2) and bool((drawn.observations[:, 1] > 0).all())
+    made = make_env({"task": "merge", "vehicles": 12, "controlled": 3}, 2, output="numpy")
+    env = ppo.RoadRewards(ppo.Shared(made), ppo.present_in(made.task), 0.9)
+    env.reset()
+    env.old_obs = np.zeros((6, len(made.task.bounds.names)), np.float32)
+    env.old_obs[:2, ppo.present_in(made.task)] = 1.0
+    before = env.ret_rms.count
+    env._update_reward(np.array([1.0, 3.0, 1e6, 1e6, 1e6, 1e6]))
+    assert env.ret_rms.count - before == pytest.approx(2.0) and env.ret_rms.mean == pytest.approx(2.0, rel=1e-3)
