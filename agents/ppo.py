@@ -216,15 +216,16 @@ class RoadReplay(ReplayBuffer):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw until so many are found; whoever is away at all draws of a memory that holds nobody else is taken."""
-        parts, found = [], 0
+        parts, found = list[list[Any]](), 0
         for _ in range(_DRAWS):
             drawn = super().sample(batch_size, env)
             there = drawn.observations[:, self.present] > 0.0
             parts.append([None if x is None else x[there] for x in drawn])
             found += int(there.sum())
             if found >= batch_size:
-                columns = zip(*parts, strict=True)
-                return ReplayBufferSamples(*(None if x[0] is None else torch.cat(x)[:batch_size] for x in columns))
+                columns: Any = zip(*parts, strict=True)
+                cut: list[Any] = [None if x[0] is None else torch.cat(x)[:batch_size] for x in columns]
+                return ReplayBufferSamples(*cut)
         return drawn
 
 
