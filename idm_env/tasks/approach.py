@@ -14,7 +14,7 @@ from idm_env.effects import IDM, Brakes, Effect, Signal
 from idm_env.metrics import fuel
 from idm_env.roads import Lanes
 from idm_env.tasks.base import Pay, World
-from idm_env.tasks.checks import Range
+from idm_env.tasks.checks import Range, in_ranges
 from idm_env.tasks.features import AgentView, Feature
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.tasks.random import Draw
@@ -91,6 +91,7 @@ class ApproachTask(OpenLanesTask):
     fuel_weight: float = 0.6
 
     def __post_init__(self) -> None:
+        in_ranges(self)
         if self.green > self.cycle:
             raise ValueError(f"green = {self.green:g} s must not exceed the cycle of {self.cycle:g} s.")
         super().__post_init__()
@@ -136,8 +137,9 @@ class ApproachTask(OpenLanesTask):
         given = super()._trips(draw, dtype)
         if self.table is not None:
             return given
-        begun = (given.departs / self.cycle).floor() * self.cycle
-        departs = begun + self.platoon * (given.departs - begun)
+        first = self.filled / self.entry_speed  # so long before an episode the first platoon begins
+        begun = ((given.departs + first) / self.cycle).floor() * self.cycle
+        departs = begun + self.platoon * (given.departs + first - begun) - first
         return given._replace(departs=departs, again=(given.again / self.cycle).ceil() * self.cycle)
 
     def begin(self, draw: Draw, params: Params) -> World:

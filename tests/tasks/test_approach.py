@@ -54,7 +54,7 @@ def test_vehicles_come_in_platoons(platoon: float) -> None:
     trips = worlds[0].state.trips
     some = trips.again.isfinite()
     assert torch.allclose(trips.again[some].remainder(60.0), torch.zeros(()).double())
-    departs = trips.departs[some].remainder(60.0)
+    departs = (trips.departs[some] + 300.0 / 14.0).remainder(60.0)
     assert bool((departs <= 60.0 * platoon + 1e-9).all()) and float(departs.max()) > 50.0 * platoon
 
 
