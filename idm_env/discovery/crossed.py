@@ -111,7 +111,7 @@ def crossed(
     short = windows(records)
     task = Task(short, noise.alike(len(short)), first_prior(own))
     ahead = _predicted(task, model, values, fold, thetas)
-    if whitened or (whitened is None and not pooled):
+    if whitened is not False and not pooled:
         other = _predicted(task, model, values, fold, _whitened(task, model, values, fold, theta))
         left = [_loss(np.bincount(short.group, x**2)[np.unique(short.group)]) ** 0.25 for x in (ahead, other)]
         whitened = bool(whitened or left[1] < CLEARLY * left[0])

@@ -334,6 +334,7 @@ def _finish(
         of_law = own(judgement.law.model, null.values, None)[0]
         first_words = words.law_first(judgement.law, null.model.catalogue.base.title, of_law)
         report["sentence"] = f"{first_words} {report['sentence']}"
+    report["details"] += words.by_use(laws, judgement.law)
     report["details"] += words.cautions(report["data"]["at_bounds"], len(np.unique(prepared.group)))
     # Drivers who adapt are calibrated on parts of the held-out runs too.
     seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in (prepared if adapt else fit_records).episodes])

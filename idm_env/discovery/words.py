@@ -317,6 +317,24 @@ def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
     )
 
 
+def by_use(laws: Sequence[Law], chosen: Law | None) -> list[str]:
+    """Say of every error which law is best for it, where that is another one and better beyond chance."""
+    told = []
+    for key, (name, _) in ERRORS.items():
+        better = [law for law in laws if key in law.against and law.against[key].light is Light.BETTER]
+        best = min(better, key=lambda law: law.against[key].ratio, default=None)
+        if best is None or best is chosen:
+            continue
+        worse = [ERRORS[k][0] for k, c in best.against.items() if c.light is Light.WORSE]
+        but = f"; {' and '.join(worse)} worse" if worse else ""
+        title, c = best.title, best.against[key]
+        told.append(
+            f"{title[:1].upper()}{title[1:]} errs least in the {name}: {percent(c.ratio)} "
+            f"(95 %: {percent(c.low)} to {percent(c.high)}){but}."
+        )
+    return told
+
+
 def _of_drivers(drivers: Solution) -> list[str]:
     """Return the strengths that are each driver's own: median and the range of 80 % of the drivers."""
     catalogue, theta = drivers.model.catalogue, np.exp(drivers.theta[np.unique(drivers.row_group)])

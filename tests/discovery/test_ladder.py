@@ -75,5 +75,6 @@ def test_nothing_is_not_said_of_an_effect_without_a_name(monkeypatch: pytest.Mon
     found = discover(made, effects=["drag"])
     told = found.report["ladder"]
     assert found.verdict is Verdict.UNEXPLAINED, found.report["sentence"]
+    assert told["rungs_m"]["one set of parameters for all"] > 2.0 * told["rungs_m"]["parameters of every driver"]
     assert told["structure"]["low"] > 0.0 and told["rungs_m"]["sensors alone"] < 0.1
     assert "smooth function of the scene" in found.report["sentence"]

@@ -75,6 +75,10 @@ def test_a_law_is_better_where_an_error_is_lower_beyond_chance() -> None:
     assert best_of([null, gipps, law(BETTER, BETTER, SAME)]).mean_ratio == pytest.approx((0.9 * 0.9 * 0.99) ** (1 / 3))
     assert best_of([null, law(SAME, SAME, SAME)]) is null
     judgement = Judgement(None, None, False, Refusal(Reason.NO_GAIN), None, None, 0)  # type: ignore[arg-type]
+    soon = law(WORSE, replace(BETTER, ratio=0.7), SAME)
+    (told,) = words.by_use([null, gipps, soon], gipps)
+    assert told.startswith("Gipps' model errs least in the gap 5 s ahead: −30.0") and "free simulation worse." in told
+    assert words.by_use([null, gipps], gipps) == words.by_use([null], None) == []
     first = judgement.beside(gipps)
     assert first.law is gipps and first.refusal == Refusal(Reason.LAW) and judgement.beside(null) is judgement
     told = words.law_first(gipps, "IDM")
