@@ -701,8 +701,9 @@ def picture(out: Path, seeds: Sequence[int], path: Path) -> None:
             rows = shown(out, f"{task}-{agent}", seeds)
             if rows:
                 curve(axes, rows, agent.upper(), colour)
-        axes.set(title=title, xscale="log", xlabel="CPU seconds of training", ylim=(-0.03, 1.03))
-        axes.legend(frameon=False)
+        axes.set(title=title, xscale="log", xlabel="CPU seconds of training", ylim=(-0.03, 1.4))
+        axes.set_yticks([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
+        axes.legend(frameon=False, loc="upper left")  # above all curves
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("share of seeds not solved yet")
     figure.savefig(path, dpi=110)
