@@ -82,6 +82,7 @@ CASES = {
         },
     ),
     "bottleneck": ("bottleneck", {"vehicles": 14, "controlled": 2, "hold": 0.1, "noise": 0.1}),
+    "approach": ("approach", {"vehicles": 14, "controlled": 2, "hold": 0.1, "max_episode_steps": 30}),
     "replay_lanes": (
         "replay_lanes",
         {"controlled": 2, "lane_changes": "drivers", "lane_commands": True, "max_episode_steps": 20},
