@@ -6,17 +6,15 @@ Shapes: what belongs to vehicles is ``[..., n]``; slots are indices into the las
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from idm_env.roads.adjacent import Preference, Side, Sideways
+from idm_env.roads.layout import LaneLayout
 from idm_env.roads.order import Order, laps
 from idm_env.types import FAR, Links, Motion, Moving, Neighbour, State
-
-if TYPE_CHECKING:
-    from idm_env.roads.lanes import Lanes
 
 
 class Claim(NamedTuple):
@@ -93,7 +91,7 @@ class _Look(torch.autograd.Function):
 class Linked(Sideways):
     """Lanes as they are in one state: neighbours by its links; ends of lanes and who is leaving merged into leaders."""
 
-    road: Lanes
+    road: LaneLayout
     links_now: Links
     position: Tensor
     shadow: Tensor | None = None
