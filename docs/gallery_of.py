@@ -83,6 +83,13 @@ axes.plot([float(line.rsplit(" ", 1)[1]) for line in lines], "o-", label="gradie
 axes.axhline(float(human) / 1000, color="black", lw=0.8, label="human drivers")
 axes.set(xlabel="update", ylabel="mean reward of a step"), axes.legend()
 """,
+    "train_approach": """
+_, (left, right) = plt.subplots(1, 2, figsize=(7, 2.8), layout="constrained")
+for name, (paid, burnt, _) in found.items():
+    left.plot(np.sort(paid[0] - found["humans"][0][0]), label=name), right.plot(np.sort(burnt[0]), label=name)
+left.set(xlabel="fresh episode, sorted", ylabel="vehicle-hours more than humans"), left.legend()
+right.set(xlabel="fresh episode, sorted", ylabel="kg of CO2 in 600 s")
+""",
     "train_pettingzoo": """
 observations, _ = env.reset(seed=1)
 earned = []

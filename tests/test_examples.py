@@ -14,9 +14,12 @@ EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"
 NEEDS = {
     "train_rllib": {"tree": "RLlib pins another gymnasium and has an environment of its own: make rllib"},
     "export_minari": {"minari": "minari is not installed (pip install 'minari[create,hdf5]')"},
+    "train_approach": {"cma": "cma is not installed (pip install cma)"},
     "tune_an_agent": {"ray": "ray is not installed (pip install 'idm-env[ray]')"},
 }
 """Modules without which an example is left out, and what to do."""
+SHORTER = {"train_approach": ("1", "2")}
+"""Arguments of an example that takes minutes: turns, and episodes that judge."""
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
@@ -26,6 +29,8 @@ def test_example(path: Path, tmp_path: Path) -> None:
         if importlib.util.find_spec(module) is None:
             warnings.warn(f"{path.name} is not run: {why}", stacklevel=1)
             pytest.skip(why)
-    done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, str(path), *SHORTER.get(path.stem, ())], capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip()
