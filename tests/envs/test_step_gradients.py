@@ -166,7 +166,7 @@ def test_gradients_are_those_of_the_torch_path_and_of_differences(case):
                 for sign in (1.0, -1.0)
             ]
             slope = float((ends[0] - ends[1]) / 2e-6)
-            assert slope == pytest.approx(float((g * towards).sum()), rel=1e-5, abs=1e-5)
+            assert slope == pytest.approx(float((g * towards).sum()), rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("case", ["agents", "replay"])
