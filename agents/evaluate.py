@@ -275,10 +275,10 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
         lost += dt * task.delay(world)
         spent += dt * there.sum(-1)
         stood += dt * (there & (state.speed < 0.5)).sum(-1)
-        infos = task.told(world)
+        infos = task.info(world)
         burnt += dt * infos["co2"][:, 0]
         waited += dt * infos["queued"][:, 0]
-    told = task.told(world)
+    told = task.info(world)
     hourly, left = 3600.0 / (steps * dt), told["outflow"][:, 0].double()
     columns = {
         "reward": -lost, "outflow": left * hourly, "ramp": told["ramp"][:, 0].double() * hourly,

@@ -21,7 +21,7 @@ from agents.environments import first_seed, human_driving, task_of
 from agents.evaluate import STEPS, evaluate_ring, judge_ring, score
 from agents.policy import Policy
 from agents.rollout import FRESH, LENGTHS, Act, Driven, Start, drive, ring_start, uniform_speed
-from idm_env.tasks import Task, World
+from idm_env.tasks import EnvState, Task
 from idm_env.tasks.failsafe import safe_accel
 
 ROWS_AT_ONCE = 192
@@ -161,7 +161,7 @@ def repeated(start: Start, times: int) -> Start:
     state = start.world.state
     fields: Any = {k: many(x) for k, x in state._asdict().items() if isinstance(x, Tensor)}
     memory = {name: many(x) for name, x in state.memory.items()}
-    world = World(state._replace(**fields, memory=memory), {k: many(x) for k, x in start.world.episode.items()})
+    world = EnvState(state._replace(**fields, memory=memory), {k: many(x) for k, x in start.world.episode.items()})
     return start._replace(world=world, seeds=start.seeds * times)
 
 

@@ -16,7 +16,7 @@ from idm_env.effects.idm import equilibrium_gap
 from idm_env.envs.batch import Batch
 from idm_env.envs.settings import settings
 from idm_env.simulator import stacked
-from idm_env.tasks import Draw, Task, World
+from idm_env.tasks import Draw, EnvState, Task
 from idm_env.types import Params
 
 LENGTHS = (220.0, 230.0, 240.0, 250.0, 260.0, 270.0)
@@ -49,7 +49,7 @@ class Start(NamedTuple):
     """A task with the worlds in which its evaluation begins."""
 
     task: Task
-    world: World
+    world: EnvState
     seeds: tuple[int, ...]
     params: Params
 
@@ -62,10 +62,10 @@ class Start(NamedTuple):
 class Moment(NamedTuple):
     """A step of a rollout: the worlds before and after it, actions and what they command (None of human drivers)."""
 
-    before: World
+    before: EnvState
     action: Tensor | None
     command: Tensor | None
-    after: World
+    after: EnvState
 
 
 def begun(act: Act | None) -> Act | None:
@@ -89,7 +89,7 @@ def moments(start: Start, act: Act | None, steps: int) -> Iterator[Moment]:
         world = after
 
 
-def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[World, Tensor | None, World]]:
+def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[EnvState, Tensor | None, EnvState]]:
     """Roll a policy out with its actions held; yield, of every Δt, the worlds of its decision and after it, and action.
 
     Without a failsafe, which looks at every Δt, and drivers' noise what lies between two decisions is one compiled
@@ -110,14 +110,14 @@ def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[Wo
                 for t in range(count):
                     now = {name: x[t] for name, x in normals.items()}
                     given = None if command is None else task.limit(world, command)
-                    inputs = task.wishes(task.inputs(world, given, now, live), action, live)
-                    driven = task.driven(world.episode, params)
+                    inputs = task.with_lane_commands(task.inputs(world, given, now, live), action, live)
+                    driven = task.episode_params(world.episode, params)
                     world = world._replace(state=task.simulator.advance(world.state, inputs, driven))
                     yield before, action, world
                 continue
-            inputs = task.wishes(task.inputs(world, command, None, live), action, live)
+            inputs = task.with_lane_commands(task.inputs(world, command, None, live), action, live)
             repeated: dict[str, Any] = {name: _repeated(x, count) for name, x in inputs.items()}
-            driven = task.driven(world.episode, params)
+            driven = task.episode_params(world.episode, params)
             state, kept = task.simulator.rollout(world.state, repeated, driven, count)
             for t in range(count):
                 motion: dict[str, Any] = {name: x[t] for name, x in kept._asdict().items()}
@@ -176,7 +176,7 @@ def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws
         k: torch.cat([getattr(s, k) for s in states]) for k in ("position", "speed", "accel", "gap", "length", "step")
     }
     episode = {name: torch.cat([e[name] for e in episodes]) for name in episodes[0]}
-    world = World(states[0]._replace(**columns, memory=memory), episode)
+    world = EnvState(states[0]._replace(**columns, memory=memory), episode)
     return Start(task, world, tuple(seeds), params)
 
 
@@ -195,7 +195,7 @@ def uniform_speed(start: Start) -> Tensor:
 
     Solves ``Σ (s0 + v T)/√(1 − (v/v0)^4) = L − Σ l`` by bisection; drivers may differ.
     """
-    p = start.task.driven(start.world.episode, start.params)["idm"]
+    p = start.task.episode_params(start.world.episode, start.params)["idm"]
     driver = start.task.simulator.base.driver(dict(p))
     free = start.world.state.gap.sum(-1)
     low, high = torch.zeros_like(free), torch.full_like(free, 0.95) * p["desired_speed"].min()

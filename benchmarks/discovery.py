@@ -155,7 +155,7 @@ def oracle(found: Any, truth: Any) -> float | None:
     from idm_env.discovery import crossed
     from idm_env.discovery import model as terms
 
-    model, values = terms.Model(), []
+    model, values = terms.Hypothesis(), []
     for name, strength in truth.effects.items():
         if name == "grade":
             place = found.records.signals[:, 18]
@@ -171,7 +171,7 @@ def oracle(found: Any, truth: Any) -> float | None:
             values += (hidden.dips(first + distance * np.arange(count), strength) - 1.0).tolist()
         elif name == "curve_speed":
             term = terms.given_profile(found.final.model.catalogue.by_name[name])
-            model, values = terms.Model(model.terms, found.final.model.catalogue), [*values, strength]
+            model, values = terms.Hypothesis(model.terms, found.final.model.catalogue), [*values, strength]
         elif name == "speed_zone":
             term = terms.placed("speed_zone", strength, *hidden.ZONE_M)
             values += [strength, *hidden.ZONE_M]

@@ -129,7 +129,7 @@ def _faces(name: str) -> list[str]:
         "## Action", "",
         f"Per agent: {actions} in [−1, 1]; −1 and 1 command {low:g} and {high:g} m/s².", "",
         "## Reward", "",
-        f"A step without a crash pays between {task.pay.low:g} and {task.pay.high:g}. A crash costs "
+        f"A step without a crash pays between {task.reward_range.low:g} and {task.reward_range.high:g}. A crash costs "
         f"{task.cost_of_crash:g} by default.", "",
         *_returns(name),
         "## Ends", "",

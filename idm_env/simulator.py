@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from idm_env import backends, compat, parameters
 from idm_env.multilane import before
-from idm_env.step import INTEGRATORS, Integration, Stepping, ballistic, euler, half_ahead, normals
+from idm_env.step import INTEGRATORS, CarFollowingStep, Integration, ballistic, euler, half_ahead, normals
 from idm_env.types import Inputs, Params, State, mapped
 
 
@@ -32,10 +32,10 @@ def _kept(state: State) -> Trajectory:
 
 
 @dataclass(frozen=True)
-class Simulator(Stepping):
+class Simulator(CarFollowingStep):
     """A road, a tuple of effects and a time step (s): the static half of a traffic model.
 
-    ``Stepping`` says what happens in one step. ``rollout`` repeats it.
+    ``CarFollowingStep`` says what happens in one step. ``rollout`` repeats it.
     """
 
     kernels: ClassVar[bool] = True
@@ -45,7 +45,7 @@ class Simulator(Stepping):
         """Return the state Δt later. Pure: the same arguments give the same result, with or without a graph.
 
         Where a road has several lanes, vehicles enter, leave and change lanes first (``multilane.before``); then all
-        drive on (``Stepping.step``). ``inputs`` maps effect names to what they take at this step; ``params`` maps
+        drive on (``CarFollowingStep.step``). ``inputs`` maps effect names to what they take at this step, ``params``
         effect and parameter names to tensors that broadcast against ``(..., vehicles)``.
         """
         return super().step(before(self, state, inputs, params), inputs, params)

@@ -27,11 +27,11 @@ from idm_env.roads.base import Road
 from idm_env.types import FAR, Driver, Inputs, Motion, Neighbour, Params, PastScenes, Scene, State
 
 Integration = Literal["ballistic", "euler", "midpoint"]
-S = TypeVar("S", bound="Stepping")
+S = TypeVar("S", bound="CarFollowingStep")
 
 
 @dataclass(frozen=True)
-class Stepping:
+class CarFollowingStep:
     """A road, a tuple of effects and a time step (s): all of a simulator that is one step.
 
     One step is: scene of the road → perceive → adapt → Σ accelerate → limit → integrate → place → gaps. It knows

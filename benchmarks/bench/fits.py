@@ -154,7 +154,7 @@ def discovery() -> dict[str, Any]:
 
     def jacobian(name: str) -> Case:
         term = model.simple(name)
-        return Case(lambda: linearise(task, model.Model((term,)), theta, np.array(term.starts[0])))
+        return Case(lambda: linearise(task, model.Hypothesis((term,)), theta, np.array(term.starts[0])))
 
     times = measure({n: jacobian(n) for n in CANDIDATES if ALL[n].sought == "anywhere"}, 3)
     begin = time.process_time()

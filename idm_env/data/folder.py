@@ -17,7 +17,7 @@ _FILE = "idm_env_file"
 
 
 @dataclass(frozen=True)
-class Share:
+class FolderSlice:
     """Some whole runs of a folder (all: none named), the files that hold their rows, and how many vehicles."""
 
     folder: Path
@@ -43,7 +43,7 @@ class Share:
             raise _unreadable(self.folder, error) from error
 
 
-def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[Share]:
+def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[FolderSlice]:
     """Return the folder's runs, in the order of their names, in shares of about so many ``vehicles``.
 
     Only the columns of identifiers are read, in pieces. A run is never divided: whoever drives in it may be somebody's
@@ -59,7 +59,7 @@ def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[Share]:
         tidy.check(names, folder.name)
         check_columns(tidy.converted(names), folder.name)
         if "run_id" not in names:
-            return [Share(folder, tuple(files), (), 0, columns)]
+            return [FolderSlice(folder, tuple(files), (), 0, columns)]
         scan = scan.filter(pl.col("vehicle_id").is_not_null())
         keys = scan.select(_run().alias("run_id"), "vehicle_id", _FILE).group_by("run_id", _FILE)
         found = keys.agg(pl.col("vehicle_id").unique()).collect(engine="streaming")
@@ -69,15 +69,15 @@ def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[Share]:
     runs = found.group_by("run_id").agg(
         pl.col("vehicle_id").explode().n_unique().alias("vehicles"), pl.col(_FILE).sort()
     )
-    cut: list[Share] = []
+    cut: list[FolderSlice] = []
     for run, count, where in runs.sort(natural("run_id"), "run_id").select("run_id", "vehicles", _FILE).rows():
         if cut and cut[-1].vehicles + count <= vehicles:
             last = cut.pop()
             both = tuple(sorted({*last.files, *where}))
-            cut.append(Share(folder, both, (*last.runs, run), last.vehicles + count, columns))
+            cut.append(FolderSlice(folder, both, (*last.runs, run), last.vehicles + count, columns))
         else:
-            cut.append(Share(folder, tuple(where), (run,), count, columns))
-    return [replace(cut[0], runs=())] if len(cut) == 1 else cut or [Share(folder, tuple(files), (), 0, columns)]
+            cut.append(FolderSlice(folder, tuple(where), (run,), count, columns))
+    return [replace(cut[0], runs=())] if len(cut) == 1 else cut or [FolderSlice(folder, tuple(files), (), 0, columns)]
 
 
 def files_of(folder: Path) -> list[str]:

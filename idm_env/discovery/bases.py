@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from idm_env.discovery import model as terms
-from idm_env.discovery.compare import Comparison, Light, compare
+from idm_env.discovery.compare import Comparison, ErrorChange, compare
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.verdict import improves, mean_ratio
 from idm_env.effects import ALL, BASES, CarFollowing, base_named, make
 
@@ -25,7 +25,7 @@ class Law(NamedTuple):
     """A law alone: its model, its errors where it was not calibrated, and how these compare with the null's."""
 
     law: CarFollowing
-    model: Model
+    model: Hypothesis
     errors: Judged
     against: dict[str, Comparison]
     at_best: bool = False
@@ -51,7 +51,7 @@ class Law(NamedTuple):
         With more parameters of the drivers' own it must predict 5 s ahead better beyond chance: in closed loop these
         may only spread a driver's noise over more of them.
         """
-        if self.own and self.against["horizon_rmse_m"].light is not Light.BETTER:
+        if self.own and self.against["horizon_rmse_m"].light is not ErrorChange.BETTER:
             return False
         return not self.at_best and improves(self.against) and self.mean_ratio < 1.0 - LEAST
 
@@ -62,7 +62,7 @@ class Law(NamedTuple):
 
 
 def compared(
-    null: Model, first: Judged, judged: Callable[[Model], tuple[Judged, bool]], seed: int,
+    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], tuple[Judged, bool]], seed: int,
     on_law: Callable[[int, int, str], None],
 ) -> list[Law]:  # fmt: skip
     """Return all laws, that of the null first.
@@ -78,7 +78,7 @@ def compared(
     named = tuple(null.named)
     laws = [Law(own, null, first, {})]
     models = [
-        Model(null.terms, Catalogue(named, base_named(name), located=False)) for name in BASES if name != own.kind
+        Hypothesis(null.terms, Catalogue(named, base_named(name), located=False)) for name in BASES if name != own.kind
     ]
     models.append(personal(null))
     for i, model in enumerate(models):
@@ -89,14 +89,14 @@ def compared(
     return laws
 
 
-def personal(null: Model) -> Model:
+def personal(null: Hypothesis) -> Hypothesis:
     """Return the null with all effects whose strengths may be each driver's own."""
     given = {e.name for e in null.named}
     effects = tuple(make(name) for name, cls in ALL.items() if cls.per_driver and name not in given)
     own = Catalogue(
         (*null.named, *effects), null.catalogue.base, located=False, personal=tuple(e.name for e in effects)
     )
-    return Model((*null.terms, *(terms.personal(e) for e in effects)), own)
+    return Hypothesis((*null.terms, *(terms.personal(e) for e in effects)), own)
 
 
 def best_of(laws: Iterable[Law]) -> Law:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from idm_env.discovery import judge
-from idm_env.discovery.free import Stand, stand
+from idm_env.discovery.free import ClosedLoopFit, stand
 from idm_env.discovery.march import BASE
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, Rows
 from idm_env.discovery.solve import Prior, Solution
 from idm_env.parameters import Parameter
@@ -31,14 +31,14 @@ class Calibrated:
     ``prior`` is the population with its weight; ``stand`` has what every weight that was tried leaves.
     """
 
-    model: Model
+    model: Hypothesis
     values: np.ndarray
     theta: np.ndarray
     prior: Prior
-    stand: Stand
+    stand: ClosedLoopFit
 
 
-def calibrate(records: Records, model: Model, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
+def calibrate(records: Records, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
     """Calibrate a model in closed-loop simulation of ``records``, φ as it stands.
 
     1. Drivers one by one, with a prior that hardly weighs anything, from the law's usual values and ``start`` [G, P].

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from idm_env.data import Trajectories
 from idm_env.data.columns import with_step
 from idm_env.discovery import judge
-from idm_env.discovery.free import Stand
+from idm_env.discovery.free import ClosedLoopFit
 from idm_env.discovery.model import Frozen
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.solve import Solution, Task, solve
@@ -31,7 +31,7 @@ CORRECTED_S = 10.0
 LAGS_S = (5.0, 20.0)
 
 
-def told(at: Stand, kept: Records, null: Solution, left: np.ndarray) -> dict[str, float | None]:
+def told(at: ClosedLoopFit, kept: Records, null: Solution, left: np.ndarray) -> dict[str, float | None]:
     """Return the ceilings by name, None where these data have none.
 
     Args:
@@ -49,7 +49,7 @@ def told(at: Stand, kept: Records, null: Solution, left: np.ndarray) -> dict[str
     return {name: value if np.isfinite(value) else None for name, value in found.items()}
 
 
-def repeats(at: Stand) -> float:
+def repeats(at: ClosedLoopFit) -> float:
     """Return the share of the gap's squared error that repeats in matched situations of other runs.
 
     A situation is speed, time gap, closing speed and the leader's acceleration; the covariance of an error with the
@@ -76,7 +76,7 @@ def repeats(at: Stand) -> float:
     return float("nan") if square == 0.0 else float(np.clip(product / square, 0.0, 1.0))
 
 
-def between_halves(at: Stand) -> float:
+def between_halves(at: ClosedLoopFit) -> float:
     """Return the correlation, over drivers, of the logarithms of time gaps of both halves of their time."""
     seen = np.unique(at.task.rows.group)
     if len(seen) < FEWEST:

@@ -18,7 +18,7 @@ ERRORS = ("gap_rmse_m", "horizon_rmse_m", "speed_rmse_mps")
 """Errors that are compared: the gap in free simulation, the gap 5 s ahead, and the speed in free simulation."""
 
 
-class Light(str, Enum):
+class ErrorChange(str, Enum):
     """What the interval of an error's ratio says."""
 
     BETTER = "better"
@@ -44,11 +44,11 @@ class Comparison:
     driver: tuple[float, float, float] = (float("nan"), float("-inf"), float("inf"))
 
     @property
-    def light(self) -> Light:
+    def light(self) -> ErrorChange:
         """``worse`` where an interval lies above 1, of the pooled errors or of the followers' ratios; so ``better``."""
         if self.low > 1.0 or self.driver[1] > 1.0:
-            return Light.WORSE
-        return Light.BETTER if self.high < 1.0 or self.driver[2] < 1.0 else Light.SAME
+            return ErrorChange.WORSE
+        return ErrorChange.BETTER if self.high < 1.0 or self.driver[2] < 1.0 else ErrorChange.SAME
 
     @property
     def most_worse(self) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from idm_env.discovery import free, judge
 from idm_env.discovery.calibrate import first_prior, population
 from idm_env.discovery.free import GRID_S, further
-from idm_env.discovery.model import Frozen, Model
+from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Records, Rows, whole, windows
 from idm_env.discovery.score import without
@@ -66,7 +66,7 @@ def _loss(left: np.ndarray) -> float:
 
 
 def crossed(
-    records: Records, model: Model, values: np.ndarray, fold: np.ndarray, noise: Noise,
+    records: Records, model: Hypothesis, values: np.ndarray, fold: np.ndarray, noise: Noise,
     start: np.ndarray | None = None, pooled: bool = False, whitened: bool | None = None,
 ) -> judge.Judged:  # fmt: skip
     """Return a model's errors on all runs, each judged by what the other folds say.
@@ -119,7 +119,7 @@ def crossed(
     return judge.Judged(rows, gap, speed, ahead, short.record, bool(whitened))
 
 
-def at_best(records: Records, model: Model, values: np.ndarray) -> tuple[judge.Judged, np.ndarray]:
+def at_best(records: Records, model: Hypothesis, values: np.ndarray) -> tuple[judge.Judged, np.ndarray]:
     """Return a model's errors on the very data that it is fitted to, and log θ [G, P]; values [Q].
 
     With parameters that did not see what is judged its gaps err more: what is too much here needs no cross-fitting.
@@ -168,7 +168,7 @@ def _simulated(
 
 
 def _whitened(
-    task: Task, model: Model, values: np.ndarray, fold: np.ndarray, theta: np.ndarray
+    task: Task, model: Hypothesis, values: np.ndarray, fold: np.ndarray, theta: np.ndarray
 ) -> dict[int, np.ndarray]:
     """Return log θ [2, G, P] of every fold, from whitened predictions 5 s ahead of each half of the drivers' blocks."""
     # The window before the first of a block is in the other half.
@@ -188,7 +188,7 @@ def _whitened(
 
 
 def _predicted(
-    task: Task, model: Model, values: np.ndarray, fold: np.ndarray, thetas: dict[int, np.ndarray]
+    task: Task, model: Hypothesis, values: np.ndarray, fold: np.ndarray, thetas: dict[int, np.ndarray]
 ) -> np.ndarray:
     """Return errors of the gap 5 s ahead [windows] with log θ [2, G, P] of every fold, from the half not scored."""
     rows, ahead = task.rows, np.zeros(len(task.rows))

@@ -29,7 +29,7 @@ from idm_env.discovery import (
 )
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
-from idm_env.discovery.model import Model, Term
+from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
@@ -138,7 +138,7 @@ def discover(
     told = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
     given = [*own, *(terms.known_effect(term) for term in told)]
-    bare = Model(told, twin.Catalogue.of(given, prepared.period, law))
+    bare = Hypothesis(told, twin.Catalogue.of(given, prepared.period, law))
     searching = Search(task, names, located and effects is None, saved, progress, bare)
     progress("null", 0, 0, law.name)
     values = search.starting_values(bare)
@@ -268,7 +268,7 @@ def _finish(
 
     fold = crossed.folds_of(prepared.runs, kept_runs, seed)
 
-    def own(model: Model, values: np.ndarray, start: np.ndarray | None) -> tuple[Solution, judge.Judged | None]:
+    def own(model: Hypothesis, values: np.ndarray, start: np.ndarray | None) -> tuple[Solution, judge.Judged | None]:
         found = searching.calibrated(model, values, start)
         return calibrate.judged(found, fit_records, None if adapt else kept, prepared, adapt)
 
@@ -295,7 +295,7 @@ def _finish(
     judgement, last = _judgement(searching, decided, kept, fit_records, alike, (first, before), seed)
     laws = []
 
-    def alone(model: Model) -> tuple[judge.Judged, bool]:
+    def alone(model: Hypothesis) -> tuple[judge.Judged, bool]:
         assert before is not None
         if not adapt:
             errors = own(model, null.values, None)[1]

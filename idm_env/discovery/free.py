@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from idm_env.discovery import judge
-from idm_env.discovery.model import Frozen, Model, Term
+from idm_env.discovery.model import Frozen, Hypothesis, Term
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.score import interval_of, log_gain, without_own_run
 from idm_env.discovery.solve import Linear, Prior, Solution, Task, finish, linearise, solve
@@ -28,7 +28,7 @@ ENDS_S = (0.5, 5e5)
 
 
 @dataclass(frozen=True, eq=False)
-class Stand:
+class ClosedLoopFit:
     """A model in free simulation: ``task`` over all time, θ from the part that is not ``scored``, and errors (m) there.
 
     ``rmse_m`` are the gap's errors on the scored time by weight (s), of which ``task.prior.alike_s`` is the best.
@@ -38,7 +38,7 @@ class Stand:
 
     task: Task
     scored: np.ndarray
-    model: Model
+    model: Hypothesis
     values: np.ndarray
     theta: np.ndarray
     linear: Linear
@@ -69,7 +69,7 @@ class Stand:
         return result
 
 
-def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, theta: np.ndarray) -> Stand:
+def stand(records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, theta: np.ndarray) -> ClosedLoopFit:
     """Calibrate a model on every other block of time in free simulation, from log θ [G, P], and see how it stands.
 
     The weight of the prior decides more on short or noisy records than any effect does: with too light a one drivers
@@ -100,7 +100,7 @@ def stand(records: Records, model: Model, values: np.ndarray, prior: Prior, thet
     meters = linearise(replace(task, rows=rows, sigma=1.0), frozen, fitted.theta, np.zeros(0))
     of_row = (meters.residual**2 * scored).sum(1) / np.maximum(scored.sum(1), 1)
     usual = max(float(np.median(of_row)), 1e-6)
-    return Stand(
+    return ClosedLoopFit(
         replace(task, rows=rows), scored, model, values, fitted.theta, meters,
         np.linalg.inv(matrix + 1e-9 * np.eye(matrix.shape[-1])), 1.0 / (of_row + usual), units(records, MANY_RUNS),
         {seconds: float(np.sqrt(square[seconds])) for seconds in sorted(square)},
@@ -127,7 +127,7 @@ class Line:
     start: np.ndarray
 
 
-def look(at: Stand, term: Term) -> Line:
+def look(at: ClosedLoopFit, term: Term) -> Line:
     """Score a candidate by its responses at its starts, each scaled by one number from other runs.
 
     Finite responses rather than derivatives at the null: what acts beyond a threshold shows, too.
@@ -159,12 +159,12 @@ def look(at: Stand, term: Term) -> Line:
     return Line(term, log_gain(own, np.maximum(left, 0.05 * own)), np.clip(first, low, high))
 
 
-def nested(at: Stand, term: Term, start: np.ndarray) -> Solution:
+def nested(at: ClosedLoopFit, term: Term, start: np.ndarray) -> Solution:
     """Fit the model with one term more in free simulation over all time, every driver's θ following."""
     return joint(at, at.model.adding(term), np.append(at.values, start))
 
 
-def joint(at: Stand, model: Model, values: np.ndarray) -> Solution:
+def joint(at: ClosedLoopFit, model: Hypothesis, values: np.ndarray) -> Solution:
     """Fit all terms of a model at once in free simulation over all time, from φ ``values``."""
     return solve(at.task, model, at.theta, values, iterations=8, tolerance=1e-3)
 
@@ -176,7 +176,7 @@ def refitted(records: Records, solution: Solution) -> tuple[Solution, np.ndarray
     return again, interval_of(again, at.task)
 
 
-def gains(before: Stand, solution: Solution) -> np.ndarray:
+def gains(before: ClosedLoopFit, solution: Solution) -> np.ndarray:
     """Return the gain of every unit [units] by a model fitted in free simulation, with φ from the other runs.
 
     φ moves by one Newton step where a run is left out, and the errors with it to first order.

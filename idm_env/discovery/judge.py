@@ -10,7 +10,7 @@ import numpy as np
 from idm_env.data import noise_sigma
 from idm_env.discovery import march as twin
 from idm_env.discovery import places
-from idm_env.discovery.model import Frozen, Model
+from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.noise import HEAVY
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.solve import Prior, Solution, Task, cost_of, solve
@@ -85,7 +85,7 @@ class Judged:
 
 
 def calibrate(
-    records: Records, model: Model, values: np.ndarray, prior: Prior, rows: Rows | None = None,
+    records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, rows: Rows | None = None,
     start: np.ndarray | None = None,
 ) -> Solution:  # fmt: skip
     """Fit θ of every group in free simulation behind the measured leader, with φ as it stands.
@@ -98,7 +98,7 @@ def calibrate(
 
 
 def unweighed(
-    records: Records, model: Model, values: np.ndarray, prior: Prior, rows: Rows | None = None,
+    records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, rows: Rows | None = None,
     start: np.ndarray | None = None,
 ) -> tuple[Task, np.ndarray]:  # fmt: skip
     """Return the task of a calibration and its first fit: log θ [G, P] with a prior that hardly weighs anything.
@@ -117,13 +117,13 @@ def unweighed(
     return task, np.where((costs.argmin(0) == 0)[:, None], fits[0].theta, fits[-1].theta)
 
 
-def weighed(task: Task, model: Model, values: np.ndarray, theta: np.ndarray) -> Solution:
+def weighed(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Solution:
     """Return the calibration in which errors of ``alike_s`` seconds count as one, from a first fit [G, 5]."""
     task = scaled(task, model, values, theta)
     return solve(task, Frozen(model, values), theta, np.zeros(0), iterations=25, tolerance=1e-5)
 
 
-def scaled(task: Task, model: Model, values: np.ndarray, theta: np.ndarray) -> Task:
+def scaled(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Task:
     """Return a task of free simulation in whose cost errors of ``alike_s`` seconds, as large as at θ, count as one."""
     rows = task.rows
     errors = task.errors(theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
@@ -185,7 +185,7 @@ def halves(rows: Rows) -> np.ndarray:
     return scored & rows.valid
 
 
-def judge(records: Records, model: Model, values: np.ndarray, theta: np.ndarray) -> Judged:
+def judge(records: Records, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Judged:
     """Return the errors of a model with log θ [G, P] and values [Q] on all of the records."""
     rows, short, frozen, empty = whole(records), windows(records), Frozen(model, values), np.zeros((1, 0))
     prior = Prior(theta.mean(0), np.ones(theta.shape[-1]))

@@ -35,7 +35,7 @@ from idm_env.scalar.graph import Leaf, TimeStep
 from idm_env.scalar.record import Form, Recording, Untraceable, record, slot_name
 from idm_env.scalar.regions import Flagged, Regions
 from idm_env.scalar.straight import Straight
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 
 ROOM = march_loops.ROOM
 BASE = IDM()
@@ -290,7 +290,7 @@ def _recorded(catalogue: Catalogue, dt: float, graph: Regions) -> Recording:
     inputs = [(name, tuple(_BESIDE), (False,) * len(_BESIDE)) for name in beside]
     inputs += [(e.name, ("",), (False,)) for e in (_slots(PULSE) if catalogue.located else ())]
     memories = tuple(e.name for e in catalogue.effects if e.remembers)
-    stepping = Stepping(Lane(), (catalogue.base, *wrapped, Brakes()), dt, "midpoint")  # type: ignore[arg-type]
+    stepping = CarFollowingStep(Lane(), (catalogue.base, *wrapped, Brakes()), dt, "midpoint")  # type: ignore[arg-type]
     return record(stepping, Form(tuple(inputs), memories, present=False), graph)
 
 

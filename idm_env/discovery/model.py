@@ -67,7 +67,7 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Model:
+class Hypothesis:
     """Terms that are in the model, in the order of adding, and the catalogue whose loop rolls it out."""
 
     terms: tuple[Term, ...] = ()
@@ -88,13 +88,13 @@ class Model:
             raise ValueError(f"a model can have {twin.SLOTS} effects without a name, and {slots[-1] + 1} were given.")
         return [(t, int(s)) for t, s in zip(self.terms, slots, strict=True)]
 
-    def adding(self, term: Term) -> Model:
+    def adding(self, term: Term) -> Hypothesis:
         """Return the model with one term more."""
-        return Model((*self.terms, term), self.catalogue)
+        return Hypothesis((*self.terms, term), self.catalogue)
 
-    def without(self, index: int) -> Model:
+    def without(self, index: int) -> Hypothesis:
         """Return the model without a term."""
-        return Model(self.terms[:index] + self.terms[index + 1 :], self.catalogue)
+        return Hypothesis(self.terms[:index] + self.terms[index + 1 :], self.catalogue)
 
     def where(self, label: str) -> slice:
         """Return which entries are those of the term ``label``."""
@@ -152,10 +152,10 @@ class Model:
         return phi
 
 
-class Frozen(Model):
+class Frozen(Hypothesis):
     """A model whose φ stands: only the drivers' own parameters are left to fit."""
 
-    def __init__(self, model: Model, values: np.ndarray) -> None:
+    def __init__(self, model: Hypothesis, values: np.ndarray) -> None:
         super().__init__(model.terms, model.catalogue)
         object.__setattr__(self, "_phi", model.phi(values))
         object.__setattr__(self, "entries", np.zeros(0, np.int64))
@@ -308,7 +308,7 @@ def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
     return refused
 
 
-def effects_of(model: Model, values: np.ndarray) -> tuple[list[Effect], dict[str, dict[str, float]]]:
+def effects_of(model: Hypothesis, values: np.ndarray) -> tuple[list[Effect], dict[str, dict[str, float]]]:
     """Return the simulator's effects of a model's terms and their parameters as numbers."""
     made: list[Effect] = []
     numbers: dict[str, dict[str, float]] = {}

@@ -12,8 +12,8 @@ from idm_env.discovery import calibrate, judge, places
 from idm_env.discovery import model as terms
 from idm_env.discovery import noise as noises
 from idm_env.discovery.calibrate import Calibrated, population
-from idm_env.discovery.free import Stand
-from idm_env.discovery.model import Model, Term
+from idm_env.discovery.free import ClosedLoopFit
+from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out, log_gain
 from idm_env.discovery.solve import Linear, Solution, Task, finish, linearise, projected, solve
@@ -50,8 +50,8 @@ class Search:
     located: bool
     saved: Store
     on_progress: OnProgress
-    base: Model = field(default_factory=Model)
-    stood: tuple[Stand, Solution] | None = None
+    base: Hypothesis = field(default_factory=Hypothesis)
+    stood: tuple[ClosedLoopFit, Solution] | None = None
     """The model that was weighed last, and how it stands in free simulation."""
     calibrations: dict[tuple[int, bytes, bytes | None], Calibrated] = field(default_factory=dict)
     """What ``calibrated`` has said, by model (held here, so that its id stays its), φ and log θ to begin with."""
@@ -65,7 +65,7 @@ class Search:
         """What a test counts."""
         return units(self.task.rows.records)
 
-    def null(self, model: Model, theta: np.ndarray, values: np.ndarray | None = None) -> Solution:
+    def null(self, model: Hypothesis, theta: np.ndarray, values: np.ndarray | None = None) -> Solution:
         """Fit a null and its noise in turn until both stand, from log θ [G, P] and φ [Q]; updates ``task``."""
         values = starting_values(model) if values is None else values
         solution = solve(self.task, model, theta, values)
@@ -74,7 +74,7 @@ class Search:
             solution = solve(self.task, model, solution.theta, solution.values, iterations=6)
         return solution
 
-    def weighed(self, now: Solution) -> tuple[Stand, Solution]:
+    def weighed(self, now: Solution) -> tuple[ClosedLoopFit, Solution]:
         """Return how a model of windows stands in free simulation of the runs that may choose, and it with that prior.
 
         In windows its drivers stay as they are. The weight of the prior becomes that of the task.
@@ -85,7 +85,7 @@ class Search:
             self.stood = found.stand, replace(now, prior=found.prior)
         return self.stood
 
-    def calibrated(self, model: Model, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
+    def calibrated(self, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
         """Return a model calibrated on the runs that may choose (``calibrate``), done once for the same beginning."""
         key = (id(model), values.tobytes(), None if start is None else start.tobytes())
         if key not in self.calibrations:
@@ -178,7 +178,7 @@ class Search:
         return Scored(term, best, gains)
 
     def _promise(
-        self, solution: Solution, model: Model, term: Term, starts: np.ndarray
+        self, solution: Solution, model: Hypothesis, term: Term, starts: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return by which share every start [S, Q] lowers the squared error [S], and the starts scaled to do so.
 
@@ -326,7 +326,7 @@ def _knots(values: np.ndarray, distance: float, most: int, period: float = 0.0) 
     return low, max((high - low) / (count - 1), 1e-6), count
 
 
-def starting_values(model: Model) -> np.ndarray:
+def starting_values(model: Hypothesis) -> np.ndarray:
     """Return φ [Q] to begin with: the first start of every term."""
     return np.concatenate([np.zeros(0), *(np.array(t.starts[0]) for t in model.terms)])
 

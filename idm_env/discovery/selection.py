@@ -10,7 +10,7 @@ from scipy.stats import ttest_1samp
 
 from idm_env.discovery import free, judge, places, together
 from idm_env.discovery.march import CURVE
-from idm_env.discovery.model import Model, Term
+from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import whole
 from idm_env.discovery.score import (
     ALPHA,
@@ -82,7 +82,7 @@ class Decided:
     steps: list[Solution]
     rounds: list[Round]
     joined: together.Joined | None
-    stand: free.Stand
+    stand: free.ClosedLoopFit
 
 
 def decide(searching: Search, null: Solution, seed: int) -> Decided:
@@ -206,7 +206,7 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     return Round(both, twice, this.before, this.left, 0, 1, share=this.share)
 
 
-def _same_class(term: Term, model: Model) -> bool:
+def _same_class(term: Term, model: Hypothesis) -> bool:
     """Tell whether the model has an effect already that only sharp inputs tell from this one, or a curve that spans it.
 
     A curve with many knots over a coordinate contains other changes of the same quantity over it: these are its error.

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from idm_env.discovery import march as twin
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Rows
 from idm_env.fitting.solver import Box, Normal, Progress, minimise
@@ -70,7 +70,7 @@ class Task:
         return len(self.rows.records.groups)
 
     def predict(
-        self, theta: np.ndarray, model: Model, values: np.ndarray, pulse: np.ndarray | None = None
+        self, theta: np.ndarray, model: Hypothesis, values: np.ndarray, pulse: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return predicted gap and speed [C, R, samples]; log θ [C, G, P], values [C, Q] or [C, G, Q]."""
         rows, records = self.rows, self.rows.records
@@ -92,7 +92,7 @@ class Task:
         return gap, speed
 
     def errors(
-        self, theta: np.ndarray, model: Model, values: np.ndarray, pulse: np.ndarray | None = None
+        self, theta: np.ndarray, model: Hypothesis, values: np.ndarray, pulse: np.ndarray | None = None
     ) -> np.ndarray:
         """Return prediction errors [C, R, m]: in windows speed and two gaps, in free simulation the gap."""
         gap, speed = self.predict(theta, model, values, pulse)
@@ -163,7 +163,7 @@ class Linear:
 class Solution:
     """log θ [G, P], values [Q], cost, the linearisation there, and how θ follows φ [G, P, Q] (times −1)."""
 
-    model: Model
+    model: Hypothesis
     theta: np.ndarray
     values: np.ndarray
     cost: float
@@ -189,7 +189,7 @@ def differences(parameters: tuple[Parameter, ...], values: np.ndarray) -> np.nda
     return size
 
 
-def linearise(task: Task, model: Model, theta: np.ndarray, values: np.ndarray) -> Linear:
+def linearise(task: Task, model: Hypothesis, theta: np.ndarray, values: np.ndarray) -> Linear:
     """Return the residual and its derivatives by forward differences."""
     count, own = model.entries.size, theta.shape[-1]
     step = np.append(np.full(own, STEP), differences(model.parameters, values))
@@ -203,7 +203,7 @@ def linearise(task: Task, model: Model, theta: np.ndarray, values: np.ndarray) -
     return Linear(residual[0], (residual[1:] - residual[0]) / step[:, None, None], own)
 
 
-def prior_of(model: Model) -> np.ndarray:
+def prior_of(model: Hypothesis) -> np.ndarray:
     """Return the inverse variance of the prior of every entry of φ: 0 but for knots of curves."""
     if not model.entries.size:
         return np.zeros(0)
@@ -245,7 +245,7 @@ def _squares(residual: np.ndarray) -> np.ndarray:
 class _Nested:
     """A task and a model as the solver sees them: log θ of every group is its own, φ is shared."""
 
-    def __init__(self, task: Task, model: Model) -> None:
+    def __init__(self, task: Task, model: Hypothesis) -> None:
         self.task, self.model = task, model
         self.prior = task.known
         self.stiffness = torch.from_numpy(prior_of(model))
@@ -289,7 +289,13 @@ def _longest(p: Parameter) -> float:
 
 
 def solve(
-    task: Task, model: Model, theta: np.ndarray, values: np.ndarray, *, iterations: int = 12, tolerance: float = 2e-4
+    task: Task,
+    model: Hypothesis,
+    theta: np.ndarray,
+    values: np.ndarray,
+    *,
+    iterations: int = 12,
+    tolerance: float = 2e-4,
 ) -> Solution:
     """Minimise over θ of every group and φ, from log θ [G, P] and values [Q]."""
     nested = _Nested(task, model)
@@ -301,7 +307,9 @@ def solve(
     return finish(task, model, own, shared, linear, cost)
 
 
-def finish(task: Task, model: Model, theta: np.ndarray, values: np.ndarray, linear: Linear, cost: float) -> Solution:
+def finish(
+    task: Task, model: Hypothesis, theta: np.ndarray, values: np.ndarray, linear: Linear, cost: float
+) -> Solution:
     """Return the solution at a point: φ's matrix per group with θ eliminated, and the prior centred there."""
     prior = task.known.following(torch.from_numpy(theta[None]))
     _, matrix = equations(replace(task, prior=prior), theta, linear)

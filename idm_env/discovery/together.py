@@ -8,7 +8,7 @@ import numpy as np
 
 from idm_env.discovery import free
 from idm_env.discovery import model as terms
-from idm_env.discovery.free import Line, Stand
+from idm_env.discovery.free import ClosedLoopFit, Line
 from idm_env.discovery.score import ALPHA, FREE_SHARE, Tested, at_level, interval_of, westfall_young
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.solve import Solution
@@ -41,7 +41,7 @@ class Joined:
     gains: np.ndarray
 
 
-def looks(searching: Search, at: Stand) -> list[Line]:
+def looks(searching: Search, at: ClosedLoopFit) -> list[Line]:
     """Return a first look at every candidate without a place that the model has not."""
     have = {t.effect for t in at.model.terms}
     late = any(ALL[name].latency for name in have if name is not None)
@@ -50,7 +50,7 @@ def looks(searching: Search, at: Stand) -> list[Line]:
     return [free.look(at, terms.simple(e)) for e in simple]
 
 
-def grow(searching: Search, start: Stand, base: int, seed: int) -> tuple[Joined | None, list[Step]]:
+def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple[Joined | None, list[Step]]:
     """Return the terms beyond the first ``base`` that hold together in free simulation, or None, and every step.
 
     Args:
@@ -76,7 +76,7 @@ def grow(searching: Search, start: Stand, base: int, seed: int) -> tuple[Joined 
     return Joined(solution, interval_of(solution, start.task), free.gains(start, solution)), steps
 
 
-def _forward(searching: Search, at: Stand, seed: int) -> tuple[Step, Solution | None]:
+def _forward(searching: Search, at: ClosedLoopFit, seed: int) -> tuple[Step, Solution | None]:
     lines = looks(searching, at)
     if not lines:
         nothing = np.zeros(0)
@@ -101,7 +101,7 @@ def _forward(searching: Search, at: Stand, seed: int) -> tuple[Step, Solution | 
     return Step(scored, tested, None, []), None
 
 
-def _backward(start: Stand, solution: Solution, base: int) -> Solution:
+def _backward(start: ClosedLoopFit, solution: Solution, base: int) -> Solution:
     """Take back terms whose interval contains their null once all are in, or that the held-out score does not miss."""
     while len(solution.model.terms) > base:
         intervals, gain = interval_of(solution, start.task), float(free.gains(start, solution).mean())
@@ -116,7 +116,7 @@ def _backward(start: Stand, solution: Solution, base: int) -> Solution:
     return solution
 
 
-def _without(start: Stand, solution: Solution, index: int) -> Solution:
+def _without(start: ClosedLoopFit, solution: Solution, index: int) -> Solution:
     begin = sum(t.size for t in solution.model.terms[:index])
     gone = np.arange(begin, begin + solution.model.terms[index].size)
     at = replace(start, theta=solution.theta)

@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from idm_env.discovery.compare import Comparison, Light
+from idm_env.discovery.compare import Comparison, ErrorChange
 
 LEFT = 0.04
 """Gain in log RMSE of a smooth function of the state above which something is left to explain.
@@ -67,7 +67,7 @@ def improves(errors: Mapping[str, Comparison]) -> bool:
         errors: How errors changed where neither model was calibrated.
     """
     lights = [c.light for c in errors.values()]
-    if Light.WORSE in lights or Light.BETTER not in lights:
+    if ErrorChange.WORSE in lights or ErrorChange.BETTER not in lights:
         return False
     gap = errors.get("gap_rmse_m")
     holds = gap is None or not (gap.ratio > HOLDS or gap.most_worse)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from idm_env.discovery.bases import Law
-from idm_env.discovery.compare import Comparison, Light
+from idm_env.discovery.compare import Comparison, ErrorChange
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Strength
 from idm_env.discovery.shared import Shared
@@ -193,7 +193,7 @@ def common(shared: Shared) -> str:
 
 def _rises(errors: Mapping[str, Comparison]) -> str:
     """Say what the errors on runs kept back have against an addition."""
-    worse = [ERRORS[k][0] for k, c in errors.items() if c.light is Light.WORSE]
+    worse = [ERRORS[k][0] for k, c in errors.items() if c.light is ErrorChange.WORSE]
     if not any(c.ratio < 1.0 for c in errors.values()):
         return "no error falls"
     if worse:
@@ -202,17 +202,17 @@ def _rises(errors: Mapping[str, Comparison]) -> str:
         return f"the error of the gap in free simulation rises by {percent(errors['gap_rmse_m'].ratio)}"
     if errors["gap_rmse_m"].most_worse:
         return f"the gap in free simulation errs more for {1.0 - errors['gap_rmse_m'].improved:.0%} of followers"
-    if not any(c.light is Light.BETTER for c in errors.values()):
+    if not any(c.light is ErrorChange.BETTER for c in errors.values()):
         return "no error falls beyond chance"
     return "errors rise on the whole"
 
 
 def _but(errors: Mapping[str, Comparison]) -> str:
     """Say what the errors on runs kept back take from a finding."""
-    worse = [ERRORS[k][0] for k, c in errors.items() if c.light is Light.WORSE]
+    worse = [ERRORS[k][0] for k, c in errors.items() if c.light is ErrorChange.WORSE]
     if worse:
         return f"; on the test set the error of the {' and the '.join(worse)} is larger with it"
-    if errors and not any(c.light is Light.BETTER for c in errors.values()):
+    if errors and not any(c.light is ErrorChange.BETTER for c in errors.values()):
         return "; no error on the test set is significantly lower with it"
     return ""
 
@@ -304,9 +304,9 @@ def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
     """Say that another law predicts better than the null, and in what; ``drivers`` are its parameters."""
     better = [
         f"{ERRORS[key][0]} {percent(c.ratio)} (95 %: {percent(c.low)} to {percent(c.high)})"
-        for key, c in law.against.items() if c.light is Light.BETTER
+        for key, c in law.against.items() if c.light is ErrorChange.BETTER
     ]  # fmt: skip
-    same = [ERRORS[key][0] for key, c in law.against.items() if c.light is Light.SAME]
+    same = [ERRORS[key][0] for key, c in law.against.items() if c.light is ErrorChange.SAME]
     rest = f"; {' and '.join(same)} the same beyond chance" if same else ""
     note = f"what it lacks: explain --base {law.law.kind}"
     if law.own and drivers is not None:
@@ -321,11 +321,11 @@ def by_use(laws: Sequence[Law], chosen: Law | None) -> list[str]:
     """Say of every error which law is best for it, where that is another one and better beyond chance."""
     told = []
     for key, (name, _) in ERRORS.items():
-        better = [law for law in laws if key in law.against and law.against[key].light is Light.BETTER]
+        better = [law for law in laws if key in law.against and law.against[key].light is ErrorChange.BETTER]
         best = min(better, key=lambda law: law.against[key].ratio, default=None)
         if best is None or best is chosen:
             continue
-        worse = [ERRORS[k][0] for k, c in best.against.items() if c.light is Light.WORSE]
+        worse = [ERRORS[k][0] for k, c in best.against.items() if c.light is ErrorChange.WORSE]
         but = f"; {' and '.join(worse)} worse" if worse else ""
         title, c = best.title, best.against[key]
         told.append(

@@ -25,7 +25,7 @@ from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
 from idm_env.roads import Lanes
 from idm_env.scalar.record import Unordered, Untraceable
-from idm_env.tasks import Draw, World
+from idm_env.tasks import Draw, EnvState
 from idm_env.types import Params, State, mapped
 from idm_env.validation import whole
 
@@ -122,7 +122,7 @@ class Batch:
         self.limit = made.limit
         self.seeds = np.zeros(count, dtype=np.int64)
         self.episodes = np.full(count, -1, dtype=np.int64)
-        self._world: World | None = None
+        self._world: EnvState | None = None
         self._moves = Moves(made)
         self._values = self._compiled()
         self._on_lanes = 0
@@ -131,7 +131,7 @@ class Batch:
         self._reasons: dict[int, str] = {}
         self._draw: Draw | None = None
         self._driven: Params | None = None
-        self._pool: World | None = None
+        self._pool: EnvState | None = None
         self._beginnings = Beginnings(self._begin, count)
         self._block: dict[str, Tensor] | None = None
         self._drawn: dict[str, np.ndarray] = {}
@@ -153,17 +153,17 @@ class Batch:
         return self._loaded or self._world is not None
 
     @property
-    def world(self) -> World | None:
+    def world(self) -> EnvState | None:
         """The worlds as they are now, or None before the first reset."""
         if self._world is None and self._loaded and self._values is not None:
             self._world = self._values.current()
         return self._world
 
     @world.setter
-    def world(self, world: World | None) -> None:
+    def world(self, world: EnvState | None) -> None:
         self._world, self._loaded = world, False
 
-    def glance(self) -> World:
+    def glance(self) -> EnvState:
         """Return the worlds as they are now, for reading only and until the next step."""
         if self._world is None and self._loaded and self._values is not None:
             return self._values.current(own=False)
@@ -221,7 +221,7 @@ class Batch:
         return Draw.of(torch.as_tensor(self.seeds[rows], device=device), torch.as_tensor(episodes, device=device))
 
     @torch.no_grad()
-    def _begin(self, rows: np.ndarray, episodes: np.ndarray) -> World:
+    def _begin(self, rows: np.ndarray, episodes: np.ndarray) -> EnvState:
         draw = self._draws(rows, episodes)
         if not self.task.warmup_pool:
             return self.task.reset(draw, self.params)
@@ -235,7 +235,7 @@ class Batch:
     @torch.no_grad()
     def _like(self, draw: Draw) -> State:
         """Return the state with which the task would begin, before any warm-up."""
-        return self.task.begin(draw, self.task.driven(self.task.who(draw), self.params)).state
+        return self.task.begin(draw, self.task.episode_params(self.task.who(draw), self.params)).state
 
     def _given(self, state: Any, draw: Draw) -> State:
         return checked(state, self._like(draw), self.task.road)
@@ -275,10 +275,10 @@ class Batch:
         self._fill(values.clock, max(self._ahead, min(64, _WINDOW // (self.count * self.task.vehicles)) or 1))
         return self._drawn_steps - self.used, self._drawn
 
-    def driven(self) -> Params:
+    def episode_params(self) -> Params:
         """Return the parameters of steps in these episodes."""
         if self._driven is None:
-            self._driven = self.task.driven(self.glance().episode, self.params)
+            self._driven = self.task.episode_params(self.glance().episode, self.params)
         return self._driven
 
     def seen(self) -> Tensor:
@@ -405,7 +405,7 @@ class Batch:
         assert before is not None
         block = self._normals(lambda: before.state.step)
         normals = None if block is None else {name: x[self.used - 1] for name, x in block.items()}
-        driven = self.task.driven(before.episode, self.params)
+        driven = self.task.episode_params(before.episode, self.params)
         self.world, told = self._moves.step(before, action, live, normals, driven)
         # What a task tells may be a part of its state: whoever is told gets numbers of his own.
         told = {name: x.clone() for name, x in told.items()}
@@ -425,7 +425,7 @@ class Batch:
             normals = self._normals(values.clock)
             noise = None if normals is None else self._drawn
             who = None if live is None else live.numpy().reshape(-1)
-            told = values.step(action, who, noise, max(self.used - 1, 0), self.driven())
+            told = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params())
         except Untraceable as why:
             self._world, self._loaded = self.world, False
             self.used, self._block = used, block

@@ -11,10 +11,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from idm_env.tasks import World
+from idm_env.tasks import EnvState
 from idm_env.types import mapped
 
-Make = Callable[[np.ndarray, np.ndarray], World]
+Make = Callable[[np.ndarray, np.ndarray], EnvState]
 """Rows and their episodes → the worlds that these episodes begin with."""
 
 
@@ -30,13 +30,13 @@ class Beginnings:
         self._ready = np.full(count, -1, dtype=np.int64)
         self._begun = np.zeros(count, dtype=np.int64)
         self._asked = 0
-        self._worlds: World | None = None
+        self._worlds: EnvState | None = None
 
     def forget(self) -> None:
         """Make everything anew from now on."""
         self._ready[:] = -1
 
-    def take(self, rows: np.ndarray, episodes: np.ndarray) -> World:
+    def take(self, rows: np.ndarray, episodes: np.ndarray) -> EnvState:
         """Return the worlds that rows (indices) begin with, by the episodes (of all rows) that they are in now."""
         missing = self._ready[rows] != episodes[rows]
         if len(rows) == self._count and missing.all():

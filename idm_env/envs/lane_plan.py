@@ -54,7 +54,7 @@ from idm_env.multilane.incentives import on_lanes, seen_merging
 from idm_env.roads import Lanes
 from idm_env.roads.linked import Linked
 from idm_env.scalar.record import Form, Unordered, Untraceable
-from idm_env.tasks import World
+from idm_env.tasks import EnvState
 from idm_env.types import Params
 
 LINKS = ("lane", "leader", "follower", "changed", "refused", "blocked", "unjudged")
@@ -291,7 +291,7 @@ class LanePlan(Plan):
     kind_of_laid = LaneLaid
 
     def __init__(
-        self, moves: Any, world: World, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
+        self, moves: Any, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
     ) -> None:  # fmt: skip
         simulator = moves.task.simulator
         self.road: Lanes = simulator.road

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from idm_env.envs.settings import Settings
-from idm_env.tasks import World
+from idm_env.tasks import EnvState
 from idm_env.types import Params
 
 
@@ -27,13 +27,13 @@ class Moves:
 
     def step(
         self,
-        world: World,
+        world: EnvState,
         action: Tensor | None,
         live: Tensor | None,
         normals: Mapping[str, Tensor] | None,
         driven: Params,
-    ) -> tuple[World, dict[str, Tensor]]:
-        """Return the worlds Δt later and everything that faces tell of the step; ``driven`` are ``task.driven``."""
+    ) -> tuple[EnvState, dict[str, Tensor]]:
+        """Return the worlds Δt later and all that faces tell of the step; ``driven`` are ``task.episode_params``."""
         command, given, inputs = self.commanded(world, action, normals, live)
         after = world._replace(state=self._advance(world.state, inputs, driven))
         if command is None:
@@ -43,7 +43,7 @@ class Moves:
 
     def commanded(
         self,
-        world: World,
+        world: EnvState,
         action: Tensor | None,
         normals: Mapping[str, Tensor] | None = None,
         live: Tensor | None = None,
@@ -52,13 +52,13 @@ class Moves:
         task = self.task
         command = None if action is None else task.command(action)
         given = None if command is None else task.limit(world, command)
-        inputs = task.wishes(task.inputs(world, given, normals, live), action, live)
+        inputs = task.with_lane_commands(task.inputs(world, given, normals, live), action, live)
         if command is not None and live is not None:
             command = torch.where(live, command, 0.0)
         return command, given, inputs
 
     def told(
-        self, before: World, command: Tensor, given: Tensor | None, after: World, commanded: bool
+        self, before: EnvState, command: Tensor, given: Tensor | None, after: EnvState, commanded: bool
     ) -> dict[str, Tensor]:
         """Return everything that faces tell of a step, by name."""
         task = self.task
@@ -83,7 +83,7 @@ class Moves:
         }
 
     def _details(
-        self, after: World, command: Tensor | None, given: Tensor | None, crashed: Tensor
+        self, after: EnvState, command: Tensor | None, given: Tensor | None, crashed: Tensor
     ) -> dict[str, Tensor]:
         """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
         task, asked, found = self.task, self._info, dict[str, Tensor]()
@@ -101,4 +101,4 @@ class Moves:
                 found["failsafe"] = task.there(after.state, given < command)
         if "crash" in asked:
             found["crash"] = crashed
-        return found | {name: x for name, x in task.told(after).items() if name in asked} if asked else found
+        return found | {name: x for name, x in task.info(after).items() if name in asked} if asked else found

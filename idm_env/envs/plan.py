@@ -30,7 +30,7 @@ from idm_env.kernels.rows import RowFunction, adjoint
 from idm_env.kernels.several import between
 from idm_env.kernels.world_loop import retreat_worlds, step_worlds, workspaces
 from idm_env.scalar.record import Form, Untraceable, slot_name
-from idm_env.tasks import World
+from idm_env.tasks import EnvState
 from idm_env.types import Params, Record, State
 
 Array = np.ndarray
@@ -220,7 +220,7 @@ class Plan:
     kind_of_laid = Laid
 
     def __init__(
-        self, moves: Moves, world: World, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
+        self, moves: Moves, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
     ) -> None:
         self.moves, task = moves, moves.task
         made = self.recorded = _record(moves, world, kind, draws)
@@ -474,7 +474,7 @@ class Bound:
         return False
 
 
-def _record(moves: Moves, world: World, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Recorded:
+def _record(moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Recorded:
     """Record a step with or without actions, and with or without saying whose count (``kind`` as in ``Plan``)."""
     idle, every = kind
     task = moves.task
@@ -564,7 +564,7 @@ def _record(moves: Moves, world: World, kind: tuple[bool, bool], draws: tuple[st
     return Recorded(first, kernel, last, seen, slots, many, flowing, back)
 
 
-def examples_of(world: World, many: int) -> dict[str, Tensor]:
+def examples_of(world: EnvState, many: int) -> dict[str, Tensor]:
     """Return the leaves of many worlds like the first of these."""
     leaves = {n: x.detach() for n, x in named(world).items()}
     return {n: x[:1].expand(many, *x.shape[1:]).contiguous() for n, x in leaves.items()}
@@ -586,7 +586,7 @@ def _flowing(function: Callable[..., Mapping[str, Tensor]], leaves: Mapping[str,
     return [n for n, x in out.items() if x.requires_grad]
 
 
-def named(world: World) -> dict[str, Tensor]:
+def named(world: EnvState) -> dict[str, Tensor]:
     """Return the tensors of a world by names that can stand in a program; the past is not among them."""
     state = world.state
     found = {f"state_{n}": x for n, x in zip(State._fields, state, strict=True) if isinstance(x, Tensor)}
@@ -598,7 +598,7 @@ def named(world: World) -> dict[str, Tensor]:
     return found | {f"episode_{n}": x for n, x in world.episode.items()}
 
 
-def world_of(leaves: Mapping[str, Tensor], like: World, prefix: str = "") -> World:
+def world_of(leaves: Mapping[str, Tensor], like: EnvState, prefix: str = "") -> EnvState:
     """Return a world of the leaves that ``named`` gives, memories as in ``like``."""
     own = {n.removeprefix(prefix): x for n, x in leaves.items() if n.startswith(prefix)}
     fields = {n.removeprefix("state_"): x for n, x in own.items() if n.startswith("state_")}
@@ -610,7 +610,7 @@ def world_of(leaves: Mapping[str, Tensor], like: World, prefix: str = "") -> Wor
             parts = {n: own[f"{part}_{n}"] for n in held._fields}
             state = state._replace(**{part: held._replace(**parts)})
     memory = {n: own.get(f"memory_{n}", x) for n, x in state.memory.items()}
-    return World(state._replace(memory=memory), episode)
+    return EnvState(state._replace(memory=memory), episode)
 
 
 def _plain(slot: str) -> str:

@@ -23,7 +23,7 @@ from idm_env.envs.past import Past
 from idm_env.envs.plan import Array, Bound, Layout, Moment, Plan, named, world_of
 from idm_env.kernels.lanes import past_tensor
 from idm_env.scalar.record import Untraceable
-from idm_env.tasks import World
+from idm_env.tasks import EnvState
 from idm_env.types import Params, mapped
 
 
@@ -49,11 +49,11 @@ class Values:
         self._whole: Array | None = None
         self._chain: Chain | None = None
         self.past: Past
-        self._world: World
+        self._world: EnvState
 
     # -- worlds --------------------------------------------------------------------------------------------------
 
-    def load(self, world: World) -> None:
+    def load(self, world: EnvState) -> None:
         """Take over worlds; they are copied, with the graph of what steps change.
 
         Untraceable where something carries a graph that no step changes.
@@ -82,7 +82,7 @@ class Values:
         if kept is not None and kept.requires_grad:
             self._token = _Enter.apply(kept, tuple(world.state.speed.shape))
 
-    def replace(self, rows: Array, fresh: World) -> None:
+    def replace(self, rows: Array, fresh: EnvState) -> None:
         """Replace some rows (indices) by the worlds of ``fresh``, with their graph; that of the rows before is cut."""
         index, blocks = torch.from_numpy(np.asarray(rows)), _block(fresh, self.layout.blocks)
         leaves = {n: x.detach().numpy() for n, x in named(fresh).items()}
@@ -113,7 +113,7 @@ class Values:
                 self.layout = self.layout._replace(still=still, version=self.layout.version + 1)
             old[rows] = values
 
-    def current(self, own: bool = True) -> World:
+    def current(self, own: bool = True) -> EnvState:
         """Return the worlds as tensors of their own, or as views until the next step, without graph and past."""
         held, clock, layout = self.blocks if own else self.blocks.detach(), self._clock, self.layout
         whole = self._whole
@@ -299,8 +299,8 @@ def _again(
 
 
 def _world(
-    like: World, layout: Layout, blocks: Tensor, clock: Array, past: Tensor | None, whole: Array | None = None
-) -> World:  # fmt: skip
+    like: EnvState, layout: Layout, blocks: Tensor, clock: Array, past: Tensor | None, whole: Array | None = None
+) -> EnvState:  # fmt: skip
     """Return worlds as tensors that share the memory given."""
     leaves = dict(zip(layout.blocks, blocks, strict=True))
     if whole is not None:
@@ -315,7 +315,7 @@ def _world(
     return made if past is None else made._replace(state=made.state._replace(memory={**made.state.memory, PAST: past}))
 
 
-def _block(world: World, names: Sequence[str]) -> Tensor:
+def _block(world: EnvState, names: Sequence[str]) -> Tensor:
     """Return what steps change of worlds as one tensor, with its graph."""
     state = world.state
     clock = state.step.to(state.speed.dtype).unsqueeze(-1)

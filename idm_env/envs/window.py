@@ -171,7 +171,7 @@ class Tape:
             ahead, normals = batch.ahead()
             room = values.past.room() if values.past.slots else ahead
             part = slice(done, min(self.steps, done + ahead, done + room))
-            bound = plan.of(values.layout, batch.driven())
+            bound = plan.of(values.layout, batch.episode_params())
             given, now, later = self.given(part), self.now[part], self.later[part]
             to = {n: _each(x, part) for n, x in self.told.items()}
             to |= {n: given[n] for n in ("command", "given", "state_step", "later_state_step") if n in given}
@@ -315,7 +315,7 @@ def compiled(batch: Batch, values: Values, policy: Any, steps: int, push: Tensor
         return None
     first = values.blocks
     tape = Tape(plan, driver, steps, first.detach(), seen.detach(), push.detach())
-    bound = plan.of(values.layout, batch.driven())
+    bound = plan.of(values.layout, batch.episode_params())
     token = values.token_of(plan)
     weights = driver.weights(policy)
     given = (*weights.values(), *(x for _, x in bound.wanted))

@@ -13,7 +13,7 @@ import torch
 from idm_env.data import DataError, Episode, Episodes, Repair, Trajectories
 from idm_env.data.errors import by_kind
 from idm_env.data.fingerprint import marks, seen
-from idm_env.data.folder import Share, shares, stamp
+from idm_env.data.folder import FolderSlice, shares, stamp
 from idm_env.effects import Brakes, base_named
 from idm_env.fitting import drivers, pictures, pieces
 from idm_env.fitting.batch import Batch
@@ -77,7 +77,7 @@ class _Work(NamedTuple):
     executor: Executor
     progress: OnProgress
 
-    def pieces(self, data: Sequence[Sequence[Episode] | Share], by: str, name: str) -> tuple[Piece, ...]:
+    def pieces(self, data: Sequence[Sequence[Episode] | FolderSlice], by: str, name: str) -> tuple[Piece, ...]:
         """Return the parts of a fit and where they are kept; one that is alone is kept step by step."""
         inputs = stamp(self.source.path), self.options.model and Path(self.options.model)
         asked = dataclasses.replace(self.source, path=Path()), self.options, by, self.part
@@ -89,7 +89,7 @@ class _Work(NamedTuple):
             for n, one in enumerate(data)
         )
 
-    def fit(self, data: Sequence[Sequence[Episode] | Share], by: str, name: str, before: str = "") -> JoinedFit:
+    def fit(self, data: Sequence[Sequence[Episode] | FolderSlice], by: str, name: str, before: str = "") -> JoinedFit:
         """Fit all parts and return what they found."""
         cut = self.pieces(data, by, name)
         parts = cut[0].parts

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from idm_env.data import LEADER_LOST_GAP_M, Episodes, Trajectories, episodes, load
 from idm_env.data.episode import windows
-from idm_env.data.folder import Share
+from idm_env.data.folder import FolderSlice
 from idm_env.data.names import Columns
 from idm_env.effects import Effect, Replay, base_named
 from idm_env.fitting.fit import Method, base_simulator
@@ -39,7 +39,7 @@ class Source:
     where: str | Sequence[str] | None = None
     columns: Columns = None
 
-    def trajectories(self, share: Share | None = None) -> Trajectories:
+    def trajectories(self, share: FolderSlice | None = None) -> Trajectories:
         """Read and check the file, or a ``share`` of the folder."""
         if share is not None:
             read = share.trajectories(ring_length=self.ring_length, place=self.place)

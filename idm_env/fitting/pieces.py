@@ -17,7 +17,7 @@ import torch
 from idm_env.data import DataError, Episode, Repair, Trajectories
 from idm_env.data.errors import Counted, by_kind
 from idm_env.data.fingerprint import marks
-from idm_env.data.folder import Share
+from idm_env.data.folder import FolderSlice
 from idm_env.fitting import drivers, pictures
 from idm_env.fitting.evaluate import Errors, errors
 from idm_env.fitting.fit import fit
@@ -39,7 +39,7 @@ class Piece:
 
     number: int
     of: int
-    data: Sequence[Episode] | Share
+    data: Sequence[Episode] | FolderSlice
     source: Source
     options: Options
     by: str
@@ -48,7 +48,7 @@ class Piece:
     resume: bool = False
 
     def __str__(self) -> str:
-        if isinstance(self.data, Share):
+        if isinstance(self.data, FolderSlice):
             return str(self.data)
         first, last = (f"{e.run_id}/{e.vehicle_id}" for e in (self.data[0], self.data[-1]))
         return f"drivers {first} to {last}"
@@ -77,7 +77,7 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
     """Fit one piece and write what is found; what a folder's data do not allow is left out and told."""
     parts, number, options = piece.parts, piece.number, piece.options
     summary: dict[str, Any] = {}
-    if isinstance(piece.data, Share):
+    if isinstance(piece.data, FolderSlice):
         try:
             trajectories = piece.source.trajectories(piece.data)
             items = piece.source.episodes(trajectories)

@@ -19,14 +19,14 @@ from idm_env.kernels import available
 from idm_env.roads import Lanes
 from idm_env.scalar.record import Form
 from idm_env.simulator import Simulator
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import Inputs, Params, State
 
 if TYPE_CHECKING:
     from idm_env.kernels.printed import TileKernel
 
 
-def found(simulator: Stepping, state: State, inputs: Inputs, params: Params) -> TileKernel | str:
+def found(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Params) -> TileKernel | str:
     """Return the kernel for this call, or why it takes the torch path."""
     why = switched_off() or surroundings() or _unfit_tensors(state, inputs, params)
     if why is not None:

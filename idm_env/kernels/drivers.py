@@ -31,7 +31,7 @@ from idm_env.scalar.driver import DriverProgram, shift_of
 from idm_env.scalar.driver_text import ADJOINT, TANGENTS, VALUES, DriverText, RowLayout
 from idm_env.scalar.graph import Leaf, inputs_of
 from idm_env.scalar.record import Form, Untraceable, record, slot_name
-from idm_env.step import Integration, Stepping
+from idm_env.step import CarFollowingStep, Integration
 from idm_env.types import Inputs, Params, Record, State
 
 BESIDE = """beside = emitted(types.void(REAL, REAL, types.int64, REAL), fastmath={"contract"})
@@ -111,7 +111,7 @@ def _kernel(
     fixed: tuple[tuple[Leaf, float], ...],
 ) -> DriverKernel | str:  # fmt: skip
     try:
-        recording = record(Stepping(road, effects, dt, integration), form)
+        recording = record(CarFollowingStep(road, effects, dt, integration), form)
         program = DriverProgram(recording, dict(fixed))
     except Untraceable as why:
         warnings.warn(f"no compiled fit, the torch path runs instead: {why}.", stacklevel=2)
@@ -121,7 +121,7 @@ def _kernel(
 
 
 def prepared(
-    simulator: Stepping, state: State, records: Mapping[str, Tensor], inputs: Inputs, driver: int
+    simulator: CarFollowingStep, state: State, records: Mapping[str, Tensor], inputs: Inputs, driver: int
 ) -> BehindRecord | str:
     """Return the compiled rollouts of these drivers, or why there are none.
 
@@ -154,7 +154,7 @@ def prepared(
     return kernel if isinstance(kernel, str) else BehindRecord(kernel, records, inputs, driver)
 
 
-def _topology(simulator: Stepping, count: int) -> list[tuple[str, Tensor]]:
+def _topology(simulator: CarFollowingStep, count: int) -> list[tuple[str, Tensor]]:
     like = torch.zeros(count)
     return [("led", simulator.road.led(like)), ("leads", simulator.road.leads(like))]
 

@@ -25,7 +25,7 @@ from idm_env.scalar import library
 from idm_env.scalar.graph import Leaf
 from idm_env.scalar.record import Form
 from idm_env.scalar.wishes import HERE, SEARCHED, SIDES, Wishes
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import Inputs, Links, Params, State
 
 if TYPE_CHECKING:
@@ -52,12 +52,12 @@ class Decision:
         return int(module.wish.address), np.array([float(x) for x in self._constants], kind)
 
 
-def decision(simulator: Stepping, form: Form) -> Decision | str:
+def decision(simulator: CarFollowingStep, form: Form) -> Decision | str:
     """Return the compiled decision of a simulator, or why there is none."""
     return printed(_decision, simulator, form, "decisions about lanes are not compiled")
 
 
-def _decision(simulator: Stepping, form: Form) -> Decision:
+def _decision(simulator: CarFollowingStep, form: Form) -> Decision:
     names = ", ".join(e.name for e in simulator.effects)
     return Decision(Wishes(simulator, form), f"One decision about lanes of {names}, {simulator.integration}.")
 

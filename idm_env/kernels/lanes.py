@@ -32,7 +32,7 @@ from idm_env.scalar.record import slot_name
 from idm_env.types import Inputs, Params, State
 
 if TYPE_CHECKING:
-    from idm_env.step import Stepping
+    from idm_env.step import CarFollowingStep
 
 BLOCK = 16
 """Steps that a tile runs before it leaves the cache, and between two states of the tape."""
@@ -43,7 +43,7 @@ class RolloutPlan:
     """Everything about a rollout that is not differentiated."""
 
     kernel: TileKernel
-    simulator: Stepping
+    simulator: CarFollowingStep
     state: State
     inputs: Inputs
     params: Params
@@ -125,7 +125,7 @@ class RolloutPlan:
         return np.zeros(shape, self.kind) if filled else take(shape, self.kind)
 
 
-def static_of(simulator: Stepping, state: State, params: Params, name: str) -> Tensor:
+def static_of(simulator: CarFollowingStep, state: State, params: Params, name: str) -> Tensor:
     """Return what a static slot stands for, as a tensor."""
     if name == "led":
         return simulator.road.view(state).led(state.speed)
@@ -180,8 +180,8 @@ def past_tensor(rows: Array, slots: int, shape: tuple[int, ...]) -> Tensor:
 
 
 def planned(
-    kernel: TileKernel, simulator: Stepping, state: State, inputs: Inputs, params: Params, steps: int, block: int,
-    keep: bool, threads: int | None,
+    kernel: TileKernel, simulator: CarFollowingStep, state: State, inputs: Inputs, params: Params, steps: int,
+    block: int, keep: bool, threads: int | None,
 ) -> tuple[RolloutPlan, list[Tensor]]:  # fmt: skip
     """Return what ``run`` takes."""
     *batch, size = state.speed.shape
@@ -371,7 +371,7 @@ def _differentiable(
 
 
 def rollout(
-    kernel: TileKernel, simulator: Stepping, state: State, inputs: Inputs, params: Params, steps: int, *,
+    kernel: TileKernel, simulator: CarFollowingStep, state: State, inputs: Inputs, params: Params, steps: int, *,
     block: int = BLOCK, keep: bool = True, threads: int | None = None,
 ) -> tuple[State, tuple[Tensor, ...] | None]:  # fmt: skip
     """Do what ``simulator.rollout`` does, by the kernel that ``dispatch`` found for it.

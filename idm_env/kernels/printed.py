@@ -22,7 +22,7 @@ from idm_env.scalar.program import PHASES, Program
 from idm_env.scalar.record import Form, Untraceable, record
 from idm_env.scalar.source import row
 from idm_env.scalar.tiles import TileText
-from idm_env.step import Integration, Stepping
+from idm_env.step import CarFollowingStep, Integration
 
 Made = TypeVar("Made")
 
@@ -157,7 +157,9 @@ def _flat(moves: dict[str, list[tuple[int, int, int]]], order: tuple[str, ...]) 
     return np.array(found, np.int64).reshape(-1, 4)
 
 
-def printed(make: Callable[[Stepping, Form], Made], simulator: Stepping, form: Form, otherwise: str) -> Made | str:
+def printed(
+    make: Callable[[CarFollowingStep, Form], Made], simulator: CarFollowingStep, form: Form, otherwise: str
+) -> Made | str:
     """Return what is printed from a simulator, kept for the next one like it; or why there is nothing.
 
     Where an effect is why, a warning says so once, and what happens ``otherwise``.
@@ -170,24 +172,24 @@ def printed(make: Callable[[Stepping, Form], Made], simulator: Stepping, form: F
 
 @lru_cache(maxsize=512)
 def _printed(
-    make: Callable[[Stepping, Form], Any], road: Road, effects: tuple[Effect, ...], dt: float,
+    make: Callable[[CarFollowingStep, Form], Any], road: Road, effects: tuple[Effect, ...], dt: float,
     integration: Integration, form: Form, otherwise: str,
 ) -> Any:  # fmt: skip
     try:
-        return make(Stepping(road, effects, dt, integration), form)
+        return make(CarFollowingStep(road, effects, dt, integration), form)
     except Untraceable as why:
         warnings.warn(f"{otherwise}: {why}.", stacklevel=3)
         return str(why)
 
 
-def tile_kernel(simulator: Stepping, form: Form) -> TileKernel | str:
+def tile_kernel(simulator: CarFollowingStep, form: Form) -> TileKernel | str:
     """Return the kernel of a simulator, or why there is none."""
     if type(simulator.road) not in (Lane, Ring, Chains):
         return f"the road is {type(simulator.road).__name__}; kernels know Lane, Ring and Lanes"
     return printed(_tile_kernel, simulator, form, "no compiled kernel, the torch path runs instead")
 
 
-def _tile_kernel(simulator: Stepping, form: Form) -> TileKernel:
+def _tile_kernel(simulator: CarFollowingStep, form: Form) -> TileKernel:
     program = Program(record(simulator, form))
     road, names = type(simulator.road).__name__.lower(), ", ".join(e.name for e in simulator.effects)
     title = f"One step of {names} on a {road}, {simulator.integration}."

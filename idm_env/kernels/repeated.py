@@ -16,10 +16,10 @@ from idm_env.kernels import lane_loops, tiles
 from idm_env.kernels import threads as pool
 from idm_env.kernels.lanes import RolloutPlan, starts, state_after
 from idm_env.kernels.workspace import take
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import Params, State
 
-_kept: dict[int, tuple[weakref.ref[Stepping], dict[int, Repeated]]] = {}
+_kept: dict[int, tuple[weakref.ref[CarFollowingStep], dict[int, Repeated]]] = {}
 """The last rollouts of every simulator that lives, by its identity and by their steps."""
 
 
@@ -68,7 +68,7 @@ class Repeated:
         return state_after(self.program, state, made, self.steps)
 
 
-def again(simulator: Stepping, state: State, params: Params, steps: int) -> State | None:
+def again(simulator: CarFollowingStep, state: State, params: Params, steps: int) -> State | None:
     """Return the state after some steps where the simulator's last rollout was like this one; otherwise None."""
     found = _kept[id(simulator)][1].get(steps) if id(simulator) in _kept else None
     return found.after(state) if found is not None and found.fits(state, params) else None

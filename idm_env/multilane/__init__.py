@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from idm_env.multilane.demand import turnover
 from idm_env.multilane.lane_change import decided
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import Inputs, Params, State
 
 
-def before(stepping: Stepping, state: State, inputs: Inputs, params: Params) -> State:
+def before(stepping: CarFollowingStep, state: State, inputs: Inputs, params: Params) -> State:
     """Return the state after entries, exits and lane changes that are due at this step; on one lane, the same state."""
     if state.links is None:
         return state

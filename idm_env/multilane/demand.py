@@ -17,7 +17,7 @@ from torch import Tensor
 
 from idm_env.roads.lanes import Lanes
 from idm_env.roads.linked import Linked, standing, still_changing, without_absent
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import FAR, Moving, Params, State, Trips
 
 
@@ -84,7 +84,7 @@ def spread(given: Trips, shape: tuple[int, ...]) -> Trips:
     return Trips(*(x.expand(shape).contiguous() for x in given))
 
 
-def waiting(stepping: Stepping, given: Trips, params: Params, *, length: Tensor | float = 5.0) -> State:
+def waiting(stepping: CarFollowingStep, given: Trips, params: Params, *, length: Tensor | float = 5.0) -> State:
     """Return a road on which nobody is yet: everybody waits for his trip.
 
     ValueError for a road without a beginning, or a lane that does not exist.
@@ -105,7 +105,7 @@ def due(given: Trips, time: Tensor) -> Tensor:
     return torch.where(time >= given.departs, 1 + more.long(), 0)
 
 
-def counts(stepping: Stepping, state: State) -> Counts:
+def counts(stepping: CarFollowingStep, state: State) -> Counts:
     """Return what became of all trips; ValueError for a state without any."""
     if state.trips is None or state.present is None:
         raise ValueError("this state has no trips. Make it with population.waiting(…).")
@@ -115,7 +115,7 @@ def counts(stepping: Stepping, state: State) -> Counts:
     return Counts(*(x.sum(-1) for x in (now, inside.long(), left, now - begun)))
 
 
-def turnover(stepping: Stepping, state: State, params: Params) -> State:
+def turnover(stepping: CarFollowingStep, state: State, params: Params) -> State:
     """Return the state after those have left who are at the end of their road, and those entered for whom it is time.
 
     This, too, is done when lanes are decided about: until then whoever is beyond the end drives on, and is followed.
@@ -127,7 +127,11 @@ def turnover(stepping: Stepping, state: State, params: Params) -> State:
 
 
 def turned(
-    stepping: Stepping, state: State, params: Params, now: Tensor, sure: Callable[[Tensor], bool] = lambda _: True
+    stepping: CarFollowingStep,
+    state: State,
+    params: Params,
+    now: Tensor,
+    sure: Callable[[Tensor], bool] = lambda _: True,
 ) -> State:
     """Return the state after that, in all rows where it is ``now``; a recording does not ask whether anybody waits."""
     if stepping.road.leaving:
@@ -135,7 +139,7 @@ def turned(
     return state if state.trips is None else _entered(stepping, state, params, now, sure)
 
 
-def _departed(stepping: Stepping, state: State, now: Tensor) -> State:
+def _departed(stepping: CarFollowingStep, state: State, now: Tensor) -> State:
     """Return the state after those have left who have come to the end of the road: nobody follows them any more."""
     view = stepping.road.view(state)
     stay = view.remaining(state.present, state.position)
@@ -151,7 +155,7 @@ def _departed(stepping: Stepping, state: State, now: Tensor) -> State:
 
 
 def _entered(
-    stepping: Stepping, state: State, params: Params, now: Tensor, sure: Callable[[Tensor], bool]
+    stepping: CarFollowingStep, state: State, params: Params, now: Tensor, sure: Callable[[Tensor], bool]
 ) -> State:  # fmt: skip
     """Return the state after those have entered for whom it is time and who have room, one on each lane.
 
@@ -241,7 +245,7 @@ def _last(view: Linked, state: State, lanes: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(mine, own, 0).amax(-1), mine.any(-1)
 
 
-def _placed(stepping: Stepping, state: State, params: Params, entry: _Entry) -> State:
+def _placed(stepping: CarFollowingStep, state: State, params: Params, entry: _Entry) -> State:
     """Return the state with those on the road who enter."""
     assert state.trips is not None and state.present is not None and state.links is not None
     goes, first, last, followed, begins, gap, speed = entry

@@ -16,7 +16,7 @@ from torch import Tensor
 from idm_env.roads.adjacent import Side, Sideways
 from idm_env.roads.linked import Linked
 from idm_env.roads.merging import LANE, MERGER_GAP, MERGER_SPEED, merger
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish
 
 
@@ -51,7 +51,7 @@ def on_lanes(state: State) -> State:
     return state._replace(memory={**state.memory, LANE: lane})
 
 
-def wished(stepping: Stepping, scene: Scene, params: Params) -> Wish:
+def wished(stepping: CarFollowingStep, scene: Scene, params: Params) -> Wish:
     """Return the sum and the largest of all utilities, and the least of all margins."""
     driver = stepping.wanted(scene, params)[2]
     total: Wish | None = None
@@ -96,7 +96,7 @@ def _larger(a: Tensor | None, b: Tensor | None) -> Tensor | None:
 
 
 def beside(
-    stepping: Stepping, view: Sideways, sides: tuple[Side, Side], state: State, inputs: Inputs, params: Params
+    stepping: CarFollowingStep, view: Sideways, sides: tuple[Side, Side], state: State, inputs: Inputs, params: Params
 ) -> Scene:
     """Return the scene with the driver's own lane, and those on his left and right."""
     scene = stepping.scene(state, inputs)._replace(history=NOW)
@@ -129,7 +129,7 @@ def _beside(scene: Scene, step: float) -> Scene:
     return scene if scene.lane is None else scene._replace(lane=scene.lane + step)
 
 
-def _room(stepping: Stepping, scene: Scene, ends: Tensor, params: Params) -> Tensor:
+def _room(stepping: CarFollowingStep, scene: Scene, ends: Tensor, params: Params) -> Tensor:
     """Return how far drivers can go on on the lane of a scene (m): to its end, or as far as effects let them."""
     for effect in stepping.rooms:
         room = effect.room(scene, dict(params[effect.name]))
@@ -139,7 +139,7 @@ def _room(stepping: Stepping, scene: Scene, ends: Tensor, params: Params) -> Ten
 
 
 def _one_side(
-    stepping: Stepping, view: Sideways, side: Side, state: State, scene: Scene, now: Tensor, params: Params
+    stepping: CarFollowingStep, view: Sideways, side: Side, state: State, scene: Scene, now: Tensor, params: Params
 ) -> Beside:
     """Return a lane beside: the driver behind its leader, and its follower behind the driver, in each driver's slot."""
     there = side.led.to(scene.speed.dtype)

@@ -10,11 +10,11 @@ import torch
 from idm_env.multilane.incentives import beside, on_lanes, seen_merging, wished
 from idm_env.roads.adjacent import preferred
 from idm_env.roads.linked import Linked, still_changing, without_absent
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import Inputs, Params, State
 
 
-def decided(stepping: Stepping, state: State, inputs: Inputs, params: Params) -> State:
+def decided(stepping: CarFollowingStep, state: State, inputs: Inputs, params: Params) -> State:
     """Return the state after the decisions that are due at this step, with gaps of those concerned measured anew."""
     due = stepping.due(state)
     if not bool(due.any()):

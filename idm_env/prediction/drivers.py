@@ -56,7 +56,7 @@ NAMES = (*CENTRE, "desired_speed")
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class DriverHypothesis:
     """What a driver may be up to: its share of drivers beforehand, the speed wanted, and where it stops.
 
     ``speed`` and ``deviation`` are median (m/s) and log-deviation of the speed wanted here and now; ``bend`` tells that
@@ -99,7 +99,7 @@ def quantiles(count: int, dimensions: int = 10) -> np.ndarray:
     return np.clip(points, 1e-3, 1 - 1e-3)
 
 
-def hypotheses(second: Second) -> list[Hypothesis]:
+def hypotheses(second: Second) -> list[DriverHypothesis]:
     """Return what the driver may be up to on this route; the shares sum to 1."""
     route, speed = second.route, float(second.speeds[-1])
     limit = route.limit if np.isfinite(route.limit) else URBAN_LIMIT
@@ -110,19 +110,19 @@ def hypotheses(second: Second) -> list[Hypothesis]:
     rest = 1.0 - obeying - staying
     here = (bend, 0.25, True) if bend < limit else (limit, 0.2, False)
     found = [
-        Hypothesis("limit", rest * (1.0 - CRUISING - SURPRISE), *here),
-        Hypothesis("cruise", rest * CRUISING, max(speed, 0.5), 0.07, False),
+        DriverHypothesis("limit", rest * (1.0 - CRUISING - SURPRISE), *here),
+        DriverHypothesis("cruise", rest * CRUISING, max(speed, 0.5), 0.07, False),
     ]
     nearest = speed * speed / (2 * 3.5) + 2.0
     reach = max(60.0 - nearest, 10.0)
     for k in range(SURPRISES):
         stop = nearest + (k + 0.5) / SURPRISES * reach
-        found.append(Hypothesis("surprise", rest * SURPRISE / SURPRISES, *here, stop=stop))
+        found.append(DriverHypothesis("surprise", rest * SURPRISE / SURPRISES, *here, stop=stop))
     if staying:
-        found.append(Hypothesis("stays", staying, *here, stop=CENTRE["min_gap"]))
+        found.append(DriverHypothesis("stays", staying, *here, stop=CENTRE["min_gap"]))
     if second.stop is not None:
         # who halts at a line has its front there, so that the leader stands the smallest gap beyond it
-        found.append(Hypothesis("line", obeying, *here, stop=second.stop.distance + CENTRE["min_gap"]))
+        found.append(DriverHypothesis("line", obeying, *here, stop=second.stop.distance + CENTRE["min_gap"]))
     return found
 
 
@@ -142,7 +142,7 @@ def posterior(seconds: Sequence[Second]) -> list[tuple[RouteDrivers, np.ndarray]
     return drawn
 
 
-def _fitted(cases: Sequence[tuple[Second, Hypothesis]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fitted(cases: Sequence[tuple[Second, DriverHypothesis]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return log-modes [G, 5], factors L of their covariances L Lᵀ [G, 5, 5], and log-evidences [G] of all cases."""
     centre = torch.tensor([[*CENTRE.values(), h.speed] for _, h in cases], dtype=torch.float64)
     deviation = torch.tensor([[*DEVIATION.values(), h.deviation] for _, h in cases], dtype=torch.float64)
@@ -163,7 +163,7 @@ def _fitted(cases: Sequence[tuple[Second, Hypothesis]]) -> tuple[np.ndarray, np.
     return own.log().numpy(), factor.numpy(), (-0.5 * cost / noise**2 + narrower).numpy()
 
 
-def _episode(number: int, second: Second, h: Hypothesis) -> Episode:
+def _episode(number: int, second: Second, h: DriverHypothesis) -> Episode:
     """Return the second as an episode behind the real leader, or behind the hypothesis' stop if that is nearer."""
     count = len(second.speeds)
     position = second.route.begin + second.front - second.driven
@@ -183,7 +183,7 @@ def _episode(number: int, second: Second, h: Hypothesis) -> Episode:
 
 
 def _draw(
-    h: Hypothesis, second: Second, log_mode: np.ndarray, factor: np.ndarray, evidence: float
+    h: DriverHypothesis, second: Second, log_mode: np.ndarray, factor: np.ndarray, evidence: float
 ) -> tuple[RouteDrivers, np.ndarray]:
     """Return drivers around one fit, and their weights."""
     count = DRAWS[h.kind]

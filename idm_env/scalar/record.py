@@ -20,7 +20,7 @@ from idm_env.roads.ends import Ending
 from idm_env.roads.ring import Ring
 from idm_env.scalar.graph import Graph, Node, TimeStep
 from idm_env.scalar.scalar import Scalar, Unordered, Untraceable, static, value_of
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import Motion, Scene, State
 
 
@@ -123,7 +123,7 @@ class SeenRoad(Ending):
 class Parameters(Mapping[str, Mapping[str, Any]]):
     """Every parameter by name; a look at an effect's parameters also notes that this effect is at work."""
 
-    def __init__(self, simulator: Stepping, graph: Graph) -> None:
+    def __init__(self, simulator: CarFollowingStep, graph: Graph) -> None:
         self._graph = graph
         self._values = {
             e.name: {p.name: static(graph, f"{e.name}.{p.name}") for p in e.parameters} for e in simulator.effects
@@ -165,7 +165,7 @@ class _Past:
 
 
 @dataclass(frozen=True)
-class _Recorder(Stepping):
+class _Recorder(CarFollowingStep):
     recording: Recording | None = None
 
     def _history(self, state: State) -> Any:
@@ -192,7 +192,7 @@ class _Recorder(Stepping):
         return super()._gaps(state, known)
 
 
-def record(simulator: Stepping, form: Form, graph: Graph | None = None) -> Recording:
+def record(simulator: CarFollowingStep, form: Form, graph: Graph | None = None) -> Recording:
     """Return one step of the simulator as graphs, in ``graph`` where one is given.
 
     The memories of ``form`` at their beginning are graphs, too (``begin``).

@@ -21,7 +21,7 @@ from idm_env.scalar.graph import Graph, Leaf, Node, inputs_of
 from idm_env.scalar.record import Form, Parameters, SeenRoad, inputs_of_form, state_of
 from idm_env.scalar.scalar import Scalar, Untraceable, value_of
 from idm_env.scalar.source import Constants, Write, body, function, row
-from idm_env.step import Stepping
+from idm_env.step import CarFollowingStep
 from idm_env.types import State, Wish
 
 SIDES = ("left", "right")
@@ -86,12 +86,12 @@ def _or_nan(sides: tuple[Side, Side], wish: Wish, blocked: Any) -> Any:
 class Wishes:
     """A recorded decision: slots that it reads, and its text; ``Untraceable`` where an effect cannot be recorded."""
 
-    def __init__(self, simulator: Stepping, form: Form) -> None:
+    def __init__(self, simulator: CarFollowingStep, form: Form) -> None:
         road = simulator.road
         assert isinstance(road, Lanes)
         graph = Graph()
         view = _Sides(Chains(road.closed), graph)
-        stepping = Stepping(view, simulator.effects, simulator.dt, simulator.integration)
+        stepping = CarFollowingStep(view, simulator.effects, simulator.dt, simulator.integration)
         given, state = Parameters(stepping, graph), state_of(form, graph)
         inputs: Mapping[str, Any] = inputs_of_form(form, graph)
         try:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from idm_env.jobs import trust
 from idm_env.tasks.approach import ApproachTask
-from idm_env.tasks.base import Advance, Bounds, Ended, Features, Pay, Task, World
+from idm_env.tasks.base import Advance, Bounds, Ended, EnvState, Features, RewardRange, Task
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.features import FEATURES, AgentView, Feature
 from idm_env.tasks.follow import FollowTask
@@ -37,6 +38,18 @@ TASKS: dict[str, type[Task]] = {
         ApproachTask,
     )
 }
+
+
+_RENAMED = {"World": EnvState, "Pay": RewardRange}
+"""Classes by the names that they had; those work for one version."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _RENAMED:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    now = _RENAMED[name]
+    warnings.warn(f"{name} is called {now.__name__} now.", DeprecationWarning, stacklevel=2)
+    return now
 
 
 def make_task(task: str = "ring", *, trusted: bool = False, **choices: Any) -> Task:
@@ -76,6 +89,7 @@ __all__ = [
     "Bounds",
     "Draw",
     "Ended",
+    "EnvState",
     "Feature",
     "Features",
     "FollowTask",
@@ -83,15 +97,14 @@ __all__ = [
     "KeywordError",
     "MergeTask",
     "OpenHighwayTask",
-    "Pay",
     "PlatoonTask",
     "ReplayLanesTask",
     "ReplayTask",
+    "RewardRange",
     "RewardTerm",
     "RingTask",
     "Task",
     "Transition",
-    "World",
     "make_task",
     "task_with",
 ]

@@ -13,7 +13,7 @@ from torch import Tensor
 from idm_env.effects import IDM, Brakes, Effect, Signal
 from idm_env.metrics import fuel
 from idm_env.roads import Lanes
-from idm_env.tasks.base import Pay, World
+from idm_env.tasks.base import EnvState, RewardRange
 from idm_env.tasks.checks import Range, in_ranges
 from idm_env.tasks.features import AgentView, Feature
 from idm_env.tasks.open_lanes import OpenLanesTask
@@ -142,7 +142,7 @@ class ApproachTask(OpenLanesTask):
         departs = begun + self.platoon * (given.departs + first - begun) - first
         return given._replace(departs=departs, again=(given.again / self.cycle).ceil() * self.cycle)
 
-    def begin(self, draw: Draw, params: Params) -> World:
+    def begin(self, draw: Draw, params: Params) -> EnvState:
         """As in the other open tasks, with what the signal does in these episodes."""
         world = super().begin(draw, params)
         speed = world.state.speed
@@ -163,16 +163,16 @@ class ApproachTask(OpenLanesTask):
         )
 
     @property
-    def own_pay(self) -> Pay:
+    def own_reward_range(self) -> RewardRange:
         """At most everybody who is due stands, and burns all that can be burnt."""
-        return Pay(-self._most * self.simulator.dt * (1.0 + self.fuel_weight * _MOST_FUEL), 0.0)
+        return RewardRange(-self._most * self.simulator.dt * (1.0 + self.fuel_weight * _MOST_FUEL), 0.0)
 
     def burnt(self, state: State) -> Tensor:
         """Return what all on the road burn (mL/s)."""
         assert state.present is not None
         return (fuel(state.speed, state.accel).clamp(0.0, _MOST_FUEL) * state.present).sum(-1)
 
-    def delay(self, world: World) -> Tensor:
+    def delay(self, world: EnvState) -> Tensor:
         """Return how many vehicles' time is lost, fuel reckoned as time."""
         return super().delay(world) + self.fuel_weight * self.burnt(world.state)
 

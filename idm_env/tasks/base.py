@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,12 +30,18 @@ from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.features import FEATURES, AgentView, Feature, ObservedFeature, chosen
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, Weighted, weighted
-from idm_env.tasks.types import Advance, Bounds, Ended, Features, Pay, World
+from idm_env.tasks.types import Advance, Bounds, Ended, EnvState, Features, RewardRange
 from idm_env.types import Command, Inputs, Params, State
 from idm_env.validation import shown
 
 _NORMALS_AT_ONCE = 1 << 16
 _MOST_STEPS = 1_000_000_000
+
+
+_RENAMED = {
+    "own_pay": "own_reward_range", "earned": "own_reward", "told": "info", "driven": "episode_params",
+    "wishes": "with_lane_commands",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -201,15 +208,23 @@ class Task(abc.ABC):
         """The most steps of Δt of an episode; without a limit those of a usual one."""
         return self.usual_steps if self.horizon is None else self.horizon * self.held
 
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Take methods by the names that they had; those work for one version."""
+        super().__init_subclass__(**keywords)
+        for old, now in _RENAMED.items():
+            if old in vars(cls):
+                warnings.warn(f"{cls.__name__}.{old} is called {now} now.", DeprecationWarning, stacklevel=2)
+                setattr(cls, now, vars(cls)[old])
+
     @property
     @abc.abstractmethod
-    def own_pay(self) -> Pay:
+    def own_reward_range(self) -> RewardRange:
         """The lowest (at most 0) and the highest (at least 0) of the task's own reward, without a crash."""
 
     @cached_property
-    def pay(self) -> Pay:
+    def reward_range(self) -> RewardRange:
         """The lowest (at most 0) and the highest (at least 0) reward of a Δt without a crash."""
-        return self.own_pay if self.weighted is None else self.weighted.pay
+        return self.own_reward_range if self.weighted is None else self.weighted.reward_range
 
     @cached_property
     def weighted(self) -> Weighted | None:
@@ -221,7 +236,7 @@ class Task(abc.ABC):
         """What an agent pays for a crash: ``crash_cost``, or the smallest that makes it worse than any survival."""
         if self.crash_cost is not None:
             return self.crash_cost
-        return self.shares * lawful_cost(self.pay, self.steps)
+        return self.shares * lawful_cost(self.reward_range, self.steps)
 
     @property
     def shares(self) -> int:
@@ -377,13 +392,13 @@ class Task(abc.ABC):
     # -- pure functions ------------------------------------------------------------------------------------------
 
     @abc.abstractmethod
-    def begin(self, draw: Draw, params: Params) -> World:
+    def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return the worlds before the warm-up, with ``state.step = −warmup``."""
 
-    def reset(self, draw: Draw, params: Params) -> World:
+    def reset(self, draw: Draw, params: Params) -> EnvState:
         """Return the worlds at the beginning of an episode: ``begin`` and the warm-up, without any control."""
         who = self.who(draw)
-        params = self.driven(who, params)
+        params = self.episode_params(who, params)
         world = self.begin(draw, params)
         world = self._unsteady(world._replace(episode={**world.episode, **who}), draw)
         speed = world.state.speed
@@ -405,7 +420,7 @@ class Task(abc.ABC):
             found["randomised"] = draw.stream("randomise").uniforms(0, len(self._ranges), torch.float64)
         return found
 
-    def driven(self, episode: Mapping[str, Tensor], params: Params) -> Params:
+    def episode_params(self, episode: Mapping[str, Tensor], params: Params) -> Params:
         """Return the parameters of a step in these episodes: each vehicle's driver's, and what episodes have drawn."""
         who, where = episode.get("driver"), episode.get("randomised")
         if who is None and where is None:
@@ -422,7 +437,7 @@ class Task(abc.ABC):
                 made.setdefault(effect, {})[name] = drawn.expand(-1, self.vehicles)
         return made
 
-    def _unsteady(self, world: World, draw: Draw) -> World:
+    def _unsteady(self, world: EnvState, draw: Draw) -> EnvState:
         """Return the worlds with drivers who drift as they are in the long run, rather than all at their mean."""
         state, names = world.state, [name for name in self.simulator.draws if name in world.state.memory]
         first = torch.zeros_like(draw.key)
@@ -442,7 +457,7 @@ class Task(abc.ABC):
             for name in self.simulator.draws
         }
 
-    def _idle(self, world: World, steps: int) -> dict[str, Any]:
+    def _idle(self, world: EnvState, steps: int) -> dict[str, Any]:
         """Return the inputs of some steps without any command, time first."""
         state = world.state
         if len(self.machinery) == 1:
@@ -477,7 +492,7 @@ class Task(abc.ABC):
             ahead = torch.where(there, ahead, x if nobody is None else nobody)
         return self.pick(ahead)
 
-    def safe_command(self, world: World) -> Tensor:
+    def safe_command(self, world: EnvState) -> Tensor:
         """Return the highest acceleration (m/s²) that the failsafe allows each agent, shape ``(…, agents)``.
 
         That of ``safe_accel``, with ``failsafe`` and ``failsafe_time``.
@@ -492,12 +507,12 @@ class Task(abc.ABC):
             self.pick(state.speed), lead_speed, gap, self.failsafe, self.failsafe_time, self.simulator.dt, euler
         )
 
-    def limit(self, world: World, command: Tensor) -> Tensor:
+    def limit(self, world: EnvState, command: Tensor) -> Tensor:
         """Return commands (m/s²) as far as the failsafe lets them pass."""
         return torch.minimum(command, self.safe_command(world)) if self.failsafe else command
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step: the command (m/s², None for nobody) and the normals of effects that draw.
 
@@ -517,13 +532,13 @@ class Task(abc.ABC):
             inputs = {"control": Command(command, active)}
         return {**inputs, **(normals or {})}
 
-    def wishes(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
+    def with_lane_commands(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
         """Return the inputs of a step with what agents command beside accelerations, where they do."""
         return inputs
 
     def step(
         self,
-        world: World,
+        world: EnvState,
         command: Tensor | None,
         normals: Mapping[str, Tensor] | None,
         params: Params,
@@ -531,26 +546,26 @@ class Task(abc.ABC):
         live: Tensor | None = None,
         advance: Advance | None = None,
         limited: bool = False,
-    ) -> World:
+    ) -> EnvState:
         """Return the world Δt later. ``command`` (m/s²) is ``(…, agents)``, each of ``normals`` ``(…, vehicles)``.
 
         ``limited`` says that ``limit`` was called already.
         """
         if command is not None and not limited:
             command = self.limit(world, command)
-        params = self.driven(world.episode, params)
+        params = self.episode_params(world.episode, params)
         state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals, live), params)
         return world._replace(state=state)
 
-    def observe(self, world: World) -> Tensor:
+    def observe(self, world: EnvState) -> Tensor:
         """Return what the agents observe, shape ``(…, agents, features)``, within ``bounds``."""
         views = {k: AgentView(self, world, k) for k in {x.ahead for x in self.observed}}
         seen = [x.feature.read(views[x.ahead]) for x in self.observed]
         return self.clip(seen if self._observation[1] is None else [self.there(world.state, x) for x in seen])
 
     @abc.abstractmethod
-    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
-        """Return the task's own rewards of a step without a crash, within ``own_pay``, shape ``(…, agents)``.
+    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
+        """Return the task's own rewards of a step without a crash, within ``own_reward_range``, shape ``(…, agents)``.
 
         ``command`` in m/s².
         """
@@ -559,7 +574,7 @@ class Task(abc.ABC):
         """Return what belongs to the agents, shape ``(…, agents)``, 0 for those who are not on the road."""
         return x if state.present is None else torch.where(self.pick(state.present) > 0, x, torch.zeros_like(x))
 
-    def rewards(self, before: World, command: Tensor, after: World, crashed: Tensor | None = None) -> Tensor:
+    def rewards(self, before: EnvState, command: Tensor, after: EnvState, crashed: Tensor | None = None) -> Tensor:
         """Return the rewards of a step, shape ``(…, agents)``, or ``−cost_of_crash``.
 
         ``command`` in m/s², which costs nothing where an agent is not on the road; ``crashed``, where the caller has it
@@ -569,22 +584,22 @@ class Task(abc.ABC):
         crashed = self.crashed(after) if crashed is None else crashed
         return torch.where(crashed, -self.cost_of_crash, self.paid(before, command, after))
 
-    def paid(self, before: World, command: Tensor, after: World) -> Tensor:
+    def paid(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return the rewards of a step without a crash: the task's own, or what ``reward`` asks for."""
         if self.weighted is None:
-            return self.earned(before, command, after)
+            return self.own_reward(before, command, after)
         return self.weighted(Transition(self, before, command, after))
 
-    def crashed(self, world: World) -> Tensor:
+    def crashed(self, world: EnvState) -> Tensor:
         """Return whose episodes end in a crash: those of all, where any two vehicles have touched (a gap ≤ 0)."""
         crashed = world.state.gap.amin(-1, keepdim=True) <= 0.0
         return crashed.expand(-1, len(self.agents)) if len(self.agents) > 1 else crashed
 
-    def told(self, world: World) -> dict[str, Tensor]:
+    def info(self, world: EnvState) -> dict[str, Tensor]:
         """Return what infos tell beyond what every task does (``idm_env.envs.info``), ``(environments, agents)``."""
         return {}
 
-    def ended(self, world: World) -> Ended:
+    def ended(self, world: EnvState) -> Ended:
         """Return whether it is over: terminated by a crash, truncated where records end (never, without any)."""
         crashed = self.crashed(world)
         return Ended(crashed, torch.zeros_like(crashed))
@@ -596,7 +611,7 @@ class Task(abc.ABC):
         """Recorded ids of all vehicles, or None where nothing is recorded but leaders."""
         return None
 
-    def crash_reason(self, world: World, row: int, agent: int | None = None) -> str:
+    def crash_reason(self, world: EnvState, row: int, agent: int | None = None) -> str:
         """Return who touched whom in one environment that has crashed, when and how deep; ``agent`` asks for its own.
 
         Of several contacts the deepest one is named.
@@ -618,4 +633,4 @@ class Task(abc.ABC):
         return (seen / self.constant("scales", lambda: self.scales, device, dtype)).clamp(low, high)
 
 
-__all__ = ["Advance", "Bounds", "Draw", "Ended", "Features", "Pay", "Task", "World"]
+__all__ = ["Advance", "Bounds", "Draw", "Ended", "EnvState", "Features", "RewardRange", "Task"]

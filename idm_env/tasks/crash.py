@@ -1,6 +1,6 @@
 """A crash is worse than any survival: the law of rewards, what it takes to keep it, and the words for a crash.
 
-Rewards of a step without a crash lie within a task's ``pay``, [low, high] with low ≤ 0 ≤ high. The step in which a
+A step's reward without a crash is in a task's ``reward_range``, [low, high] with low ≤ 0 ≤ high. The step in which a
 vehicle touches another pays ``−crash_cost`` instead, ``N (high − low) + 1`` by default, N being the most steps of an
 episode. So the return of an episode that ends in a crash, less than ``N high − crash_cost < N low``, lies below that of
 every episode that does not; and from any moment on, with any discount, going on pays more than crashing.
@@ -16,10 +16,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from idm_env.tasks.types import NOBODY, Pay
+from idm_env.tasks.types import NOBODY, RewardRange
 
 
-def lawful_cost(pay: Pay, steps: int) -> float:
+def lawful_cost(pay: RewardRange, steps: int) -> float:
     """Return the cost that makes a crash worse than any survival of at most ``steps`` steps."""
     return steps * (pay.high - pay.low) + 1.0
 

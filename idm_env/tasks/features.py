@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.tasks.types import Agents, World
+from idm_env.tasks.types import Agents, EnvState
 from idm_env.types import State
 from idm_env.validation import one_of, whole
 
@@ -30,7 +30,7 @@ class AgentView:
     Everything that is asked for has shape ``(…, agents)`` and is 0 for agents that are not on the road.
     """
 
-    def __init__(self, task: Agents, world: World, ahead: int = 0) -> None:
+    def __init__(self, task: Agents, world: EnvState, ahead: int = 0) -> None:
         self.task, self.world, self.ahead = task, world, ahead
         self._known: dict[Any, tuple[Tensor, ...]] = {}
 

@@ -15,7 +15,7 @@ from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Ended, Pay, Task, World
+from idm_env.tasks.base import Ended, EnvState, RewardRange, Task
 from idm_env.tasks.checks import Range
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import FEATURES, Feature, feature
@@ -124,11 +124,11 @@ class FollowTask(Task):
         return SEEN
 
     @property
-    def own_pay(self) -> Pay:
+    def own_reward_range(self) -> RewardRange:
         """From −4 to 1, more where an agent may catch up."""
-        return Pay(LOWEST, HIGHEST + _CLOSING * self.lag_weight)
+        return RewardRange(LOWEST, HIGHEST + _CLOSING * self.lag_weight)
 
-    def begin(self, draw: Draw, params: Params) -> World:
+    def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return a queue in equilibrium behind a drawn stretch of a drawn leader."""
         base = self.simulator.base
         like = self.like(params)
@@ -147,7 +147,7 @@ class FollowTask(Task):
             length=self.vehicle_length,
             step=torch.full((len(start),), -self.warmup, device=device),
         )
-        return World(state, episode)
+        return EnvState(state, episode)
 
     def _motion(self, episode: dict[str, Tensor], step: Tensor, dtype: torch.dtype) -> Tensor:
         """Return position, speed and acceleration of the leaders at a step, shape ``(n, 3)``."""
@@ -155,7 +155,7 @@ class FollowTask(Task):
         return motion[episode["trace"], (episode["start"] + step).clamp(0, motion.shape[1] - 1)]
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, with the leader's record at its end."""
         inputs = dict(super().inputs(world, command, normals, live))
@@ -164,7 +164,7 @@ class FollowTask(Task):
         inputs["replay"] = head(self._motion(dict(world.episode), state.step + 1, state.speed.dtype), first)
         return inputs
 
-    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return ``1 − w fuel − 0.002 u² − 2 p − l clip(v_lead − v, ±20)``, saturated below −2."""
         state = after.state
         fuel = metrics.fuel(state.speed, state.accel, self.fuel_model) * _GALLONS_PER_HOUR
@@ -179,7 +179,7 @@ class FollowTask(Task):
             reward = reward - self.lag_weight * lag.clamp(-_CLOSING, _CLOSING)
         return floored(reward, KNEE, LOWEST)
 
-    def ended(self, world: World) -> Ended:
+    def ended(self, world: EnvState) -> Ended:
         """Return whether vehicles have touched, or the record is at its end."""
         ends = super().ended(world)
         steps = self.constant("steps", self.leaders.steps, world.state.step.device, torch.int64)

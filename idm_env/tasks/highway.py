@@ -12,7 +12,7 @@ from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Effect, Mobil
 from idm_env.roads import Lanes
-from idm_env.tasks.base import World
+from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import Range
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.random import Draw
@@ -74,7 +74,7 @@ class HighwayTask(LanesTask):
         """Length of road for each vehicle of the fullest lane (m)."""
         return self.length / -(-self.vehicles // self.lanes_count)
 
-    def begin(self, draw: Draw, params: Params) -> World:
+    def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return vehicles spread evenly over the lanes, each up to a quarter of its room aside, at their pace."""
         like = self.like(params)
         aside = draw.uniforms(_PLACE_STREAM, self.vehicles, like.dtype) - 0.5
@@ -88,13 +88,13 @@ class HighwayTask(LanesTask):
             length=self.vehicle_length, step=torch.full((len(position),), -self.warmup, device=like.device),
             lane=index % self.lanes_count,
         )  # fmt: skip
-        return World(state, {})
+        return EnvState(state, {})
 
     def apart(self, ahead: Tensor) -> Tensor:
         """Return differences of positions (m) as distances round the ring, the shorter way."""
         return (ahead + 0.5 * self.length).remainder(self.length) - 0.5 * self.length
 
-    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return ``v/40 − 0.1 (u/u_max)²``."""
         speed = self.pick(after.state.speed).clamp_max(FASTEST) / FASTEST
         hardest = max(abs(limit) for limit in self.command_limits)

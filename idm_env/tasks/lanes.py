@@ -13,7 +13,7 @@ from torch import Tensor
 
 from idm_env.effects import Control, Effect, LaneCommand
 from idm_env.roads import Lanes
-from idm_env.tasks.base import Pay, Task, World
+from idm_env.tasks.base import EnvState, RewardRange, Task
 from idm_env.tasks.checks import Range
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.random import Draw
@@ -78,7 +78,7 @@ class LanesTask(Task):
         """Effects through which agents act."""
         return (Control(), LaneCommand()) if self.lane_commands else (Control(),)
 
-    def reset(self, draw: Draw, params: Params) -> World:
+    def reset(self, draw: Draw, params: Params) -> EnvState:
         """Return the worlds at the beginning of an episode, in which nobody has changed lanes yet."""
         world = super().reset(draw, params)
         links = world.state.links
@@ -86,7 +86,7 @@ class LanesTask(Task):
         none = {name: torch.zeros_like(links.lane) for name in ("changed", "refused", "blocked", "unjudged")}
         return world._replace(state=world.state._replace(links=links._replace(**none)))
 
-    def told(self, world: World) -> dict[str, Tensor]:
+    def info(self, world: EnvState) -> dict[str, Tensor]:
         """Return how often agents' vehicles changed lanes in this episode, and how often they could not."""
         links = world.state.links
         assert links is not None
@@ -106,7 +106,7 @@ class LanesTask(Task):
         """Return the commanded accelerations (m/s²)."""
         return super().command(action[..., : len(self.agents)])
 
-    def safe_command(self, world: World) -> Tensor:
+    def safe_command(self, world: EnvState) -> Tensor:
         """Return what the failsafe allows: behind the leader, and before the end of a lane as if somebody stood there.
 
         Both count, whichever is nearer: a leader may leave the lane.
@@ -120,7 +120,7 @@ class LanesTask(Task):
         return torch.minimum(found, self._safe_behind(state, torch.zeros_like(room), room))
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, in which lanes are left to the drivers."""
         found = super().inputs(world, command, normals, live)
@@ -128,7 +128,7 @@ class LanesTask(Task):
             found = {**found, "lane_command": torch.full_like(world.state.speed, torch.nan)}
         return found
 
-    def wishes(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
+    def with_lane_commands(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
         """Return the inputs with the lanes that agents command."""
         if not self.lane_commands or action is None:
             return inputs
@@ -176,9 +176,9 @@ class LanesTask(Task):
         return (*self.features_of_self, *nearby)
 
     @property
-    def own_pay(self) -> Pay:
+    def own_reward_range(self) -> RewardRange:
         """Rewards of a step lie between −0.1 and 1."""
-        return Pay(-0.1, 1.0)
+        return RewardRange(-0.1, 1.0)
 
     def apart(self, ahead: Tensor) -> Tensor:
         """Return differences of positions (m) as distances on this road."""

@@ -16,7 +16,7 @@ from idm_env.effects import IDM, Brakes, Control, Courtesy, Destination, Effect,
 from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
 from idm_env.roads import End, Lanes, lane_drop, on_ramp
-from idm_env.tasks.base import Pay, World
+from idm_env.tasks.base import EnvState, RewardRange
 from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
@@ -270,7 +270,7 @@ class OpenLanesTask(LanesTask):
             torch.full(shape, self.entry_speed, dtype=dtype, device=device), none, none.clone(),
         )  # fmt: skip
 
-    def begin(self, draw: Draw, params: Params) -> World:
+    def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return free traffic up to ``filled``, and everybody else waiting."""
         like = self.like(params)
         trips = self._trips(draw, like.dtype)
@@ -285,7 +285,7 @@ class OpenLanesTask(LanesTask):
             step=torch.full((len(place),), -self.warmup, device=like.device),
         )  # fmt: skip
         free = self.simulator.base.driver(dict(params[self.simulator.base.name])).desired_speed.detach()
-        return World(
+        return EnvState(
             state._replace(trips=trips._replace(entered=inside.long())),
             {"free_speed": free.to(place.dtype).expand_as(place).contiguous()},
         )
@@ -306,7 +306,7 @@ class OpenLanesTask(LanesTask):
             Feature("next_left", "", "lanes", 1.0, -last, last, _next_left),
         )
 
-    def told(self, world: World) -> dict[str, Tensor]:
+    def info(self, world: EnvState) -> dict[str, Tensor]:
         """As in ``LanesTask``, and of all traffic what became of trips, who stands and what is burnt, now or so far.
 
         ``present``: agents that are there; ``queued``: vehicles that wait at the entries, a queue that grows is an
@@ -327,7 +327,7 @@ class OpenLanesTask(LanesTask):
         }  # fmt: skip
         speeds = torch.where(there, state.speed, 0.0).sum(-1) / found.inside.clamp_min(1)
         every["travel"] = (self.road.length or 0.0) / speeds.clamp_min(_STANDS)
-        own = {**super().told(world), "present": self.pick(there)}
+        own = {**super().info(world), "present": self.pick(there)}
         return own | {n: x.unsqueeze(-1).expand(-1, len(self.agents)).contiguous() for n, x in every.items()}
 
     @property
@@ -347,22 +347,22 @@ class OpenLanesTask(LanesTask):
         return 2.0 * self.vehicles + sum(self.inflows.values()) * seconds / 3600.0
 
     @property
-    def own_pay(self) -> Pay:
+    def own_reward_range(self) -> RewardRange:
         """At most everybody who is due stands."""
-        return Pay(-self._most * self.simulator.dt, 0.0)
+        return RewardRange(-self._most * self.simulator.dt, 0.0)
 
-    def delay(self, world: World) -> Tensor:
+    def delay(self, world: EnvState) -> Tensor:
         """Return how many vehicles' time is lost: ``Σ (1 − min(v/v0, 1))`` of those on the road, and all in a queue."""
         state = world.state
         assert state.present is not None
         lost = 1.0 - (state.speed / world.episode["free_speed"]).clamp_max(1.0)
         return (lost * state.present).sum(-1) + demand.counts(self.simulator, state).queued
 
-    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return minus the delay of all in this step (vehicle-seconds)."""
         return (-self.simulator.dt * self.delay(after)).unsqueeze(-1).expand(-1, len(self.agents))
 
-    def crashed(self, world: World) -> Tensor:
+    def crashed(self, world: EnvState) -> Tensor:
         """Return whose episodes end in a crash: of all, where vehicles touch or one drives over the end of its lane."""
         crashed = super().crashed(world)
         return crashed | self._over(world.state).any(-1, keepdim=True).expand_as(crashed)
@@ -372,7 +372,7 @@ class OpenLanesTask(LanesTask):
         assert state.links is not None and state.present is not None
         return (state.position > self.road.closed_at(state.links.lane, state.position)) & (state.present > 0)
 
-    def crash_reason(self, world: World, row: int, agent: int | None = None) -> str:
+    def crash_reason(self, world: EnvState, row: int, agent: int | None = None) -> str:
         """As ``Task`` says; or who has driven over the end of which lane, where nobody has touched anybody."""
         state, over = world.state, self._over(world.state)[row]
         if float(state.gap[row].min()) <= 0.0 or not bool(over.any()):

@@ -15,7 +15,7 @@ from torch import Tensor
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Pay, Task, World
+from idm_env.tasks.base import EnvState, RewardRange, Task
 from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import FEATURES, AgentView, Feature, feature, speed
@@ -83,11 +83,11 @@ class PlatoonTask(Task):
         return own, FEATURES["relative_speed"], FEATURES["gap"], deviation
 
     @property
-    def own_pay(self) -> Pay:
+    def own_reward_range(self) -> RewardRange:
         """Costs only."""
-        return Pay(_LOWEST, 0.0)
+        return RewardRange(_LOWEST, 0.0)
 
-    def begin(self, draw: Draw, params: Params) -> World:
+    def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return a platoon in equilibrium at v̄, with drawn waves ahead of it."""
         base = self.simulator.base
         like = self.like(params)
@@ -109,7 +109,7 @@ class PlatoonTask(Task):
         gaps = equilibrium_gap(driver, speed).expand_as(speed)[:, 1:]
         positions = queue(first[:, :1], gaps, self.vehicle_length)
         state = self.simulator.state(positions, speed, params, length=self.vehicle_length, step=step)
-        return World(state, {"waves": waves})
+        return EnvState(state, {"waves": waves})
 
     def _motion(self, waves: Tensor, step: Tensor) -> Tensor:
         """Return position, speed and acceleration of the head at a step, shape ``(n, 3)``."""
@@ -125,7 +125,7 @@ class PlatoonTask(Task):
         return torch.stack((position, speed, accel), dim=-1)
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, with the head's motion at its end."""
         inputs = dict(super().inputs(world, command, normals, live))
@@ -134,7 +134,7 @@ class PlatoonTask(Task):
         inputs["replay"] = head(self._motion(world.episode["waves"], state.step + 1), first)
         return inputs
 
-    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return minus the quadratic costs of speed and effort, and of time gaps out of bounds."""
         state = after.state
         speed, last = self.pick(state.speed), state.speed[..., -1:]

@@ -14,7 +14,7 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Ended, Pay, Task, World
+from idm_env.tasks.base import Ended, EnvState, RewardRange, Task
 from idm_env.tasks.checks import count_of, in_ranges
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import Feature
@@ -134,9 +134,9 @@ class ReplayTask(Task):
         return SEEN
 
     @property
-    def own_pay(self) -> Pay:
+    def own_reward_range(self) -> RewardRange:
         """Distances are costs only; the terms of ``follow`` lie in −4 … 1."""
-        return Pay(_FARTHEST, 0.0) if self.reward_terms == "imitation" else Pay(LOWEST, HIGHEST)
+        return RewardRange(_FARTHEST, 0.0) if self.reward_terms == "imitation" else RewardRange(LOWEST, HIGHEST)
 
     @property
     def shares(self) -> int:
@@ -225,7 +225,7 @@ class ReplayTask(Task):
             raise ValueError(f"vehicles {ids} never follow recorded leaders at one time. Control others or fewer.")
         return np.flatnonzero(remaining[:-1] >= min(self._wanted + 1, longest))
 
-    def begin(self, draw: Draw, params: Params) -> World:
+    def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return the recorded road at a drawn time."""
         like = self.like(params)
         starts = self.constant("starts", self._starts, draw.key.device, torch.int64)
@@ -242,7 +242,7 @@ class ReplayTask(Task):
             step=torch.zeros_like(start),
             lane=self.lane_at(start),
         )
-        return World(state, {"start": start})
+        return EnvState(state, {"start": start})
 
     def lane_at(self, time: Tensor) -> Tensor | None:
         """Return the recorded lanes at time steps of the record; None where vehicles keep theirs."""
@@ -256,7 +256,7 @@ class ReplayTask(Task):
         return motion[inside], present[inside]
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, with the record at its end; who is not there yet is placed by it."""
         inputs = dict(super().inputs(world, command, normals, live))
@@ -268,7 +268,7 @@ class ReplayTask(Task):
         inputs["replay"] = Record(position, speed, accel, replayed | (state.present <= 0), present)
         return inputs
 
-    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return minus the distance to the record (10 m), or the terms of ``follow``; 0 of those who are not there."""
         state = after.state
         if self.reward_terms == "imitation":
@@ -279,22 +279,22 @@ class ReplayTask(Task):
         terms = 1.0 - 0.1 * fuel - 0.002 * command * command - 2.0 * far
         return self.there(state, floored(terms, KNEE, LOWEST))
 
-    def distance(self, world: World) -> Tensor:
+    def distance(self, world: EnvState) -> Tensor:
         """Return how far the agents are from their records (m), 0 where these have ended, shape ``(…, agents)``."""
         state = world.state
         motion, present = self._recorded(world.episode["start"] + state.step, state.speed.dtype)
         return self.pick((state.position - motion[..., 0]).abs() * present)
 
-    def crashed(self, world: World) -> Tensor:
+    def crashed(self, world: EnvState) -> Tensor:
         """Return which agents touch their leaders."""
         return self.pick(world.state.gap) <= 0.0
 
-    def crash_reason(self, world: World, row: int, agent: int | None = None) -> str:
+    def crash_reason(self, world: EnvState, row: int, agent: int | None = None) -> str:
         """Return which agent touched its leader: recorded vehicles may overlap, and nobody minds."""
         own = int(self.pick(world.state.gap[row].detach()).argmin()) if agent is None else agent
         return super().crash_reason(world, row, own)
 
-    def ended(self, world: World) -> Ended:
+    def ended(self, world: EnvState) -> Ended:
         """Return, for each agent, whether it touches its leader, and whether its record has ended."""
         state = world.state
         assert state.present is not None

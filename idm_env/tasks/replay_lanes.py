@@ -12,7 +12,7 @@ from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Control, Effect, LaneCommand, Mobil, Replay
 from idm_env.roads import End, Lanes
-from idm_env.tasks.base import World
+from idm_env.tasks.base import EnvState
 from idm_env.tasks.crash import contact
 from idm_env.tasks.features import FEATURES, Feature, feature
 from idm_env.tasks.lane_scenes import LanesScene, made_up_lanes, recorded_lanes
@@ -96,7 +96,7 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         return lane[time.clamp(0, len(lane) - 1)]
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, with the record at its end, lanes included where they are recorded."""
         found = dict(super().inputs(world, command, normals, live))
@@ -128,12 +128,12 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         """Return the gap of whoever follows each vehicle (m), its own where nobody does."""
         return self.road.view(state).back(state.gap)
 
-    def crashed(self, world: World) -> Tensor:
+    def crashed(self, world: EnvState) -> Tensor:
         """Return which agents touch whoever is ahead of or behind them on their lane."""
         state = world.state
         return self.pick(torch.minimum(state.gap, self._behind(state))) <= 0.0
 
-    def crash_reason(self, world: World, row: int, agent: int | None = None) -> str:
+    def crash_reason(self, world: EnvState, row: int, agent: int | None = None) -> str:
         """Return who touched whom: an agent its leader, or a recorded vehicle an agent."""
         state = world.state
         links = state.links

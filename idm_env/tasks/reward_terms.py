@@ -19,7 +19,7 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.tasks import features
 from idm_env.tasks.features import AgentView
-from idm_env.tasks.types import Agents, Pay, World
+from idm_env.tasks.types import Agents, EnvState, RewardRange
 from idm_env.validation import finite
 
 
@@ -28,9 +28,9 @@ class Transition:
     """One step: what was commanded (m/s², ``(…, agents)``, as given), and the worlds before and after it."""
 
     task: Agents
-    before: World
+    before: EnvState
     command: Tensor
-    after: World
+    after: EnvState
 
     @property
     def view(self) -> AgentView:
@@ -136,10 +136,10 @@ class Weighted:
     terms: tuple[tuple[RewardTerm, float], ...]
 
     @property
-    def pay(self) -> Pay:
+    def reward_range(self) -> RewardRange:
         """The lowest (at most 0) and the highest (at least 0) sum."""
         ends = [sorted((weight * term.low, weight * term.high)) for term, weight in self.terms]
-        return Pay(min(0.0, sum(low for low, _ in ends)), max(0.0, sum(high for _, high in ends)))
+        return RewardRange(min(0.0, sum(low for low, _ in ends)), max(0.0, sum(high for _, high in ends)))
 
     def __call__(self, step: Transition) -> Tensor:
         """Return the reward of a step, ``(…, agents)``; 0 for agents that are not on the road."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Ring, Road
-from idm_env.tasks.base import Pay, Task, World
+from idm_env.tasks.base import EnvState, RewardRange, Task
 from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import Feature, feature
@@ -146,15 +146,15 @@ class RingTask(Task):
         )
 
     @property
-    def own_pay(self) -> Pay:
+    def own_reward_range(self) -> RewardRange:
         """From full commands and every weighted term at its worst to a ring at 40 m/s."""
-        return Pay(self._worst() - _FUEL * self.fuel, 0.2 * _FASTEST)
+        return RewardRange(self._worst() - _FUEL * self.fuel, 0.2 * _FASTEST)
 
     def _worst(self) -> float:
         """Return the reward below which the fuel's term saturates; without its weight none lies below."""
         return -4.0 * max(-self.command_limits[0], self.command_limits[1]) - self.tailgating - _FUEL * self.fuel
 
-    def begin(self, draw: Draw, params: Params) -> World:
+    def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return rings of drawn lengths: standing at equal gaps, or in a wave."""
         like = self.like(params)
         low, high = span("length", self.length, 1.0, "m")
@@ -177,7 +177,7 @@ class RingTask(Task):
             circumference=length.squeeze(-1),
             step=torch.full((len(length),), -self.warmup, device=length.device),
         )
-        return World(state, {})
+        return EnvState(state, {})
 
     @cached_property
     def _leaders(self) -> tuple[int, ...]:
@@ -190,7 +190,7 @@ class RingTask(Task):
         return x.index_select(-1, self.constant("leaders", self._leaders, x.device, torch.int64))
 
     def inputs(
-        self, world: World, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step: those of every task, and the command of the human who brakes."""
         inputs = super().inputs(world, command, normals, live)
@@ -206,7 +206,7 @@ class RingTask(Task):
     def _is_shocked(self) -> list[bool]:
         return [i == self.shocked for i in range(self.vehicles)]
 
-    def earned(self, before: World, command: Tensor, after: World) -> Tensor:
+    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return ``4 mean(v)/20 − 4 mean|u|``, less the terms that have a weight."""
         state = after.state
         effort = command.abs()
@@ -220,4 +220,4 @@ class RingTask(Task):
         if self.tailgating:
             time_gap = metrics.time_gap(self.pick(state.gap), self.pick(state.speed))
             reward = reward - self.tailgating * torch.relu(1.0 - time_gap / self.tailgating_below)
-        return floored(reward, self._worst(), self.own_pay.low) if self.fuel else reward
+        return floored(reward, self._worst(), self.own_reward_range.low) if self.fuel else reward

@@ -20,7 +20,7 @@ NOBODY = "—"
 """Id of a slot in which no recorded vehicle is."""
 
 
-class World(NamedTuple):
+class EnvState(NamedTuple):
     """Everything that a step carries over: the state of the traffic, and what is constant in an episode.
 
     Every tensor has the environments as its first dimension.
@@ -79,7 +79,7 @@ class Bounds(NamedTuple):
     high: tuple[float, ...]
 
 
-class Pay(NamedTuple):
+class RewardRange(NamedTuple):
     """The lowest and the highest reward that a step without a crash can give."""
 
     low: float

@@ -12,7 +12,7 @@ from idm_env.data import synthetic
 from idm_env.discovery import discover, write_report
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.march import Catalogue
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.solve import Task
 from idm_env.effects import BASES, Brakes, Replay, base_named
@@ -29,7 +29,7 @@ def test_the_loop_of_a_law_is_the_simulator(platoon: Records, name: str) -> None
     law = base_named(name)
     rows, prior = whole(platoon), first_prior(law.declared)
     task = Task(rows, None, prior)
-    model = Model((), Catalogue((), law, located=False))
+    model = Hypothesis((), Catalogue((), law, located=False))
     mine = task.predict(np.tile(prior.centre, (1, task.groups, 1)), model, np.zeros((1, 0)))[0][0]
     simulator = Simulator(Lane(), (law, Replay(), Brakes()), dt=platoon.dt, integration="midpoint")
     batch = Batch.of(platoon.episodes, substeps=1)

@@ -11,7 +11,7 @@ import pytest
 from idm_env.data import Trajectories, episodes, synthetic
 from idm_env.discovery import crossed, discover, judge
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.search import first_noise
 from idm_env.discovery.verdict import HOLDS
@@ -35,7 +35,7 @@ def moved(records: Records, begin_s: float, end_s: float) -> Records:
 
 
 def theta(records: Records) -> np.ndarray:
-    return judge.calibrate(records, Model(), np.zeros(0), first_prior()).theta
+    return judge.calibrate(records, Hypothesis(), np.zeros(0), first_prior()).theta
 
 
 def test_what_happens_before_a_driver_has_settled_moves_no_parameter(records: Records) -> None:
@@ -48,7 +48,7 @@ def test_all_time_is_scored_and_by_parameters_that_have_not_seen_it(records: Rec
     noise = first_noise(windows(records))
 
     def judged(of: Records) -> judge.Judged:
-        return crossed.crossed(of, Model(), np.zeros((2, 0)), fold, noise)
+        return crossed.crossed(of, Hypothesis(), np.zeros((2, 0)), fold, noise)
 
     rows = whole(records)
     second = judge.halves(rows)

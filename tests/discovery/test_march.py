@@ -17,7 +17,7 @@ from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.judge import Frozen
 from idm_env.discovery.march import Catalogue
-from idm_env.discovery.model import Model, Term
+from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, Rows, whole, windows
 from idm_env.discovery.solve import Task
 from idm_env.effects import CANDIDATES, IDM, Brakes, Replay
@@ -58,7 +58,7 @@ def places(records: Records) -> dict[str, tuple[Term, tuple[float, ...]]]:
     }
 
 
-def simulated(records: Records, model: Model, values: np.ndarray) -> np.ndarray:
+def simulated(records: Records, model: Hypothesis, values: np.ndarray) -> np.ndarray:
     """The gap of the simulator, on the samples that discovery keeps."""
     effects, numbers = terms.effects_of(model, values)
     simulator = Simulator(Lane(), (IDM(), Replay(), *effects, Brakes()), dt=records.dt, integration="midpoint")
@@ -73,22 +73,22 @@ def simulated(records: Records, model: Model, values: np.ndarray) -> np.ndarray:
         return problem.simulate(rows).gap.numpy()[4::5].T
 
 
-def twin(records: Records, model: Model, values: np.ndarray) -> np.ndarray:
+def twin(records: Records, model: Hypothesis, values: np.ndarray) -> np.ndarray:
     rows = whole(records)
     task = Task(rows, None, first_prior())
     theta = np.tile(THETA, (1, task.groups, 1))
     return task.predict(theta, Frozen(model, values), np.zeros((1, 0)))[0][0]
 
 
-def modelled(term: Term | None) -> Model:
+def modelled(term: Term | None) -> Hypothesis:
     if term is not None and term.profile is not None:
         # A known profile takes the place of the one that would be searched.
         known = terms.known_effect(term)
-        return Model((term,), Catalogue.of([known]))
-    return Model(() if term is None else (term,))
+        return Hypothesis((term,), Catalogue.of([known]))
+    return Hypothesis(() if term is None else (term,))
 
 
-def agrees(records: Records, model: Model, values: np.ndarray) -> np.ndarray:
+def agrees(records: Records, model: Hypothesis, values: np.ndarray) -> np.ndarray:
     """Hold the loop to the simulator and return its gaps."""
     mine, reference = twin(records, model, values), simulated(records, model, values)
     valid = whole(records).valid
@@ -101,7 +101,7 @@ def agrees(records: Records, model: Model, values: np.ndarray) -> np.ndarray:
 def check(records: Records, term: Term | None, values: tuple[float, ...]) -> None:
     mine = agrees(records, modelled(term), np.array(values, float))
     if term is not None:
-        without = twin(records, Model(), np.zeros(0))
+        without = twin(records, Hypothesis(), np.zeros(0))
         assert np.abs(mine - without)[whole(records).valid].max() > 0.01  # so that the parity is of something
 
 
@@ -122,7 +122,7 @@ def test_places_and_times(platoon: Records) -> None:
 
 
 def test_all_together(platoon: Records) -> None:
-    model = Model(
+    model = Hypothesis(
         tuple(terms.simple(n) for n in ("delay", "leader_acceleration", "speed_dependent_gap", "drag", "asymmetry"))
     )
     agrees(platoon, model, np.array([0.3, 0.2, 2.0, 3e-4, 0.1]))
@@ -131,7 +131,7 @@ def test_all_together(platoon: Records) -> None:
 def test_windows_share_their_winding_up(platoon: Records) -> None:
     """A window behind others of its record ends where it ends when it is rolled out alone."""
     rows = windows(platoon)
-    model, values = Model((terms.simple("memory"), terms.simple("delay"))), np.array([[0.7, 40.0, 0.46]])
+    model, values = Hypothesis((terms.simple("memory"), terms.simple("delay"))), np.array([[0.7, 40.0, 0.46]])
 
     def ends(some: Rows) -> np.ndarray:
         task = Task(some, None, first_prior())
@@ -152,7 +152,7 @@ def test_a_printed_loop_depends_on_no_number() -> None:
 def test_what_has_no_name_ends_with_the_states_that_were_seen() -> None:
     """A residual over the state is nothing beyond them: held on, it drove free simulations away by tens of metres."""
     term = terms.curve("acceleration", "speed", 5.0, 5.0, 3)
-    (effect,), numbers = terms.effects_of(Model((term,)), np.array([0.3, -0.2, 0.4]))
+    (effect,), numbers = terms.effects_of(Hypothesis((term,)), np.array([0.3, -0.2, 0.4]))
     simulator = Simulator(Lane(), (IDM(), effect, Brakes()))
     params = simulator.defaults(dtype=torch.float64)
     params[effect.name] = {k: torch.tensor(v, dtype=torch.float64) for k, v in numbers[effect.name].items()}
@@ -172,14 +172,14 @@ import sys
 import numpy as np
 from idm_env.data import episodes, synthetic
 from idm_env.discovery.march import Catalogue
-from idm_env.discovery.model import Model, simple
+from idm_env.discovery.model import Hypothesis, simple
 from idm_env.discovery.records import gather
 from idm_env.effects import make
 from tests.discovery.test_march import twin
 
 records = gather(episodes(synthetic.generate(11, runs=1, followers=1, seconds=30.0)[0], smooth=True))
 for name in sys.argv[1:]:
-    assert np.isfinite(twin(records, Model((simple(name),), Catalogue((make(name),))), np.array([0.0]))).any()
+    assert np.isfinite(twin(records, Hypothesis((simple(name),), Catalogue((make(name),))), np.array([0.0]))).any()
 """
 
 

@@ -16,7 +16,7 @@ from idm_env import effects as catalogue
 from idm_env.data import Trajectories, synthetic
 from idm_env.discovery import discover, march, places
 from idm_env.discovery import model as terms
-from idm_env.discovery.model import Model, simple
+from idm_env.discovery.model import Hypothesis, simple
 from idm_env.discovery.records import Records
 from idm_env.effects import Effect
 from idm_env.effects.registry import is_candidate
@@ -108,7 +108,7 @@ def test_an_effect_of_ones_own_is_found_in_data_that_have_it(tmp_path: Path) -> 
 def test_its_loop_does_what_the_simulator_does(platoon: Records) -> None:
     """A memory, a look back and a static choice of an effect defined here, alone and among others."""
     own = Mood(scale=50.0)
-    model = Model((simple(own),), march.Catalogue.of([own]))
+    model = Hypothesis((simple(own),), march.Catalogue.of([own]))
     agrees(platoon, model, np.array([0.2, 4.0]))
     both = model.adding(simple("delay")).adding(simple("asymmetry"))
     agrees(platoon, both, np.array([0.2, 4.0, 0.33, 0.2]))

@@ -10,7 +10,7 @@ from idm_env.data import episodes, synthetic
 from idm_env.discovery import model as terms
 from idm_env.discovery import search
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import _same_class
@@ -23,7 +23,7 @@ def begun(records: Records, *names: str) -> tuple[Search, Solution]:
     rows = windows(records)
     task = Task(rows, search.first_noise(rows), first_prior())
     searching = Search(task, names, False, Store(None, "", False), lambda *_: None)
-    return searching, searching.null(Model(), np.tile(task.prior.centre, (task.groups, 1)))
+    return searching, searching.null(Hypothesis(), np.tile(task.prior.centre, (task.groups, 1)))
 
 
 def made(seed: int, **choices: object) -> Records:
@@ -55,7 +55,7 @@ def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypa
         monkeypatch.setattr(Task, "predict", counted)
         for term in map(terms.simple, names):
             copies.clear()
-            model = Model().adding(term)
+            model = Hypothesis().adding(term)
             share, scaled = searching._promise(null, model, term, np.array(term.starts))
             assert len(share) == len(scaled) == len(term.starts) and copies == [len(term.starts)]
             found = searching._nested(null, term, np.ones(len(searching.units)), term.label).solution
@@ -72,7 +72,7 @@ def test_only_groups_that_moved_are_rolled_out_again(platoon: Records) -> None:
     """Free simulation, and windows, whose errors depend on those before: the same bits as everything anew."""
     searching, null = begun(platoon, "drag")
     for task in (searching.task, Task(whole(platoon), None, searching.task.prior)):
-        model, values = Model((terms.simple("drag"),)), np.array([1e-4])
+        model, values = Hypothesis((terms.simple("drag"),)), np.array([1e-4])
         nested = _Nested(task, model)
         shared, first = torch.tensor(values[None]), torch.tensor(null.theta[None])
         nested.linear(first, shared)
@@ -87,5 +87,5 @@ def test_a_curve_has_intervals_over_its_coordinate_in_it() -> None:
     zone, shift = terms.placed("speed_zone", 0.7, 500.0, 900.0), terms.placed("regime_shift", 0.3, 100.0)
     profile = terms.unknown_profile("speed_profile", 0.0, 80.0, 40, 0.0)
     ramp = terms.curve("time_gap", "time", 0.0, 200.0, 2, label="time_gap ramp")
-    assert _same_class(zone, Model((profile,))) and not _same_class(profile, Model((zone,)))
-    assert not _same_class(shift, Model((profile,))) and not _same_class(shift, Model((ramp,)))
+    assert _same_class(zone, Hypothesis((profile,))) and not _same_class(profile, Hypothesis((zone,)))
+    assert not _same_class(shift, Hypothesis((profile,))) and not _same_class(shift, Hypothesis((ramp,)))

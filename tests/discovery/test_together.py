@@ -11,7 +11,7 @@ from idm_env.data import episodes, synthetic
 from idm_env.discovery import free, search, selection, together
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import gather, windows
 from idm_env.discovery.score import interval_of
 from idm_env.discovery.search import Search
@@ -29,13 +29,15 @@ def searching() -> Search:
 
 
 @pytest.fixture(scope="module")
-def start(searching: Search) -> free.Stand:
+def start(searching: Search) -> free.ClosedLoopFit:
     task = searching.task
-    null = solve(task, Model(), np.tile(task.prior.centre, (task.groups, 1)), np.zeros(0))
+    null = solve(task, Hypothesis(), np.tile(task.prior.centre, (task.groups, 1)), np.zeros(0))
     return free.stand(task.rows.records, null.model, null.values, null.prior, null.theta)
 
 
-def test_what_is_there_is_added_in_free_simulation_and_nothing_else(searching: Search, start: free.Stand) -> None:
+def test_what_is_there_is_added_in_free_simulation_and_nothing_else(
+    searching: Search, start: free.ClosedLoopFit
+) -> None:
     joined, steps = together.grow(searching, start, 0, seed=0)
     assert joined is not None
     assert [t.label for t in joined.solution.model.terms] == ["speed_time_gap"]
@@ -45,8 +47,8 @@ def test_what_is_there_is_added_in_free_simulation_and_nothing_else(searching: S
     assert len(start.units) == 18 and set(start.rmse_m) >= set(free.GRID_S)
 
 
-def test_a_term_that_is_not_there_is_taken_back(start: free.Stand) -> None:
-    model = Model((terms.simple("speed_time_gap"), terms.simple("drag")))
+def test_a_term_that_is_not_there_is_taken_back(start: free.ClosedLoopFit) -> None:
+    model = Hypothesis((terms.simple("speed_time_gap"), terms.simple("drag")))
     both = free.joint(start, model, np.array([-0.3, 1e-4]))
     kept = together._backward(start, both, 0)
     assert [t.label for t in kept.model.terms] == ["speed_time_gap"]
@@ -55,7 +57,7 @@ def test_a_term_that_is_not_there_is_taken_back(start: free.Stand) -> None:
 def test_a_term_of_windows_whose_interval_contains_its_null_is_taken_back_whatever_it_gains(
     searching: Search, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = Model((terms.simple("speed_time_gap"), terms.simple("drag")))
+    model = Hypothesis((terms.simple("speed_time_gap"), terms.simple("drag")))
     task = searching.task
     both = solve(task, model, np.tile(task.prior.centre, (task.groups, 1)), np.array([-0.3, 1e-4]))
     intervals = interval_of(both, task)
@@ -64,16 +66,18 @@ def test_a_term_of_windows_whose_interval_contains_its_null_is_taken_back_whatev
     assert [t.label for t in selection._delete(searching, both, 0).model.terms] == ["speed_time_gap"]
 
 
-def test_what_windows_found_is_fitted_in_free_simulation_once_more(searching: Search, start: free.Stand) -> None:
+def test_what_windows_found_is_fitted_in_free_simulation_once_more(
+    searching: Search, start: free.ClosedLoopFit
+) -> None:
     """A strength that is a quarter of the true one comes back."""
-    model = Model((terms.simple("speed_time_gap"),))
+    model = Hypothesis((terms.simple("speed_time_gap"),))
     off = free.in_windows(searching.task, replace(free.joint(start, model, np.array([-0.3])), values=np.array([-0.1])))
     again, intervals = free.refitted(start.task.rows.records, off)
     assert again.values[0] == pytest.approx(-0.4, rel=0.3)
     assert intervals[0, 1] < again.values[0] < intervals[0, 2]
 
 
-def test_theta_follows_on_time_that_is_not_scored(start: free.Stand) -> None:
+def test_theta_follows_on_time_that_is_not_scored(start: free.ClosedLoopFit) -> None:
     """A response that θ can make up for leaves next to nothing."""
     by_theta = start.linear.by_theta[..., [2]]
     left = start.across(by_theta)

@@ -15,9 +15,9 @@ from idm_env.discovery import Discovery, compare, crossed, discover, judge, page
 from idm_env.discovery import model as terms
 from idm_env.discovery.bases import Law, best_of
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.compare import ERRORS, Comparison, Light
+from idm_env.discovery.compare import ERRORS, Comparison, ErrorChange
 from idm_env.discovery.march import Catalogue
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.power import Strength
 from idm_env.discovery.records import gather
 from idm_env.discovery.summary import Judgement
@@ -63,7 +63,7 @@ def test_a_law_is_better_where_an_error_is_lower_beyond_chance() -> None:
 
     def law(*three: Comparison) -> Law:
         base = base_named("gipps")
-        model = Model((), Catalogue((), base, located=False))
+        model = Hypothesis((), Catalogue((), base, located=False))
         return Law(base, model, None, errors(*three) if three else {})  # type: ignore[arg-type]
 
     null, gipps = law(), law(UP, BETTER, SAME)
@@ -100,8 +100,8 @@ def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
 
 
 def test_a_light_needs_the_whole_interval_on_one_side() -> None:
-    assert [c.light for c in (BETTER, SAME, WORSE)] == [Light.BETTER, Light.SAME, Light.WORSE]
-    assert Comparison(1.0, 1.0, 1.0, float("nan"), float("nan")).light is Light.SAME
+    assert [c.light for c in (BETTER, SAME, WORSE)] == [ErrorChange.BETTER, ErrorChange.SAME, ErrorChange.WORSE]
+    assert Comparison(1.0, 1.0, 1.0, float("nan"), float("nan")).light is ErrorChange.SAME
 
 
 def test_intervals_cover_the_true_change() -> None:
@@ -123,7 +123,7 @@ def test_intervals_cover_the_true_change() -> None:
 
 def test_one_follower_tells_nothing() -> None:
     found = compare.compared(np.ones(1), np.full(1, 0.1), 10.0, np.array(["a"]), 0)
-    assert found.light is Light.SAME and found.low == 0.0 and found.high == float("inf")
+    assert found.light is ErrorChange.SAME and found.low == 0.0 and found.high == float("inf")
 
 
 def test_a_driver_in_pieces_is_one_driver() -> None:
@@ -133,7 +133,7 @@ def test_a_driver_in_pieces_is_one_driver() -> None:
     cut = made.table.filter(~since.is_between(28.0, 30.0))
     records = gather(list(episodes(replace(made, table=cut), smooth=True, min_seconds=12.0)))
     assert len(records) > len(records.groups) == 4
-    judged = judge.judge(records, Model(), np.zeros(0), np.tile(first_prior().centre, (4, 1)))
+    judged = judge.judge(records, Hypothesis(), np.zeros(0), np.tile(first_prior().centre, (4, 1)))
     assert len(judged.followers) == len(judged.gap_rmse) == 4
     total = judged.squares["gap_rmse_m"][1]
     pooled = np.sqrt((judged.gap_rmse**2 * total).sum() / total.sum())

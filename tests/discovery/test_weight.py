@@ -9,7 +9,7 @@ import numpy as np
 from idm_env.data import episodes, synthetic
 from idm_env.discovery import free, judge, words
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.model import Model
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.search import first_noise
 from idm_env.discovery.solve import Solution, Task, solve
@@ -20,7 +20,7 @@ def fitted(seconds: float, ou: float, spread: float, seed: int = 5) -> tuple[Rec
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
     task = Task(rows, first_noise(rows), first_prior())
-    null = solve(task, Model(), np.tile(first_prior().centre, (task.groups, 1)), np.zeros(0))
+    null = solve(task, Hypothesis(), np.tile(first_prior().centre, (task.groups, 1)), np.zeros(0))
     seen = null.theta[np.unique(records.group)]
     return records, replace(null, prior=replace(first_prior(), centre=np.median(seen, axis=0), width=np.full(5, 0.3)))
 
@@ -47,9 +47,9 @@ def test_short_noisy_records_of_like_drivers_lean_on_the_population() -> None:
     errors = []
     for seconds in (5.0, alike_s):
         prior = replace(null.prior, alike_s=seconds)
-        theta = judge.calibrate(others, Model(), empty, prior, replace(rows, valid=rows.valid & ~second)).theta
+        theta = judge.calibrate(others, Hypothesis(), empty, prior, replace(rows, valid=rows.valid & ~second)).theta
         scored = Task(replace(rows, valid=second), None, prior)
-        errors.append(np.linalg.norm(scored.errors(theta[None], Model(), empty[None])))
+        errors.append(np.linalg.norm(scored.errors(theta[None], Hypothesis(), empty[None])))
     assert errors[1] < 0.95 * errors[0]
 
 

@@ -22,7 +22,7 @@ def rolled(seconds: int, **choices: Any) -> Any:
     idle = Command(torch.zeros((), dtype=torch.float64), torch.zeros(60, dtype=torch.bool))
     inputs = {"control": Command(*(x.expand(10, *x.shape) for x in idle))}
     worlds = [world]
-    driven = task.driven(world.episode, params)
+    driven = task.episode_params(world.episode, params)
     for _ in range(seconds):
         state, _ = task.simulator.rollout(worlds[-1].state, inputs, driven, 10)
         worlds.append(world._replace(state=state))

@@ -45,8 +45,8 @@ def test_every_feature_keeps_its_bounds_and_every_term_its_own_in_every_task(tas
             one = make_task(task, controlled=2, reward={name: weight})
             paid = one.paid(before, command, after)
             assert paid.shape == command.shape
-            assert one.pay.low <= float(paid.min()) <= float(paid.max()) <= one.pay.high
-            assert one.pay.low <= 0.0 <= one.pay.high
+            assert one.reward_range.low <= float(paid.min()) <= float(paid.max()) <= one.reward_range.high
+            assert one.reward_range.low <= 0.0 <= one.reward_range.high
 
 
 @pytest.mark.parametrize("task", ["ring", "follow", "merge"])
@@ -107,7 +107,7 @@ def test_those_of_a_file_are_run_only_if_it_is_trusted(tmp_path):
     assert env.unwrapped.task.bounds.names == ("speed", "approach")
     env.reset(seed=0)
     assert env.step(env.action_space.sample())[0].shape == (2,)
-    assert make_task("ring", **keywords, trusted=True).pay.low == -10.0
+    assert make_task("ring", **keywords, trusted=True).reward_range.low == -10.0
 
 
 def test_objects_of_ones_own_and_what_they_must_be():

@@ -39,7 +39,7 @@ def begun(name: str, path: str, count: int = 40, **more: object):
 @pytest.mark.parametrize("name", ["ring", "follow", "platoon", "highway", "merge"])
 def test_every_vehicle_has_the_parameters_of_one_driver(name: str, path: str) -> None:
     task, params, world = begun(name, path, warmup=3)
-    who, made = world.episode["driver"], task.driven(world.episode, params)["idm"]
+    who, made = world.episode["driver"], task.episode_params(world.episode, params)["idm"]
     assert who.shape == (40, task.vehicles) and set(who.flatten().tolist()) == {0, 1, 2}
     assert torch.equal(made["time_gap"], torch.tensor(GAPS, dtype=torch.float64)[who])
     assert torch.equal(made["desired_speed"], torch.tensor(SPEEDS, dtype=torch.float64)[who])
@@ -92,7 +92,7 @@ def test_compiled_loops_and_torch_drive_alike_also_where_single_rows_begin_anew(
 
 def test_what_parameters_name_is_everybodys(path: str) -> None:
     task, params, world = begun("ring", path, parameters={"idm.time_gap": 2.0})
-    made = task.driven(world.episode, params)["idm"]
+    made = task.episode_params(world.episode, params)["idm"]
     assert float(made["time_gap"]) == 2.0 and made["desired_speed"].shape == (40, task.vehicles)
 
 

@@ -20,7 +20,7 @@ def test_all_drivers_of_an_episode_have_what_it_has_drawn(name: str) -> None:
     task = make_task(name, randomise=RANGES)
     params, seeds = task.params(torch.float64, "cpu"), torch.arange(400)
     world = task.reset(Draw.of(seeds, torch.zeros_like(seeds)), params)
-    made = task.driven(world.episode, params)["idm"]
+    made = task.episode_params(world.episode, params)["idm"]
     for parameter, (low, high) in (("time_gap", (0.8, 1.2)), ("max_accel", (0.7, 1.4))):
         drawn = made[parameter]
         assert drawn.shape == (400, task.vehicles) and bool((drawn == drawn[:, :1]).all())
@@ -64,7 +64,7 @@ def test_ranges_stand_over_parameters_and_single_drivers(tmp_path: Path) -> None
     save_model(file, Model((IDM(), Brakes()), {}, drivers=single))
     task = make_task("ring", drivers=str(file), parameters={"idm.max_accel": 1.1}, randomise={"idm.time_gap": [0.9, 1]})
     params, seeds = task.params(torch.float64, "cpu"), torch.arange(9)
-    made = task.driven(task.reset(Draw.of(seeds, seeds), params).episode, params)["idm"]
+    made = task.episode_params(task.reset(Draw.of(seeds, seeds), params).episode, params)["idm"]
     assert bool((made["time_gap"] <= 1.0).all()) and set(made["min_gap"].flatten().tolist()) == {3.3, 3.7}
     assert float(made["max_accel"]) == 1.1
 

@@ -174,7 +174,7 @@ def test_drivers_and_agents_may_change_lanes_themselves():
                 lane = 2.0 * torch.rand((3, count), generator=generator, dtype=torch.float64) - 1.0
                 action = torch.cat((torch.zeros_like(lane), lane), -1) if task.lane_commands else None
                 command = None if action is None else task.command(action)
-                inputs = task.wishes(task.inputs(world, command, None), action)
+                inputs = task.with_lane_commands(task.inputs(world, command, None), action)
                 world = world._replace(state=task.simulator.step(world.state, inputs, params))
         at = (world.episode["start"] + 150).numpy()
         lanes = world.state.links.lane.numpy()

@@ -74,9 +74,9 @@ def test_every_crash_returns_less_than_every_survival(name):
 @pytest.mark.parametrize("name", CASES)
 def test_no_state_pays_beyond_the_bounds_that_the_cost_is_made_of(name):
     task = make_task(**CASES[name])
-    assert task.pay.low <= 0.0 <= task.pay.high
+    assert task.reward_range.low <= 0.0 <= task.reward_range.high
     shared = task.cost_of_crash / task.shares
-    assert (task.steps - 1) * task.pay.high - shared < task.steps * task.pay.low
+    assert (task.steps - 1) * task.reward_range.high - shared < task.steps * task.reward_range.low
     params = task.params(torch.float64, "cpu")
     draw = Draw.of(torch.arange(500), torch.zeros(500, dtype=torch.int64))
     world = task.begin(draw, params)
@@ -86,9 +86,9 @@ def test_no_state_pays_beyond_the_bounds_that_the_cost_is_made_of(name):
         position=world.state.position + 1e5 * u[:, 0], step=world.state.step + 9,
     )  # fmt: skip
     command = task.command(2.0 * u[:, 1, : len(task.agents)] - 1.0)
-    earned = task.earned(world, command, world._replace(state=state))
+    earned = task.own_reward(world, command, world._replace(state=state))
     assert bool(torch.isfinite(earned).all())
-    assert task.pay.low <= float(earned.min()) < float(earned.max()) <= task.pay.high
+    assert task.reward_range.low <= float(earned.min()) < float(earned.max()) <= task.reward_range.high
 
 
 def test_every_task_is_tried():
@@ -114,3 +114,24 @@ def test_a_cost_of_ones_own_replaces_the_lawful_one():
     gap[0, 3] = -0.1
     touched = world._replace(state=world.state._replace(gap=gap))
     assert float(task.rewards(world, torch.zeros(1, 1, dtype=torch.float64), touched)) == -50.0
+
+
+def test_a_task_of_ones_own_with_the_words_of_before_still_works():
+    """With a warning for each; so do the classes."""
+    with pytest.warns(DeprecationWarning, match="RewardRange"):
+        from idm_env.tasks import Pay
+
+    with pytest.warns(DeprecationWarning) as told:
+
+        class Old(TASKS["follow"]):
+            @property
+            def own_pay(self):
+                return Pay(-3.0, 2.0)
+
+            def earned(self, before, command, after):
+                return 0.0 * self.pick(after.state.speed)
+
+    assert {"Old.own_pay is called own_reward_range now.", "Old.earned is called own_reward now."} == {
+        str(each.message) for each in told
+    }
+    assert Old().own_reward_range == (-3.0, 2.0) and Old.own_reward is Old.earned
