@@ -9,11 +9,13 @@ from typing import Any
 import pytest
 import torch
 
+from idm_env.model_file import load_environment
 from idm_env.multilane import demand
 from idm_env.tasks import Draw, Task, make_task
 from idm_env.tasks import trip_table as table
 from idm_env.types import Command
 
+ROOT = Path(__file__).resolve().parents[2]
 ROWS = [
     {"depart": 30.0, "lane": 1, "class": "truck", "destination": "exit"},
     {"depart": 5.0, "lane": 0, "speed": 22.0},
@@ -119,6 +121,14 @@ BAD: dict[str, tuple[str, dict[str, Any]]] = {
         "open_highway", {"on_ramp": [400.0, 600.0], "off_ramp": [500.0, 700.0]}),
     "lets nobody depart": ("merge", {"trips": {"per_hour": {1: 0}}}),
 }  # fmt: skip
+
+
+def test_a_motorway_in_yaml_is_that_in_python() -> None:
+    """configs/motorway.yaml and examples/motorway.py: the same keywords, so the same environment."""
+    said: dict[str, Any] = {}
+    exec((ROOT / "examples" / "motorway.py").read_text(encoding="utf-8").split("\nenv = ")[0], said)
+    given = load_environment(ROOT / "configs" / "motorway.yaml")
+    assert given == {"task": "open_highway", "controlled": 1, **said["road"]}
 
 
 @pytest.mark.parametrize("says", BAD)
