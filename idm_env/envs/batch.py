@@ -72,23 +72,6 @@ class Outcome(NamedTuple):
         return cls(told["observation"], told["reward"], told["terminated"], told["truncated"], whole, rest)
 
 
-class Unrolled(NamedTuple):
-    """A window of n environments, time first, with its graph.
-
-    ``observation`` ``(steps + 1, n, features)`` is what the policy saw, and sees next: where an episode ended, that of
-    the next one, through which no gradient flows. ``action`` ``(steps, n, actions)`` is what it did. ``reward``,
-    ``terminated`` and ``truncated`` ``(steps, n)`` are those of ``step``. ``final`` ``(steps, n, features)`` is what is
-    observed after each step, before any reset.
-    """
-
-    observation: Tensor
-    action: Tensor
-    reward: Tensor
-    terminated: Tensor
-    truncated: Tensor
-    final: Tensor
-
-
 def _held(before: Outcome, after: Outcome, over: Any) -> Outcome:
     """Return what two steps under one action give: sums of rewards, the rest of the second; where over of the first."""
 
@@ -304,52 +287,17 @@ class Batch:
         own = {n: self.__dict__[n] for n in _MARKED}
         return {**own, "episodes": self.episodes.copy()}, self._values.mark()
 
+    @property
+    def values(self) -> Values | None:
+        """The worlds as compiled loops step them, None where torch does."""
+        return self._values
+
     def back_to(self, mark: tuple[Any, ...]) -> None:
         """Undo steps, and resets within them."""
         assert self._values is not None
         self.__dict__.update(mark[0])
         self._values.back_to(mark[1])
         self._beginnings.forget()
-
-    def unroll(self, policy: Callable[[Tensor], Tensor], steps: int, push: Tensor | None) -> Unrolled:
-        """Return a window of steps with a policy between them; see ``Face.unroll``.
-
-        ValueError for a policy whose actions have another shape.
-        """
-        shape = (self.count, len(self.task.agents) * len(self.task.commands))
-        extra = torch.zeros(shape, dtype=self.settings.dtype) if push is None else push.expand(shape).contiguous()
-        values = self._values
-        # On several lanes, and where actions are held, a window is its steps, each of which is compiled.
-        fits = self.task.held == 1 and not (isinstance(self.task.road, Lanes) or self.task.simulator.untried)
-        fits = fits and values is not None and dispatch.surroundings() is None
-        if values is not None and fits:
-            from idm_env.envs import window
-
-            try:
-                self.settle()
-                made = window.compiled(self, values, policy, steps, extra)
-                if made is not None:
-                    return Unrolled(*made)
-            except Untraceable:
-                pass
-        kept: list[tuple[Tensor, ...]] = []
-        seen = self.seen()
-        first = [seen]
-        for _ in range(steps):
-            action = policy(seen) + extra
-            if action.shape != shape or not bool(action.isfinite().all()):
-                raise ValueError(
-                    f"policy gives actions of shape {tuple(action.shape)}; finite ones of shape {shape} are needed."
-                )
-            outcome = self.step(action)
-            seen = final = outcome.observation.reshape(self.count, -1)
-            over = np.flatnonzero((outcome.whole.terminated | outcome.whole.truncated).numpy())
-            if len(over):
-                seen = torch.as_tensor(self.reset(over)).reshape(self.count, -1)
-            first.append(seen)
-            kept.append((action, *outcome.whole, final))
-        action, reward, terminated, truncated, final = (torch.stack(x) for x in zip(*kept, strict=True))
-        return Unrolled(torch.stack(first), action, reward, terminated, truncated, final)
 
     def step(self, action: Tensor | np.ndarray | None, live: Tensor | None = None) -> Outcome:
         """Advance every row; ``action`` has shape ``(n, agents)``, None leaves everybody to the drivers.

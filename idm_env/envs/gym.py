@@ -13,10 +13,11 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from idm_env import compat
-from idm_env.envs.batch import Batch, Unrolled
+from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
 from idm_env.envs.settings import RENDER_MODES, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
+from idm_env.envs.unrolled import Unrolled, unroll
 from idm_env.tasks import Task
 from idm_env.types import Params, State, mapped
 from idm_env.validation import whole
@@ -96,7 +97,7 @@ class Face:
             raise ValueError(
                 f"autoreset_mode = '{mode.value}': unroll begins anew within the step. Make it with 'SameStep'."
             )
-        return self.batch.unroll(policy, whole("steps", steps, 1), push)
+        return unroll(self.batch, policy, whole("steps", steps, 1), push)
 
     def detach(self) -> None:
         """Cut the graph behind the present states, for truncated back-propagation."""

@@ -1,0 +1,72 @@
+"""A window of steps with a policy between them, of any face: compiled together where they can be, else step by step.
+
+Shapes: rows are environments, and time comes first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from idm_env.envs.batch import Batch
+from idm_env.kernels import dispatch
+from idm_env.roads import Lanes
+from idm_env.scalar.record import Untraceable
+
+
+class Unrolled(NamedTuple):
+    """A window of n environments, time first, with its graph.
+
+    ``observation`` ``(steps + 1, n, features)`` is what the policy saw, and sees next: where an episode ended, that of
+    the next one, through which no gradient flows. ``action`` ``(steps, n, actions)`` is what it did. ``reward``,
+    ``terminated`` and ``truncated`` ``(steps, n)`` are those of ``step``. ``final`` ``(steps, n, features)`` is what is
+    observed after each step, before any reset.
+    """
+
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    final: Tensor
+
+
+def unroll(batch: Batch, policy: Callable[[Tensor], Tensor], steps: int, push: Tensor | None) -> Unrolled:
+    """Return a window of steps; see ``Face.unroll``. ValueError for a policy whose actions have another shape."""
+    task, values = batch.task, batch.values
+    shape = (batch.count, len(task.agents) * len(task.commands))
+    extra = torch.zeros(shape, dtype=batch.settings.dtype) if push is None else push.expand(shape).contiguous()
+    # On several lanes, and where actions are held, a window is its steps, each of which is compiled.
+    fits = task.held == 1 and not (isinstance(task.road, Lanes) or task.simulator.untried)
+    if fits and values is not None and dispatch.surroundings() is None:
+        from idm_env.envs import window
+
+        try:
+            batch.settle()
+            made = window.compiled(batch, values, policy, steps, extra)
+            if made is not None:
+                return Unrolled(*made)
+        except Untraceable:
+            pass
+    kept: list[tuple[Tensor, ...]] = []
+    seen = batch.seen()
+    first = [seen]
+    for _ in range(steps):
+        action = policy(seen) + extra
+        if action.shape != shape or not bool(action.isfinite().all()):
+            raise ValueError(
+                f"policy gives actions of shape {tuple(action.shape)}; finite ones of shape {shape} are needed."
+            )
+        outcome = batch.step(action)
+        seen = final = outcome.observation.reshape(batch.count, -1)
+        over = np.flatnonzero((outcome.whole.terminated | outcome.whole.truncated).numpy())
+        if len(over):
+            seen = torch.as_tensor(batch.reset(over)).reshape(batch.count, -1)
+        first.append(seen)
+        kept.append((action, *outcome.whole, final))
+    action, reward, terminated, truncated, final = (torch.stack(x) for x in zip(*kept, strict=True))
+    return Unrolled(torch.stack(first), action, reward, terminated, truncated, final)
