@@ -19,7 +19,8 @@ JOBS = ("explain", "fit", "filter", "reconstruct", "predict", "simulate")
 MODULES = {
     "core": ("Simulate", ("simulator", "types", "parameters", "roads")),
     "effects": ("Effects", ("effects",)),
-    "environments": ("Environments and tasks", ("envs.gym", "envs.vector", "envs.pettingzoo", "tasks", "metrics")),
+    "environments": ("Environments", ("envs.gym", "envs.vector", "envs.pettingzoo", "metrics")),
+    "tasks": ("Tasks", ("tasks",)),
     "data": ("Read and generate data", ("data", "data.episode", "data.synthetic", "model_file")),
     "fitting": ("Calibrate", ("fitting.fit", "fitting.job", "fitting.options")),
     "discovery": ("Find what a model lacks", ("discovery.discover", "discovery.sets", "drift.forecast")),

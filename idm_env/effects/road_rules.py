@@ -130,7 +130,7 @@ class Signal(Effect):
     ::
 
         red where (t − φ) mod C ≥ C − r;   who is before the line x_s and can stop, v² ≤ 2 b_m (x_s − x), stops there:
-    A += −a max(0, (s*/s)²_line − (s*/s)²_leader),   that of somebody who stands at the line
+        A += −a max(0, (s*/s)²_line − (s*/s)²_leader),   that of somebody who stands at the line
 
     Amber is in b_m: who would have to brake harder drives on. Absent at r = 0.
     """
