@@ -63,8 +63,8 @@ class _Sort:
     """A sort of drift, or none, to be estimated."""
 
     kind: Effect | None
-    smooth: Sequence[Episode]
-    measured: Sequence[Episode]
+    smooth: Batch
+    measured: Batch
     noise: tuple[float, float] | None
 
     def __str__(self) -> str:
@@ -72,13 +72,13 @@ class _Sort:
 
     @property
     def simulator(self) -> Simulator:
-        return behind_a_record(self.smooth[0].dt, *(() if self.kind is None else (self.kind,)))
+        return behind_a_record(self.smooth.dt, *(() if self.kind is None else (self.kind,)))
 
 
 def _estimated(sort: _Sort, progress: OnProgress) -> dict[str, Tensor]:
-    batch, raw = (Batch.of(x, substeps=1) for x in (sort.smooth, sort.measured))
-    found = estimate(sort.simulator, batch, IDM_NAMES, usual(IDM_NAMES), measured=raw, noise=sort.noise)
-    return found.kept()
+    return estimate(
+        sort.simulator, sort.smooth, IDM_NAMES, usual(IDM_NAMES), measured=sort.measured, noise=sort.noise
+    ).kept()  # fmt: skip
 
 
 def tell(
@@ -102,7 +102,8 @@ def tell(
         executor: Whoever estimates the sorts, a part each.
         on_progress: Called with the name, done, total and the log-likelihood.
     """
-    sorts = [_Sort(kind, smooth, measured, noise) for kind in (None, *kinds)]
+    batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
+    sorts = [_Sort(kind, batch, raw, noise) for kind in (None, *kinds)]
     kept = {} if store is None else {s: x for s in sorts if (x := store.get(str(s))) is not None}
     missing = [s for s in sorts if s not in kept]
     for place, numbers in (executor or Serial()).map(_estimated, missing):
@@ -110,7 +111,6 @@ def tell(
         if store is not None:
             store.put(str(missing[place]), numbers)
         on_progress(str(missing[place]), len(kept), len(sorts), float(numbers["log_likelihood"]))
-    batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
     steady, *others = (Estimate.of_kept(MeasuredDrivers(s.simulator, batch, raw, IDM_NAMES), kept[s]) for s in sorts)
     found = {kind.name: estimate for kind, estimate in zip(kinds, others, strict=True)}
     told = Told(steady, found, ())

@@ -147,12 +147,18 @@ class Signal(Effect):
         Parameter("most_decel", "b_m", "m/s²", 3.0, 0.5, 9.0, role="threshold"),
     )
 
+    @staticmethod
+    def phase(time: Tensor, p: P) -> tuple[Tensor, Tensor]:
+        """Return the time since it became green (s), and whether it is red."""
+        since = torch.remainder(time - p["offset"], p["cycle"])
+        return since, since >= p["cycle"] - p["red"]
+
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return what drivers brake for somebody who stands at the line while it is red (m/s²)."""
-        phase = torch.remainder(scene.time - p["offset"], p["cycle"])
+        _, red = self.phase(scene.time, p)
         way = p["place"] - scene.position
         can = (way >= 0) & (scene.speed * scene.speed <= 2.0 * p["most_decel"] * way)
-        return _before(torch.where((phase >= p["cycle"] - p["red"]) & can, way, FAR), scene, driver)
+        return _before(torch.where(red & can, way, FAR), scene, driver)
 
 
 @dataclass(frozen=True)

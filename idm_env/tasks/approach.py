@@ -34,11 +34,10 @@ def _line(view: AgentView) -> Tensor:
 
 def _signal(view: AgentView) -> tuple[Tensor, Tensor]:
     """Return 1 where it is red, and the time to the next change (s)."""
-    offset, cycle, red = (view.world.episode[f"signal_{name}"] for name in _SAID)
-    phase = torch.remainder(view.task.simulator.time(view.state) - offset, cycle)
-    now = phase >= cycle - red
-    until = torch.where(now, cycle - phase, cycle - red - phase)
-    return view.own(now.to(phase.dtype)), view.own(until)
+    said = {name: view.world.episode[f"signal_{name}"] for name in _SAID}
+    since, red = Signal.phase(view.task.simulator.time(view.state), said)
+    until = torch.where(red, said["cycle"] - since, said["cycle"] - said["red"] - since)
+    return view.own(red.to(since.dtype)), view.own(until)
 
 
 def _red(view: AgentView) -> Tensor:
