@@ -204,7 +204,12 @@ class OpenLanesTask(LanesTask):
     @cached_property
     def rules(self) -> tuple[Effect, ...]:
         """What the road tells its drivers."""
-        return rules_of(self.limits, self.closures, self.road.count)
+        return rules_of(self.limits, self.closed, self.road.count)
+
+    @property
+    def closed(self) -> Sequence[Mapping[str, Any]]:
+        """The lanes that are closed, as ``closures`` says them."""
+        return self.closures
 
     def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
         """Return checked parameters as tensors, those of classes in the slots of theirs."""
@@ -443,11 +448,15 @@ class OpenHighwayTask(OpenLanesTask):
 
     @cached_property
     def rules(self) -> tuple[Effect, ...]:
-        """What the road tells its drivers; between the ramps there is no lane 0."""
+        """What the road tells its drivers."""
+        return (*super().rules, Destination()) if self._ramps[1] else super().rules
+
+    @property
+    def closed(self) -> Sequence[Mapping[str, Any]]:
+        """As they are given; between the ramps there is no lane 0."""
         on, off = self._ramps
         between = ({"lane": 0, "begin": on[1], "end": off[0]},) if on and off else ()
-        told = rules_of(self.limits, (*self.closures, *between), self.road.count)
-        return (*told, Destination()) if off else told
+        return (*self.closures, *between)
 
     @property
     def exits(self) -> Mapping[str, float]:
