@@ -103,6 +103,7 @@ class Simulator(CarFollowingStep):
         runs instead of ``step`` (``kernels.dispatch`` says when). Second derivatives of a
         kernel's rollout are recomputed on the torch path; inside ``backends.off()`` everything is.
 
+        The state has the shape ``(…, vehicles)``, what is kept ``(steps, …, vehicles)``.
         ``inputs`` carry a leading time dimension of at least ``steps``. ``checkpoint_every`` k > 0 saves the graph's
         tensors only every k steps and recomputes the rest in the backward pass: memory over ``steps / k + k`` steps
         instead of ``steps``, for about one more forward pass. ``seed`` draws the normals that no input

@@ -46,10 +46,10 @@ def noise_sigma(values: ArrayLike, stride: int = 1) -> float:
 
 
 def fuse(position: np.ndarray, speed: np.ndarray, dt: float) -> SmoothMotion:
-    """Return the smooth motion of one unbroken record, with both noises estimated from the record itself.
+    """Return the smooth motion of one unbroken record [T], with both noises estimated from the record itself.
 
-    A position that drifts against the integral of the speed over 1 s (an antenna's, for instance) is as uncertain as
-    that drift, however smooth it looks.
+    ``position`` is in m, ``speed`` in m/s, the time step ``dt`` in s. A position that drifts against the integral of
+    the speed over 1 s (an antenna's, for instance) is as uncertain as that drift, however smooth it looks.
     """
     strides = range(1, max(1, round(LONGEST_STRIDE_S / dt)) + 1)
     sigma = max(noise_sigma(position, stride) for stride in strides)

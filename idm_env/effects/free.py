@@ -27,7 +27,7 @@ Target = Literal["time_gap", "desired_speed", "max_accel", "comfort_decel", "min
 
 
 def feature_of(scene: Scene, feature: str, period: float | None) -> Tensor:
-    """Return a feature of the scene, in the unit of ``FEATURES``."""
+    """Return a feature of the scene, in the unit of ``FEATURES``, shape ``(…, vehicles)``; ``period`` has that unit."""
     values = {
         "position": scene.position,
         "time": scene.time,

@@ -31,7 +31,7 @@ _SAFE_DECEL = Parameter("safe_decel", "b_safe", "m/s²", 4.0, 0.5, 9.0, role="th
 
 
 def margin(side: Beside, here: Beside, safe_decel: Tensor) -> Tensor:
-    """Return by how much (m/s²) a change is safe: for the follower there, and for oneself.
+    """Return by how much (m/s²) a change is safe: for the follower there, and for oneself; shape ``(…, vehicles)``.
 
     The follower need not brake harder than b_safe; nor need the driver, unless he must do so in his own lane, too.
     """

@@ -37,7 +37,7 @@ class Beginnings:
         self._ready[:] = -1
 
     def take(self, rows: np.ndarray, episodes: np.ndarray) -> EnvState:
-        """Return the worlds that rows (indices) begin with, by the episodes (of all rows) that they are in now."""
+        """Return the worlds that ``rows`` [n] (indices) begin with, by the ``episodes`` [rows] that all are in now."""
         missing = self._ready[rows] != episodes[rows]
         if len(rows) == self._count and missing.all():
             return self._make(rows, episodes[rows])

@@ -124,8 +124,8 @@ def fit(
     Where ``free`` is not given it is the car-following law's parameters (IDM's, unless ``simulator`` has another).
     ``by`` is ``driver``, ``all`` or a column. ``method`` is ``lm`` (Levenberg–Marquardt with exact forward-mode
     Jacobians, from ``starts`` starts per group, the pooled optimum among them) or ``adam`` (500 steps of reverse
-    mode, learning rate 0.1 → 0.01, as in the paper). ``start`` gives own and shared values to begin from instead;
-    ``fixed`` gives parameters that are not free another value than their default. ``prior`` makes it a maximum
+    mode, learning rate 0.1 → 0.01, as in the paper). ``start`` gives own [G, P] and shared [Q] values (SI) to begin
+    from; ``fixed`` gives parameters that are not free another value than their default. ``prior`` makes it a maximum
     a posteriori, from the prior's centre unless ``start`` is given.
     ``checkpoint`` names the folder that makes an interrupted fit resumable with the same result. ValueError and
     DataError for what cannot be fitted.

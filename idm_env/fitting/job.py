@@ -379,7 +379,7 @@ def in_words(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def problem_of(model: Model, items: Episodes, seed: int = 0) -> tuple[Problem, torch.Tensor, int]:
-    """Return a problem with all parameters of a model, their values per episode, and how many drivers were matched."""
+    """Return a problem with all P parameters of a model, their values [episodes, P] (SI), and the drivers matched."""
     batch = Batch.of(items, substeps=model.substeps)
     effects = behind_records(model)
     simulator = Simulator(Lane(), effects, dt=batch.step, integration=model.integration)

@@ -29,7 +29,7 @@ _READ, _SECOND_LEVEL, _DATA = 0, 2, 1
 
 
 def addresses(arrays: Sequence[np.ndarray[Any, Any] | None]) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Return where arrays begin, 0 for None; the caller keeps them as long as the addresses are used."""
+    """Return where arrays begin [arrays], 0 for None; the caller keeps them as long as the addresses are used."""
     return np.array([0 if x is None else x.__array_interface__["data"][0] for x in arrays], np.int64)
 
 

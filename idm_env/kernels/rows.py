@@ -610,7 +610,7 @@ class RowFunction:
 
 
 def storage(x: Tensor) -> int:
-    """Return what tells the memory of a tensor from that of others."""
+    """Return what tells the memory of a tensor of any shape from that of others."""
     return x.untyped_storage().data_ptr()
 
 
@@ -645,7 +645,7 @@ def adjoint(
     """Return the vector-Jacobian product of a function, by torch: to be recorded in its place.
 
     It takes what the function takes and, as ``on_NAME``, what falls on each of the ``outputs``; it returns what falls
-    on the inputs ``by``, of those on which anything does.
+    on the inputs ``by``, of those on which anything does; each has the shape of its output or input.
     """
 
     def back(**leaves: Tensor) -> dict[str, Tensor]:

@@ -96,7 +96,7 @@ def kernel_of(simulator: Simulator, state: State, inputs: Inputs) -> TileKernel 
 def rollout(
     kernel: TileKernel, simulator: Simulator, state: State, inputs: Inputs, params: Params, steps: int, keep: bool
 ) -> tuple[State, tuple[Tensor, ...] | None] | None:
-    """Do what ``Simulator.rollout`` does; None where vehicles are not in the order of their links."""
+    """Do what ``Simulator.rollout`` does, shapes as there; None where vehicles are not in the order of their links."""
     inner, road = between(simulator), simulator.road
     assert isinstance(road, Lanes)
     own = {name: params[name] for name in inner.by_name}

@@ -34,7 +34,10 @@ NOW = _Now()
 
 
 def seen_merging(view: Linked, state: State, who: Tensor, due: Tensor) -> State:
-    """Return the state in which drivers remember who signals (slots, own for nobody), where they have decided."""
+    """Return the state in which drivers remember who signals (slots, own for nobody), where they have decided.
+
+    ``who`` (integers) and ``due`` (bool) have the state's shape ``(…, vehicles)``.
+    """
     gap, speed = view.to_slot(state.position, state.length, who), view.at(state.speed, who)
     some = (gap > 0) & (gap < 0.5 * FAR)
     fresh = {MERGER_GAP: torch.where(some, gap, FAR), MERGER_SPEED: torch.where(some, speed, 0.0)}

@@ -127,7 +127,7 @@ def hypotheses(second: Second) -> list[DriverHypothesis]:
 
 
 def posterior(seconds: Sequence[Second]) -> list[tuple[RouteDrivers, np.ndarray]]:
-    """Return, for every route, drivers drawn around the fits of its hypotheses, and the weight of each.
+    """Return, for every route, N drivers drawn around the fits of its hypotheses, and their weights [N].
 
     Weights are share × evidence / number drawn, with the evidence by Laplace's method: what the mode costs, and how
     much narrower than the prior the posterior is.

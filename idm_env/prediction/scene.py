@@ -118,7 +118,7 @@ class MapScene:
         return RouteLeader(rear - back, speed)
 
     def speeds(self, agent: Agent) -> np.ndarray:
-        """Return speeds from the first step to the present; what is not valid takes the nearest that is."""
+        """Return speeds (m/s) [present + 1] from the first step on; what is not valid takes the nearest that is."""
         speed = np.hypot(*agent.velocity[: self.present + 1].T)
         known = np.flatnonzero(agent.valid[: self.present + 1])
         return np.asarray(np.interp(np.arange(self.present + 1), known, speed[known]))

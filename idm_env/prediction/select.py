@@ -40,7 +40,9 @@ def select(
 def chances(
     samples: np.ndarray, weight: np.ndarray, chosen: np.ndarray, speed: float
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the chosen futures in the order of their confidence, and the confidences.
+    """Return the chosen futures [F, S, 2] (m) in the order of their confidence, and the confidences [F].
+
+    ``samples`` [N, S, 2] (m) have the weights [N]; ``speed`` (m/s) sets the size of the box.
 
     The first is the one likeliest to hit, in the sense of the benchmark's box and on average over its horizons, were
     one of the samples to come true; each next one the likeliest to hit what those before it miss. That is what the

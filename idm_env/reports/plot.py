@@ -12,7 +12,7 @@ from idm_env.reports.diagrams import COLOURS, Panel, panels, place_label, rollou
 
 
 def edie(drawn: Sequence[Panel], *, seconds: float = 60.0, metres: float = 100.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return density (vehicles/m) and flow (vehicles/s) of the cells of ``seconds`` by ``metres`` that are whole.
+    """Return density (vehicles/m) and flow (vehicles/s) [cells] of whole cells of ``seconds`` by ``metres``.
 
     Edie (1963): with the area A of a cell, density is the time that vehicles spend in it over A, flow the distance
     that they cover in it over A. On a ring a cell is the whole lap. ValueError where no cell is whole.

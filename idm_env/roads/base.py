@@ -19,6 +19,7 @@ from idm_env.types import FAR, Links, Motion, Neighbour, State
 class Road(abc.ABC):
     """A topology over the last tensor dimension, vehicles sorted front first.
 
+    Tensors have the shape ``(…, vehicles)``; circumferences have ``(…)``, one number per row.
     Written with shifted views instead of index gathers, because compilers fuse those. A road on which the order changes
     (``Lanes``) answers through ``view(state)``, which is bound to the links of that state.
     """

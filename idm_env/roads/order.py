@@ -118,6 +118,6 @@ def missing(way: Tensor, other: Tensor, position: Tensor, ring: float) -> Tensor
 
 
 def places(position: Tensor, ring: float | None) -> Tensor:
-    """Return positions (m) in float64, without a graph, and within one lap of a ring."""
+    """Return positions (m), shape as given, in float64, without a graph, and within one lap of a ring."""
     plain = position.detach().double()
     return plain if ring is None else plain.remainder(ring)

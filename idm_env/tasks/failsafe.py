@@ -18,7 +18,7 @@ def safe_accel(
     dt: float,
     euler: bool,
 ) -> Tensor:
-    """Return the highest acceleration (m/s²) that leaves room to stop behind a leader who brakes as hard.
+    """Return the highest acceleration (m/s²), elementwise, that leaves room to stop behind a leader who brakes as hard.
 
     The safe speed of Krauß 1998 (Microscopic modeling of traffic flow), which SUMO keeps, for one step Δt: the largest
     v' with ``(v + v')/2 Δt + v' τ + v'²/(2b) ≤ s − 1 m + v_lead²/(2b)``, b and τ being ``decel`` (m/s²) and

@@ -37,7 +37,7 @@ _GALLONS_PER_HOUR = 0.951
 
 
 def headway_penalty(gap: Tensor, speed: Tensor) -> Tensor:
-    """Return 0 … 1: how far a gap is below 7 m, above 120 m, or a time gap below 1 s.
+    """Return 0 … 1, elementwise: how far a gap (m) is below 7 m, above 120 m, or a time gap below 1 s.
 
     The source takes 1 at any violation. Here it rises over 1 m, 10 m and 0.2 s, so that it has a gradient; a deeper
     violation counts 1 as in the source.

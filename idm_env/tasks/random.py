@@ -26,7 +26,7 @@ _LOW = 0xFFFFFFFF
 
 
 def mix(z: Tensor) -> Tensor:
-    """Return the SplitMix64 finaliser of int64 counters: every input bit changes half of the output bits."""
+    """Return the SplitMix64 finaliser of int64 counters, elementwise: every input bit changes half of the output."""
     return _mixed(z.clone())
 
 

@@ -198,7 +198,7 @@ def _scene(
 
 
 def smoothed(track: Track, seat: np.ndarray | None, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smooth motion (time, 3) and presence; where it is not there a vehicle stands where it was last."""
+    """Return the smooth motion [T, 3] (m, m/s, m/s²) and presence [T]; an absent vehicle stands where it was last."""
     from idm_env.data.smooth import fuse
 
     position, speed = (track.position, track.speed) if seat is None else seat

@@ -19,7 +19,7 @@ BLOCKS = 4
 
 
 def thinned(track: TrackPiece) -> tuple[TrackPiece, np.ndarray]:
-    """Return a track without every second point, and the indices of the points left out; both ends stay."""
+    """Return a track without every second point, and the indices [n] of the points left out; both ends stay."""
     out = np.arange(1, len(track) - 1, 2)
     return track.part(np.setdiff1d(np.arange(len(track)), out)), out
 

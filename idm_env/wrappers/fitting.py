@@ -123,7 +123,7 @@ class ParameterFitting:
         return residual.square().sum() / self.problem.samples.sum()
 
     def root_mean_squared_error(self, values: Tensor | np.ndarray | None = None) -> Tensor:
-        """Return the square root of ``mean_squared_error`` (m for spacing)."""
+        """Return the square root of ``mean_squared_error`` (m for spacing) of ``values``, shaped as there."""
         # At an error of exactly 0 the root has no gradient.
         return torch.sqrt(self.mean_squared_error(values) + 1e-18)
 

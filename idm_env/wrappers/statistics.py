@@ -33,13 +33,16 @@ class Moments:
         self.mean, self.var, self.count = self.mean + delta * (n / total), spread / total, total
 
     def normalise(self, rows: Tensor) -> Tensor:
-        """Return ``(x − mean) / √(var + ε)``, differentiable in x."""
+        """Return ``(x − mean) / √(var + ε)``, differentiable in x; rows have shape ``(n, …)``."""
         mean, scale = self.mean.to(rows), (self.var + self._epsilon).rsqrt().to(rows)
         return (rows - mean) * scale
 
 
 class NormalizeObservation(gymnasium.Wrapper):
-    """Normalise the observations of one environment by running moments; ``update_running_mean=False`` freezes them."""
+    """Normalise the observations of one environment by running moments; ``update_running_mean=False`` freezes them.
+
+    Observations keep the shape of the environment's ``observation_space``, and have no unit any more.
+    """
 
     def __init__(self, env: gymnasium.Env, epsilon: float = 1e-8) -> None:
         super().__init__(env)
