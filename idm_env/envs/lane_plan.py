@@ -433,7 +433,7 @@ class LanePlan(Plan):
     # -- forwards ------------------------------------------------------------------------------------------------
 
     def run(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> dict[str, Array]:
-        """Do one step of blocks [rows · vehicles], as ``Plan.run``; Unordered, with nothing changed, where torch must."""
+        """Do one step of blocks [rows · vehicles], as ``Plan.run``; Unordered, nothing changed, where torch must."""
         bound, lanes, made = moment.bound, moment.lanes, self.recorded
         assert isinstance(bound, LaneBound) and isinstance(lanes, Crossing)
         moment.now, moment.later = now.data_ptr(), later.data_ptr()

@@ -68,8 +68,8 @@ def recorded_leaders(path: str, dt: float) -> Leaders:
 def starts(draw: Draw, steps: Tensor, wanted: int) -> tuple[Tensor, Tensor]:
     """Return a leader and a first step per environment, so that ``wanted`` steps remain where there are so many.
 
-    ``steps`` [leaders] are those of every leader; both results are indices, shape ``(environments,)``. Leaders that are long
-    enough are drawn alike; if none is, all are.
+    ``steps`` [leaders] are those of every leader; both results are indices, shape ``(environments,)``. Leaders that
+    are long enough are drawn alike; if none is, all are.
     """
     enough = steps > wanted
     choices = torch.nonzero(enough if bool(enough.any()) else steps > 1).squeeze(-1)
