@@ -45,8 +45,8 @@ _RENAMED = {"Motion": SmoothMotion, "Record": VehicleRecord}
 def __getattr__(name: str) -> Any:
     if name in _RENAMED:
         now = _RENAMED[name]
-        told = f"idm_env.data.{name} is called {now.__name__}. Import that."
-        warnings.warn(told, DeprecationWarning, stacklevel=2)
+        message = f"idm_env.data.{name} is called {now.__name__}. Import that."
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
         return now
     if name == "synthetic":  # a second of scipy, which those who read files do not wait for
         return importlib.import_module("idm_env.data.synthetic")

@@ -135,11 +135,11 @@ def without_empty(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[
     Raises:
         DataError: If one of the others has no run.
     """
-    kept = frame.filter(pl.all_horizontal(pl.col("vehicle_id", "time_s").is_not_null()))
-    check_runs(kept.filter(pl.col("run_id").is_null()), source)
-    count = frame.height - kept.height
+    rows = frame.filter(pl.all_horizontal(pl.col("vehicle_id", "time_s").is_not_null()))
+    check_runs(rows.filter(pl.col("run_id").is_null()), source)
+    count = frame.height - rows.height
     text = f"{count} rows without a vehicle or a time were left out."
-    return kept, [Repair("no time", count, text)] if count else []
+    return rows, [Repair("no time", count, text)] if count else []
 
 
 def check_runs(nowhere: pl.DataFrame, source: str) -> None:
@@ -161,11 +161,11 @@ class Filled:
 
     def add(self, frame: pl.DataFrame) -> None:
         """Count the rows of one more piece."""
-        there = frame.select(pl.col(REQUIRED).is_not_null())
+        present = frame.select(pl.col(REQUIRED).is_not_null())
         self.rows += frame.height
-        self.whole += int(there.select(pl.all_horizontal(REQUIRED).sum()).item())
+        self.whole += int(present.select(pl.all_horizontal(REQUIRED).sum()).item())
         for name in REQUIRED:
-            self.filled[name] += int(there[name].sum())
+            self.filled[name] += int(present[name].sum())
 
     def check(self, source: str) -> None:
         """Raise DataError if no row can be used."""
@@ -173,9 +173,9 @@ class Filled:
             raise DataError(f"{source}: the table has a header and no rows; give at least one leader and one follower.")
         empty = [name for name, count in self.filled.items() if not count]
         if empty or not self.whole:
-            told = f"{listed(empty)} is empty in every row" if empty else f"no row has all of {listed(REQUIRED)}"
+            fault = f"{listed(empty)} is empty in every row" if empty else f"no row has all of {listed(REQUIRED)}"
             raise DataError(
-                f"{source}: {told}; fill it: the vehicle, the time in seconds, and the position of the front bumper "
+                f"{source}: {fault}; fill it: the vehicle, the time in seconds, and the position of the front bumper "
                 "in metres."
             )
 
@@ -195,13 +195,13 @@ def ordered(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair], pl.DataFra
     same = (pl.col("run_id") == pl.col("run_id").shift(1)) & (pl.col("vehicle_id") == pl.col("vehicle_id").shift(1))
     repeated = (pl.col("time_s").diff() == 0) & same
     moved = frame.filter(repeated & ((pl.col("position_m") - pl.col("position_m").shift(1)).abs() > 1e-6))
-    kept = frame.filter(~repeated.fill_null(False))
-    count = frame.height - kept.height
+    rows = frame.filter(~repeated.fill_null(False))
+    count = frame.height - rows.height
     if count:
         text = f"{count} rows repeat a time of their vehicle and were left out; the first of each was kept."
         repairs.append(Repair("duplicated time", count, text))
     twice = moved.group_by(TRACK, maintain_order=True).agg(pl.col("time_s").first(), pl.len().alias("moved"))
-    return kept, repairs, twice
+    return rows, repairs, twice
 
 
 def check_recordings(twice: pl.DataFrame, rows: int, source: str) -> None:
@@ -249,11 +249,11 @@ def single_holes(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
 
 def without_position(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     """Leave out rows whose position is still missing; tracks are split there."""
-    kept = frame.filter(pl.col("position_m").is_not_null())
-    count = frame.height - kept.height
+    rows = frame.filter(pl.col("position_m").is_not_null())
+    count = frame.height - rows.height
     if not count:
-        return kept, []
+        return rows, []
     tracks = frame.filter(pl.col("position_m").is_null()).select(TRACK).unique(maintain_order=True).rows()
     names = listed(vehicle for _, vehicle in tracks)
     text = f"{count} rows without a position were left out; tracks are split there (vehicles {names})."
-    return kept, [Repair("no position", count, text)]
+    return rows, [Repair("no position", count, text)]

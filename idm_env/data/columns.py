@@ -49,10 +49,10 @@ def filled(values: np.ndarray) -> np.ndarray | None:
 
 def labels(table: pl.DataFrame, names: list[str], begin: int, end: int) -> dict[str, str]:
     """Return, as text, the columns that hold one value, and no empty cell, from row `begin` to `end`."""
-    found = {}
+    constants = {}
     part = table.select(names).slice(begin, end - begin)
     for name in names:
         first = part[name][0]
         if first is not None and part[name].n_unique() == 1:
-            found[name] = str(first)
-    return found
+            constants[name] = str(first)
+    return constants

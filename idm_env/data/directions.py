@@ -40,8 +40,8 @@ def ends(frame: pl.DataFrame) -> pl.DataFrame:
     """Return ``END`` and the lane of every vehicle; on a ring, where a fall is a new lap, there is no direction."""
     if "ring_length_m" in frame.columns:
         frame = frame.filter(pl.col("ring_length_m").is_null())
-    known = frame.filter(pl.col("position_m").is_not_null())
-    return known.group_by(TRACK, maintain_order=True).agg(*END, lane_of(frame))
+    rows = frame.filter(pl.col("position_m").is_not_null())
+    return rows.group_by(TRACK, maintain_order=True).agg(*END, lane_of(frame))
 
 
 def against(vehicles: pl.DataFrame, source: str) -> pl.DataFrame:

@@ -122,13 +122,13 @@ def _spans(
     joined = both & (leader[1:] == leader[:-1])
     begins = np.flatnonzero(valid & ~np.append(False, joined))
     ends = np.flatnonzero(valid & ~np.append(joined, False)) + 1
-    kept: list[tuple[int, int]] = []
+    spans: list[tuple[int, int]] = []
     short: list[tuple[int, int]] = []
     for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
         step = trajectories.steps[table["run_id"][begin]]
         enough = (end - begin) * step >= min_seconds - 1e-9 and end - begin > 3
-        (kept if enough else short).append((begin, end))
-    return kept, int((both & ~joined).sum()), short
+        (spans if enough else short).append((begin, end))
+    return spans, int((both & ~joined).sum()), short
 
 
 def _place(trajectories: Trajectories, values: np.ndarray, run: str) -> np.ndarray:

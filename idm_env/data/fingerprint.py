@@ -29,16 +29,16 @@ def marks(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[Track, s
 
     The places x (m, rounded) are those at every multiple of ``every`` seconds of the file's clock, from ``first`` on.
     """
-    found = {}
+    by_track = {}
     for track, time, position in _tracks(trajectories, drivers):
         every = 1
         while time[-1] - time[0] >= every * MOST_PLACES:
             every *= 2
-        at = np.arange(np.ceil(time[0] / every), np.floor(time[-1] / every) + 1) * every
-        if len(at):
-            places = np.round(np.interp(at, time, position)).astype(int)
-            found[track] = " ".join(map(str, (every, int(at[0]), *places)))
-    return found
+        times = np.arange(np.ceil(time[0] / every), np.floor(time[-1] / every) + 1) * every
+        if len(times):
+            places = np.round(np.interp(times, time, position)).astype(int)
+            by_track[track] = " ".join(map(str, (every, int(times[0]), *places)))
+    return by_track
 
 
 def seen(trajectories: Trajectories, drivers: Iterable[Track], known: Iterable[str]) -> set[Track] | None:
@@ -48,25 +48,25 @@ def seen(trajectories: Trajectories, drivers: Iterable[Track], known: Iterable[s
     """
     times, places, owner, count = [], [], [], 0
     for mark in filter(_READABLE.fullmatch, known):
-        every, first, *told = (int(x) for x in mark.split())
-        times.append(first + every * np.arange(len(told)))
-        places.append(np.array(told, float))
-        owner.append(np.full(len(told), count))
+        every, first, *values = (int(x) for x in mark.split())
+        times.append(first + every * np.arange(len(values)))
+        places.append(np.array(values, float))
+        owner.append(np.full(len(values), count))
         count += 1
     if not count:
         return None
-    when, where, whose = (np.concatenate(parts) for parts in (times, places, owner))
+    when, where, index = (np.concatenate(parts) for parts in (times, places, owner))
     order = np.argsort(when, kind="stable")
-    when, where, whose = when[order], where[order], whose[order]
-    found = set()
+    when, where, index = when[order], where[order], index[order]
+    drivers_seen = set()
     for track, time, position in _tracks(trajectories, drivers):
         part = slice(*np.searchsorted(when, (time[0], time[-1] + 1e-6)))
         near = np.abs(np.interp(when[part], time, position) - where[part]) <= NEAR_M
-        shared = np.bincount(whose[part], minlength=count)
-        alike = np.bincount(whose[part], near, minlength=count)
+        shared = np.bincount(index[part], minlength=count)
+        alike = np.bincount(index[part], near, minlength=count)
         if ((shared > 1) & (alike >= ALIKE * shared)).any():
-            found.add(track)
-    return found
+            drivers_seen.add(track)
+    return drivers_seen
 
 
 def fitted_on(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[str, Any]:
@@ -76,7 +76,7 @@ def fitted_on(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[str,
 
 def _tracks(trajectories: Trajectories, drivers: Iterable[Track]) -> Iterator[tuple[Track, np.ndarray, np.ndarray]]:
     """Yield each driver with his times (s) and places (m)."""
-    wanted = pl.DataFrame(sorted(set(drivers)), schema=dict.fromkeys(TRACK, pl.String), orient="row")
-    table = trajectories.table.select(*TRACK, "time_s", "position_m").join(wanted, on=TRACK, how="semi")
+    keys = pl.DataFrame(sorted(set(drivers)), schema=dict.fromkeys(TRACK, pl.String), orient="row")
+    table = trajectories.table.select(*TRACK, "time_s", "position_m").join(keys, on=TRACK, how="semi")
     for (run, vehicle), part in table.partition_by(TRACK, as_dict=True).items():
         yield (run, vehicle), part["time_s"].to_numpy(), part["position_m"].to_numpy()

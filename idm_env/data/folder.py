@@ -62,11 +62,11 @@ def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[FolderS
             return [FolderSlice(folder, tuple(files), (), 0, columns)]
         scan = scan.filter(pl.col("vehicle_id").is_not_null())
         keys = scan.select(_run().alias("run_id"), "vehicle_id", _FILE).group_by("run_id", _FILE)
-        found = keys.agg(pl.col("vehicle_id").unique()).collect(engine="streaming")
+        vehicles_of_files = keys.agg(pl.col("vehicle_id").unique()).collect(engine="streaming")
         clean.check_runs(scan.filter(_run().is_null()).select("vehicle_id").head(1).collect(), folder.name)
     except (pl.exceptions.PolarsError, OSError) as error:
         raise _unreadable(folder, error) from error
-    runs = found.group_by("run_id").agg(
+    runs = vehicles_of_files.group_by("run_id").agg(
         pl.col("vehicle_id").explode().n_unique().alias("vehicles"), pl.col(_FILE).sort()
     )
     cut: list[FolderSlice] = []
@@ -82,18 +82,18 @@ def shares(folder: Path, vehicles: int, columns: Columns = None) -> list[FolderS
 
 def files_of(folder: Path) -> list[str]:
     """Return the parquet files in a folder and below it, in the order of their names. DataError if there is none."""
-    found = sorted(str(path) for path in folder.rglob("*.parquet") if not path.name.startswith((".", "_")))
-    if not found:
+    files = sorted(str(path) for path in folder.rglob("*.parquet") if not path.name.startswith((".", "_")))
+    if not files:
         raise DataError(f"{folder} is a folder without a parquet file; name a file, or a folder of parquet files.")
-    return found
+    return files
 
 
 def stamp(path: Path) -> Path | list[tuple[str, int, int]]:
     """Return what tells a file, or a folder, from another: itself, or names, sizes and times of all files in it."""
     if not path.is_dir():
         return path
-    found = [Path(name) for name in files_of(path)]
-    return [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in found]
+    files = map(Path, files_of(path))
+    return [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
 
 
 def partition(folder: Path, file: str) -> dict[str, str]:
@@ -111,8 +111,8 @@ def _named(scan: pl.LazyFrame, columns: Columns, source: str) -> pl.LazyFrame:
     """Return the rows with the columns that were asked for; DataError as in ``names.renamed``."""
     if columns is None:
         return scan
-    made, _ = renamed(scan.collect_schema().to_frame(), columns, source)
-    return scan.map_batches(lambda rows: renamed(rows, columns, source)[0], schema=made.schema)
+    sample, _ = renamed(scan.collect_schema().to_frame(), columns, source)
+    return scan.map_batches(lambda rows: renamed(rows, columns, source)[0], schema=sample.schema)
 
 
 def _run() -> pl.Expr:

@@ -108,7 +108,7 @@ def curvature(position: np.ndarray) -> np.ndarray:
     return np.sum([k * np.exp(-(((position - x) / 80.0) ** 2)) for x, k in BENDS_PER_M.items()], axis=0)
 
 
-def wanted(
+def desired_accel(
     view: View, seen: tuple[np.ndarray, np.ndarray, np.ndarray], drivers: Drivers, on: dict[str, float]
 ) -> np.ndarray:
     """Return what the followers want (m/s²), but for the leader's acceleration and the vehicle's limits.
@@ -128,8 +128,8 @@ def wanted(
     if "speed_dependent_gap" in on:
         desired = desired + on["speed_dependent_gap"] * np.sqrt(np.maximum(speed, 0.0) / top)
     if "gap_stiffness" in on:
-        kept = (drivers.min_gap + speed * time_gap) / np.sqrt(1 - np.clip(speed / top, 0.0, 0.95) ** 4)
-        desired = desired * np.clip(np.maximum(gap, 0.1) / kept, 0.05, 20.0) ** (1 - on["gap_stiffness"])
+        equilibrium = (drivers.min_gap + speed * time_gap) / np.sqrt(1 - np.clip(speed / top, 0.0, 0.95) ** 4)
+        desired = desired * np.clip(np.maximum(gap, 0.1) / equilibrium, 0.05, 20.0) ** (1 - on["gap_stiffness"])
     interaction = (desired / np.maximum(gap, 0.1)) ** 2
     if "second_leader" in on:
         behind_two = _desired_gap(speed, speed - view.second_speed, time_gap, drivers)
@@ -196,10 +196,10 @@ def _adapted(view: View, drivers: Drivers, on: dict[str, float]) -> tuple[np.nda
 
 def habit_of(gap: np.ndarray, speed: np.ndarray, drivers: Drivers) -> np.ndarray:
     """Return the gap relative to that of equilibrium, which drivers get used to."""
-    wanted = (drivers.min_gap + speed * drivers.time_gap) / np.sqrt(
+    equilibrium = (drivers.min_gap + speed * drivers.time_gap) / np.sqrt(
         np.maximum(1 - (speed / drivers.desired_speed) ** 4, 0.1)
     )
-    return np.clip(gap / wanted, 0.2, 2.0)
+    return np.clip(gap / equilibrium, 0.2, 2.0)
 
 
 def _desired_gap(speed: np.ndarray, closing: np.ndarray, time_gap: np.ndarray, drivers: Drivers) -> np.ndarray:

@@ -35,8 +35,8 @@ def derive(frame: pl.DataFrame) -> pl.DataFrame:
 
 def derived(followers: int, lanes: bool) -> Repair:
     """Return what is to be said of so many vehicles whose leaders were derived."""
-    told = "lane and position" if lanes else "position, all vehicles being in one lane"
-    text = f"leader_id is absent: the leaders of {followers} vehicles were derived from {told}."
+    source = "lane and position" if lanes else "position, all vehicles being in one lane"
+    text = f"leader_id is absent: the leaders of {followers} vehicles were derived from {source}."
     return Repair("leaders derived", followers, text)
 
 
@@ -45,14 +45,14 @@ def in_lane(laned: pl.Expr) -> pl.Expr:
     return pl.when(laned).then(pl.col("lane")).otherwise(0).alias("in_lane")
 
 
-def known(frame: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+def named_leaders(frame: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Return the frame with leader_id null where it says "none" (empty, 0, -1) or names no other vehicle of the run.
 
     Also return how many rows name whom: columns ``leader_id``, ``state`` and ``len``, for ``named``. ``vehicles`` has
     the run_id and vehicle_id of everybody.
     """
-    there = vehicles.select("run_id", pl.col("vehicle_id").alias("leader_id"), exists=True).unique()
-    joined = frame.join(there, on=["run_id", "leader_id"], how="left", maintain_order="left")
+    names = vehicles.select("run_id", pl.col("vehicle_id").alias("leader_id"), exists=True).unique()
+    joined = frame.join(names, on=["run_id", "leader_id"], how="left", maintain_order="left")
     # 0 and -1 mean "none" only where no vehicle has that name
     none = pl.col("leader_id").is_null() | pl.col("leader_id").str.to_lowercase().is_in(NO_LEADER)
     own = pl.when(pl.col("leader_id") == pl.col("vehicle_id")).then(pl.lit("own"))
@@ -95,19 +95,19 @@ def steady(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     """
     leader = pl.col("leader_id")
 
-    def at(shift: int, name: str = "leader_id") -> pl.Expr:
+    def shifted(shift: int, name: str = "leader_id") -> pl.Expr:
         return pl.col(name).shift(shift).over(TRACK)
 
-    beside = at(1).eq_missing(at(-1))
-    around = pl.sum_horizontal(at(shift).eq_missing(at(1)).cast(pl.Int8) for shift in (-2, -1, 1, 2))
-    whole = at(-1, "step") - at(1, "step") == 2
-    flicker = (beside & whole & (around >= 3) & leader.ne_missing(at(1))).fill_null(False)
+    same_around = shifted(1).eq_missing(shifted(-1))
+    around = pl.sum_horizontal(shifted(shift).eq_missing(shifted(1)).cast(pl.Int8) for shift in (-2, -1, 1, 2))
+    whole = shifted(-1, "step") - shifted(1, "step") == 2
+    flicker = (same_around & whole & (around >= 3) & leader.ne_missing(shifted(1))).fill_null(False)
     count = int(frame.select(flicker.sum()).item())
     if not count:
         return frame, []
-    changes = [pl.when(flicker).then(at(1)).otherwise(leader).alias("leader_id")]
+    changes = [pl.when(flicker).then(shifted(1)).otherwise(leader).alias("leader_id")]
     if "gap_m" in frame.columns:
-        mean = (at(1, "gap_m") + at(-1, "gap_m")) / 2
+        mean = (shifted(1, "gap_m") + shifted(-1, "gap_m")) / 2
         changes.append(pl.when(flicker).then(mean).otherwise("gap_m").alias("gap_m"))
     text = f"{count} single samples of another leader were taken as of the one before and after."
     return frame.with_columns(changes), [Repair("leader flickers", count, text)]

@@ -59,13 +59,13 @@ def load(
         raise _unreadable(path, error) from error
 
 
-def files_of(given: Sequence[Path]) -> list[Path]:
+def files_of(paths: Sequence[Path]) -> list[Path]:
     """Return the files that paths, folders and patterns such as ``drives/*.csv`` name, in order, each once.
 
     DataError for a folder or a pattern without a file.
     """
-    found: list[Path] = []
-    for path in given:
+    files: list[Path] = []
+    for path in paths:
         if path.is_dir():
             some = sorted(p for p in path.iterdir() if p.name.lower().endswith(EXTENSIONS) and p.is_file())
         elif path.exists() or not glob.has_magic(str(path)):
@@ -74,8 +74,8 @@ def files_of(given: Sequence[Path]) -> list[Path]:
             some = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
         if not some:
             raise DataError(f"{path} holds no data set; name files that end in {', '.join(EXTENSIONS)}.")
-        found += some
-    return list(dict.fromkeys(found))
+        files += some
+    return list(dict.fromkeys(files))
 
 
 def refuse_head(
@@ -137,9 +137,9 @@ def batches(
     path, layout = Path(path), _layout(layout, columns)
     if path.is_dir():
         for file in folder.files_of(path):
-            given = [pl.lit(value).alias(name) for name, value in folder.partition(path, file).items()]
+            labels = [pl.lit(value).alias(name) for name, value in folder.partition(path, file).items()]
             for frame, repairs in batches(file, layout=layout, columns=columns):
-                yield frame.with_columns(given), repairs
+                yield frame.with_columns(labels), repairs
         return
     if own := _own_reader(path, layout):
         yield own(path)
@@ -177,11 +177,11 @@ def _pieces(path: Path, extension: str, written: dict[str, Any]) -> Iterator[pl.
 
             with parquet.ParquetFile(path) as file:
                 empty = pl.DataFrame(pl.from_arrow(file.schema_arrow.empty_table()))
-                found = False
+                has_rows = False
                 for piece in file.iter_batches(BATCH_ROWS):
-                    found = True
+                    has_rows = True
                     yield pl.DataFrame(pl.from_arrow(piece))
-                if not found:
+                if not has_rows:
                     yield empty
             return
         opener = gzip.open if extension == ".csv.gz" else open
@@ -223,9 +223,9 @@ def _plain_layout(
         return ultra_av.read(table, source)
     if layout == "ngsim" or (layout == "auto" and ngsim.matches(table.columns)):
         return ngsim.read(table, source)
-    found = layout if layout in drones.CSV else drones.layout_of(table.columns) if layout == "auto" else None
-    if found:
-        return drones.CSV[found](table, source)
+    drone_layout = layout if layout in drones.CSV else drones.layout_of(table.columns) if layout == "auto" else None
+    if drone_layout:
+        return drones.CSV[drone_layout](table, source)
     if layout == "auto":
         tidy.check(table.columns, source)
     return tidy.read(table)
@@ -252,7 +252,7 @@ def _checked(path: Path) -> tuple[str, list[str], dict[str, Any]]:
         raise DataError(f"{path} is a directory; name one file in it ({', '.join(EXTENSIONS)}).")
     if not path.exists():
         raise DataError(f"{path} does not exist; check the path.")
-    extension = next((known for known in EXTENSIONS if path.name.lower().endswith(known)), None)
+    extension = next((ending for ending in EXTENSIONS if path.name.lower().endswith(ending)), None)
     if extension is None:
         raise DataError(f"{path.name} has an unknown extension; use one of {', '.join(EXTENSIONS)}.")
     if path.stat().st_size == 0:

@@ -47,11 +47,11 @@ Columns = Mapping[str, str] | str | None
 def pairs(columns: Columns) -> tuple[tuple[str, str], ...]:
     """Return what is asked for as pairs of a tidy name and the text behind it. DataError for what names no column."""
     if isinstance(columns, str):
-        given = [tuple(part.strip() for part in text.split("=", 1)) for text in columns.split(",")]
+        entries = [tuple(part.strip() for part in text.split("=", 1)) for text in columns.split(",")]
     else:
-        given = list((columns or {}).items())
-    found: dict[str, str] = {}
-    for pair in given:
+        entries = list((columns or {}).items())
+    columns_by_name: dict[str, str] = {}
+    for pair in entries:
         if len(pair) != 2 or not all(pair):
             raise DataError(f"columns = {columns!r} is no list such as time_s=t,vehicle_id=car,position_m=x[ft].")
         name = SHORT.get(str(pair[0]), str(pair[0]))
@@ -59,23 +59,25 @@ def pairs(columns: Columns) -> tuple[tuple[str, str], ...]:
             guess = nearest(name, [*SHORT, *SHORT.values()])
             cure = f"did you mean {guess!r}?" if guess else f"use one of {listed(TIDY, 20)}."
             raise DataError(f"columns: {name!r} is no column that is read; {cure}")
-        found[name] = str(pair[1])
-    return tuple(found.items())
+        columns_by_name[name] = str(pair[1])
+    return tuple(columns_by_name.items())
 
 
-def place(name: str, told: str, there: list[str], source: str) -> tuple[str, float | None]:
-    """Return the column of a file that ``told`` names for ``name``, and the factor of its unit; None without one.
+def place(name: str, text: str, columns: list[str], source: str) -> tuple[str, float | None]:
+    """Return the column of a file that ``text`` names for ``name``, and the factor of its unit; None without one.
 
-    A name that is there with its brackets is that column, and the brackets are its unit where they hold one.
-    DataError for a column that is not there, and for an unknown unit.
+    A name that a column has with its brackets is that column, and the brackets are its unit where they hold one.
+    DataError for a column that is not among ``columns``, and for an unknown unit.
     """
-    column, unit = told, None
-    if found := re.fullmatch(r"(.+?)\s*[\[(]([^\[\]()]+)[\])]", told):
-        known = found[2].strip() in UNITS.get(name, {})
-        column, unit = (told, found[2].strip() if known else None) if told in there else (found[1], found[2].strip())
-    if column not in there:
-        guess = nearest(column, there)
-        cure = f"did you mean {guess!r}?" if guess else f"it has {listed(there)}."
+    column, unit = text, None
+    if match := re.fullmatch(r"(.+?)\s*[\[(]([^\[\]()]+)[\])]", text):
+        has_unit = match[2].strip() in UNITS.get(name, {})
+        column, unit = (
+            (text, match[2].strip() if has_unit else None) if text in columns else (match[1], match[2].strip())
+        )
+    if column not in columns:
+        guess = nearest(column, columns)
+        cure = f"did you mean {guess!r}?" if guess else f"it has {listed(columns)}."
         raise DataError(f"{source}: there is no column {column!r} for {name}; {cure}")
     if unit is None:
         return column, None
@@ -84,7 +86,7 @@ def place(name: str, told: str, there: list[str], source: str) -> tuple[str, flo
         factor = float(unit) if re.fullmatch(r"\d*\.?\d+(e-?\d+)?", unit) else None
     if not factor:
         known_units = f"use one of {', '.join(UNITS[name])}, or a factor" if name in UNITS else "leave it out"
-        raise DataError(f"{source}: {name} = {told} has the unit {unit!r}; {known_units}.")
+        raise DataError(f"{source}: {name} = {text} has the unit {unit!r}; {known_units}.")
     return column, factor
 
 
@@ -94,25 +96,24 @@ def renamed(frame: pl.DataFrame, columns: Columns, source: str) -> tuple[pl.Data
     Raises:
         DataError: If a column is not there, a unit is unknown, or a cell is no number.
     """
-    repairs, taken, made = [], set(), frame
-    for name, told in pairs(columns):
-        column, factor = place(name, told, frame.columns, source)
-        made = made.with_columns(frame[column].alias(name))
+    repairs, taken, table = [], set(), frame
+    for name, source_column in pairs(columns):
+        column, factor = place(name, source_column, frame.columns, source)
+        table = table.with_columns(frame[column].alias(name))
         taken.add(column)
         if factor is not None:
-            made = parsed(made, name, source).with_columns(pl.col(name).cast(pl.Float64) * factor)
+            table = parsed(table, name, source).with_columns(pl.col(name).cast(pl.Float64) * factor)
         text = f"Column {column!r} was read as {name}" + (f" (× {factor:.6g})." if factor is not None else ".")
         repairs.append(Repair("column named", 1, text))
-    asked = {name for name, _ in pairs(columns)}
-    return made.drop(taken - asked), repairs
+    return table.drop(taken.difference(name for name, _ in pairs(columns))), repairs
 
 
 def check_columns(columns: list[str], source: str) -> None:
     """Raise DataError if the table lacks a required column, or seems to misspell an optional one."""
     for name in REQUIRED:
         if name not in columns:
-            told = missing_column(name, columns, source, known=TIDY)
-            raise DataError(f"{told} Or name it: {guessed(columns)}")
+            error = missing_column(name, columns, source, known=TIDY)
+            raise DataError(f"{error} Or name it: {guessed(columns)}")
     others = [name for name in columns if name not in TIDY]
     for name in TIDY:
         guess = None if name in columns or name == "accel_mps2" else nearest(name, others, cutoff=0.85)
@@ -123,17 +124,17 @@ def check_columns(columns: list[str], source: str) -> None:
 
 def guessed(columns: list[str]) -> str:
     """Return the option ``--columns`` that a header may need; ``?`` where nothing fits."""
-    found: dict[str, str] = {}
+    guesses: dict[str, str] = {}
     for name, pattern in GUESSES.items():
         if name in columns:
             continue
         here = next(filter(None, map(partial(_like, name, pattern), columns)), None)
-        if here and here not in found.values():
-            found[name] = here
+        if here and here not in guesses.values():
+            guesses[name] = here
         elif name in REQUIRED:
-            found[name] = "?"
-    told = ",".join(f"{name}={column}" for name, column in found.items())
-    return f"--columns {shlex.quote(told)}"
+            guesses[name] = "?"
+    option = ",".join(f"{name}={column}" for name, column in guesses.items())
+    return f"--columns {shlex.quote(option)}"
 
 
 def _like(name: str, pattern: str, column: str) -> str | None:

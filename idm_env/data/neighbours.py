@@ -44,10 +44,10 @@ def _behind(leader: np.ndarray, gap: np.ndarray) -> np.ndarray:
 
 def _adjacent(rows: pl.DataFrame, leader: np.ndarray) -> np.ndarray:
     """Return the nearest vehicle, along the road, of the lanes beside one's own; the leader itself does not count."""
-    found = np.full(rows.height, NONE)
+    rows_beside = np.full(rows.height, NONE)
     lanes = rows.select((pl.col("lane").max() - pl.col("lane").min()).over("run_id").alias("lanes"))["lanes"]
     if not (lanes.fill_null(0) > 0).any():
-        return found
+        return rows_beside
     nearest = np.full(rows.height, np.inf)
     position = rows["position_m"].to_numpy()
     others = rows.filter(pl.col("lane").is_not_null()).select("run_id", "step", "lane", "position_m", other="row")
@@ -56,12 +56,12 @@ def _adjacent(rows: pl.DataFrame, leader: np.ndarray) -> np.ndarray:
         mine = rows.filter(pl.col("lane").is_not_null()).select(
             "run_id", "step", pl.col("lane") + side, "position_m", "row"
         )
-        beside = mine.sort("position_m").join_asof(
+        pairs = mine.sort("position_m").join_asof(
             others, on="position_m", by=["run_id", "step", "lane"], strategy="nearest", check_sortedness=False
         )
-        beside = beside.filter(pl.col("other").is_not_null())
-        row, other = beside["row"].to_numpy().astype(int), beside["other"].to_numpy().astype(int)
+        pairs = pairs.filter(pl.col("other").is_not_null())
+        row, other = pairs["row"].to_numpy().astype(int), pairs["other"].to_numpy().astype(int)
         distance = np.abs(position[row] - position[other])
         closer = (distance < nearest[row]) & (leader[row] != other)
-        found[row[closer]], nearest[row[closer]] = other[closer], distance[closer]
-    return found
+        rows_beside[row[closer]], nearest[row[closer]] = other[closer], distance[closer]
+    return rows_beside

@@ -37,11 +37,11 @@ def about(lines: list[str]) -> dict[str, str | list[str]]:
     for line in lines:
         key, *values = [cell.strip().strip('"') for cell in line.strip().split(",")]
         cells[key.strip().lower().replace(" ", "_")] = [value for value in values if value]
-    found: dict[str, str | list[str]] = {"vehicles": cells.get("vehicle_order", [])}
+    facts: dict[str, str | list[str]] = {"vehicles": cells.get("vehicle_order", [])}
     for key, name in (("acc", "acc_run"), ("distance_setting", "time_gap_setting"), ("date", "date")):
         if cells.get(key):
-            found[name] = "-".join(cells[key])
-    return found
+            facts[name] = "-".join(cells[key])
+    return facts
 
 
 def read(frame: pl.DataFrame, lines: list[str], run: str, source: str) -> tuple[pl.DataFrame, list[Repair]]:
@@ -57,9 +57,8 @@ def read(frame: pl.DataFrame, lines: list[str], run: str, source: str) -> tuple[
     time = next((name for name in frame.columns if name.lower() == "time"), None)
     slots: dict[int, dict[str, str]] = {}
     for name in frame.columns:
-        found = _SLOT.match(name)
-        if found:
-            slots.setdefault(int(found[2]), {})[found[1].lower()] = name
+        if match := _SLOT.match(name):
+            slots.setdefault(int(match[2]), {})[match[1].lower()] = name
     slots = {slot: names for slot, names in slots.items() if "speed" in names}
     if time is None or not slots:
         raise DataError(

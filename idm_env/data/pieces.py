@@ -24,9 +24,9 @@ def recordings(
     columns: Columns = None, where: Sequence[str] | None = None, seconds: float | None = None,
 ) -> Trajectories:  # fmt: skip
     """Return what ``load`` reads of a file, of it what ``where`` names, cut into runs of so many ``seconds``."""
-    found = load(path, ring_length=ring_length, place=place, layout=layout, columns=columns)
-    found = found if where is None else found.where(where)
-    return found if seconds is None else split_runs(found, seconds)
+    trajectories = load(path, ring_length=ring_length, place=place, layout=layout, columns=columns)
+    trajectories = trajectories if where is None else trajectories.where(where)
+    return trajectories if seconds is None else split_runs(trajectories, seconds)
 
 
 def seconds_of(text: str | None) -> float | None:

@@ -70,8 +70,8 @@ class Platoon:
             self._held = here[1]
             if k + 1 == steps:
                 break
-            there = self._rates(k + 1, k, state + self.step * here)
-            state = state + 0.5 * self.step * (here + there)
+            ahead = self._rates(k + 1, k, state + self.step * here)
+            state = state + 0.5 * self.step * (here + ahead)
             state[1] = np.maximum(state[1], 0.0)
         return out
 
@@ -84,13 +84,13 @@ class Platoon:
         zero = np.zeros_like(speed)
         return np.stack([position, speed, zero, speed / self.drivers.desired_speed, 1.0 + zero])
 
-    def _rates(self, k: int, known: int, state: np.ndarray) -> np.ndarray:
+    def _rates(self, k: int, last: int, state: np.ndarray) -> np.ndarray:
         """Return the time derivative of the state at fine step k; what drivers saw is recorded up to step `known`."""
         view = self._view(k, state)
-        if k == known:
+        if k == last:
             self._seen[:, k] = view.gap, view.speed, view.lead_speed
-        gap, speed, lead_speed = self._perceived(k, known, view)
-        accel = hidden.wanted(view, (gap, speed, lead_speed), self.drivers, self.on) + self.noise[known]
+        gap, speed, lead_speed = self._perceived(k, last, view)
+        accel = hidden.desired_accel(view, (gap, speed, lead_speed), self.drivers, self.on) + self.noise[last]
         accel = self._chained(k, accel, view.speed, state[2])
         rates = np.empty_like(state)
         rates[0] = state[1]
@@ -114,13 +114,13 @@ class Platoon:
             ahead = lagged[:, i] if "lag" in self.on else result[:, i]
         return result
 
-    def _perceived(self, k: int, known: int, view: View) -> np.ndarray:
+    def _perceived(self, k: int, last: int, view: View) -> np.ndarray:
         if "delay" not in self.on:
             return np.stack([view.gap, view.speed, view.lead_speed])
-        past = np.clip(k - self.on["delay"] / self.step, 0.0, known)
+        past = np.clip(k - self.on["delay"] / self.step, 0.0, last)
         low = int(past)
         share = past - low
-        return (1 - share) * self._seen[:, low] + share * self._seen[:, min(low + 1, known)]
+        return (1 - share) * self._seen[:, low] + share * self._seen[:, min(low + 1, last)]
 
     def _view(self, k: int, state: np.ndarray) -> View:
         position, speed = state[0], state[1]

@@ -70,7 +70,7 @@ def prepare(
 
 def _led(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     if "leader_id" in frame.columns:
-        frame, counts = leaders.known(frame, frame)
+        frame, counts = leaders.named_leaders(frame, frame)
         if (counts["state"] == "none").all():
             raise DataError(
                 f"{source}: leader_id is empty in every row, so that nobody follows anybody; fill it, or remove the "

@@ -76,9 +76,9 @@ class Scenario:
         return len(self.agents[0].valid)
 
 
-def check_scenario(agents: tuple[Agent, ...], wanted: tuple[int, ...], present: int, source: str) -> None:
+def check_scenario(agents: tuple[Agent, ...], targets: tuple[int, ...], present: int, source: str) -> None:
     """Raise DataError for tracks to predict that do not exist, and for a scenario that ends before its present."""
-    wrong = [i for i in wanted if not 0 <= i < len(agents)]
+    wrong = [i for i in targets if not 0 <= i < len(agents)]
     if wrong:
         raise DataError(f"{source}: track_index {wrong[0]} to predict is outside the {len(agents)} agents.")
     if len(agents[0].valid) <= present:

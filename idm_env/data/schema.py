@@ -71,7 +71,7 @@ def check(table: pl.DataFrame, source: str) -> pl.DataFrame:
     Raises:
         DataError: If a column is missing, has another type, lacks a value or breaks a bound.
     """
-    for name, (kind, always, rule, said) in COLUMNS.items():
+    for name, (kind, always, rule, rule_text) in COLUMNS.items():
         if name not in table.columns:
             raise DataError(f"{source}: column {name!r} of the tidy table is missing.")
         if table.schema[name] != kind:
@@ -79,5 +79,5 @@ def check(table: pl.DataFrame, source: str) -> pl.DataFrame:
         if always and table[name].null_count():
             raise DataError(f"{source}: column {name!r} of the tidy table lacks a value.")
         if not table.select(rule.all()).item():
-            raise DataError(f"{source}: column {name!r} of the tidy table holds values that are not {said}.")
+            raise DataError(f"{source}: column {name!r} of the tidy table holds values that are not {rule_text}.")
     return table

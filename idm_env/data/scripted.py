@@ -64,7 +64,7 @@ def lapping(random: np.random.Generator, runs: int, steps: int, step: float, cru
     return Scripted(position, speed, np.gradient(speed, step, axis=0))
 
 
-def beside(leader: Scripted) -> Scripted:
+def adjacent_queue(leader: Scripted) -> Scripted:
     """Return a slower queue in the adjacent lane, long enough to have somebody beside each follower all the time."""
     start = leader.position[0][None, :, None]
     ahead = 40.0 * (np.arange(VEHICLES_BESIDE) - 6)

@@ -35,8 +35,8 @@ def unwrapped(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
 def lengths(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     """Return the frame with a length for every vehicle: its median, or the default where the file gives none."""
     empty = frame["length_m"].null_count() if "length_m" in frame.columns else frame.height
-    known = pl.col("length_m").median().over(TRACK) if "length_m" in frame.columns else pl.lit(None, pl.Float64)
-    frame = frame.with_columns(known.alias("length_m"))
+    median = pl.col("length_m").median().over(TRACK) if "length_m" in frame.columns else pl.lit(None, pl.Float64)
+    frame = frame.with_columns(median.alias("length_m"))
     without = frame.filter(pl.col("length_m").is_null()).select(TRACK).n_unique()
     filled = empty - frame["length_m"].null_count()
     repairs = []

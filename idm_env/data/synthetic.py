@@ -94,7 +94,7 @@ def generate(
     leader = script(random, runs, steps, step, 0.8 * drivers.desired_speed.min())
     platoon = Platoon(
         leader=leader,
-        beside=scripted.beside(leader) if "lateral" in on else None,
+        beside=scripted.adjacent_queue(leader) if "lateral" in on else None,
         drivers=drivers,
         lengths=random.uniform(4.0, 5.2, (runs, 1 + followers)),
         starts=dt * random.integers(0, round(LATEST_START_S / dt), runs),

@@ -85,18 +85,18 @@ def _scenario(content: dict[str, Any], source: str) -> Scenario:
     metadata = content.get("metadata") or {}
     chosen = metadata.get("tracks_to_predict")
     if chosen is None:
-        wanted = tuple(i for i, agent in enumerate(agents) if agent.valid[PRESENT])
+        targets = tuple(i for i, agent in enumerate(agents) if agent.valid[PRESENT])
         notes.append("the file names no tracks_to_predict: every agent valid at the present step is predicted")
     else:
-        wanted = tuple(int(item["track_index"]) if isinstance(item, dict) else int(item) for item in chosen)
-    check_scenario(agents, wanted, PRESENT, source)
+        targets = tuple(int(item["track_index"]) if isinstance(item, dict) else int(item) for item in chosen)
+    check_scenario(agents, targets, PRESENT, source)
     name = str(content.get("scenario_id") or content.get("name") or source)
-    return Scenario(name, agents, tuple(lanes), wanted, PRESENT, tuple(controls), tuple(notes))
+    return Scenario(name, agents, tuple(lanes), targets, PRESENT, tuple(controls), tuple(notes))
 
 
 def _signals(lights: Any) -> list[TrafficControl]:
     """Return the signals of ``tl_states``, lane → states over time, as they are at the present and not later."""
-    found = []
+    signals = []
     for key, light in (lights or {}).items():
         steps = [int(step) for step in light.get("time_index", range(len(light["state"])))]
         seen = [i for i, step in enumerate(steps) if step <= PRESENT]
@@ -107,8 +107,8 @@ def _signals(lights: Any) -> list[TrafficControl]:
         shows = SHOWN[_STATES.index(name)] if name in _STATES else "unknown"
         lane = light.get("lane_id", key)
         lanes = (int(lane),) if str(lane).lstrip("-").isdigit() else ()
-        found.append(TrafficControl(shows, np.array([float(light["x"][last]), float(light["y"][last])]), lanes))
-    return found
+        signals.append(TrafficControl(shows, np.array([float(light["x"][last]), float(light["y"][last])]), lanes))
+    return signals
 
 
 def _agent(item: dict[str, Any], number: int) -> Agent:

@@ -165,18 +165,18 @@ def _scenario(message: Any, source: str) -> Scenario:
         elif feature.HasField("stop_sign"):
             sign = feature.stop_sign
             controls.append(TrafficControl("sign", np.array([sign.position.x, sign.position.y]), tuple(sign.lane)))
-    wanted = tuple(int(item.track_index) for item in message.tracks_to_predict)
+    targets = tuple(int(item.track_index) for item in message.tracks_to_predict)
     present = int(message.current_time_index)
     # only the state at the present: later ones are the future
     for light in message.dynamic_map_states[present].lane_states if len(message.dynamic_map_states) > present else ():
         shows = SHOWN[light.state] if light.state < len(SHOWN) else "unknown"
         controls.append(TrafficControl(shows, np.array([light.stop_point.x, light.stop_point.y]), (int(light.lane),)))
     notes: tuple[str, ...] = ()
-    if not wanted:
-        wanted = tuple(i for i, agent in enumerate(agents) if agent.valid[present])
+    if not targets:
+        targets = tuple(i for i, agent in enumerate(agents) if agent.valid[present])
         notes = ("the record names no tracks_to_predict: every agent valid at the present step is predicted",)
-    check_scenario(agents, wanted, present, source)
-    return Scenario(message.scenario_id or source, agents, tuple(lanes), wanted, present, tuple(controls), notes)
+    check_scenario(agents, targets, present, source)
+    return Scenario(message.scenario_id or source, agents, tuple(lanes), targets, present, tuple(controls), notes)
 
 
 def _agent(track: Any) -> Agent:

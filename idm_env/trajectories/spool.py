@@ -178,7 +178,7 @@ class Spool:
         for chunk in range(self.chunks):
             frame = pl.read_parquet(self.shelf.path(chunk), glob=False)
             if "leader_id" in frame.columns:
-                frame, counts = leaders.known(frame, index)
+                frame, counts = leaders.named_leaders(frame, index)
                 named.append(counts)
             ticks, _ = clock.regularise(frame, steps, starts, BRIDGED_S)
             files.append(self.folder / f"ticks-{chunk:05d}.parquet")
