@@ -1,8 +1,8 @@
-"""What following a driver's drift is worth in forecasts, on runs kept back.
+"""Forecasts of one driver behind his leader, on runs kept back: drift, and what others put beside IDM.
 
-    python -m benchmarks.drift --data ../shared/data [--draws 60]
+    python studies/2026-11-23-rivals-behind-a-leader/rivals.py --data ../shared/data [--file NAME] [--draws 60]
 
-NGSIM I-80 pairs by the split of ``explain`` (a quarter of the runs kept back, seed 0). Drivers of these runs are
+Pairs by the split of ``explain`` (a quarter of the runs kept back, seed 0). Drivers of these runs are
 calibrated on every other block of time, as ``explain`` does, with the population of the other runs as prior. Forecasts
 begin every 5 s in the blocks between, from the measured state, behind the leader as recorded. IDM and every row below
 it have the same calibrations. σ, τ and all else come from runs that are not kept back. A forecast of 10 or 30 s may end
@@ -12,18 +12,22 @@ in a block that calibrated the driver, for all rows alike.
 from __future__ import annotations
 
 import argparse
+import copy
 import dataclasses
+import itertools
 import os
 import pathlib
+import re
 import sys
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import torch  # noqa: E402
+from torch import Tensor  # noqa: E402
 from scipy.stats import energy_distance  # noqa: E402
 
 from idm_env.data import Episode, episodes, load  # noqa: E402
@@ -31,12 +35,14 @@ from idm_env.drift import forecast  # noqa: E402
 from idm_env.drift.estimate import Estimate, estimate, usual  # noqa: E402
 from idm_env.drift.linear import MeasuredDrivers, Path  # noqa: E402
 from idm_env.effects import IDM, AccelNoise, Brakes, Effect, Noise, Replay, Wander  # noqa: E402
+from idm_env.effects.base import P  # noqa: E402
 from idm_env.fitting.batch import Batch  # noqa: E402
 from idm_env.fitting.fit import fit  # noqa: E402
 from idm_env.fitting.prior import Prior  # noqa: E402
 from idm_env.fitting.problem import IDM_NAMES  # noqa: E402
 from idm_env.roads import Lane  # noqa: E402
 from idm_env.simulator import Simulator  # noqa: E402
+from idm_env.types import Driver, Scene  # noqa: E402
 
 HORIZONS = (1.0, 5.0, 10.0, 30.0)
 EVERY_S, FIRST_S = 5.0, 5.0
@@ -267,6 +273,128 @@ def by_residual(
     return gap, speed
 
 
+FEATURES = ("v", "s", "dv", "al", "a")
+"""Speed over 10 m/s, logarithm of the gap over 15 m, closing speed, the leader's acceleration, what IDM wants."""
+DEGREE, SEEDS, WIDTH, EPOCHS = 3, 3, 16, 400
+LARGEST = 2.0
+"""No residual of a learned model is larger (m/s²): outside of its data it would drive as it likes."""
+THRESHOLDS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
+SPARE = (1.0, 1.05)
+"""The sparsest polynomial is taken whose squared error on drivers that it was not fitted to is so many times the least."""
+
+
+def features(speed: Tensor, gap: Tensor, closing: Tensor, leader: Tensor, wanted: Tensor) -> Tensor:
+    """Return what a residual may depend on [..., 5]; without dimension, or in m/s and m/s²."""
+    logarithm = torch.log(gap.clamp_min(0.5) / 15.0)
+    return torch.stack((speed / 10.0, logarithm, closing, leader, wanted.clamp(-4.0, 3.0)), -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Learned(Effect):
+    """What a function of the scene adds to IDM's acceleration."""
+
+    kind: ClassVar[str] = "learned"
+    rank: ClassVar[int] = -10
+    function: Any = None
+
+    def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return the acceleration with the residual."""
+        x = features(
+            scene.speed, scene.leader.gap, scene.speed - scene.leader.speed, scene.leader.accel, accel
+        )  # fmt: skip
+        return accel + self.function(x).to(accel.dtype).clamp(-LARGEST, LARGEST) * scene.leader.present
+
+
+def samples(drivers: MeasuredDrivers, theta: np.ndarray) -> tuple[Tensor, Tensor, np.ndarray]:
+    """Return features [n, 5], what IDM lacks (m/s²) [n] and the driver [n] of every measured sample."""
+    batch = drivers.batch
+    lacking = residuals(drivers, theta)
+    rows, x = [], []
+    for r, e in enumerate(batch.episodes):
+        n = len(e) - 1
+        lead, accel = e.leader.speed_mps, e.leader.accel_mps2[:n]
+        wanted = np.diff(e.speed_mps[: n + 1]) / e.dt - lacking[:n, r]
+        columns = (e.speed_mps[:n], e.gap_m[:n], e.speed_mps[:n] - lead[:n], accel, wanted)
+        x.append(features(*(torch.tensor(np.ascontiguousarray(c)) for c in columns)))
+        rows.append(np.full(n, r))
+    y = torch.cat([torch.tensor(lacking[: len(k), r]) for r, k in enumerate(rows)])
+    x, who = torch.cat(x), np.concatenate(rows)
+    fine = torch.isfinite(y) & torch.isfinite(x).all(-1)
+    return x[fine], y[fine].clamp(-3.0, 3.0), who[fine.numpy()]
+
+
+def powers() -> list[tuple[int, ...]]:
+    """Return the exponents of every monomial of the library."""
+    return [k for k in itertools.product(range(DEGREE + 1), repeat=len(FEATURES)) if sum(k) <= DEGREE]
+
+
+def library(x: Tensor) -> Tensor:
+    """Return every monomial of the features [..., 56]."""
+    return torch.stack([torch.prod(x ** torch.tensor(k, dtype=x.dtype), -1) for k in powers()], -1)
+
+
+def sparse(x: Tensor, y: Tensor, who: np.ndarray, spare: float) -> tuple[Any, str]:
+    """Return a sparse polynomial of the features (sequentially thresholded least squares), and its formula.
+
+    Brunton, Proctor and Kutz 2016. The threshold, in units of the residual's standard deviation per standard deviation
+    of the monomial, is the largest whose error is ``spare`` times the least on every fourth of the drivers to fit.
+    """
+    a, kept = library(x).numpy(), who % 4 == 0
+    scale, out = a.std(0) + (a.std(0) == 0.0), y.numpy()
+    def fitted(rows: np.ndarray, threshold: float) -> np.ndarray:
+        used = np.ones(a.shape[1], bool)
+        for _ in range(10):
+            w = np.zeros(a.shape[1])
+            w[used] = np.linalg.lstsq(a[rows][:, used] / scale[used], out[rows], rcond=None)[0]
+            used = np.abs(w) > threshold * out.std()
+        return np.where(used, w, 0.0) / scale
+    errors = [float(np.mean((a[kept] @ fitted(~kept, t) - out[kept]) ** 2)) for t in THRESHOLDS]
+    threshold = max(t for t, error in zip(THRESHOLDS, errors) if error <= spare * min(errors))
+    w = fitted(np.ones(len(out), bool), threshold)
+    words = ["".join(f" {n}" + (f"^{e}" if e > 1 else "") for n, e in zip(FEATURES, k) if e) for k in powers()]
+    formula = " ".join(f"{c:+.3f}{name}" for c, name in zip(w, words) if c)
+    weights = torch.tensor(w)
+    return lambda z: library(z.double()) @ weights, formula
+
+
+def net(x: Tensor, y: Tensor, who: np.ndarray) -> Any:
+    """Return the mean of small nets, each as it was when it served best the drivers that it was not trained on."""
+    kept = torch.tensor(who % 4 == 0)
+    centre, spread = x.mean(0), x.std(0)
+    nets = []
+    for seed in range(SEEDS):
+        torch.manual_seed(seed)
+        own = torch.nn.Sequential(
+            torch.nn.Linear(len(FEATURES), WIDTH), torch.nn.Tanh(), torch.nn.Linear(WIDTH, WIDTH), torch.nn.Tanh(),
+            torch.nn.Linear(WIDTH, 1),
+        ).double()  # fmt: skip
+        optimiser, best = torch.optim.Adam(own.parameters(), lr=1e-2), (float("inf"), copy.deepcopy(own))
+        for _ in range(EPOCHS):
+            optimiser.zero_grad()
+            error = own((x - centre) / spread)[:, 0] - y
+            error[~kept].square().mean().backward()
+            now = float(error[kept].square().mean().detach())
+            best = (now, copy.deepcopy(own)) if now < best[0] else best
+            optimiser.step()
+        nets.append(best[1])
+    return lambda z: torch.stack([own((z.double() - centre) / spread)[..., 0] for own in nets]).mean(0)
+
+
+def by_learned(
+    drivers: MeasuredDrivers, theta: np.ndarray, starts: list[tuple[int, int]], steps: int, function: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the forecasts [steps, 1, starts] of IDM with a learned residual, in closed loop."""
+    items, dt = drivers.batch.episodes, drivers.batch.dt
+    model = simulator(dt, Learned(function=function))
+    made = Batch.of([items[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
+    params = {**model.defaults(dtype=torch.float64), **drivers.params(torch.tensor(theta[[r for r, _ in starts]]))}
+    with torch.no_grad():
+        _, kept = model.rollout(made.start(model, params), made.inputs(model), params, made.steps)
+    gap, speed = (np.full((steps, 1, len(starts)), np.nan) for _ in range(2))
+    gap[: made.steps, 0], speed[: made.steps, 0] = kept.gap[..., 1].numpy(), kept.speed[..., 1].numpy()
+    return gap, speed
+
+
 def persistent(
     drivers: MeasuredDrivers, nothing: Estimate, theta: np.ndarray, starts: list[tuple[int, int]], gap: np.ndarray,
     speed: np.ndarray,
@@ -292,14 +420,14 @@ def still_levels(drivers: MeasuredDrivers) -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((*drivers.batch.gap.shape, k)), np.zeros((*drivers.batch.gap.shape, k, k))
 
 
-def i80(folder: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[float, float]]) -> str:
-    """Return the table of I-80; with ``choose`` of drivers to fit, for every noise, instead of those kept back."""
+def table(path: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[float, float]]) -> str:
+    """Return the table of a file; with ``choose`` of drivers to fit, for every noise, instead of those kept back."""
     begin = time.perf_counter()
 
     def say(text: str) -> None:
         print(f"{time.perf_counter() - begin:6.0f} s  {text}", file=sys.stderr, flush=True)
 
-    found = list(episodes(load(folder / "ngsim_i80_pairs.parquet"), min_seconds=12.0))
+    found = list(episodes(load(path), min_seconds=12.0))
     found = [thinned(e) for e in found]
     train, kept = split(found)
     dt = found[0].dt
@@ -328,6 +456,14 @@ def i80(folder: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[
     past, count = residuals(plain, mine), round(HORIZONS[-1] / dt)
     on = going_on(past, starts, autoregression(trained, theta), dt, count)
     rows.score(f"IDM + AR({ORDER})", *by_residual(plain, mine, starts, on))
+    x, y, who = samples(trained, theta)
+    polynomials = {formula: learned for learned, formula in (sparse(x, y, who, spare) for spare in SPARE)}
+    for formula, learned in polynomials.items():
+        terms = len(re.findall(r"[+-]\d", formula))
+        say(f"{terms} terms: {formula}")
+        rows.score(f"IDM + polynomial of {terms} terms", *by_learned(plain, mine, starts, count, learned))
+    rows.score("IDM + small net", *by_learned(plain, mine, starts, count, net(x, y, who)))
+    say("learned")
     for name, drifts in MODELS.items():
         for noise in NOISES if choose else (noises[name],):
             label = f"{name}, noise {noise[0]:g} m, {noise[1]:g} m/s"
@@ -349,10 +485,11 @@ def main() -> None:
     parser.add_argument(
         "--data", type=pathlib.Path, default=pathlib.Path(os.environ.get("IDM_ENV_DATA", "../shared/data"))
     )
+    parser.add_argument("--file", default="ngsim_i80_pairs.parquet")
     parser.add_argument("--draws", type=int, default=60)
     parser.add_argument("--choose", action="store_true", help="score every noise on drivers to fit, to choose one")
     arguments = parser.parse_args()
-    print(i80(arguments.data, arguments.draws, arguments.choose, CHOSEN))
+    print(table(arguments.data / arguments.file, arguments.draws, arguments.choose, CHOSEN))
 
 
 if __name__ == "__main__":
