@@ -339,7 +339,7 @@ def check_places(path: str | Path, content: Mapping[Any, Any]) -> None:
             where = one.get("effect") if isinstance(one, Mapping) else one
             if not isinstance(where, str) or ":" not in where or catalogue.imported(place := where.rpartition(":")[0]):
                 continue
-            if not trust.given():
+            if not trust.permission():
                 raise ValueError(
                     f"{path}: effect {shown(where)} is code of {shown(place)}, which is not run unasked. Read it, then "
                     f"give --trust, trusted=True in Python, or {trust.VARIABLE}=1."

@@ -132,7 +132,7 @@ def elsewhere(p: Planted) -> None:
 
 def on_ray(p: Planted) -> None:
     """What a task of Ray does with its payload."""
-    kind, found = executor._work(pickle.dumps((os.getcwd(), trust.given(), read_there, p.model)))
+    kind, found = executor._work(pickle.dumps((os.getcwd(), trust.permission(), read_there, p.model)))
     if kind != "done":
         raise found
 
@@ -252,9 +252,9 @@ def test_what_is_trusted_is_run_and_said(way: str, planted: Planted, caplog: pyt
 def test_trust_holds_inside_and_in_workers(way: str, planted: Planted, monkeypatch: pytest.MonkeyPatch) -> None:
     with trust.trusting(), trust.trusting(False):
         WAYS[way](planted)
-    assert planted.mark.exists() and not trust.given()
+    assert planted.mark.exists() and not trust.permission()
     monkeypatch.setenv(trust.VARIABLE, "1")
-    assert trust.given()
+    assert trust.permission()
 
 
 def test_a_worker_trusts_whom_the_one_that_asks_trusts(planted: Planted) -> None:

@@ -128,8 +128,8 @@ class Estimate:
                     return f"{symbol} is at the end of what is searched, {math.exp(packed[i]):.3g}"
         return ""
 
-    def kept(self) -> dict[str, torch.Tensor]:
-        """Return the numbers as a store takes them; ``of_kept`` makes the estimate of them again."""
+    def numbers(self) -> dict[str, torch.Tensor]:
+        """Return the numbers as a store takes them; ``of_numbers`` makes the estimate of them again."""
         s, path = self.settings, self.path
         arrays = {
             "sigma": s.sigma, "memory_time": s.memory_time, "noise": s.noise, "jitter": s.jitter, "spread": s.spread,
@@ -139,9 +139,9 @@ class Estimate:
         return {name: torch.as_tensor(np.asarray(value, float)) for name, value in arrays.items()}
 
     @classmethod
-    def of_kept(cls, drivers: MeasuredDrivers, kept: Mapping[str, torch.Tensor]) -> Estimate:
-        """Return the estimate of which ``kept`` holds the numbers, on the same drivers."""
-        x = {name: value.numpy() for name, value in kept.items()}
+    def of_numbers(cls, drivers: MeasuredDrivers, numbers: Mapping[str, torch.Tensor]) -> Estimate:
+        """Return the estimate with these ``numbers``, on the same drivers."""
+        x = {name: value.numpy() for name, value in numbers.items()}
         settings = DriftSettings(x["sigma"], x["memory_time"], x["noise"], float(x["jitter"]), x["spread"])
         path = Path(**{f.name: x[f.name] for f in fields(Path)})
         return cls(drivers, settings, _names(drivers), x["log_error"], float(x["log_likelihood"]), path)
@@ -189,8 +189,8 @@ class Likelihood:
 
     def filtered(self, s: DriftSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return filtered means and covariances and smoothed means [T, rows, …] of gap, speed and levels."""
-        found: tuple[np.ndarray, np.ndarray, np.ndarray] = loops.smooth(*(*self.given, *self._settings(s)))
-        return found
+        moments: tuple[np.ndarray, np.ndarray, np.ndarray] = loops.smooth(*(*self.given, *self._settings(s)))
+        return moments
 
 
 def estimate(
@@ -222,10 +222,10 @@ def estimate(
         ValueError: For a simulator that looks back.
     """
     drivers = MeasuredDrivers(simulator, batch, measured or batch, tuple(free))
-    known = catalogue(simulator.effects)
+    parameters = catalogue(simulator.effects)
     settings = DriftSettings(
-        np.array([known[f"{n}.sigma"].default for n in drivers.drifts]),
-        np.array([known[f"{n}.memory_time"].default for n in drivers.drifts]),
+        np.array([parameters[f"{n}.sigma"].default for n in drivers.drifts]),
+        np.array([parameters[f"{n}.memory_time"].default for n in drivers.drifts]),
         np.array(noise or (0.1, 0.1)), 0.02, np.broadcast_to(np.asarray(spread, float), len(free)).copy(),
     )  # fmt: skip
     limits = _limits(drivers, noise)
@@ -248,11 +248,11 @@ def _names(drivers: MeasuredDrivers) -> tuple[str, ...]:
 
 
 def _limits(drivers: MeasuredDrivers, noise: tuple[float, float] | None) -> np.ndarray:
-    known = catalogue(drivers.simulator.effects)
-    highest = [known[f"{n}.sigma"].high for n in drivers.drifts]
-    found = [(1e-3 * x, x) for x in highest] + [(2.0 * drivers.batch.dt, 300.0)] * len(highest)
+    parameters = catalogue(drivers.simulator.effects)
+    highest = [parameters[f"{n}.sigma"].high for n in drivers.drifts]
+    drifts = [(1e-3 * x, x) for x in highest] + [(2.0 * drivers.batch.dt, 300.0)] * len(highest)
     both = [(QUIETEST, 5.0)] * 2 if noise is None else [(x, x) for x in noise]
-    return np.log([*found, *both, JITTER])
+    return np.log([*drifts, *both, JITTER])
 
 
 def _maximised(around: Likelihood, settings: DriftSettings, limits: np.ndarray) -> DriftSettings:
@@ -278,8 +278,8 @@ def _path(around: Likelihood, settings: DriftSettings) -> Path:
     theta = np.clip(theta, *around.drivers.bounds)
     level = np.zeros_like(path.level)
     level[..., :own] = theta - path.theta
-    known, covariance, _ = around.centred(theta).filtered(replace(settings, spread=np.zeros(own)))
-    return predicted(replace(path, level=level), settings, around.drivers.batch.dt, known, covariance)
+    mean, covariance, _ = around.centred(theta).filtered(replace(settings, spread=np.zeros(own)))
+    return predicted(replace(path, level=level), settings, around.drivers.batch.dt, mean, covariance)
 
 
 def predicted(path: Path, settings: DriftSettings, dt: float, mean: np.ndarray, covariance: np.ndarray) -> Path:
@@ -318,8 +318,8 @@ def _errors(around: Likelihood, settings: DriftSettings, limits: np.ndarray) -> 
             curvature[a, b] = curvature[b, a] = -both / NUDGE**2
     error = np.full(len(x), np.inf)
     # What the likelihood hardly knows (a jitter next to nothing) may not spoil the others.
-    told = np.diag(curvature) > FLAT
-    inside, curvature = [i for i, y in zip(inside, told, strict=True) if y], curvature[np.ix_(told, told)]
+    sharp = np.diag(curvature) > FLAT
+    inside, curvature = [i for i, y in zip(inside, sharp, strict=True) if y], curvature[np.ix_(sharp, sharp)]
     variance = np.diag(np.linalg.pinv(curvature))
     error[inside] = np.where(variance > 0, np.sqrt(np.maximum(variance, 0.0)), np.inf)
     return error

@@ -95,7 +95,7 @@ def likelihood(
     """Return the log-likelihood of every row; innovations of the first ``skip`` samples do not count."""
     rows, k = gap.shape[1], decay.shape[0]
     d = 2 + k
-    found = np.zeros(rows)
+    log_likelihood = np.zeros(rows)
     kick = sigma * sigma * (1.0 - decay * decay)
     a, w, gain = np.zeros((2, d)), np.zeros((2, d + 1)), np.zeros(d)
     r2 = noise * noise
@@ -109,8 +109,8 @@ def likelihood(
             f, u = update(m, p, 1, measured_speed[t + 1, r], r2[1], gain)
             if t >= skip:
                 total -= 0.5 * (2.0 * LOG_2PI + np.log(s * u) + e * e / s + f * f / u)
-        found[r] = total
-    return found
+        log_likelihood[r] = total
+    return log_likelihood
 
 
 @compiled

@@ -30,7 +30,7 @@ def followed(
     return mean[..., 2:], covariance[..., 2:, 2:]
 
 
-def drawn(
+def futures(
     drivers: MeasuredDrivers,
     settings: DriftSettings,
     theta: np.ndarray,
@@ -46,11 +46,11 @@ def drawn(
     end of a record a future means nothing.
     """
     steps = round(seconds / drivers.batch.dt)
-    found = [
+    chunks = [
         _chunk(drivers, settings, theta, levels, starts[i : i + 64], steps, count, seed + i)
         for i in range(0, len(starts), 64)
     ]
-    gap, speed = (np.concatenate(x, -1) for x in zip(*found, strict=True))
+    gap, speed = (np.concatenate(x, -1) for x in zip(*chunks, strict=True))
     return gap, speed
 
 
@@ -61,11 +61,11 @@ def _chunk(
     simulator, d = drivers.simulator, drivers.driver
     batch = Batch.of([drivers.batch.episodes[r].part(t, t + steps + 1) for r, t in starts], substeps=1)
     random = np.random.default_rng(seed)
-    rows, at = np.array([r for r, _ in starts]), np.array([t for _, t in starts])
-    values, vectors = np.linalg.eigh(levels[1][at, rows])
+    rows, samples = np.array([r for r, _ in starts]), np.array([t for _, t in starts])
+    values, vectors = np.linalg.eigh(levels[1][samples, rows])
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
     normals = random.standard_normal((count, *levels[0].shape[2:], len(starts)))
-    level = levels[0][at, rows] + np.einsum("rij,njr->nri", root, normals)
+    level = levels[0][samples, rows] + np.einsum("rij,njr->nri", root, normals)
     own = len(drivers.free)
     params = drivers.params(torch.tensor(np.clip(theta[rows] + level[..., :own], *drivers.bounds)))
     for j, name in enumerate(drivers.drifts):
@@ -83,9 +83,9 @@ def _chunk(
     state = state._replace(memory={**state.memory, **memory}, step=state.step.expand(state.speed.shape[:-1]))
     inputs = {n: _wider(x) for n, x in batch.inputs(simulator.without(*simulator.draws)).items()}
     inputs = simulator.drawn(state.speed, inputs, batch.steps, seed)
-    _, kept = simulator.rollout(state, inputs, params, batch.steps)
-    made = (x[..., d].numpy() for x in (kept.gap, kept.speed))
-    gap, speed = (np.pad(x, [(0, steps - len(x)), (0, 0), (0, 0)], constant_values=np.nan) for x in made)
+    _, trajectory = simulator.rollout(state, inputs, params, batch.steps)
+    parts = (x[..., d].numpy() for x in (trajectory.gap, trajectory.speed))
+    gap, speed = (np.pad(x, [(0, steps - len(x)), (0, 0), (0, 0)], constant_values=np.nan) for x in parts)
     return gap, speed
 
 
@@ -94,33 +94,33 @@ def _wider(value: Any) -> Any:
     return type(value)(*(None if x is None else x.unsqueeze(1) for x in value))
 
 
-def crps(drawn: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def crps(draws: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return the continuous ranked probability score of draws [n, …], without the bias of few draws.
 
     ``E|X − y| − ½ E|X − X'|`` (Gneiting, Raftery 2007, JASA 102); of a single draw the absolute error.
     """
-    n = len(drawn)
-    first = np.abs(drawn - truth).mean(0)
+    n = len(draws)
+    first = np.abs(draws - truth).mean(0)
     if n == 1:
         return np.asarray(first)
-    ranked = np.sort(drawn, 0)
+    ranked = np.sort(draws, 0)
     weight = (2.0 * np.arange(1, n + 1) - n - 1.0).reshape(-1, *(1,) * truth.ndim)
     return np.asarray(first - (weight * ranked).sum(0) / (n * (n - 1.0)))
 
 
-def log_score(drawn: np.ndarray, truth: np.ndarray, least: float = 0.1) -> np.ndarray:
+def log_score(draws: np.ndarray, truth: np.ndarray, least: float = 0.1) -> np.ndarray:
     """Return minus the log density of the truth under a normal of the draws' mean and variance: small is good.
 
     ``least`` is added as a standard deviation, since all draws may agree that a car stands.
     """
-    variance = drawn.var(0, ddof=1) + least**2
-    return np.asarray(0.5 * (math.log(2.0 * math.pi) + np.log(variance) + (truth - drawn.mean(0)) ** 2 / variance))
+    variance = draws.var(0, ddof=1) + least**2
+    return np.asarray(0.5 * (math.log(2.0 * math.pi) + np.log(variance) + (truth - draws.mean(0)) ** 2 / variance))
 
 
-def covers(drawn: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+def covers(draws: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
     """Return whether the central band of ``share`` of the draws holds the truth, and the band's width."""
-    low, high = np.quantile(drawn, [0.5 - 0.5 * share, 0.5 + 0.5 * share], axis=0)
+    low, high = np.quantile(draws, [0.5 - 0.5 * share, 0.5 + 0.5 * share], axis=0)
     return (truth >= low) & (truth <= high), high - low
 
 
-__all__ = ["covers", "crps", "drawn", "followed", "log_score"]
+__all__ = ["covers", "crps", "followed", "futures", "log_score"]

@@ -29,8 +29,8 @@ LEAST = 8
 
 def split(count: int, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the places of drivers to estimate on, and of every fourth, kept back; none of fewer than ``LEAST``."""
-    kept = np.arange(count)[3::4] if count >= LEAST else np.zeros(0, int)
-    return evenly(np.setdiff1d(np.arange(count), kept), most), evenly(kept, MOST)
+    back = np.arange(count)[3::4] if count >= LEAST else np.zeros(0, int)
+    return evenly(np.setdiff1d(np.arange(count), back), most), evenly(back, MOST)
 
 
 def evenly(places: np.ndarray, most: int) -> np.ndarray:
@@ -53,23 +53,23 @@ def scores(
     begins = [np.arange(FIRST_S, (len(e) - 1) * dt - longest, EVERY_S) for e in smooth]
     starts = [(r, round(t / dt)) for r, times in enumerate(begins) for t in times]
     rows: list[dict[str, Any]] = []
-    for name, found in estimates.items() if starts else ():
-        drivers = MeasuredDrivers(found.drivers.simulator, batch, raw, IDM_NAMES)
-        theta = np.broadcast_to(np.median(found.theta, 0), (len(smooth), len(IDM_NAMES))).copy()
-        levels = forecast.followed(drivers, found.settings, theta)
-        gap, _ = forecast.drawn(drivers, found.settings, theta, levels, starts, longest, DRAWS, seed)
+    for name, estimate in estimates.items() if starts else ():
+        drivers = MeasuredDrivers(estimate.drivers.simulator, batch, raw, IDM_NAMES)
+        theta = np.broadcast_to(np.median(estimate.theta, 0), (len(smooth), len(IDM_NAMES))).copy()
+        levels = forecast.followed(drivers, estimate.settings, theta)
+        gap, _ = forecast.futures(drivers, estimate.settings, theta, levels, starts, longest, DRAWS, seed)
         for ahead in HORIZONS_S:
             steps = round(ahead / dt)
             truth = np.array([measured[r].gap_m[t + steps] for r, t in starts])
-            drawn = gap[steps - 1]
-            able = np.isfinite(truth) & np.isfinite(drawn).all(0)
-            truth, drawn = truth[able], drawn[:, able]
+            draws = gap[steps - 1]
+            able = np.isfinite(truth) & np.isfinite(draws).all(0)
+            truth, draws = truth[able], draws[:, able]
             rows.append({
                 "model": name, "ahead_s": ahead, "forecasts": int(able.sum()),
-                "gap_rmse_m": float(np.sqrt(np.mean((drawn.mean(0) - truth) ** 2))),
-                "gap_crps_m": float(forecast.crps(drawn, truth).mean()),
-                "in_50_percent": 100.0 * float(forecast.covers(drawn, truth, 0.5)[0].mean()),
-                "in_90_percent": 100.0 * float(forecast.covers(drawn, truth, 0.9)[0].mean()),
+                "gap_rmse_m": float(np.sqrt(np.mean((draws.mean(0) - truth) ** 2))),
+                "gap_crps_m": float(forecast.crps(draws, truth).mean()),
+                "in_50_percent": 100.0 * float(forecast.covers(draws, truth, 0.5)[0].mean()),
+                "in_90_percent": 100.0 * float(forecast.covers(draws, truth, 0.9)[0].mean()),
             })  # fmt: skip
     return rows
 

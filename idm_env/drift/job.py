@@ -61,28 +61,28 @@ def drift_file(
         trajectories = source.trajectories()
         thinned = replace(source, dt=source.dt or step_of(trajectories))
         both = [replace(thinned, smooth=x).episodes(trajectories) for x in (True, False)]
-        taken, kept = held_out.split(len(both[0]), drivers)
-        fitted, back = ([[found[i] for i in places] for found in both] for places in (taken, kept))
+        taken, rest = held_out.split(len(both[0]), drivers)
+        fitted, back = ([[episodes[i] for i in places] for episodes in both] for places in (taken, rest))
         mark = storage.fingerprint(source.path, replace(thinned, path=Path()), drivers)
         store = storage.Store(out / storage.UNFINISHED / "drift", mark, resume)
-        told = tell(*fitted, store=store, executor=executor, on_progress=progress)
-        best = told.found[told.one_of[0]] if told.one_of else told.steady
-        progress("kept back", 0, 0, f"{len(kept)} drivers")
-        sorts = {"no drift": told.steady} | {name: e for name, e in told.found.items() if not e.why_not}
-        scores = held_out.scores(sorts, back[0], back[1]) if len(kept) and told.verdict != "cannot_tell" else []
-        foreseen = held_out.sentence(scores, next(iter(told.one_of), None), len(kept))
+        answer = tell(*fitted, store=store, executor=executor, on_progress=progress)
+        best = answer.found[answer.one_of[0]] if answer.one_of else answer.steady
+        progress("kept back", 0, 0, f"{len(rest)} drivers")
+        sorts = {"no drift": answer.steady} | {name: e for name, e in answer.found.items() if not e.why_not}
+        scores = held_out.scores(sorts, back[0], back[1]) if len(rest) and answer.verdict != "cannot_tell" else []
+        foreseen = held_out.sentence(scores, next(iter(answer.one_of), None), len(rest))
         marked = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fitted[0]])
         save_model(out / "model.yaml", replace(model_of(best), fitted_on=marked))
         result = {
             "schema": 1,
             "command": page.command_line(),
-            "verdict": told.verdict,
-            "one_of": list(told.one_of),
-            "sentence": f"{sentence(told)} {foreseen}".rstrip(),
-            "sorts": _sorts(told),
-            "kept_back": {"drivers": len(kept), "scores": scores},
+            "verdict": answer.verdict,
+            "one_of": list(answer.one_of),
+            "sentence": f"{sentence(answer)} {foreseen}".rstrip(),
+            "sorts": _sorts(answer),
+            "kept_back": {"drivers": len(rest), "scores": scores},
             "estimates": {
-                name: [] if e.why_not else e.table() for name, e in {"none": told.steady, **told.found}.items()
+                name: [] if e.why_not else e.table() for name, e in {"none": answer.steady, **answer.found}.items()
             },
             "data": {
                 **trajectories.summary(), "episodes": len(both[0]), "taken": len(taken), "dt": best.drivers.batch.dt,
@@ -95,61 +95,61 @@ def drift_file(
         return result
 
 
-def model_of(found: Estimate) -> Model:
+def model_of(estimate: Estimate) -> Model:
     """Return drivers who drift as estimated: the median driver and everyone's own parameters."""
-    drivers, names = found.drivers, found.drivers.free
+    drivers, names = estimate.drivers, estimate.drivers.free
 
     def numbers(row: np.ndarray) -> Numbers:
         return nested(dict(zip(names, np.exp(row).tolist(), strict=True)))
 
-    s = found.settings
+    s = estimate.settings
     drifts = {
         name: {"sigma": float(s.sigma[j]), "memory_time": float(s.memory_time[j])}
         for j, name in enumerate(drivers.drifts)
     }
     records: dict[str, list[np.ndarray]] = {}
-    for e, theta in zip(drivers.batch.episodes, found.theta, strict=True):
+    for e, theta in zip(drivers.batch.episodes, estimate.theta, strict=True):
         records.setdefault(f"{e.run_id}/{e.vehicle_id}", []).append(theta)
     effects = tuple(e for e in drivers.simulator.effects if not isinstance(e, Replay))
     return Model(
-        effects, {**numbers(np.median(found.theta, 0)), **drifts}, drivers.simulator.dt,
+        effects, {**numbers(np.median(estimate.theta, 0)), **drifts}, drivers.simulator.dt,
         drivers.simulator.integration, {key: numbers(np.mean(x, 0)) for key, x in records.items()},
     )  # fmt: skip
 
 
-def sentence(told: Told) -> str:
+def sentence(answer: Told) -> str:
     """Return in one sentence how drivers drift."""
-    if told.verdict == "cannot_tell":
-        why = told.steady.why_not or "; ".join(f"{name}: {e.why_not}" for name, e in told.found.items())
+    if answer.verdict == "cannot_tell":
+        why = answer.steady.why_not or "; ".join(f"{name}: {e.why_not}" for name, e in answer.found.items())
         return f"These data cannot tell how drivers drift: {why}."
-    if not told.one_of:
+    if not answer.one_of:
         return "No drift: steady drivers and white noise explain these records as well."
     titles = {kind.name: f"{kind.title} ({kind.name})" for kind in DRIFTS}
-    rows = {str(row["name"]): row for row in told.found[told.one_of[0]].table()}
-    told_of = []
-    size = next(p.unit for e in DRIFTS if e.name == told.one_of[0] for p in e.parameters if p.name == "sigma")
+    rows = {str(row["name"]): row for row in answer.found[answer.one_of[0]].table()}
+    parts = []
+    size = next(p.unit for e in DRIFTS if e.name == answer.one_of[0] for p in e.parameters if p.name == "sigma")
     for key, symbol, unit in (("sigma", "sigma", "" if size == "1" else f" {size}"), ("memory_time", "tau", " s")):
-        row = rows[f"{told.one_of[0]}.{key}"]
+        row = rows[f"{answer.one_of[0]}.{key}"]
         estimate, low, high = (float(row[end]) for end in ("estimate", "low", "high"))
-        told_as = f"{low:.3g} to {high:.3g}" if high < UNKNOWN * estimate else "these data do not tell it"
-        told_of.append(f"{symbol} {estimate:.3g}{unit} ({told_as})")
-    others = ", ".join(titles[n] for n in told.one_of[1:])
+        interval = f"{low:.3g} to {high:.3g}" if high < UNKNOWN * estimate else "these data do not tell it"
+        parts.append(f"{symbol} {estimate:.3g}{unit} ({interval})")
+    others = ", ".join(titles[n] for n in answer.one_of[1:])
     apart = f" Not told apart from: {others}." if others else ""
-    return f"Drivers drift: {titles[told.one_of[0]]}, {', '.join(told_of)}.{apart}"
+    return f"Drivers drift: {titles[answer.one_of[0]]}, {', '.join(parts)}.{apart}"
 
 
-def _sorts(told: Told) -> list[dict[str, Any]]:
+def _sorts(answer: Told) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    for name in sorted(told.found, key=lambda n: (bool(told.found[n].why_not), -told.gain[n])):
-        if why := told.found[name].why_not or told.steady.why_not:
+    for name in sorted(answer.found, key=lambda n: (bool(answer.found[n].why_not), -answer.gain[n])):
+        if why := answer.found[name].why_not or answer.steady.why_not:
             rows.append({
                 "sort": name, "log_likelihood": None, "sigma": None, "tau_s": None, "note": f"not estimated: {why}",
             })  # fmt: skip
             continue
-        found = {str(row["name"]): row for row in told.found[name].table()}
+        numbers = {str(row["name"]): row for row in answer.found[name].table()}
         rows.append({
-            "sort": name, "log_likelihood": told.gain[name],
-            "sigma": found[f"{name}.sigma"]["estimate"], "tau_s": found[f"{name}.memory_time"]["estimate"],
+            "sort": name, "log_likelihood": answer.gain[name],
+            "sigma": numbers[f"{name}.sigma"]["estimate"], "tau_s": numbers[f"{name}.memory_time"]["estimate"],
             "note": "",
         })  # fmt: skip
     return rows

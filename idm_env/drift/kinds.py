@@ -78,7 +78,7 @@ class _Sort:
 def _estimated(sort: _Sort, progress: OnProgress) -> dict[str, Tensor]:
     return estimate(
         sort.simulator, sort.smooth, IDM_NAMES, usual(IDM_NAMES), measured=sort.measured, noise=sort.noise
-    ).kept()  # fmt: skip
+    ).numbers()  # fmt: skip
 
 
 def tell(
@@ -104,21 +104,22 @@ def tell(
     """
     batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
     sorts = [_Sort(kind, batch, raw, noise) for kind in (None, *kinds)]
-    kept = {} if store is None else {s: x for s in sorts if (x := store.get(str(s))) is not None}
-    missing = [s for s in sorts if s not in kept]
+    stored = {} if store is None else {s: x for s in sorts if (x := store.get(str(s))) is not None}
+    missing = [s for s in sorts if s not in stored]
     for place, numbers in (executor or Serial()).map(_estimated, missing):
-        kept[missing[place]] = numbers
+        stored[missing[place]] = numbers
         if store is not None:
             store.put(str(missing[place]), numbers)
-        on_progress(str(missing[place]), len(kept), len(sorts), float(numbers["log_likelihood"]))
-    steady, *others = (Estimate.of_kept(MeasuredDrivers(s.simulator, batch, raw, IDM_NAMES), kept[s]) for s in sorts)
-    found = {kind.name: estimate for kind, estimate in zip(kinds, others, strict=True)}
-    told = Told(steady, found, ())
-    order = sorted((n for n in found if not found[n].why_not), key=lambda name: -told.gain[name])
-    if told.verdict == "cannot_tell":
-        return told
+        on_progress(str(missing[place]), len(stored), len(sorts), float(numbers["log_likelihood"]))
+    drivers = (MeasuredDrivers(s.simulator, batch, raw, IDM_NAMES) for s in sorts)
+    steady, *others = (Estimate.of_numbers(d, stored[s]) for d, s in zip(drivers, sorts, strict=True))
+    estimates = dict(zip((kind.name for kind in kinds), others, strict=True))
+    answer = Told(steady, estimates, ())
+    order = sorted((n for n in estimates if not estimates[n].why_not), key=lambda name: -answer.gain[name])
+    if answer.verdict == "cannot_tell":
+        return answer
     best = order[0]
     usual_sigma = {kind.name: catalogue((kind,))[f"{kind.name}.sigma"].default for kind in kinds}
-    if told.gain[best] < FOUND or found[best].settings.sigma[0] < LEAST * usual_sigma[best]:
-        return told
-    return Told(steady, found, tuple(n for n in order if told.gain[best] - told.gain[n] < APART))
+    if answer.gain[best] < FOUND or estimates[best].settings.sigma[0] < LEAST * usual_sigma[best]:
+        return answer
+    return Told(steady, estimates, tuple(n for n in order if answer.gain[best] - answer.gain[n] < APART))

@@ -74,8 +74,8 @@ class MeasuredDrivers:
             raise ValueError(f"effect '{late}' looks back, and a filter of drift does not. Leave it out here.")
         self.simulator, self.batch, self.measured, self.free = simulator, batch, measured, free
         self.drifts = tuple(e.name for e in simulator.effects if e.draws and e.remembers)
-        known = catalogue(simulator.effects)
-        self.bounds = np.log([[known[name].low, known[name].high] for name in free]).T
+        parameters = catalogue(simulator.effects)
+        self.bounds = np.log([[parameters[name].low, parameters[name].high] for name in free]).T
         self.at, self.driver = batch.columns(simulator)
 
     @property
@@ -102,27 +102,27 @@ class MeasuredDrivers:
         """
         gap, speed = (torch.tensor(x[:-1], requires_grad=True) for x in (path.gap, path.speed))
         level = [torch.tensor(path.level[1:, :, j], requires_grad=True) for j in range(self.levels)]
-        made = self._stepped(path, gap, speed, level)
-        slopes = [torch.autograd.grad(x.sum(), (gap, speed, *level), retain_graph=True) for x in made]
+        after = self._stepped(path, gap, speed, level)
+        slopes = [torch.autograd.grad(x.sum(), (gap, speed, *level), retain_graph=True) for x in after]
 
         def both(part: slice) -> np.ndarray:
             return np.stack([np.stack([g.numpy() for g in s[part]], -1) for s in slopes], -2)
 
-        to, by_level = np.stack([x.detach().numpy() for x in made], -1), both(slice(2, None))
+        to, by_level = np.stack([x.detach().numpy() for x in after], -1), both(slice(2, None))
         middle = to.copy()
         for j in range(len(self.drifts)):
-            off, at = math.sqrt(3.0) * path.unsure[1:, :, j], len(self.free) + j
+            off, slot = math.sqrt(3.0) * path.unsure[1:, :, j], len(self.free) + j
             if not off.any():
                 continue
             with torch.no_grad():
-                ends = [[*level[:at], level[at] + sign * torch.tensor(off), *level[at + 1 :]] for sign in (1.0, -1.0)]
+                moves = (torch.tensor(off), -torch.tensor(off))
+                ends = [[*level[:slot], level[slot] + move, *level[slot + 1 :]] for move in moves]
                 high, low = (
                     np.stack([x.numpy() for x in self._stepped(path, gap, speed, end)], -1) for end in ends
                 )  # fmt: skip
             to += (high + low - 2.0 * middle) / 6.0
-            by_level[..., at] = np.where(
-                off[..., None] > NARROW, (high - low) / (2.0 * np.maximum(off, NARROW))[..., None], by_level[..., at]
-            )
+            slope = (high - low) / (2.0 * np.maximum(off, NARROW))[..., None]
+            by_level[..., slot] = np.where(off[..., None] > NARROW, slope, by_level[..., slot])
         return LinearSteps(path, to, both(slice(0, 2)), by_level)
 
     def _stepped(self, path: Path, gap: Tensor, speed: Tensor, level: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -141,9 +141,9 @@ class MeasuredDrivers:
             step=batch.first_step + torch.arange(len(gap))[:, None],
         )  # fmt: skip
         levels = {name: level[own + j].unsqueeze(-1).expand(position.shape) for j, name in enumerate(self.drifts)}
-        there, faster = (x[1:, :, self.at] for x in (batch.all_speed, batch.accel))
+        speeds_later, accels_later = (x[1:, :, self.at] for x in (batch.all_speed, batch.accel))
         record = Record(
-            later, there, faster,
+            later, speeds_later, accels_later,
             (torch.arange(position.shape[-1]) != d).expand(position.shape),
             None if present is None else present[1:],
         )  # fmt: skip

@@ -173,7 +173,7 @@ def _flow(
         while waiting or flying:
             while waiting and len(flying) < (1 if deaths else workers.room()):
                 number = waiting.popleft()
-                flying[workers.submit(dumps((here, trust.given(), function, parts[number])))] = number
+                flying[workers.submit(dumps((here, trust.permission(), function, parts[number])))] = number
             done = workers.wait(list(flying))
             number = flying.pop(done)
             try:
@@ -294,8 +294,8 @@ class _Team:
         from concurrent.futures import BrokenExecutor
 
         try:
-            found: tuple[str, Any] = handle.result()
-            return found
+            answer: tuple[str, Any] = handle.result()
+            return answer
         except BrokenExecutor:
             self.close()
             raise _LostError(f"the process that worked on it died {ATTEMPTS} times", False) from None
@@ -370,10 +370,10 @@ def _answers(address: str) -> None:
             return
         # HTTP/2 begins with SETTINGS (type 4) on either side: RFC 9113, section 3.4.
         line.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0")
-        said = b""
-        while len(said) < 4 and (more := line.recv(4 - len(said))):
-            said += more
-    if said[3:] != b"\4":
+        reply = b""
+        while len(reply) < 4 and (more := line.recv(4 - len(reply))):
+            reply += more
+    if reply[3:] != b"\4":
         raise OSError("what answers there is not Ray")
 
 
@@ -397,8 +397,8 @@ class _Cluster:
 
     def result(self, handle: Any) -> tuple[str, Any]:
         try:
-            found: tuple[str, Any] = self._ray.get(handle)
-            return found
+            answer: tuple[str, Any] = self._ray.get(handle)
+            return answer
         except self._ray.exceptions.RayError as error:
             words = f"the worker or node that worked on it was lost ({type(error).__name__})"
             raise _LostError(words, True) from None

@@ -37,10 +37,10 @@ class Parts:
 
         ValueError for a table that is not what was written.
         """
-        found = self.store.get_json(f"{number:06d}")
-        if found is None:
+        part = self.store.get_json(f"{number:06d}")
+        if part is None:
             return False
-        for name, digest in found["tables"].items():
+        for name, digest in part["tables"].items():
             path = self.folder / name
             if not path.is_file() or storage.fingerprint(path) != digest:
                 raise ValueError(f"{path} is broken (not what was written). {storage.AFRESH}")
@@ -53,7 +53,7 @@ class Parts:
 
     def summaries(self) -> list[dict[str, Any]]:
         """Return what is remembered of all parts, in their order."""
-        return [self.store.get_json(key)["summary"] for key in self.store.kept()]
+        return [self.store.get_json(key)["summary"] for key in self.store.names()]
 
     def tables(self, name: str) -> list[Path]:
         """Return the files of all parts' tables of a name, in the order of the parts."""

@@ -55,13 +55,13 @@ def write(path: Path, writer: Callable[[Path], Any], *, shared: bool = False) ->
     OSError, in one line, where the disk is full; nothing is left of the file then.
     """
     mine = f"-{uuid.uuid4().hex}" if shared else ""
-    beside = path.with_name(f".{path.stem}{_PART}{mine}{path.suffix}")
+    part = path.with_name(f".{path.stem}{_PART}{mine}{path.suffix}")
     try:
-        writer(beside)
-        os.replace(beside, path)
+        writer(part)
+        os.replace(part, path)
     except BaseException as error:
         with suppress(OSError):
-            beside.unlink(missing_ok=True)
+            part.unlink(missing_ok=True)
         reason = full(error)
         if reason is None:
             raise
@@ -71,13 +71,13 @@ def write(path: Path, writer: Callable[[Path], Any], *, shared: bool = False) ->
 def full(error: BaseException) -> str | None:
     """Return why nothing more can be written, or None; libraries in Rust tell the number of the error in words."""
     number = error.errno if isinstance(error, OSError) else None
-    told = [n for n in _FULL if n == number or f"os error {n})" in str(error)]
-    return os.strerror(told[0]) if told else None
+    numbers = [n for n in _FULL if n == number or f"os error {n})" in str(error)]
+    return os.strerror(numbers[0]) if numbers else None
 
 
 def write_text(path: Path, content: str) -> None:
     """Write a text file in one piece."""
-    write(path, lambda beside: beside.write_text(content, encoding="utf-8"))
+    write(path, lambda part: part.write_text(content, encoding="utf-8"))
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -126,20 +126,20 @@ def read(path: Path, reader: Callable[[Path], R], cure: str) -> R:
 
 def fingerprint(*parts: object) -> str:
     """Return a digest of files (a path's bytes, where there is a file), arrays and tensors, and all else by repr."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, Path) and part.is_file():
             with part.open("rb") as file:
                 while block := file.read(1 << 20):
-                    found.update(block)
+                    digest.update(block)
         elif hasattr(part, "detach"):
-            found.update(part.detach().cpu().numpy().tobytes())
+            digest.update(part.detach().cpu().numpy().tobytes())
         elif hasattr(part, "tobytes"):
-            found.update(part.tobytes())
+            digest.update(part.tobytes())
         else:
-            found.update(repr(part).encode(errors="surrogateescape"))
-        found.update(b"\0")
-    return found.hexdigest()
+            digest.update(repr(part).encode(errors="surrogateescape"))
+        digest.update(b"\0")
+    return digest.hexdigest()
 
 
 # -- results ---------------------------------------------------------------------------------------------------------
@@ -147,9 +147,9 @@ def fingerprint(*parts: object) -> str:
 
 def not_an_input(output: Path, inputs: Iterable[Path | str | None]) -> None:
     """Raise ValueError where an output is the same file as an input, through links too."""
-    for given in inputs:
-        if given is not None and output.exists() and Path(given).exists() and os.path.samefile(output, given):
-            raise ValueError(f"{given} is an input, and {output} would overwrite it. Give --out another place.")
+    for source in inputs:
+        if source is not None and output.exists() and Path(source).exists() and os.path.samefile(output, source):
+            raise ValueError(f"{source} is an input, and {output} would overwrite it. Give --out another place.")
 
 
 @contextmanager
@@ -163,14 +163,14 @@ def results(out: str | Path, names: Sequence[str], inputs: Iterable[Path | str |
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file. Give --out a folder.")
     left = _real(folder / UNFINISHED)
-    for given in inputs:
-        if given is not None and _real(given).is_relative_to(left):
-            raise ValueError(f"{given} belongs to an interrupted run, which removes it at its end. Copy it elsewhere.")
-        if given is not None and Path(given).is_dir() and _real(folder).is_relative_to(_real(given)):
-            raise ValueError(f"{folder} lies in {given}, whose files are all read. Give --out a folder elsewhere.")
+    for source in inputs:
+        if source is not None and _real(source).is_relative_to(left):
+            raise ValueError(f"{source} belongs to an interrupted run, which removes it at its end. Copy it elsewhere.")
+        if source is not None and Path(source).is_dir() and _real(folder).is_relative_to(_real(source)):
+            raise ValueError(f"{folder} lies in {source}, whose files are all read. Give --out a folder elsewhere.")
     for name in names:
         not_an_input(folder / name, inputs)
-    with alone(folder):
+    with folder_lock(folder):
         mark = _mark(folder)
         if mark is None and os.path.lexists(folder / MARK):
             raise ValueError(f"{folder / MARK} is not one of {_OWNER}'s. Move it, or give --out another folder.")
@@ -180,23 +180,23 @@ def results(out: str | Path, names: Sequence[str], inputs: Iterable[Path | str |
             if os.path.lexists(path) and not (
                 name in ours and path.is_file() and ours[name] in (None, fingerprint(path))
             ):
-                told = f"was changed since {_OWNER} wrote it" if name in ours else f"was not written by {_OWNER}"
-                raise ValueError(f"{path} {told}. Move it, or give --out another folder.")
+                reason = f"was changed since {_OWNER} wrote it" if name in ours else f"was not written by {_OWNER}"
+                raise ValueError(f"{path} {reason}. Move it, or give --out another folder.")
         # No digest: being written. Whoever is killed leaves files that the next run may replace.
         _sign(folder, files={**ours, **dict.fromkeys(names)})
         try:
             yield folder
         finally:
             now = {name: fingerprint(folder / name) for name in names if (folder / name).is_file()}
-            kept = {name: value for name, value in ours.items() if name not in names} | now
-            if kept:
-                _sign(folder, files=kept)
+            files = {name: value for name, value in ours.items() if name not in names} | now
+            if files:
+                _sign(folder, files=files)
             else:
                 (folder / MARK).unlink(missing_ok=True)
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def folder_lock(folder: Path) -> Iterator[None]:
     """Hold a folder, which is made if missing, while this lasts; whoever holds it may do so again.
 
     The system lets go of the lock when its process ends, however that ends. Where there are no locks nothing is held.
@@ -248,8 +248,8 @@ def _locked(folder: Path) -> int | None:
                 if os.path.samestat(os.fstat(lock), os.stat(path)):
                     with suppress(OSError):  # a full disk
                         os.ftruncate(lock, 0)
-                        told = f"process {os.getpid()} on {socket.gethostname()}, since {time.ctime()}"
-                        os.write(lock, told.encode())
+                        holder = f"process {os.getpid()} on {socket.gethostname()}, since {time.ctime()}"
+                        os.write(lock, holder.encode())
                     return lock
             os.close(lock)
         except BlockingIOError:
@@ -273,11 +273,11 @@ def _real(path: Path | str) -> Path:
 def _mark(folder: Path) -> dict[str, Any] | None:
     """Return what the ``run.json`` of a folder says, or None where it is none of ours."""
     try:
-        found = json.loads((folder / MARK).read_text(encoding="utf-8"))
+        mark = json.loads((folder / MARK).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    ours = isinstance(found, dict) and found.get("written_by") == _OWNER and isinstance(found.get("files", {}), dict)
-    return found if ours else None
+    ours = isinstance(mark, dict) and mark.get("written_by") == _OWNER and isinstance(mark.get("files", {}), dict)
+    return mark if ours else None
 
 
 def _sign(folder: Path, **content: Any) -> None:
@@ -334,7 +334,7 @@ class Store:
         """Return what was kept by ``put``, or None."""
         import torch
 
-        return self._get(key, lambda kept: torch.load(io.BytesIO(kept), weights_only=True))
+        return self._get(key, lambda content: torch.load(io.BytesIO(content), weights_only=True))
 
     def put_json(self, key: str, content: Any) -> None:
         """Keep plain values."""
@@ -344,8 +344,8 @@ class Store:
         """Return what was kept by ``put_json``, or None."""
         return self._get(key, json.loads)
 
-    def kept(self) -> list[str]:
-        """Return the names under which contents are kept, sorted."""
+    def names(self) -> list[str]:
+        """Return the names of all contents, sorted."""
         if self.folder is None:
             return sorted(self._memory)
         return sorted(p.stem for p in self.folder.glob("*.kept") if _PART not in p.name)
@@ -364,7 +364,7 @@ class Store:
             self._memory[key] = content
         else:
             sealed = hashlib.sha256(content).digest() + content
-            write(self.folder / f"{key}.kept", lambda beside: beside.write_bytes(sealed), shared=True)
+            write(self.folder / f"{key}.kept", lambda part: part.write_bytes(sealed), shared=True)
 
     def _get(self, key: str, reader: Callable[[bytes], Any]) -> Any:
         key = quote(key, safe="")

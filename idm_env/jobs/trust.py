@@ -12,7 +12,7 @@ VARIABLE = "IDM_ENV_TRUST"
 _given: ContextVar[bool] = ContextVar("idm_env_trust", default=False)
 
 
-def given() -> bool:
+def permission() -> bool:
     """Tell whether the code that files name may run."""
     return _given.get() or os.environ.get(VARIABLE) == "1"
 

@@ -109,7 +109,7 @@ def hypotheses(second: Second) -> list[DriverHypothesis]:
     staying = STAYING * (1.0 - obeying) if speed < STANDING_MPS else 0.0
     rest = 1.0 - obeying - staying
     here = (bend, 0.25, True) if bend < limit else (limit, 0.2, False)
-    found = [
+    cases = [
         DriverHypothesis("limit", rest * (1.0 - CRUISING - SURPRISE), *here),
         DriverHypothesis("cruise", rest * CRUISING, max(speed, 0.5), 0.07, False),
     ]
@@ -117,13 +117,13 @@ def hypotheses(second: Second) -> list[DriverHypothesis]:
     reach = max(60.0 - nearest, 10.0)
     for k in range(SURPRISES):
         stop = nearest + (k + 0.5) / SURPRISES * reach
-        found.append(DriverHypothesis("surprise", rest * SURPRISE / SURPRISES, *here, stop=stop))
+        cases.append(DriverHypothesis("surprise", rest * SURPRISE / SURPRISES, *here, stop=stop))
     if staying:
-        found.append(DriverHypothesis("stays", staying, *here, stop=CENTRE["min_gap"]))
+        cases.append(DriverHypothesis("stays", staying, *here, stop=CENTRE["min_gap"]))
     if second.stop is not None:
         # who halts at a line has its front there, so that the leader stands the smallest gap beyond it
-        found.append(DriverHypothesis("line", obeying, *here, stop=second.stop.distance + CENTRE["min_gap"]))
-    return found
+        cases.append(DriverHypothesis("line", obeying, *here, stop=second.stop.distance + CENTRE["min_gap"]))
+    return cases
 
 
 def posterior(seconds: Sequence[Second]) -> list[tuple[RouteDrivers, np.ndarray]]:
@@ -135,11 +135,11 @@ def posterior(seconds: Sequence[Second]) -> list[tuple[RouteDrivers, np.ndarray]
     cases = [(second, h) for second in seconds for h in hypotheses(second)]
     log_mode, spread, evidence = _fitted(cases)
     evidence = evidence - evidence.max()
-    drawn: list[tuple[RouteDrivers, np.ndarray]] = []
+    draws: list[tuple[RouteDrivers, np.ndarray]] = []
     for second in seconds:
         parts = [_draw(h, second, log_mode[i], spread[i], evidence[i]) for i, (s, h) in enumerate(cases) if s is second]
-        drawn.append((RouteDrivers.joined([one for one, _ in parts]), np.concatenate([weight for _, weight in parts])))
-    return drawn
+        draws.append((RouteDrivers.joined([one for one, _ in parts]), np.concatenate([weight for _, weight in parts])))
+    return draws
 
 
 def _fitted(cases: Sequence[tuple[Second, DriverHypothesis]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,13 +152,13 @@ def _fitted(cases: Sequence[tuple[Second, DriverHypothesis]]) -> tuple[np.ndarra
         return centre.log().numpy(), torch.diag_embed(deviation).numpy(), np.zeros(len(cases))
     noise = SPEED_SIGMA * np.sqrt(samples / INDEPENDENT)
     episodes = [_episode(i, second, h) for i, (second, h) in enumerate(cases)]
-    found = fit(
+    result = fit(
         episodes, objective="speed", loss="mse", prior=Prior(centre, deviation, noise), iterations=12, substeps=1
     )  # fmt: skip
-    own = found.own
-    covariance = found.uncertainty.covariance / (own[:, :, None] * own[:, None, :])
+    own = result.own
+    covariance = result.uncertainty.covariance / (own[:, :, None] * own[:, None, :])
     factor = torch.linalg.cholesky(covariance + 1e-10 * torch.eye(len(NAMES), dtype=torch.float64))
-    cost = normal(found.problem, own[None], found.shared[None]).cost[0]
+    cost = normal(result.problem, own[None], result.shared[None]).cost[0]
     narrower = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) - deviation.log().sum(-1)
     return own.log().numpy(), factor.numpy(), (-0.5 * cost / noise**2 + narrower).numpy()
 
@@ -189,11 +189,11 @@ def _draw(
     count = DRAWS[h.kind]
     u = quantiles(count)
     values = np.exp(log_mode + norm.ppf(u[:, :5]) @ factor.T)
-    wanted, lateral = values[:, 4], LATERAL_MPS2 * np.exp(LATERAL_DEVIATION * norm.ppf(u[:, 5]))
+    desired, lateral = values[:, 4], LATERAL_MPS2 * np.exp(LATERAL_DEVIATION * norm.ppf(u[:, 5]))
     if h.bend:
         # the speed in the bend tells which lateral acceleration is accepted; the one wanted behind it is unknown
         limit = second.route.limit if np.isfinite(second.route.limit) else URBAN_LIMIT
-        wanted, lateral = limit * np.exp(0.2 * norm.ppf(u[:, 5])), LATERAL_MPS2 * (wanted / h.speed) ** 2
+        desired, lateral = limit * np.exp(0.2 * norm.ppf(u[:, 5])), LATERAL_MPS2 * (desired / h.speed) ** 2
     spread = (u[:, 6] - 0.5) * max(60.0 / SURPRISES, 1.0) if h.kind == "surprise" else 0.0
     wait, opens = np.full(count, np.inf), np.full(count, np.inf)
     if h.kind == "line" and second.stop is not None and second.stop.kind == "sign":
@@ -202,18 +202,18 @@ def _draw(
         opens = LONGEST_RED_S * u[:, 7]
     stop = np.maximum(np.full(count, h.stop) + spread, 0.5)
     a, b, time_gap, min_gap = np.maximum(values[:, :4].T, 0.05)
-    drivers = RouteDrivers(a, b, time_gap, min_gap, wanted, lateral, stop, wait, opens, u[:, 9])
+    drivers = RouteDrivers(a, b, time_gap, min_gap, desired, lateral, stop, wait, opens, u[:, 9])
     return drivers, np.full(count, h.share / count * np.exp(evidence))
 
 
 def middle(speed: float, limit: float, stop: Stop | None) -> RouteDrivers:
     """Return the one driver of the prior's medians who keeps about his speed and stops where he must."""
-    known = limit if np.isfinite(limit) else URBAN_LIMIT
+    limit = limit if np.isfinite(limit) else URBAN_LIMIT
     halts = stop.distance + CENTRE["min_gap"] if stop is not None else np.inf
     wait = WAIT_S if stop is not None and stop.kind == "sign" else np.inf
     opens = 0.5 * LONGEST_RED_S if stop is not None and stop.kind == "red" else np.inf
-    wanted = 0.5 * (max(speed, 1.0) + known)
-    values = {**CENTRE, "desired_speed": wanted, "lateral": LATERAL_MPS2, "stop": halts, "wait": wait, "opens": opens}
+    desired = 0.5 * (max(speed, 1.0) + limit)
+    values = {**CENTRE, "desired_speed": desired, "lateral": LATERAL_MPS2, "stop": halts, "wait": wait, "opens": opens}
     return RouteDrivers(**{name: np.array([value]) for name, value in values.items()}, passing=np.array([0.5]))
 
 

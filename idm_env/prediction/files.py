@@ -138,10 +138,10 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scen
     tables: list[pl.DataFrame] = []
     rows: list[dict[str, Any]] = []
     pictures: list[dict[str, str]] = []
-    found = 0
+    scenario_count = 0
     for scenario in _readable(path, left_out):
-        on_scenario(found)
-        found += 1
+        on_scenario(scenario_count)
+        scenario_count += 1
         scene = MapScene(scenario)
         notes += [{"scenario": scenario.id, "note": note} for note in _notes(scenario)]
         for index in scenario.to_predict:
@@ -153,8 +153,8 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scen
             rows.append(_parameters(scenario, ours))
             cases = {name: case_of(scenario, prediction) for name, prediction in done.items()}
             if cases[OURS].valid.any():
-                kept = {name: asdict(score(case)) for name, case in cases.items()}
-                scores.append({"scene": scenario.id, "methods": kept})
+                by_method = {name: asdict(score(case)) for name, case in cases.items()}
+                scores.append({"scene": scenario.id, "methods": by_method})
             if len(pictures) < MOST_PICTURES:
                 block = page.picture(*scene_picture(scenario, ours))
                 pictures.append({"text": block.text, "image": block.image})
@@ -163,7 +163,7 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scen
     parts.finish(
         number,
         {
-            "scenarios": found, "agents": len(tables), "scores": scores, "left_out": left_out, "notes": notes,
+            "scenarios": scenario_count, "agents": len(tables), "scores": scores, "left_out": left_out, "notes": notes,
             "pictures": pictures,
         },
     )  # fmt: skip
@@ -201,10 +201,10 @@ def case_of(scenario: Scenario, prediction: Prediction) -> Case:
     """Return a prediction with the truth of the scenario; no truth is valid where the future is not known."""
     agent, now = scenario.agents[prediction.agent], scenario.present
     steps = prediction.futures.shape[1]
-    known = min(steps, len(agent.valid) - now - 1)
-    later = slice(now + 1, now + 1 + known)
+    ahead = min(steps, len(agent.valid) - now - 1)
+    later = slice(now + 1, now + 1 + ahead)
     truth, heading, valid = np.zeros((steps, 2)), np.zeros(steps), np.zeros(steps, bool)
-    truth[:known], heading[:known], valid[:known] = agent.position[later], agent.heading[later], agent.valid[later]
+    truth[:ahead], heading[:ahead], valid[:ahead] = agent.position[later], agent.heading[later], agent.valid[later]
     speed = np.hypot(*agent.velocity[now:].T)
     shape = shape_of(agent.position[now:], agent.heading[now:], speed, agent.valid[now:])
     return Case(
@@ -237,18 +237,18 @@ def _parameters(scenario: Scenario, prediction: Prediction) -> dict[str, Any]:
 def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.Block]]:
     """Return the report of all parts, and the pictures."""
     scored = [item for part in parts for item in part["scores"]]
-    scores = [(item["scene"], {name: Score(**kept) for name, kept in item["methods"].items()}) for item in scored]
+    scores = [(item["scene"], {name: Score(**x) for name, x in item["methods"].items()}) for item in scored]
     names = list(scores[0][1]) if scores else [OURS]
 
     def rows(scene: str | None = None, kind: str | None = None) -> list[dict[str, Any]]:
         chosen = [
-            kept for where, kept in scores if scene in (None, where) and kind in (None, kept[OURS].kind)
+            item for where, item in scores if scene in (None, where) and kind in (None, item[OURS].kind)
         ]  # fmt: skip
-        return [{"method": name, **summary([kept[name] for kept in chosen])} for name in names]
+        return [{"method": name, **summary([item[name] for item in chosen])} for name in names]
 
     def with_intervals() -> list[dict[str, Any]]:
         scenes = [where for where, _ in scores]
-        between = {name: intervals([kept[name] for _, kept in scores], scenes) for name in names}
+        between = {name: intervals([item[name] for _, item in scores], scenes) for name in names}
         return [{**row, "intervals": between[row["method"]]} for row in rows()]
 
     left_out = [item for part in parts for item in part["left_out"]]
@@ -259,7 +259,7 @@ def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.
         "agents_with_known_future": len(scores),
         "methods": with_intervals(),
         "scenes": {name: rows(scene=name) for name in sorted({where for where, _ in scores})},
-        "kinds": {kind: rows(kind=kind) for kind in sorted({kept[OURS].kind for _, kept in scores})},
+        "kinds": {kind: rows(kind=kind) for kind in sorted({item[OURS].kind for _, item in scores})},
         "left_out": left_out,
         "account": page.account(
             (),

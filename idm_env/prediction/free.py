@@ -73,9 +73,9 @@ def free_futures(agent: Agent, present: int, steps: int, dt: float = 0.1) -> np.
     speeds[stopping] = np.maximum(speed - (0.5 + u[stopping, 0])[:, None] * time, 0.0)
     if agent.kind == "pedestrian":
         walking = u[:, 2] > 1.0 - WALKING
-        wanted = (WALK_MPS + WALK_DEVIATION * norm.ppf(u[walking, 0]))[:, None]
+        target = (WALK_MPS + WALK_DEVIATION * norm.ppf(u[walking, 0]))[:, None]
         slowness = (WALK_S[0] + (WALK_S[1] - WALK_S[0]) * u[walking, 3])[:, None]
-        speeds[walking] = np.maximum(wanted + (speed - wanted) * np.exp(-time / slowness), 0.0)
+        speeds[walking] = np.maximum(target + (speed - target) * np.exp(-time / slowness), 0.0)
     wander = WANDER.get(agent.kind, 0.3) * norm.ppf(u[:, 1])
     angle = direction + turning * faded + wander[:, None] * (1 - np.exp(-time / 3.0))
     step = dt * speeds[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)

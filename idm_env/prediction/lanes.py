@@ -70,10 +70,10 @@ def nearest(line: np.ndarray, length: np.ndarray, point: np.ndarray) -> tuple[fl
     square = np.maximum((step * step).sum(1), 1e-12)
     share = np.clip(((point - begin) * step).sum(1) / square, 0.0, 1.0)
     apart = point - (begin + share[:, None] * step)
-    at = int(np.argmin((apart * apart).sum(1)))
-    heading = float(np.arctan2(step[at, 1], step[at, 0]))
-    lateral = float(-np.sin(heading) * apart[at, 0] + np.cos(heading) * apart[at, 1])
-    return float(length[at] + share[at] * (length[at + 1] - length[at])), lateral, heading
+    segment = int(np.argmin((apart * apart).sum(1)))
+    heading = float(np.arctan2(step[segment, 1], step[segment, 0]))
+    lateral = float(-np.sin(heading) * apart[segment, 0] + np.cos(heading) * apart[segment, 1])
+    return float(length[segment] + share[segment] * (length[segment + 1] - length[segment])), lateral, heading
 
 
 def arc_length(line: np.ndarray) -> np.ndarray:
@@ -94,14 +94,14 @@ class LaneGraph:
 
     def _meeting(self, lane: MapLane) -> tuple[int, ...]:
         end, along = lane.line[-1], lane.line[-1] - lane.line[-2]
-        found = []
+        lanes = []
         for other in self.lanes.values():
             if other.id == lane.id or np.hypot(*(other.line[0] - end)) > JOIN_M:
                 continue
             ahead = other.line[1] - other.line[0]
             if abs(turn(np.arctan2(ahead[1], ahead[0]) - np.arctan2(along[1], along[0]))) < JOIN_TURN:
-                found.append(other.id)
-        return tuple(found)
+                lanes.append(other.id)
+        return tuple(lanes)
 
     def on(self, point: np.ndarray, heading: float, *, bike: bool = False) -> list[tuple[int, float, float, float]]:
         """Return (lane, arc length, lateral, weight) of every lane that an agent may be on, the likeliest first.
@@ -109,7 +109,7 @@ class LaneGraph:
         The weight falls with the distance from the centre line (deviation 0.8 m) and the difference of direction
         (0.25 rad); lanes for bicycles are for cyclists only.
         """
-        found = []
+        candidates = []
         for key, lane in self.lanes.items():
             if lane.bike and not bike:
                 continue
@@ -120,21 +120,21 @@ class LaneGraph:
             distance = abs(lateral) if place is None else float(np.hypot(*(point - place)))
             if distance <= FARTHEST_M and off <= LARGEST_TURN:
                 weight = float(np.exp(-0.5 * (distance / 0.8) ** 2 - 0.5 * (off / 0.25) ** 2))
-                found.append((key, along, lateral, weight))
-        return sorted(found, key=lambda item: -item[3])
+                candidates.append((key, along, lateral, weight))
+        return sorted(candidates, key=lambda item: -item[3])
 
     def routes(self, point: np.ndarray, heading: float, reach: float, *, bike: bool = False) -> list[Route]:
         """Return the routes that lie ahead of an agent for ``reach`` metres, the likeliest first, at most eight.
 
         Every branch is followed; turns are taken to be half as likely as going straight on.
         """
-        found: list[tuple[float, tuple[int, ...], float, float]] = []
+        candidates: list[tuple[float, tuple[int, ...], float, float]] = []
         for key, along, lateral, weight in self.on(point, heading, bike=bike)[:4]:
             for chain in self._chains(key, along + reach):
-                found.append((weight * self._straightness(chain, along), chain, along, lateral))
-        found.sort(key=lambda item: -item[0])
+                candidates.append((weight * self._straightness(chain, along), chain, along, lateral))
+        candidates.sort(key=lambda item: -item[0])
         routes: list[Route] = []
-        for weight, chain, along, lateral in found:
+        for weight, chain, along, lateral in candidates:
             route = self._route(chain, along, lateral, weight)
             if route is not None and not any(_same(route, other, reach) for other in routes):
                 routes.append(route)

@@ -58,22 +58,22 @@ def at_two_hertz(seconds: int, rate: int = 10) -> np.ndarray:
 
 def displacement(case: Case, seconds: int) -> tuple[np.ndarray, np.ndarray]:
     """Return mean distance up to a horizon and distance at it, of every future [F] (m); NaN where no truth is."""
-    at = at_two_hertz(seconds)
-    at = at[at < len(case.truth)]
-    distance = np.linalg.norm(case.futures[:, at] - case.truth[at], axis=-1)
-    valid = case.valid[at]
+    steps = at_two_hertz(seconds)
+    steps = steps[steps < len(case.truth)]
+    distance = np.linalg.norm(case.futures[:, steps] - case.truth[steps], axis=-1)
+    valid = case.valid[steps]
     count = len(case.futures)
     mean = distance[:, valid].mean(1) if valid.any() else np.full(count, np.nan)
-    return mean, distance[:, -1] if len(at) == seconds * PER_SECOND and valid[-1] else np.full(count, np.nan)
+    return mean, distance[:, -1] if len(steps) == seconds * PER_SECOND and valid[-1] else np.full(count, np.nan)
 
 
 def hits(case: Case, seconds: int) -> np.ndarray | None:
     """Return which futures end within the box around the truth [F]; None where there is no truth at the horizon."""
-    at = seconds * 10 - 1
-    if at >= len(case.truth) or not case.valid[at]:
+    step = seconds * 10 - 1
+    if step >= len(case.truth) or not case.valid[step]:
         return None
-    apart = case.futures[:, at] - case.truth[at]
-    c, s = np.cos(case.heading[at]), np.sin(case.heading[at])
+    apart = case.futures[:, step] - case.truth[step]
+    c, s = np.cos(case.heading[step]), np.sin(case.heading[step])
     along, across = apart @ np.array([c, s]), apart @ np.array([-s, c])
     lateral, longitudinal = (bound * speed_scale(case.speed) for bound in MISS_M[seconds])
     return np.asarray((np.abs(across) <= lateral) & (np.abs(along) <= longitudinal))
@@ -83,10 +83,10 @@ def shape_of(
     position: np.ndarray, heading: np.ndarray, speed: np.ndarray, valid: np.ndarray
 ) -> str:  # fmt: skip
     """Return the shape of a true trajectory from its present (index 0) to its last valid step."""
-    known = np.flatnonzero(valid)
-    if len(known) == 0 or known[-1] == 0:
+    steps = np.flatnonzero(valid)
+    if len(steps) == 0 or steps[-1] == 0:
         return "stationary"
-    last = known[-1]
+    last = steps[-1]
     apart = position[last] - position[0]
     turn = float((heading[last] - heading[0] + np.pi) % (2 * np.pi) - np.pi)
     c, s = np.cos(heading[0]), np.sin(heading[0])
@@ -119,8 +119,8 @@ def score(case: Case) -> Score:
     both = [displacement(case, seconds) for seconds in HORIZONS]
     best = [[float(x.min()) if np.isfinite(x).any() else None for x in column] for column in zip(*both, strict=True)]
     reached = [hits(case, seconds) for seconds in HORIZONS]
-    found = [None if hit is None else [bool(x) for x in hit] for hit in reached]
-    return Score(case.kind, case.shape, [float(x) for x in case.confidence], best[0], best[1], found)
+    by_horizon = [None if hit is None else [bool(x) for x in hit] for hit in reached]
+    return Score(case.kind, case.shape, [float(x) for x in case.confidence], best[0], best[1], by_horizon)
 
 
 def average_precision(scores: Sequence[Score], seconds: int) -> float:
@@ -178,38 +178,38 @@ def intervals(
     unit = names if len(np.unique(names)) >= ENOUGH_SCENES else np.arange(len(scores))
     count = len(np.unique(unit))
     generator = np.random.default_rng(seed)
-    drawn = [np.bincount(generator.integers(count, size=count), minlength=count) for _ in range(draws)]
-    weights = np.stack(drawn)[:, unit].astype(float) if count > 1 else np.zeros((0, len(scores)))
-    found: dict[str, tuple[float, float]] = {}
+    counts = [np.bincount(generator.integers(count, size=count), minlength=count) for _ in range(draws)]
+    weights = np.stack(counts)[:, unit].astype(float) if count > 1 else np.zeros((0, len(scores)))
+    bounds: dict[str, tuple[float, float]] = {}
     for i, seconds in enumerate(HORIZONS):
         missed = [None if (h := item.hit[i]) is None else float(not any(h)) for item in scores]
         for name, values in (
             ("minADE", [item.ade[i] for item in scores]), ("minFDE", [item.fde[i] for item in scores]),
             ("miss_rate", missed),
         ):  # fmt: skip
-            found[f"{name}_{seconds}s"] = _between(_weighted_means(values, weights))
-        found[f"mAP_{seconds}s"] = _between(_weighted_map(scores, seconds, weights))
-    return found
+            bounds[f"{name}_{seconds}s"] = _between(_weighted_means(values, weights))
+        bounds[f"mAP_{seconds}s"] = _between(_weighted_map(scores, seconds, weights))
+    return bounds
 
 
 def _weighted_means(values: Sequence[float | None], weights: np.ndarray) -> np.ndarray:
     """Return the mean of what is known under every row of weights [draws, agents]."""
     numbers = np.array([np.nan if v is None else v for v in values], float)
-    known = np.isfinite(numbers)
-    total = weights[:, known].sum(1)
-    sums = weights[:, known] @ numbers[known]
+    finite = np.isfinite(numbers)
+    total = weights[:, finite].sum(1)
+    sums = weights[:, finite] @ numbers[finite]
     return np.divide(sums, total, out=np.full(len(weights), np.nan), where=total > 0)
 
 
 def _weighted_map(scores: Sequence[Score], seconds: int, weights: np.ndarray) -> np.ndarray:
     """Return the mean average precision over shapes under every row of weights [draws, agents]."""
     horizon = HORIZONS.index(seconds)
-    kept = [n for n, item in enumerate(scores) if item.hit[horizon] is not None]
-    shapes = sorted({scores[n].shape for n in kept})
+    cases = [n for n, item in enumerate(scores) if item.hit[horizon] is not None]
+    shapes = sorted({scores[n].shape for n in cases})
     each = np.full((len(shapes), len(weights)), np.nan)
     for s, shape in enumerate(shapes):
         agents, confidence, correct = [], [], []
-        for n in kept:
+        for n in cases:
             item, hit = scores[n], scores[n].hit[horizon] or []
             if item.shape != shape:
                 continue
@@ -228,19 +228,19 @@ def _weighted_map(scores: Sequence[Score], seconds: int, weights: np.ndarray) ->
                 precision = np.divide(hits, all_of, out=np.zeros_like(hits), where=all_of > 0)
                 best = np.maximum.accumulate(precision[::-1])[::-1]
                 each[s, d] = float(np.sum(np.diff(np.concatenate([[0.0], hits / total])) * best))
-    known = np.isfinite(each)
-    total = known.sum(0)
-    return np.divide(np.where(known, each, 0.0).sum(0), total, out=np.full(len(weights), np.nan), where=total > 0)
+    finite = np.isfinite(each)
+    total = finite.sum(0)
+    return np.divide(np.where(finite, each, 0.0).sum(0), total, out=np.full(len(weights), np.nan), where=total > 0)
 
 
 def _between(values: np.ndarray) -> tuple[float, float]:
-    known = values[np.isfinite(values)]
-    if len(known) < 2:
+    finite = values[np.isfinite(values)]
+    if len(finite) < 2:
         return float("nan"), float("nan")
-    low, high = np.percentile(known, [2.5, 97.5])
+    low, high = np.percentile(finite, [2.5, 97.5])
     return float(low), float(high)
 
 
 def _mean(values: Sequence[float | None]) -> float:
-    known = [float(v) for v in values if v is not None and np.isfinite(v)]
-    return float(np.mean(known)) if known else float("nan")
+    finite = [float(v) for v in values if v is not None and np.isfinite(v)]
+    return float(np.mean(finite)) if finite else float("nan")

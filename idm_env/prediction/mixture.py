@@ -59,10 +59,10 @@ def share_of(shares: Shares, kind: str, speed: float, on_lane: bool) -> np.ndarr
     Kinds that the table lacks are taken as vehicles.
     """
     pace = pace_of(speed)
-    found = np.array(shares.get((kind, pace), shares["vehicle", pace]))
+    share = np.array(shares.get((kind, pace), shares["vehicle", pace]))
     if not on_lane:
-        found[-1] = 0.0
-    return np.asarray(found / found.sum())
+        share[-1] = 0.0
+    return np.asarray(share / share.sum())
 
 
 def seen(case: Case, futures: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Seen | None:
@@ -79,12 +79,12 @@ def seen(case: Case, futures: Sequence[np.ndarray], weights: Sequence[np.ndarray
 def fit_shares(agents: Iterable[Seen]) -> Shares:
     """Return the shares of every kind and pace; those of which no agent is seen keep the prior."""
     every = list(agents)
-    found: Shares = {}
+    shares: Shares = {}
     for kind, pace in SHARES:
         prior = np.array([0.5, 0.5, 0.0] if kind == "pedestrian" else [1 / 3, 1 / 3, 1 / 3])
         group = [one.hit for one in every if (one.kind, one.pace) == (kind, pace)]
-        found[kind, pace] = tuple(float(x) for x in _expectation_maximisation(group, prior))
-    return found
+        shares[kind, pace] = tuple(float(x) for x in _expectation_maximisation(group, prior))
+    return shares
 
 
 def _expectation_maximisation(group: Sequence[np.ndarray], prior: np.ndarray) -> np.ndarray:
@@ -93,12 +93,12 @@ def _expectation_maximisation(group: Sequence[np.ndarray], prior: np.ndarray) ->
         return prior
     chance = np.concatenate(group) + NOT_HIT
     counted = np.concatenate([np.full(len(hit), 1.0 / len(hit)) for hit in group])
-    known = np.isfinite(chance)
+    finite = np.isfinite(chance)
     share = prior
     for _ in range(200):
         # what an agent cannot do tells nothing of its share: there it explains as well as the others on average
-        mean = (share * np.where(known, chance, 0.0)).sum(-1) / (share * known).sum(-1)
-        part = share * np.where(known, chance, mean[:, None])
+        mean = (share * np.where(finite, chance, 0.0)).sum(-1) / (share * finite).sum(-1)
+        part = share * np.where(finite, chance, mean[:, None])
         part = part / part.sum(-1, keepdims=True)
         share = PRIOR_AGENTS * prior + counted @ part
         share = share / share.sum()

@@ -62,30 +62,30 @@ def mixture(scene: MapScene, index: int) -> Mixture:
         return Mixture(index, (*futures, np.empty((0, STEPS, 2))), (*weights, np.empty(0)), {})
     around = [scene.ahead(index, route) for route in routes]
     seconds = [scene.second(agent, route, past) for route, (past, _) in zip(routes, around, strict=True)]
-    drawn = posterior(seconds)
+    drivers = posterior(seconds)
     courses = [
         Course(route, one, future, route.begin)
-        for route, (_, future), (one, _) in zip(routes, around, drawn, strict=True)
+        for route, (_, future), (one, _) in zip(routes, around, drivers, strict=True)
     ]
     rolled = roll(courses, scene.speed(agent), STEPS, 0.5 * agent.length)
-    mass = np.concatenate([route.weight * weight for route, (_, weight) in zip(routes, drawn, strict=True)])
+    mass = np.concatenate([route.weight * weight for route, (_, weight) in zip(routes, drivers, strict=True)])
     futures.append(np.concatenate([lifted(route, part[0].T) for route, part in zip(routes, rolled, strict=True)]))
     weights.append(mass / mass.sum())
-    parameters = {p.name: _moments(p.name, [one for one, _ in drawn], weights[-1]) for p in IDM.declared}
+    parameters = {p.name: _moments(p.name, [one for one, _ in drivers], weights[-1]) for p in IDM.declared}
     return Mixture(index, tuple(futures), tuple(weights), parameters)
 
 
-def chosen(scene: MapScene, found: Mixture, shares: Shares = SHARES) -> Prediction:
+def chosen(scene: MapScene, ways: Mixture, shares: Shares = SHARES) -> Prediction:
     """Return up to six futures of an agent's mixture, and their confidences, with these shares of the ways.
 
     Constant velocity is always one of them, so that no agent is predicted worse than by it.
     """
-    agent = scene.valid(found.agent)
-    speed, on_lane = scene.speed(agent), len(found.weights[-1]) > 0
+    agent = scene.valid(ways.agent)
+    speed, on_lane = scene.speed(agent), len(ways.weights[-1]) > 0
     share = share_of(shares, agent.kind, speed, on_lane)
-    weight = np.concatenate([part * one for part, one in zip(share, found.weights, strict=True)])
-    futures, confidence = select(np.concatenate(found.futures), weight, speed)
-    return Prediction(found.agent, futures, confidence, "lane" if on_lane else "free", found.parameters)
+    weight = np.concatenate([part * one for part, one in zip(share, ways.weights, strict=True)])
+    futures, confidence = select(np.concatenate(ways.futures), weight, speed)
+    return Prediction(ways.agent, futures, confidence, "lane" if on_lane else "free", ways.parameters)
 
 
 def predict(scene: MapScene, index: int) -> Prediction:
@@ -93,9 +93,9 @@ def predict(scene: MapScene, index: int) -> Prediction:
     return chosen(scene, mixture(scene, index))
 
 
-def _moments(name: str, drawn: list[RouteDrivers], shares: np.ndarray) -> tuple[float, float]:
+def _moments(name: str, drivers: list[RouteDrivers], shares: np.ndarray) -> tuple[float, float]:
     """Return mean and deviation of one parameter over weighted drivers."""
-    values = getattr(RouteDrivers.joined(drawn), name)
+    values = getattr(RouteDrivers.joined(drivers), name)
     mean = float((shares * values).sum())
     return mean, float(np.sqrt((shares * (values - mean) ** 2).sum()))
 
@@ -136,32 +136,32 @@ def as_published(scene: MapScene, index: int) -> Prediction:
     return Prediction(index, lifted(routes[0], along[None]), np.ones(1), "the paper's recipe")
 
 
-def published_distance(scene: MapScene, index: int, known: dict[int, np.ndarray]) -> np.ndarray:
-    """Return how far an agent goes by the paper's recipe at every step [S] (m); ``known`` holds those worked out."""
+def published_distance(scene: MapScene, index: int, cache: dict[int, np.ndarray]) -> np.ndarray:
+    """Return how far an agent goes by the paper's recipe at every step [S] (m); ``cache`` holds those worked out."""
     from idm_env.trajectories import paper
 
-    if index in known:
-        return known[index]
+    if index in cache:
+        return cache[index]
     agent = scene.scenario.agents[index]
     speed = scene.speed(agent)
     # entered first: who is not on a lane, and who closes a circle of leaders, goes on at this speed
-    known[index] = speed * DT * np.arange(1, STEPS + 1)
+    cache[index] = speed * DT * np.arange(1, STEPS + 1)
     routes = scene.routes(agent)
     if not routes:
-        return known[index]
+        return cache[index]
     route, front = routes[0], 0.5 * agent.length
-    found = scene.leader(index, route)
+    leader = scene.leader(index, route)
     past, future = scene.ahead(index, route)
-    if found is not None:
-        gone = np.concatenate([[0.0], published_distance(scene, found[0], known)])
+    if leader is not None:
+        gone = np.concatenate([[0.0], published_distance(scene, leader[0], cache)])
         future = type(future)(past.rear[-1] + gone, np.gradient(gone, DT))
     second = scene.second(agent, route, past)
     own = route.begin + front - second.driven
     values = paper.START.copy()
     if len(second.speeds) > 1:
         values = paper.follow(own, float(second.speeds[0]), second.ahead.rear, second.ahead.speed, DT)
-    known[index] = paper.drive(values, speed, future.rear - route.begin - front, future.speed, DT)[1:]
-    return known[index]
+    cache[index] = paper.drive(values, speed, future.rear - route.begin - front, future.speed, DT)[1:]
+    return cache[index]
 
 
 METHODS = {

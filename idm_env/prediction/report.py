@@ -54,8 +54,8 @@ def metrics(rows: Sequence[dict[str, Any]]) -> page.Block:
             for name, title in WHAT:
                 low, high = row["intervals"][f"{name}_{seconds}s"]
                 cells[title] = row[f"{name}_{seconds}s"]
-                known = low == low
-                cells[f"{title}: 95 %"] = page.Cell(f"{low:.2f} … {high:.2f}" if known else "–", low)
+                finite = low == low
+                cells[f"{title}: 95 %"] = page.Cell(f"{low:.2f} … {high:.2f}" if finite else "–", low)
             table.append(cells)
     return page.table(table, digits={title: 2 for _, title in WHAT}, first=True)
 

@@ -111,7 +111,7 @@ def roll(courses: Sequence[Course], speed: float, steps: int, front: float) -> l
     params = sim.defaults(dtype=torch.float64)
     names = ("max_accel", "comfort_decel", "time_gap", "min_gap")
     idm = {name: torch.as_tensor(getattr(drivers, name))[:, None] for name in names}
-    wanted = torch.as_tensor(drivers.desired_speed)
+    desired = torch.as_tensor(drivers.desired_speed)
     # IDM brakes without measure above its desired speed: there it is kept to comfortable braking
     gentle = (1.0 + idm["comfort_decel"][:, 0] / idm["max_accel"][:, 0]) ** -0.25
     state = sim.state(
@@ -120,20 +120,20 @@ def roll(courses: Sequence[Course], speed: float, steps: int, front: float) -> l
         params | {"idm": {**params["idm"], **idm}}, length=torch.tensor([0.0, 2 * front], dtype=torch.float64),
     )  # fmt: skip
     active = torch.tensor([True, False]).expand(len(rows), 2)
-    kept = torch.empty(2, steps, len(rows), dtype=torch.float64)
+    motion = torch.empty(2, steps, len(rows), dtype=torch.float64)
     index, nothing = torch.arange(len(rows)), torch.zeros_like(own)
     with torch.no_grad():
         for k in range(steps):
-            at = ((state.position[:, 1] - front) / spacing).round().long().clamp(0, limits.shape[1] - 1)
+            cell = ((state.position[:, 1] - front) / spacing).round().long().clamp(0, limits.shape[1] - 1)
             now = state.speed[:, 1]
-            target = torch.maximum(torch.minimum(wanted, limits[index, at]), now * gentle).clamp_min(0.5)
+            target = torch.maximum(torch.minimum(desired, limits[index, cell]), now * gentle).clamp_min(0.5)
             line = stops.after(k, state.position[:, 1], now)
             place = torch.stack([torch.minimum(rear[k + 1], line), nothing], dim=-1)
             speeds = torch.stack([torch.where(line < rear[k + 1], 0.0, pace[k + 1]), nothing], dim=-1)
             record = Record(place, speeds, torch.zeros_like(speeds), active)
             state = sim.step(state, {"replay": record}, params | {"idm": {**idm, "desired_speed": target[:, None]}})
-            kept[0, k], kept[1, k] = state.position[:, 1] - front + shift, state.speed[:, 1]
-    return [part.numpy() for part in kept.split(sizes, dim=-1)]
+            motion[0, k], motion[1, k] = state.position[:, 1] - front + shift, state.speed[:, 1]
+    return [part.numpy() for part in motion.split(sizes, dim=-1)]
 
 
 class _StopLine:

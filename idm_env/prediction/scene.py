@@ -28,8 +28,8 @@ DEEPEST = 4
 def _turning_alike(route: Route, speed: float, turning: float) -> float:
     """Return how well a yaw rate (rad/s) fits the route over the next second: a normal density, 1 at its best."""
     near = route.begin + np.linspace(0.0, max(speed, 1.0), 5)
-    wanted = speed * float(np.interp(near, route.length, route.curvature).mean())
-    return float(np.exp(-0.5 * ((turning - wanted) / YAW_SIGMA) ** 2))
+    expected = speed * float(np.interp(near, route.length, route.curvature).mean())
+    return float(np.exp(-0.5 * ((turning - expected) / YAW_SIGMA) ** 2))
 
 
 class MapScene:
@@ -68,11 +68,11 @@ class MapScene:
         reach = max(40.0, SECONDS * self.speed(agent) + 0.5 * 1.5 * SECONDS**2)
         heading = float(agent.heading[self.present])
         bike = agent.kind == "cyclist"
-        found = self.graph.routes(agent.position[self.present], heading, reach, bike=bike)
+        routes = self.graph.routes(agent.position[self.present], heading, reach, bike=bike)
         _, _, _, turning = motion_now(agent, self.present)
-        found = [replace(r, weight=r.weight * _turning_alike(r, self.speed(agent), turning)) for r in found]
-        found.sort(key=lambda route: -route.weight)
-        return [route for route in found if route.weight >= LEAST_ROUTE * found[0].weight]
+        routes = [replace(r, weight=r.weight * _turning_alike(r, self.speed(agent), turning)) for r in routes]
+        routes.sort(key=lambda route: -route.weight)
+        return [route for route in routes if route.weight >= LEAST_ROUTE * routes[0].weight]
 
     def leader(self, index: int, route: Route) -> tuple[int, float, float] | None:
         """Return who is next ahead on a route, arc length and lateral distance of its centre (m), or None.
@@ -88,10 +88,10 @@ class MapScene:
                 continue
             along, lateral, heading = route.locate(agent.position[self.present])
             off = abs(float(turn(heading - agent.heading[self.present])))
-            beside = along - route.begin < 0.5 * (me.length + agent.length)
+            alongside = along - route.begin < 0.5 * (me.length + agent.length)
             apart_across = abs(lateral) > 0.5 * (me.width + agent.width)
             crosses = agent.kind != "pedestrian" and off > np.pi / 3
-            if beside or apart_across or crosses:
+            if alongside or apart_across or crosses:
                 continue
             if best is None or along < best[1]:
                 best = other, along, lateral
@@ -99,10 +99,10 @@ class MapScene:
 
     def ahead(self, index: int, route: Route, depth: int = 0) -> tuple[RouteLeader, RouteLeader]:
         """Return the vehicle ahead over the last second and over the future, by its own predicted motion."""
-        found = self.leader(index, route)
-        if found is None:
+        leader = self.leader(index, route)
+        if leader is None:
             return nobody(self.present), nobody(STEPS)
-        other, along, lateral = found
+        other, along, lateral = leader
         agent = self.scenario.agents[other]
         travelled = self.travelled(other, depth + 1)
         speed = np.gradient(np.concatenate([[0.0], travelled]), DT)
@@ -120,14 +120,14 @@ class MapScene:
     def speeds(self, agent: Agent) -> np.ndarray:
         """Return speeds (m/s) [present + 1] from the first step on; what is not valid takes the nearest that is."""
         speed = np.hypot(*agent.velocity[: self.present + 1].T)
-        known = np.flatnonzero(agent.valid[: self.present + 1])
-        return np.asarray(np.interp(np.arange(self.present + 1), known, speed[known]))
+        valid = np.flatnonzero(agent.valid[: self.present + 1])
+        return np.asarray(np.interp(np.arange(self.present + 1), valid, speed[valid]))
 
     def second(self, agent: Agent, route: Route, past: RouteLeader) -> Second:
         """Return the last second of an agent on a route, from where it has been valid without a break."""
-        known = agent.valid[max(self.present - 10, 0) : self.present + 1]
-        broken = np.flatnonzero(~known)
-        first = self.present - len(known) + 1 + (int(broken[-1]) + 1 if len(broken) else 0)
+        valid = agent.valid[max(self.present - 10, 0) : self.present + 1]
+        broken = np.flatnonzero(~valid)
+        first = self.present - len(valid) + 1 + (int(broken[-1]) + 1 if len(broken) else 0)
         front = 0.5 * agent.length
         stop = self.lines.ahead(route, front, self.speed(agent))
         return Second(

@@ -63,7 +63,7 @@ def chances(
 
 def _hits(samples: np.ndarray, chosen: np.ndarray, speed: float) -> np.ndarray:
     """Return 1.0 where a chosen future ends within the box around a sample, [horizons, N, F]."""
-    found = []
+    hits = []
     for seconds in HORIZONS:
         end = min(seconds * 10, samples.shape[1]) - 1
         moved = samples[:, end] - samples[:, max(end - 10, 0)]
@@ -75,19 +75,19 @@ def _hits(samples: np.ndarray, chosen: np.ndarray, speed: float) -> np.ndarray:
         left = along[:, :1] * apart[..., 1] - along[:, 1:] * apart[..., 0]
         lateral, longitudinal = (bound * speed_scale(speed) for bound in MISS_M[seconds])
         reach = np.where(size > 0.3, longitudinal, lateral)
-        found.append((np.abs(ahead) <= reach) & (np.abs(left) <= lateral))
-    return np.stack(found).astype(float)
+        hits.append((np.abs(ahead) <= reach) & (np.abs(left) <= lateral))
+    return np.stack(hits).astype(float)
 
 
 def _loss(futures: np.ndarray, speed: float) -> np.ndarray:
     """Return the loss [N, N] of sample i if future j is chosen."""
     total = np.zeros((len(futures), len(futures)))
     for seconds in HORIZONS:
-        at = at_two_hertz(seconds)[-3:]
-        if at[-1] >= futures.shape[1]:
+        steps = at_two_hertz(seconds)[-3:]
+        if steps[-1] >= futures.shape[1]:
             continue
         box = MISS_M[seconds][1] * speed_scale(speed)
-        points = futures[:, at]
+        points = futures[:, steps]
         distance = np.linalg.norm(points[:, None] - points[None], axis=-1).mean(-1)
         scale = float(distance.mean()) + 1e-6
         total += (0.5 * np.minimum(distance / (1.5 * box), 1.0) + 0.5 * distance / (distance + scale)) / len(HORIZONS)

@@ -40,8 +40,8 @@ class StopLines:
             if control.shows in ("go", "unknown"):
                 continue
             if control.shows == "sign":
-                known = [lane for lane in control.lanes if lane in graph.lanes]
-                for lane in known or _lanes_of(graph, control.point):
+                lanes = [lane for lane in control.lanes if lane in graph.lanes]
+                for lane in lanes or _lanes_of(graph, control.point):
                     self._by_lane.setdefault(lane, []).append(("sign", graph.lanes[lane].line[-1]))
             elif control.lanes:
                 for lane in control.lanes:
@@ -53,13 +53,13 @@ class StopLines:
         """Return the next stop line of a route, None if there is none; ``front`` (m) is from centre to bumper."""
         shown = [item for lane in route.chain for item in self._by_lane.get(lane, ())]
         shown += [item for item in self._loose if abs(route.locate(item[1])[1]) < ON_LINE_M]
-        found = []
+        stops = []
         for shows, point in shown:
             distance = route.locate(point)[0] - route.begin - front
             hard = speed * speed > 2.0 * YELLOW_DECEL * max(distance, 0.1)
             if distance > -PASSED_M and not (shows == "caution" and hard):
-                found.append(Stop(max(distance, 0.0), "sign" if shows == "sign" else "red"))
-        return min(found, key=lambda stop: stop.distance, default=None)
+                stops.append(Stop(max(distance, 0.0), "sign" if shows == "sign" else "red"))
+        return min(stops, key=lambda stop: stop.distance, default=None)
 
 
 def _lanes_of(graph: LaneGraph, point: np.ndarray) -> list[int]:
@@ -68,7 +68,7 @@ def _lanes_of(graph: LaneGraph, point: np.ndarray) -> list[int]:
     Lanes of several exits lead up to a junction; those inside it have one, and the post of a crossing road may stand
     beside them.
     """
-    found = []
+    lanes = []
     for key, lane in graph.lanes.items():
         if len(graph.exits[key]) < 2:
             continue
@@ -76,5 +76,5 @@ def _lanes_of(graph: LaneGraph, point: np.ndarray) -> list[int]:
         along, left = direction / np.hypot(*direction), np.array([-direction[1], direction[0]]) / np.hypot(*direction)
         apart = point - lane.line[-1]
         if abs(apart @ along) <= POST_ALONG_M and POST_RIGHT_M[0] <= -(apart @ left) <= POST_RIGHT_M[1]:
-            found.append(key)
-    return found
+            lanes.append(key)
+    return lanes
