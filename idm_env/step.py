@@ -120,7 +120,7 @@ class CarFollowingStep:
         return any(e.own for e in self.effects)
 
     @cached_property
-    def changes(self) -> tuple[Effect, ...]:
+    def lane_change_models(self) -> tuple[Effect, ...]:
         """Effects that change lanes."""
         return self._hooks["change"]
 
@@ -142,12 +142,12 @@ class CarFollowingStep:
     @cached_property
     def decides_after(self) -> int:
         """Steps between two decisions about lanes."""
-        return max(1, round(min((e.decides_every for e in self.changes), default=1.0) / self.dt))
+        return max(1, round(min((e.decides_every for e in self.lane_change_models), default=1.0) / self.dt))
 
     @cached_property
     def decides_in_blocks(self) -> int:
         """Slots of a block that decides together, blocks taking turns a step apart; 0: all at once."""
-        return max((e.decides_in_blocks for e in self.changes), default=0)
+        return max((e.decides_in_blocks for e in self.lane_change_models), default=0)
 
     def turns(self, vehicles: int) -> Tensor:
         """Return at which of the ``decides_after`` steps from one decision to the next every slot decides."""

@@ -185,7 +185,7 @@ def simple(effect: str | Effect) -> Term:
     parameters = tuple(_searched(p) for p in one.parameters)
     starts = tuple(product(*(_starts(p) for p in parameters)))
     period = float(getattr(one, "period", None) or 0.0)
-    return Term(one.name, one.name, parameters, starts, what=one.changes, coordinate="state", period=period, made=one)
+    return Term(one.name, one.name, parameters, starts, what=one.acts_on, coordinate="state", period=period, made=one)
 
 
 def personal(effect: str | Effect) -> Term:
@@ -213,7 +213,7 @@ def placed(effect: str | Effect, *values: float, period: float = 0.0) -> Term:
     one = catalogue.make(effect) if isinstance(effect, str) else effect
     coordinate = {"interval": "position", "step": "time"}[one.sought]
     return Term(
-        one.name, one.name, one.parameters, (values,), what=one.changes, coordinate=coordinate, period=period, made=one,
+        one.name, one.name, one.parameters, (values,), what=one.acts_on, coordinate=coordinate, period=period, made=one,
     )  # fmt: skip
 
 
@@ -224,7 +224,7 @@ def unknown_profile(effect: str | Effect, first: float, distance: float, count: 
     declared = replace(one, knots=knots).parameters  # type: ignore[call-arg]
     parameters = tuple(replace(p, default=0.0) for p in declared)
     return Term(
-        one.name, one.name, parameters, ((0.0,) * count,), what=one.changes, coordinate="position", form=twin.CURVE,
+        one.name, one.name, parameters, ((0.0,) * count,), what=one.acts_on, coordinate="position", form=twin.CURVE,
         knots=(first, distance, count), period=period, smoothness=abs(one.strength_of(SPREAD)), made=one,
     )  # fmt: skip
 
@@ -297,10 +297,10 @@ def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
                 refused[effect.name] = f"no {effect.beyond} is measured"
         if effect.sought == "given" and not any(effect.column in e.columns for e in records.episodes):
             refused[effect.name] = f"the file has no column {effect.column}"
-        if effect.sought in ("profile", "interval", "step") and effect.changes not in twin.PULSED:
+        if effect.sought in ("profile", "interval", "step") and effect.acts_on not in twin.PULSED:
             refused[effect.name] = (
                 f"an effect that is sought at places or times must say which of {', '.join(twin.PULSED)} it changes, "
-                f"and changes = '{effect.changes}'"
+                f"and acts_on = '{effect.acts_on}'"
             )
         unknown = effect.name not in refused and effect.kind not in catalogue.PACKAGED
         if unknown and (why := twin.why_not_recorded(effect, records.dt)):

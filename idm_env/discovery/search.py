@@ -259,9 +259,9 @@ class Search:
         for effect in self._sought("profile"):
             curve_of(terms.unknown_profile(effect, *position, period), "position")
         for effect in self._sought("interval"):
-            interval_of(effect.changes, "position", named=effect)
+            interval_of(effect.acts_on, "position", named=effect)
         for effect in self._sought("step"):
-            interval_of(effect.changes, "time", open_end=True, named=effect)
+            interval_of(effect.acts_on, "time", open_end=True, named=effect)
         if not self.located:
             return result
         for what in ("time_gap", "accel_and_decel", "acceleration"):

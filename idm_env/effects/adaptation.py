@@ -30,7 +30,7 @@ class SpeedDependentGap(Effect):
     )
     looks_like: ClassVar[tuple[str, ...]] = ("drag", "time_gap")
     told_by: ClassVar[str] = "following at 5 to 30 m/s by one driver tells the gap from drag"
-    changes: ClassVar[str] = "desired_gap"
+    acts_on: ClassVar[str] = "desired_gap"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("extra_gap", "s1", "m", 3.0, -10.0, 15.0, null=0.0, starts=(0.5,)),
     )
@@ -60,7 +60,7 @@ class LongMemory(Effect):
     )
     looks_like: ClassVar[tuple[str, ...]] = ("regime_shift", "time_gap")
     told_by: ClassVar[str] = "runs that begin at different times of the day tell memory from a shift of regime"
-    changes: ClassVar[str] = "time_gap"
+    acts_on: ClassVar[str] = "time_gap"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("strength", "β", "1", 0.5, -0.9, 3.0, null=0.0, starts=(0.5,)),
         Parameter("memory_time", "τ", "s", 60.0, 5.0, 900.0, role="shape", starts=(30.0, 150.0)),
@@ -97,7 +97,7 @@ class SpeedZone(Effect):
     looks_like: ClassVar[tuple[str, ...]] = ("grade", "time_gap over position")
     told_by: ClassVar[str] = "the same place at low and high speed, with and without leader, tells a zone from a grade"
     sought: ClassVar[Sought] = "interval"
-    changes: ClassVar[str] = "desired_speed"
+    acts_on: ClassVar[str] = "desired_speed"
     rank: ClassVar[int] = 1
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("factor", "f", "1", 0.7, 0.2, 2.0, null=1.0),
@@ -133,7 +133,7 @@ class RegimeShift(Effect):
     looks_like: ClassVar[tuple[str, ...]] = ("memory", "time_gap over time")
     told_by: ClassVar[str] = "runs with different clock offsets tell a shift of regime from memory"
     sought: ClassVar[Sought] = "step"
-    changes: ClassVar[str] = "time_gap"
+    acts_on: ClassVar[str] = "time_gap"
     rank: ClassVar[int] = 2
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("strength", "k", "1", 0.3, -0.8, 3.0, null=0.0),

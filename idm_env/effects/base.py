@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
@@ -71,7 +72,7 @@ class Effect:
     ``latency``     the response comes late by the first parameter (s). Latencies are one class, told apart by sharp
                     inputs only, and one below a step of the data belongs to how these were made
     ``sought``      what has to be found beside the strength
-    ``changes``     what it changes: an acceleration, a parameter of the driver, a perceived signal, the response
+    ``acts_on``     what it changes: an acceleration, a parameter of the driver, a perceived signal, the response
     ``beyond``      whom the record must show
     ``takes``       the type of what it takes from outside at every step (``scene.input``), if anything
     ``wind_up_s``   seconds of the record that it needs before a prediction begins; all of it, for one that remembers,
@@ -104,7 +105,7 @@ class Effect:
     cancels: ClassVar[tuple[str, ...]] = ()
     latency: ClassVar[bool] = False
     sought: ClassVar[Sought] = "anywhere"
-    changes: ClassVar[str] = "acceleration"
+    acts_on: ClassVar[str] = "acceleration"
     beyond: ClassVar[Neighbour] = "leader"
     takes: ClassVar[type | None] = None
     wind_up_s: ClassVar[float] = 0.1
@@ -132,6 +133,10 @@ class Effect:
                 raise TypeError(
                     f"effect {cls.__name__}: {promise} = {value!r} is none of {', '.join(map(repr, get_args(known)))}."
                 )
+        if "changes" in vars(cls):
+            told = f"effect {cls.__name__}: `changes` is called `acts_on` now. Rename it; the old name goes with 0.2."
+            warnings.warn(told, DeprecationWarning, stacklevel=2)
+            cls.acts_on = vars(cls)["changes"]
         # Not inherited: a subclass has another equation, and what its parent promised of his is not known of it.
         cls.adds = vars(cls).get("adds", cls.hook in ("adapt", "accelerate", "limit"))
         cls.own = not cls.__module__.startswith("idm_env.")
@@ -169,7 +174,7 @@ class Effect:
 
     @classmethod
     def strength_of(cls, change: float) -> float:
-        """Return the strength that changes what it ``changes`` by ``change``, to first order, from its null on.
+        """Return the strength that changes what it ``acts_on`` by ``change``, to first order, from its null on.
 
         A scan over places or times finds ``change``; a search starts from what this makes of it.
         """

@@ -65,7 +65,7 @@ class ActionPoint(Effect):
     told_by: ClassVar[str] = (
         "accelerations measured at 10 Hz or more (steps, and stretches without change) tell action points from lag"
     )
-    changes: ClassVar[str] = "response"
+    acts_on: ClassVar[str] = "response"
     wind_up_s: ClassVar[float] = 2.0
     rank: ClassVar[int] = 30
     declared: ClassVar[tuple[Parameter, ...]] = (
@@ -131,7 +131,7 @@ class Lag(Effect):
     looks_like: ClassVar[tuple[str, ...]] = ("delay", "leader_acceleration with the other sign")
     told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells lag from delay"
     latency: ClassVar[bool] = True
-    changes: ClassVar[str] = "response"
+    acts_on: ClassVar[str] = "response"
     wind_up_s: ClassVar[float] = 2.0
     rank: ClassVar[int] = 50
     sees_truth: ClassVar[bool] = True

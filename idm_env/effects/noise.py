@@ -65,7 +65,7 @@ class AccelNoise(Effect):
     wording: ClassVar[tuple[str, str]] = ("", "drivers accelerate by something beside the scene that wanders in time")
     looks_like: ClassVar[tuple[str, ...]] = ("perception_noise", "wander")
     told_by: ClassVar[str] = "free traffic, where neither a time gap nor a perceived gap matters"
-    changes: ClassVar[str] = "acceleration"
+    acts_on: ClassVar[str] = "acceleration"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("sigma", "σ", "m/s²", 0.1, 0.0, 2.0, null=0.0),
         _memory_time(2.0),
@@ -100,7 +100,7 @@ class Wander(Effect):
     wording: ClassVar[tuple[str, str]] = ("", "drivers' time gap wanders about its mean")
     looks_like: ClassVar[tuple[str, ...]] = ("accel_noise", "perception_noise", "time_gap over time")
     told_by: ClassVar[str] = "the same driver at low and high speed: a time gap acts by the speed, an acceleration not"
-    changes: ClassVar[str] = "time_gap"
+    acts_on: ClassVar[str] = "time_gap"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("sigma", "σ", "1", 0.2, 0.0, 1.5, null=0.0),
         _memory_time(20.0),
@@ -142,7 +142,7 @@ class PerceptionNoise(Effect):
     wording: ClassVar[tuple[str, str]] = ("", "drivers misjudge the gap or the closing speed, for a while each time")
     looks_like: ClassVar[tuple[str, ...]] = ("wander", "accel_noise")
     told_by: ClassVar[str] = "standstill and slow traffic: a misjudged gap matters there, a wandering time gap does not"
-    changes: ClassVar[str] = "gap"
+    acts_on: ClassVar[str] = "gap"
     signal: Literal["gap", "closing_speed"] = "gap"
 
     @property

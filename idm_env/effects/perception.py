@@ -35,7 +35,7 @@ class Delay(Effect):
     told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells delay from lag"
     cancels: ClassVar[tuple[str, ...]] = ("leader_acceleration", "second_leader")
     latency: ClassVar[bool] = True
-    changes: ClassVar[str] = "response"
+    acts_on: ClassVar[str] = "response"
     max_delay: float = 1.0
 
     @property
@@ -72,7 +72,7 @@ class DeadZone(Effect):
     )
     looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel", "action_point")
     told_by: ClassVar[str] = "slow approaches at long gaps tell a threshold from softer braking"
-    changes: ClassVar[str] = "closing_speed"
+    acts_on: ClassVar[str] = "closing_speed"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("threshold", "θ", "rad/s", 0.002, 0.0, 0.02, null=0.0, role="threshold", starts=(0.001, 0.004)),
     )
@@ -106,7 +106,7 @@ class ClosingGain(Effect):
     )
     looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel",)
     told_by: ClassVar[str] = "nothing within the bounds of b tells it from the comfortable deceleration"
-    changes: ClassVar[str] = "closing_speed"
+    acts_on: ClassVar[str] = "closing_speed"
     per_driver: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("gain", "k", "1", 0.5, 0.05, 20.0, null=1.0, starts=(0.7, 1.4)),
@@ -134,7 +134,7 @@ class GapBias(Effect):
     told_by: ClassVar[str] = (
         "gaps measured a second way, or standstill behind a leader with known bumpers, tell a bias from the minimum gap"
     )
-    changes: ClassVar[str] = "gap"
+    acts_on: ClassVar[str] = "gap"
     declared: ClassVar[tuple[Parameter, ...]] = (Parameter("bias", "d", "m", 1.0, -5.0, 5.0, null=0.0, starts=(0.2,)),)
 
     def perceive(self, scene: Scene, p: P) -> Scene:

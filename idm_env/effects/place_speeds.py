@@ -35,7 +35,7 @@ class SpeedProfile(Effect):
         "the same place at low and high speed: a slope acts always, a desired speed on those near it"
     )
     sought: ClassVar[Sought] = "profile"
-    changes: ClassVar[str] = "desired_speed"
+    acts_on: ClassVar[str] = "desired_speed"
     rank: ClassVar[int] = 1
     knots: tuple[float, ...] = (0.0, 250.0, 500.0, 750.0, 1000.0)
     period: float | None = None
@@ -84,7 +84,7 @@ class CurveSpeed(Effect):
     told_by: ClassVar[str] = "bends of several radii: one lateral acceleration fits all of them, a zone each its own"
     sought: ClassVar[Sought] = "given"
     column: ClassVar[str] = "curvature"
-    changes: ClassVar[str] = "desired_speed"
+    acts_on: ClassVar[str] = "desired_speed"
     rank: ClassVar[int] = 1
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter(

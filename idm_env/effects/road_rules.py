@@ -58,7 +58,7 @@ class SpeedLimit(Effect):
 
     kind: ClassVar[str] = "speed_limit"
     needs: ClassVar[frozenset[str]] = frozenset({"lane"})
-    changes: ClassVar[str] = "desired_speed"
+    acts_on: ClassVar[str] = "desired_speed"
     title: ClassVar[str] = "speed limits"
     equation: ClassVar[str] = "v0 → v0 + c (min(v0, v_lim) − v0)"
     rank: ClassVar[int] = 2

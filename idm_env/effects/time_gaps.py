@@ -34,7 +34,7 @@ class SpeedTimeGap(Effect):
     )
     looks_like: ClassVar[tuple[str, ...]] = ("speed_dependent_gap", "drag", "min_gap and time_gap together")
     told_by: ClassVar[str] = "following at 5 to 35 m/s by one driver tells a line over speed from a root and from drag"
-    changes: ClassVar[str] = "time_gap"
+    acts_on: ClassVar[str] = "time_gap"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("slope", "k", "1", -0.3, -0.95, 2.0, null=0.0, starts=(0.1,)),
     )
@@ -72,7 +72,7 @@ class SetPointAsymmetry(Effect):
         "leaders that accelerate or brake gently for 10 s and longer tell a time gap, which saturates and lasts, from "
         "answers to the acceleration"
     )
-    changes: ClassVar[str] = "time_gap"
+    acts_on: ClassVar[str] = "time_gap"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("strength", "k", "1", 0.15, -0.8, 0.8, null=0.0, starts=(0.05,)),
     )
@@ -111,7 +111,7 @@ class Relaxation(Effect):
     )
     looks_like: ClassVar[tuple[str, ...]] = ("memory", "regime_shift", "max_accel")
     told_by: ClassVar[str] = "gaps that a cut-in or a hard brake left far from the usual one, followed for a minute"
-    changes: ClassVar[str] = "time_gap"
+    acts_on: ClassVar[str] = "time_gap"
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("strength", "β", "1", 0.5, 0.0, 0.95, null=0.0, starts=(0.3,)),
         Parameter("memory_time", "τ", "s", 15.0, 2.0, 200.0, role="shape", starts=(8.0, 30.0)),
@@ -166,7 +166,7 @@ class GapStiffness(Effect):
     )
     looks_like: ClassVar[tuple[str, ...]] = ("relaxation", "max_accel", "comfort_decel")
     told_by: ClassVar[str] = "gaps far from the usual one at steady speeds, closing and opening, tell it from a and b"
-    changes: ClassVar[str] = "time_gap"
+    acts_on: ClassVar[str] = "time_gap"
     per_driver: ClassVar[bool] = True
     declared: ClassVar[tuple[Parameter, ...]] = (
         Parameter("stiffness", "w", "1", 0.5, 0.05, 4.0, null=1.0, starts=(0.7, 1.4)),

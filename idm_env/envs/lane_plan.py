@@ -325,7 +325,7 @@ class LanePlan(Plan):
             self.turn = Stage(self._turned(names), {**sample, **given}, made.many, self.moving, list(names))
         truths = {"fresh": torch.ones(made.many, self.size, dtype=torch.bool)}
         self.found: Any = None
-        if simulator.changes:
+        if simulator.lane_change_models:
             self.found = decision(simulator, Form.of(like._replace(links=None, trips=None), made.inputs))
             if isinstance(self.found, str):
                 raise Untraceable(self.found)

@@ -88,11 +88,11 @@ class UtilityLogit(Choice):
     @property
     def title(self) -> str:  # type: ignore[override]
         """The effects' titles."""
-        return " and ".join(effect.name for effect in self.simulator.changes)
+        return " and ".join(effect.name for effect in self.simulator.lane_change_models)
 
     @cached_property
     def _free(self) -> tuple[Parameter, ...]:
-        known = {f"{e.name}.{p.name}": p for e in self.simulator.changes for p in e.parameters}
+        known = {f"{e.name}.{p.name}": p for e in self.simulator.lane_change_models for p in e.parameters}
         for name in self.free:
             if name not in known:
                 raise ValueError(f"parameter '{name}' says nothing on lane changes. Take some of {', '.join(known)}.")

@@ -32,7 +32,7 @@ def found(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Par
     if why is not None:
         return why
     if isinstance(simulator.road, Lanes):
-        if simulator.changes and simulator.road.duration:
+        if simulator.lane_change_models and simulator.road.duration:
             return "compiled changes take no time, and Lanes has a duration"
         from idm_env.kernels.several import kernel_of
 

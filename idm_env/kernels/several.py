@@ -100,7 +100,7 @@ def rollout(
     inner, road = between(simulator), simulator.road
     assert isinstance(road, Lanes)
     own = {name: params[name] for name in inner.by_name}
-    stops = bool(simulator.changes) or state.present is not None
+    stops = bool(simulator.lane_change_models) or state.present is not None
     every = simulator.decides_after if stops else max(steps, 1)
     blocks = stops and simulator.decides_in_blocks
     stages = sorted({0, *simulator.turns(state.speed.shape[-1]).tolist()}) if blocks else [0]
@@ -115,7 +115,7 @@ def rollout(
         phase = (clocks + done) % every
         own_turn = np.isin(phase, stages) if blocks else (phase == 0) & stops
         wishes: Any = ""
-        if simulator.changes and own_turn.any():
+        if simulator.lane_change_models and own_turn.any():
             wishes = decision(simulator, Form.of(state._replace(links=None), inputs))
         alike = len(phase) == 1
         if own_turn.all() and alike:
@@ -158,7 +158,7 @@ def _decided(traffic: Traffic, wishes: Any, state: State, inputs: Inputs, params
     simulator = traffic.simulator
     if stage == 0:
         state = traffic.begin(state, params)
-    if not simulator.changes:
+    if not simulator.lane_change_models:
         return state
     return traffic.decide(wishes, state, inputs, params, stage)
 

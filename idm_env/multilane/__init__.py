@@ -14,7 +14,7 @@ def before(stepping: CarFollowingStep, state: State, inputs: Inputs, params: Par
         return state
     if state.present is not None:
         state = turnover(stepping, state, params)
-    return decided(stepping, state, inputs, params) if stepping.changes else state
+    return decided(stepping, state, inputs, params) if stepping.lane_change_models else state
 
 
 __all__ = ["before"]

@@ -58,7 +58,7 @@ def wished(stepping: CarFollowingStep, scene: Scene, params: Params) -> Wish:
     """Return the sum and the largest of all utilities, and the least of all margins."""
     driver = stepping.wanted(scene, params)[2]
     total: Wish | None = None
-    for effect in stepping.changes:
+    for effect in stepping.lane_change_models:
         wish = effect.change(scene, driver, dict(params[effect.name]))
         wish = wish._replace(left_most=wish.left, right_most=wish.right)
         if total is not None:

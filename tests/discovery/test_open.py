@@ -172,9 +172,9 @@ def test_a_profile_of_what_cannot_be_changed_by_place_is_refused(platoon: Record
     class Mistaken(Mood):
         kind = "mistaken"
         sought = "profile"
-        changes = "gap"
+        acts_on = "gap"
 
-    assert "changes = 'gap'" in terms.testable(platoon, [Mistaken()])["mistaken"]
+    assert "acts_on = 'gap'" in terms.testable(platoon, [Mistaken()])["mistaken"]
 
 
 def test_a_class_that_no_search_can_use_is_refused_at_once() -> None:
