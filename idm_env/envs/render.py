@@ -12,7 +12,6 @@ import numpy as np
 
 from idm_env.extras import needed
 from idm_env.reports.diagrams import COLOURS, space_time
-from idm_env.roads import Lanes
 from idm_env.types import State
 
 if TYPE_CHECKING:
@@ -111,10 +110,11 @@ class _View:
 def _view(task: Task, values: dict[str, np.ndarray], lanes: int) -> _View:
     """Return the whole of a road that ends, else what is around its vehicles, at least 170 m."""
     there = values["present"] > 0
-    if isinstance(task.road, Lanes) and task.road.length is not None:
-        wanted = LANE_M * (WIDE - 2 * _EDGE) / task.road.length
-        return _View(0.0, task.road.length, lanes, float(np.clip(wanted, *_LANE_PIXELS)))
-    if isinstance(task.road, Lanes):
+    outline = task.road.outline
+    if outline is not None and outline.length is not None:
+        wanted = LANE_M * (WIDE - 2 * _EDGE) / outline.length
+        return _View(0.0, outline.length, lanes, float(np.clip(wanted, *_LANE_PIXELS)))
+    if outline is not None:
         middle = float(values["position"][task.agents[0]])
         return _View(middle - _NEAR, middle + _NEAR, lanes, _LANE_PIXELS[1])
     front = float(values["position"][there].max()) if there.any() else 2.0 * _NEAR
@@ -144,9 +144,11 @@ class Viewer:
         """Return the picture of one row of a state as ``(height, width, 3)`` uint8, or show it in the window."""
         ring = state.links is None and task.road.lap(state) is not None
         lane, lanes = np.array(task.lanes), min(max(task.lanes) + 1, _MOST_LANES)
-        if isinstance(task.road, Lanes) and state.links is not None:
+        outline = task.road.outline
+        if outline is not None and state.links is not None:
             # The left lane is on top, as seen by drivers who go to the right.
-            lane, lanes = task.road.count - 1 - state.links.lane[row].cpu().numpy(), task.road.count
+            lanes = len(outline.lanes)
+            lane = lanes - 1 - state.links.lane[row].cpu().numpy()
         values = {
             name: getattr(state, name)[row].detach().cpu().double().numpy()
             for name in ("position", "speed", "gap", "length")
@@ -155,8 +157,8 @@ class Viewer:
         values["present"] = everybody if state.present is None else state.present[row].detach().cpu().numpy()
         values["lane"] = lane
         self._watch(task, state, row, lane)
-        if isinstance(task.road, Lanes) and task.road.length is None:
-            _around(task, values, task.road.ring)
+        if outline is not None and outline.length is None:
+            _around(task, values, outline.ring)
         fastest = 10.0 if ring else 30.0
         view = _view(task, values, lanes)
         canvas = self._pygame.Surface((SIZE, SIZE) if ring else (WIDE, 2 * math.ceil(0.5 * (view.bottom + 34))))
@@ -207,14 +209,14 @@ class Viewer:
 
     def _lane(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float, view: _View) -> None:
         draw = self._pygame.draw
-        road = task.road if isinstance(task.road, Lanes) and task.road.ring is None else None
+        outline = task.road.outline
+        lap = None if outline is None else outline.ring
         for lane in range(view.lanes):
             first, last = view.back - 1e4, view.front + 1e4
             stops = math.inf
-            if road is not None:
-                k = road.count - 1 - lane
-                first, stops = road.table("begins")[k], road.table("stops")[k]
-                last = min(stops, road.table("leaves")[k], last)
+            if outline is not None and lap is None:
+                first, stops, leaves = outline.lanes[-1 - lane]
+                last = min(stops, leaves, last)
             left, right = (min(max(view.x(m), 0.0), float(WIDE)) for m in (first, last))
             top = view.y(lane) - 0.5 * view.lane
             draw.rect(canvas, _ASPHALT, (left, top, right - left, view.lane + 1))
@@ -227,7 +229,6 @@ class Viewer:
         for post in np.arange(view.step * math.ceil(view.back / view.step), view.front + 1e-6, view.step):
             x = view.x(post)
             draw.line(canvas, _INK, (x, view.bottom + 3), (x, view.bottom + 9))
-            lap = task.road.ring if isinstance(task.road, Lanes) else None
             self._text(canvas, f"{post if lap is None else post % lap:.0f} m", (x, view.bottom + 20))
         for i in np.flatnonzero(values["present"] > 0):
             x = view.x(values["position"][i] - 0.5 * values["length"][i])

@@ -7,12 +7,23 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from idm_env.types import FAR, Links, Motion, Neighbour, State
+
+
+class Outline(NamedTuple):
+    """What there is to draw of a road of several lanes: its ``length`` or ``ring`` (m), else neither.
+
+    ``lanes``: of each, right lane first, where it begins, where one must stop, and where one leaves it (m).
+    """
+
+    lanes: tuple[tuple[float, float, float], ...]
+    length: float | None
+    ring: float | None
 
 
 @dataclass(frozen=True)
@@ -51,6 +62,11 @@ class Road(abc.ABC):
 
     def lap(self, state: State) -> Tensor | None:
         """Return the circumference (m) of a ring in every row of a state, None on any other road."""
+        return None
+
+    @property
+    def outline(self) -> Outline | None:
+        """What there is to draw of several lanes, None on a road of one."""
         return None
 
     @property

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from idm_env.roads.base import Road
+from idm_env.roads.base import Outline, Road
 from idm_env.roads.layout import LaneLayout
 from idm_env.roads.linked import Linked
 from idm_env.roads.order import Order
@@ -36,6 +36,12 @@ class Lanes(LaneLayout, Road):
     def beside(self) -> bool:  # type: ignore[override]
         """Whether there is more than one lane."""
         return self.count > 1
+
+    @property
+    def outline(self) -> Outline:
+        """Where each lane begins, stops and is left (m)."""
+        places = (self.table("begins"), self.table("stops"), self.table("leaves"))
+        return Outline(tuple(zip(*places, strict=True)), self.length, self.ring)
 
     def lap(self, state: State) -> Tensor | None:
         """Return the circumference (m) in every row of a state, None where lanes go straight on."""
