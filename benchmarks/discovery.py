@@ -42,7 +42,12 @@ TRUE = {
     "gap_bias": ("bias", -1.0),
 }  # fmt: skip
 """Parameter of each effect that has one number to recover, and the sign between generator and model."""
-OUTSIDE = ("time_gap over places", "time_gap ramp", "a and b step", "period", "speed-dependent T", "run")
+OUTSIDE = (
+    "time_gap over places", "time_gap ramp", "a and b step", "period", "run",
+    "speed-dependent T", "closing", "gap", "speed x gap", "closing x gap",
+)  # fmt: skip
+"""Kinds outside the catalogue, those of ``IN_A_STATE`` last."""
+IN_A_STATE = OUTSIDE[5:]
 TWO = (
     ("delay", "grade"), ("speed_zone", "leader_acceleration"), ("drag", "regime_shift"), ("memory", "brake_light"),
     ("delay", "leader_acceleration"), ("delay", "second_leader"),
@@ -106,9 +111,21 @@ def generated(job: Job) -> tuple[Any, Any]:
     original = synthetic.Platoon
     synthetic.Platoon = outside(original, job.effect)  # type: ignore[attr-defined, assignment, misc]
     try:
-        return synthetic.generate(job.seed)
+        return synthetic.generate(job.seed, ou=job.ou)
     finally:
         synthetic.Platoon = original  # type: ignore[attr-defined]
+
+
+def longer(kind: str, view: Any, drivers: Any) -> np.ndarray:
+    """Return by which share the time gap is longer in a state of the driver: an effect that has no name."""
+    closing = view.speed - view.lead_speed
+    if kind == "closing":  # counts double above 2 m/s
+        twice = np.maximum(closing - 2.0, 0.0) / (2.0 * np.sqrt(drivers.max_accel * drivers.comfort_decel))
+        return np.asarray(twice / drivers.time_gap)
+    near = 0.5 * np.exp(-(((view.gap - 15.0) / 6.0) ** 2))
+    if kind == "gap":
+        return np.asarray(near)
+    return np.asarray(near * np.clip(view.speed / 10.0 if kind == "speed x gap" else 1.0 + closing, 0.0, 2.0))
 
 
 def outside(base: type, kind: str) -> type:
@@ -131,6 +148,8 @@ def outside(base: type, kind: str) -> type:
                 )
             elif kind == "speed-dependent T":
                 change["time_gap"] = drivers.time_gap * (1 + 0.5 * np.exp(-(((speed - 8) / 3) ** 2)))
+            elif kind in IN_A_STATE:
+                change["time_gap"] = drivers.time_gap * (1 + longer(kind, self._view(k, state), drivers))
             self.drivers = dataclasses.replace(drivers, **change)
             try:
                 rates = super()._rates(k, known, state)
@@ -255,12 +274,18 @@ def table(rows: list[dict[str, Any]]) -> str:
         named = [bool(r["found"]) and right(r) for r in groups[strength, ou]]
         lines.append(f"{text} | {share(named)} ({share([right(r) for r in groups[strength, ou]])} with faint ones)")
     for ou in (0.0, 0.1, 0.2):
-        none = [bool(r["found"]) or r["verdict"] == "located" for r in rows if r["kind"] == "none" and r["ou"] == ou]
+        none = [
+            bool(r["found"]) or r["verdict"] in ("shape", "located")
+            for r in rows
+            if r["kind"] == "none" and r["ou"] == ou
+        ]
         lines.append(f"something found where nothing is, OU {ou:g} | {share(none)}")
-    few = [bool(r["found"]) or r["verdict"] == "located" for r in rows if r["kind"] == "few"]
+    few = [bool(r["found"]) or r["verdict"] in ("shape", "located") for r in rows if r["kind"] == "few"]
     lines.append(f"something found where nothing is, 4 to 9 runs, OU 0 to 0.2 | {share(few)}")
     outside_rows = [r for r in rows if r["kind"] == "outside"]
     lines.append(f"catalogue name for an effect outside it | {share([bool(r['named']) for r in outside_rows])}")
+    noticed = [r["verdict"] in ("shape", "located", "unexplained") for r in outside_rows]
+    lines.append(f"an effect outside it is noticed | {share(noticed)}")
     both = [set(r["effect"].split("+")) <= set(r["named"]) for r in rows if r["kind"] == "two"]
     lines.append(f"two effects at once, both named | {share(both)}")
     if clean:

@@ -18,6 +18,7 @@ from idm_env.discovery import (
     calibrate,
     ceilings,
     crossed,
+    found,
     free,
     judge,
     places,
@@ -76,6 +77,13 @@ class Discovery:
     def verdict(self) -> Verdict:
         """What is concluded."""
         return Verdict(self.report["verdict"])
+
+    @property
+    def found_effect(self) -> str:
+        """What was found in a state of the driver and has no name, as the text of a file with effects; "" for none."""
+        told = {f["label"]: f["parameters"] for f in self.report["found"]}
+        added = [(term, told[term.label]) for term in self.judgement.terms if term.label in told]
+        return found.source(added, self.report["sentence"])
 
     @property
     def model(self) -> SavedModel:

@@ -173,8 +173,8 @@ class Frozen(Hypothesis):
 
 SPREAD = 0.3
 """Prior width of a curve's knots, in units of what it changes: m/s², or relative."""
-STATES = ("speed", "gap", "closing_speed", "lead_accel")
-"""Coordinates of the state: a curve without a name over one of them ends where nobody was seen."""
+STATES = {"speed": 3.0, "gap": 6.0, "closing_speed": 1.0, "lead_accel": 0.4, "relative_gap": 0.2}
+"""Coordinates of the state, with the distance of a curve's knots: it ends where nobody was seen."""
 EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed": 0.2, "lead_accel": 0.1}
 """Half-width over which an interval of a located effect sets in."""
 

@@ -18,6 +18,7 @@ from idm_env.reports.page import Block
 TITLES = {
     Verdict.NAMED: "What IDM lacks here has a name",
     Verdict.ONE_OF: "What IDM lacks here is one of several effects",
+    Verdict.SHAPE: "What IDM lacks here has a shape, but no name",
     Verdict.LOCATED: "What IDM lacks here has a place, but no name",
     Verdict.UNEXPLAINED: "IDM lacks something here that nothing tried explains",
     Verdict.NONE: "Nothing was found that IDM lacks here",

@@ -10,11 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from idm_env.discovery.march import PULSED
 from idm_env.discovery.records import Rows
 from idm_env.discovery.solve import Solution, Task, equations
 from idm_env.discovery.units import Units, units
+from idm_env.effects.free import FREE
 
 WHATS = PULSED
 PULSE = 0.05
@@ -79,6 +81,9 @@ def respond(task: Task, solution: Solution) -> Responses:
         "time": signals[at, 17],
         "speed": signals[at, 15],
         "gap": signals[at, 0] - signals[at, 14],
+        "closing_speed": signals[at, 15] - signals[at, 1],
+        "lead_accel": signals[at, 2],
+        "relative_gap": relative_gap(solution, rows, at),
     }
     linear = solution.linear
     matrix = equations(task, solution.theta, linear)[1][:, : linear.own, : linear.own]
@@ -88,6 +93,17 @@ def respond(task: Task, solution: Solution) -> Responses:
         rows, counted, change, linear.residual, linear.by_theta,
         np.linalg.inv(matrix + 1e-9 * np.eye(len(matrix[0]))), coordinates, square,
     )  # fmt: skip
+
+
+def relative_gap(solution: Solution, rows: Rows, at: np.ndarray) -> np.ndarray:
+    """Return the gap over the one that each driver keeps, at samples [R, J]: the feature of that name."""
+    signals, catalogue = rows.records.signals, solution.model.catalogue
+    theta = torch.from_numpy(np.exp(solution.theta[rows.group]))[..., None]
+    own = {p.name: theta[:, i] for i, (_, p) in enumerate(catalogue.of_driver[: len(catalogue.base.parameters)])}
+    driver = catalogue.base.driver(own)
+    speed = torch.from_numpy(signals[at, 15])
+    kept = driver.min_gap + driver.extra_gap + driver.time_gap * speed
+    return np.clip((signals[at, 0] - signals[at, 14]) / kept.numpy(), 0.0, FREE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -177,6 +177,18 @@ def half_width(solution: Solution, task: Task) -> np.ndarray:
     Where the runs' spread is smaller than the noise allows, the noise decides. ``SYSTEMATIC`` of the strength is added
     in squares: what smoothing and steps of 0.1 s do, alike in every run, so that no spread shows it.
     """
+    spread, noise, times = _variances(solution, task)
+    width = np.maximum(
+        times * np.sqrt(np.maximum(np.diag(spread), 0.0)), 1.96 * np.sqrt(np.maximum(np.diag(noise), 0.0))
+    )
+    null = np.array([p.null or 0.0 if p.role == "strength" else 0.0 for p in solution.model.parameters])
+    own = np.array([p.role != "place" for p in solution.model.parameters])
+    result: np.ndarray = np.sqrt(width**2 + (1.96 * SYSTEMATIC * own * (solution.values - null)) ** 2)
+    return result
+
+
+def _variances(solution: Solution, task: Task) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return φ's covariance [Q, Q] by the spread of runs, and by the noise, and Student's t of the former."""
     runs = len(task.rows.records.runs)
     gradient, matrix = per_run(task, solution)
     big = matrix.sum(0) + np.diag(prior_of(solution.model))
@@ -185,12 +197,33 @@ def half_width(solution: Solution, task: Task) -> np.ndarray:
     spread = gradient - gradient.mean(0)
     sandwich = inverse @ (spread.T @ spread * runs / max(runs - 1, 1)) @ inverse
     variance = float((solution.linear.residual**2).mean())
-    plain = inverse * variance
-    width = np.maximum(
-        student.ppf(0.975, max(runs - 1, 1)) * np.sqrt(np.maximum(np.diag(sandwich), 0.0)),
-        1.96 * np.sqrt(np.maximum(np.diag(plain), 0.0)),
-    )
-    null = np.array([p.null or 0.0 if p.role == "strength" else 0.0 for p in solution.model.parameters])
-    own = np.array([p.role != "place" for p in solution.model.parameters])
-    result: np.ndarray = np.sqrt(width**2 + (1.96 * SYSTEMATIC * own * (solution.values - null)) ** 2)
-    return result
+    return sandwich, inverse * variance, float(student.ppf(0.975, max(runs - 1, 1)))
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """The ends of a curve that surely differ most: numbers of the lower and the higher knot, and by how much."""
+
+    low_knot: int
+    high_knot: int
+    estimate: float
+    low: float
+    high: float
+
+
+def contrast_of(solution: Solution, task: Task, label: str) -> Contrast:
+    """Return which two knots of the curve ``label`` differ most, by the near end of the difference's 95 % interval.
+
+    Single knots say less: drivers' own parameters move a curve up and down as a whole, and its contrasts stay.
+    """
+    at = solution.model.where(label)
+    values, (spread, noise, times) = solution.values[at], _variances(solution, task)
+    wide = np.zeros((len(values), len(values)))
+    for matrix, factor in ((spread[at, at], times), (noise[at, at], 1.96)):
+        own = np.diag(matrix)
+        wide = np.maximum(wide, factor * np.sqrt(np.maximum(own[:, None] + own - matrix - matrix.T, 0.0)))
+    off = np.subtract.outer(values, values)
+    i, j = np.unravel_index((off - wide).argmax(), off.shape)
+    if i == j:  # no two differ beyond chance
+        i, j = np.unravel_index(off.argmax(), off.shape)
+    return Contrast(int(j), int(i), float(off[i, j]), float(off[i, j] - wide[i, j]), float(off[i, j] + wide[i, j]))

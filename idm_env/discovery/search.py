@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -104,8 +105,11 @@ class Search:
         prior = population(solution.theta, self.task.rows, solution.model.catalogue.own)
         return replace(self.task, noise=noise, prior=replace(prior, alike_s=self.task.prior.alike_s))
 
-    def round(self, solution: Solution, number: int) -> tuple[list[Scored], np.ndarray]:
-        """Score every candidate on top of ``solution``; return them and the null's held-out squares [units]."""
+    def round(self, solution: Solution, number: int, first: bool = True) -> tuple[list[Scored], np.ndarray]:
+        """Score every candidate on top of ``solution``; return them and the null's held-out squares [units].
+
+        Shapes are sought in the ``first`` round only: beside an effect, a curve is what that one lacks of the true one.
+        """
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
         wanted = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
@@ -115,7 +119,7 @@ class Search:
         for i, term in enumerate(wanted):
             self.on_progress(f"round {number}", i, len(wanted) + 12, term.label)
             found.append(self._nested(solution, term, before, f"{number}/{term.label}"))
-        for i, scored in enumerate(self._places(solution, responses, before, number)):
+        for i, scored in enumerate(self._places(solution, responses, before, number, first)):
             self.on_progress(f"round {number}", len(wanted) + i, len(wanted) + 12, scored.term.label)
             found.append(scored)
         return found, before
@@ -207,7 +211,9 @@ class Search:
 
     # -- where and when ----------------------------------------------------------------------------------------------
 
-    def _places(self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int) -> list[Scored]:
+    def _places(
+        self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int, first: bool
+    ) -> list[Scored]:
         have = {t.label for t in solution.model.terms}
         period = self.task.rows.records.period
         result: list[Scored] = []
@@ -232,32 +238,22 @@ class Search:
             gains = np.where(found.stable, one.gains, found.gains)
             result.append(Scored(term, one.solution, gains, found.stable))
 
-        def curve_of(term: Term, coordinate: str) -> None:
-            if term.label in have:
-                return
-            values = responses.coordinates[coordinate]
-            first, distance, count = term.knots
-            basis = places.hats(values, first, distance, count, term.period)
-            spread = term.smoothness if term.made is None else terms.SPREAD
-            start, gains = places.linear_curve(responses, term.what, basis, spread)
-            if gains.mean() < WORTH and (term.effect is None or term.what != "acceleration"):
-                result.append(Scored(term, None, gains))
-                return
-            low, high = term.parameters[0].low, term.parameters[0].high
-            begin = start if term.made is None else np.array([term.made.strength_of(float(x)) for x in start])
-            result.append(
-                self._nested(
-                    solution,
-                    term,
-                    before,
-                    f"{number}/{term.label}",
-                    [np.append(solution.values, np.clip(begin, 0.9 * low, 0.9 * high))],
-                )
-            )
+        def curve_of(*wanted: Term) -> None:
+            looked = [(t, *_line(responses, t)) for t in wanted if t.label not in have]
+            looked.sort(key=lambda one: -one[2].mean())
+            for i, (term, start, gains) in enumerate(looked):
+                faint = gains.mean() < WORTH and (term.effect is None or term.what != "acceleration")
+                if faint or i >= RACED:
+                    result.append(Scored(term, None, gains))
+                    continue
+                low, high = term.parameters[0].low, term.parameters[0].high
+                begin = start if term.made is None else np.array([term.made.strength_of(float(x)) for x in start])
+                starts = [np.append(solution.values, np.clip(begin, 0.9 * low, 0.9 * high))]
+                result.append(self._nested(solution, term, before, f"{number}/{term.label}", starts))
 
         position = _knots(responses.coordinates["position"], 80.0, 48, period)
         for effect in self._sought("profile"):
-            curve_of(terms.unknown_profile(effect, *position, period), "position")
+            curve_of(terms.unknown_profile(effect, *position, period))
         for effect in self._sought("interval"):
             interval_of(effect.acts_on, "position", named=effect)
         for effect in self._sought("step"):
@@ -271,14 +267,14 @@ class Search:
         for what in ("desired_speed", "accel_and_decel", "acceleration"):
             interval_of(what, "time", open_end=True)
         coarse = _knots(responses.coordinates["position"], 150.0, 30, period)
-        curve_of(terms.curve("time_gap", "position", *coarse, period), "position")
+        curve_of(terms.curve("time_gap", "position", *coarse, period))
         time = responses.coordinates["time"]
         ramp = (float(time.min()), float(np.ptp(time)) + 1e-6, 2)
-        curve_of(terms.curve("time_gap", "time", *ramp, label="time_gap ramp"), "time")
-        curve_of(terms.curve("acceleration", "time", *_knots(time, 8.0, 24)), "time")
-        for what, coordinate, step in (("acceleration", "speed", 3.0), ("time_gap", "speed", 3.0),
-                                       ("acceleration", "gap", 6.0), ("time_gap", "gap", 6.0)):  # fmt: skip
-            curve_of(terms.curve(what, coordinate, *_knots(responses.coordinates[coordinate], step, 10)), coordinate)
+        curve_of(terms.curve("time_gap", "time", *ramp, label="time_gap ramp"))
+        curve_of(terms.curve("acceleration", "time", *_knots(time, 8.0, 24)))
+        if first:
+            knots = {c: _knots(responses.coordinates[c], step, 10) for c, step in terms.STATES.items()}
+            curve_of(*(terms.curve(what, c, *knots[c]) for what, c in product(places.WHATS, knots)))
         cycle, gains = places.best_period(responses, "acceleration")
         term = terms.curve("acceleration", "time", 0.0, cycle / 8, 8, cycle, label="acceleration over phase")
         if term.label not in have:
@@ -289,6 +285,13 @@ class Search:
                 one = self._nested(solution, term, before, f"{number}/{term.label}", [start])
                 result.append(Scored(term, one.solution, np.minimum(one.gains, gains + 0.5 * np.abs(gains))))
         return result
+
+
+def _line(responses: places.Responses, term: Term) -> tuple[np.ndarray, np.ndarray]:
+    """Return a curve's knots by its linear response, and honest gains of units."""
+    basis = places.hats(responses.coordinates[term.coordinate], *term.knots, term.period)
+    spread = term.smoothness if term.made is None else terms.SPREAD
+    return places.linear_curve(responses, term.what, basis, spread)
 
 
 def _interval_term(

@@ -111,7 +111,7 @@ def _joined(
     """Return what holds in free simulation beside what windows told, and add to ``rounds`` what was seen."""
     now, last = steps[-1] if steps else null, rounds[-1]
     few = last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS
-    if few or (steps and _at_floor(searching, now)):
+    if few or (steps and (_is_shape(now) or _at_floor(searching, now))):
         return None
     joined, forward = together.grow(searching, searching.weighed(now)[0], len(null.model.terms), seed)
     rounds += [
@@ -126,9 +126,9 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
     steps: list[Solution] = []
     rounds: list[Round] = []
     for number in range(1, MOST_ROUNDS + 2):
-        if len(steps) == MOST_ROUNDS or (steps and _at_floor(searching, now)):
+        if len(steps) == MOST_ROUNDS or (steps and (_is_shape(now) or _at_floor(searching, now))):
             break
-        scored, before = searching.round(now, number)
+        scored, before = searching.round(now, number, not steps)
         scored = [s for s in scored if not _same_class(s.term, now.model)]
         if not scored and rounds:
             break
@@ -162,6 +162,11 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
 def _tested(searching: Search, scored: Sequence[Scored], seed: int) -> Tested:
     """Test candidates in windows, at their share of the level."""
     return at_level(westfall_young(np.array([s.gains for s in scored]), seed, searching.units.run), 1.0 - FREE_SHARE)
+
+
+def _is_shape(now: Solution) -> bool:
+    """Tell whether the last term is a curve over a state: beside it a name explains the curve's corners."""
+    return now.model.terms[-1].fades
 
 
 def _is_a_step(now: Solution, dt: float) -> bool:

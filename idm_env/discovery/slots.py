@@ -34,7 +34,7 @@ OVER = Parameter("over", "", "1", 0.0, 0.0, len(FEATURES) - 1.0, role="shape")
 """Which feature a curve runs over: its place in ``FEATURES``."""
 
 
-def _value(effect: Slot | Push, scene: Scene, p: P) -> Tensor:
+def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
     """Return c."""
     if effect.given:
         given: Tensor = scene.input(effect.name)
@@ -42,7 +42,7 @@ def _value(effect: Slot | Push, scene: Scene, p: P) -> Tensor:
     x: Any = 0.0
     for number, feature in enumerate(FEATURES):
         # Chosen, not summed: the loop need not wait for what does not count.
-        x = torch.where(p["over"] == number, feature_of(scene, feature, None), x)
+        x = torch.where(p["over"] == number, feature_of(scene, driver, feature, None), x)
     return curve(x, p, "knot", effect.knots, None, effect.values)
 
 
@@ -73,7 +73,7 @@ class Slot(Effect):
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the parameters changed."""
-        c = _value(self, scene, p)
+        c = _value(self, scene, driver, p)
         now = {n: getattr(driver, n) for n in self.targets}
         return driver._replace(**{n: torch.where(p[n] > 0.0, x * (1.0 + c), x) for n, x in now.items()})
 
@@ -96,4 +96,4 @@ class Push(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return c (m/s²)."""
-        return _value(self, scene, p)
+        return _value(self, scene, driver, p)

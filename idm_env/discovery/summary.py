@@ -13,10 +13,11 @@ from idm_env.discovery import bases, judge, words
 from idm_env.discovery import ladder as ladders
 from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
 from idm_env.discovery.ladder import Ladder
-from idm_env.discovery.model import Term
+from idm_env.discovery.march import CURVE
+from idm_env.discovery.model import STATES, Term
 from idm_env.discovery.power import Bar, Strength, powerful, strength_of
 from idm_env.discovery.records import Records
-from idm_env.discovery.score import FREE_SHARE, interval_of, level
+from idm_env.discovery.score import FREE_SHARE, contrast_of, interval_of, level
 from idm_env.discovery.selection import LEAST_GAIN, Round
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution, Task
@@ -142,7 +143,7 @@ def report(
     entries: list[dict[str, Any]] = []
     if compared is not None:
         known = judged.intervals if judged.intervals is not None else interval_of(compared, task)
-        entries = _found(compared, rounds, known, base)
+        entries = _found(compared, rounds, known, base, task)
     found = entries if judged.added else []
     first = rounds[0]
     structured = any(r.significant for r in (first, *(r for r in rounds if r.free)))
@@ -159,7 +160,7 @@ def report(
     others = [name for f in found if f["effect"] for name in f["equivalent"] if name in ALL]
     verdict = conclude(
         bool(found), any(f["effect"] for f in found), refusal, structured, first.left, power, common is not None,
-        apart=not others,
+        apart=not others, in_a_state=all(f["where"]["coordinate"] in (*STATES, "state") for f in found),
     )  # fmt: skip
     if (
         verdict is Verdict.UNEXPLAINED
@@ -287,7 +288,7 @@ def _where(term: Term, values: dict[str, float]) -> dict[str, Any]:
     return {"coordinate": "state" if term.coordinate in ("", "state") else term.coordinate, "interval": [None, None]}
 
 
-def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: int) -> list[dict[str, Any]]:
+def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: int, task: Task) -> list[dict[str, Any]]:
     result = []
     at = sum(t.size for t in compared.model.terms[:base])
     for term in compared.model.terms[base:]:
@@ -308,6 +309,7 @@ def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: i
             }
             for p, x in zip(term.parameters, mine, strict=True)
         }
+        contrast = contrast_of(compared, task, term.label) if term.located and term.form == CURVE else None
         where = _where(term, values)
         if where["coordinate"] == "time" and (where["interval"][1] or 0) > 9e5:
             where["interval"][1] = None
@@ -321,7 +323,7 @@ def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: i
                 "label": term.label,
                 "title": words.plain(term.effect or term.label),
                 "equation": words.CHANGES[term.what][3] if effect is None else effect.equation,
-                "clause": words.clause(term, mine.tolist()),
+                "clause": words.clause(term, mine.tolist(), contrast),
                 "equivalent": [this.scored[i].term.effect or this.scored[i].term.label for i in this.equivalent],
                 "looks_like": [] if effect is None else list(effect.looks_like),
                 "told_by": "" if effect is None else effect.told_by,

@@ -23,6 +23,7 @@ class Verdict(str, Enum):
     NONE = "none"
     NAMED = "named"
     ONE_OF = "one_of"
+    SHAPE = "shape"
     LOCATED = "located"
     UNEXPLAINED = "unexplained"
     CANNOT_TELL = "cannot_tell"
@@ -82,7 +83,7 @@ def mean_ratio(errors: Mapping[str, Comparison]) -> float:
 
 def conclude(
     added: bool, named: bool, refusal: Refusal | None, structured: bool, left: np.ndarray, power: bool = True,
-    shared: bool = False, apart: bool = True,
+    shared: bool = False, apart: bool = True, in_a_state: bool = False,
 ) -> Verdict:  # fmt: skip
     """Return the verdict.
 
@@ -95,9 +96,12 @@ def conclude(
         power: Whether what is in the catalogue would have been found, were it there.
         shared: Whether vehicles of one run miss the model alike at one time.
         apart: Whether no other effect of the catalogue did about as well as one that was added.
+        in_a_state: Whether all that was added acts in a state of the driver, and nothing at a place or a time.
     """
     if added:
-        return (Verdict.NAMED if apart else Verdict.ONE_OF) if named else Verdict.LOCATED
+        if named:
+            return Verdict.NAMED if apart else Verdict.ONE_OF
+        return Verdict.SHAPE if in_a_state else Verdict.LOCATED
     if refusal is not None and refusal.reason is Reason.LAW:
         return Verdict.UNEXPLAINED
     if shared:

@@ -13,10 +13,12 @@ from idm_env.discovery.bases import Law
 from idm_env.discovery.compare import Comparison, ErrorChange
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Strength
+from idm_env.discovery.score import Contrast
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution
 from idm_env.discovery.verdict import HOLDS, Reason, Refusal, Verdict
 from idm_env.effects import ALL
+from idm_env.effects.free import FEATURES
 from idm_env.parameters import Parameter
 
 ERRORS = {
@@ -40,7 +42,7 @@ CHANGES = {
 """Of what can be located without a name: what drivers do with less and more of it, its noun, and its equation."""
 ALONG = {
     "position": "place", "time": "time", "speed": "speed", "gap": "gap", "closing_speed": "closing speed",
-    "lead_accel": "leader's acceleration",
+    "lead_accel": "leader's acceleration", "relative_gap": "gap relative to the desired one",
 }  # fmt: skip
 SHOWN = 3
 """Effects named in the sentence of ``none``, of those known best and of those that show least."""
@@ -76,8 +78,11 @@ def told(p: Parameter, estimate: float, low: float, high: float) -> str:
     return f"{p.symbol or p.name} = {number(estimate)}{unit} [{number(low)}, {number(high)}]"
 
 
-def clause(term: Term, values: Sequence[Sequence[float]]) -> str:
-    """Return what drivers do with a term in the model, its equation and its parameters [(estimate, low, high)]."""
+def clause(term: Term, values: Sequence[Sequence[float]], contrast: Contrast | None = None) -> str:
+    """Return what drivers do with a term in the model, its equation and its parameters [(estimate, low, high)].
+
+    Of a curve without a name its ``contrast`` is told.
+    """
     estimates = [v[0] for v in values]
     if len(values) <= MANY:
         shown = [p.role != "place" or term.effect is not None for p in term.parameters]
@@ -94,12 +99,31 @@ def clause(term: Term, values: Sequence[Sequence[float]]) -> str:
         told_as = f"{name}: {effect.equation}" if effect.equation else name
         return f"{text or below or f'an effect is missing that {name} describes'} ({told_as}, with {numbers})"
     below, above, noun, equation = CHANGES[term.what]
+    if contrast is not None:
+        return f"the {noun} {_contrast(term, estimates, contrast)} ({equation}, with {numbers})"
     if len(values) > MANY or term.knots[2] > 2:
         return f"the {noun} depends on {_over(term)} ({equation}, with {numbers})"
     if len(values) == 2:
         return f"the {noun} drifts over {ALONG[term.coordinate]} ({equation}, with {numbers})"
     text = below if estimates[0] < 0 else above
     return f"{text} {_interval(term, estimates)} than elsewhere ({equation}, with {numbers})"
+
+
+def _contrast(term: Term, estimates: Sequence[float], c: Contrast) -> str:
+    """Say where a curve's two surely most different knots lie, and by how much the higher one is above the lower."""
+    first, distance, _ = term.knots
+    high, low = (first + distance * knot for knot in (c.high_knot, c.low_knot))
+    unit = "s" if term.coordinate == "time" else "m" if term.coordinate == "position" else FEATURES[term.coordinate]
+    if term.what == "acceleration":
+        told = f"{number(c.estimate, 2)} m/s² [{number(c.low, 2)}, {number(c.high, 2)}] higher"
+    else:  # of relative changes c: (1 + c at the higher knot) / (1 + c at the lower one)
+        below = 1.0 + estimates[c.low_knot]
+        told = f"{100 * c.estimate / below:.0f} % [{100 * c.low / below:.0f}, {100 * c.high / below:.0f}] higher"
+    where = f"{amount(high, unit)} than at {amount(low, unit)}"
+    if "phase" in term.label:
+        where += f" of a cycle of {term.period:.0f} s"
+    of = f"a {ALONG[term.coordinate]} of " if term.fades else ""
+    return f"is {told} at {of}{where}".replace("[-", "[−")
 
 
 def _over(term: Term) -> str:
@@ -158,9 +182,10 @@ def headline(
         return f"No effect added to IDM predicts as well.{nearest}"
     if shared is not None and not clauses:
         return common(shared)
-    if verdict in (Verdict.NAMED, Verdict.ONE_OF, Verdict.LOCATED):
+    if verdict in (Verdict.NAMED, Verdict.ONE_OF, Verdict.SHAPE, Verdict.LOCATED):
         text = ", and ".join(clauses)
-        unnamed = "; the catalogue has no name for it" if verdict is Verdict.LOCATED else ""
+        without = verdict in (Verdict.SHAPE, Verdict.LOCATED)
+        unnamed = "; the catalogue has no name for it" if without else ""
         if verdict is Verdict.ONE_OF:
             unnamed = f"; or {' or '.join(plain(x) for x in others)}, which these data do not tell from it"
         return f"{text[0].upper()}{text[1:]}{unnamed}{_but(errors)}."

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from idm_env.discovery.discover import Discovery
+from idm_env.discovery.found import FILE
 from idm_env.jobs.storage import results, write_json
 from idm_env.model_file import save_model
 from idm_env.reports.page import write_page
@@ -15,17 +16,20 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
     """Write report.json, report.html (self-contained) and models into a folder; return their paths by file name.
 
     ``model.yaml`` predicts best of the models compared; where two were, the other lies beside it as
-    ``model_idm.yaml`` or ``model_corrected.yaml``.
+    ``model_idm.yaml`` or ``model_corrected.yaml``. A finding in a state that has no name is ``found_effect.py``, too.
     """
     from idm_env.discovery import page
 
     with results(out, EXPLAINED) as folder:
-        paths = {name: folder / name for name in ("report.json", "report.html", *discovery.models)}
+        unnamed = (FILE,) if discovery.found_effect else ()
+        paths = {name: folder / name for name in ("report.json", "report.html", *discovery.models, *unnamed)}
         for name in EXPLAINED:  # the other model of an earlier run would be taken for one of this
             if name not in paths:
                 (folder / name).unlink(missing_ok=True)
         write_json(paths["report.json"], discovery.report)
         for name, model in discovery.models.items():
             save_model(paths[name], model)
+        if FILE in paths:
+            paths[FILE].write_text(discovery.found_effect, encoding="utf-8")
         write_page(paths["report.html"], page.title(discovery), page.blocks(discovery))
     return paths

@@ -20,14 +20,21 @@ FEATURES: dict[str, str] = {
     "gap": "m",
     "closing_speed": "m/s",
     "lead_accel": "m/s²",
+    "relative_gap": "1",
 }
 """Features that a curve can run over, with their units."""
+FREE = 3.0
+"""Relative gap from which on a driver is free: a larger one is not told from it."""
 
 Target = Literal["time_gap", "desired_speed", "max_accel", "comfort_decel", "min_gap"]
 
 
-def feature_of(scene: Scene, feature: str, period: float | None) -> Tensor:
-    """Return a feature of the scene, in the unit of ``FEATURES``, shape ``(…, vehicles)``; ``period`` has that unit."""
+def feature_of(scene: Scene, driver: Driver, feature: str, period: float | None) -> Tensor:
+    """Return a feature of the scene, in the unit of ``FEATURES``, shape ``(…, vehicles)``; ``period`` has that unit.
+
+    The relative gap is ``min(s / (s0 + T v), 3)``.
+    """
+    kept = driver.min_gap + driver.extra_gap + driver.time_gap * scene.speed
     values = {
         "position": scene.position,
         "time": scene.time,
@@ -35,6 +42,7 @@ def feature_of(scene: Scene, feature: str, period: float | None) -> Tensor:
         "gap": scene.leader.gap,
         "closing_speed": scene.speed - scene.leader.speed,
         "lead_accel": scene.leader.accel,
+        "relative_gap": (scene.leader.gap / kept).clamp(0.0, FREE),
     }
     return along(values[feature], period)
 
@@ -73,7 +81,7 @@ class Curve(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the curve's acceleration (m/s²)."""
-        x = feature_of(scene, self.feature, self.period)
+        x = feature_of(scene, driver, self.feature, self.period)
         return curve(x, p, "knot", self.knots, self.period)
 
 
@@ -107,6 +115,6 @@ class DriverCurve(Effect):
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the target parameter changed."""
-        x = feature_of(scene, self.feature, self.period)
+        x = feature_of(scene, driver, self.feature, self.period)
         change = curve(x, p, "knot", self.knots, self.period)
         return driver._replace(**{self.target: getattr(driver, self.target) * (1.0 + change)})

@@ -13,7 +13,7 @@ from idm_env.reports.diagrams import space_time
 if TYPE_CHECKING:
     from idm_env.data import Trajectories
 
-EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml")
+EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml", "found_effect.py")
 """What ``explain`` writes."""
 
 

@@ -54,6 +54,8 @@ def places(records: Records) -> dict[str, tuple[Term, tuple[float, ...]]]:
         "T over places": (terms.interval("time_gap", "position", *middle, 0.4), (0.4, *middle)),
         "a and b over time": (terms.interval("accel_and_decel", "time", 30.0, 50.0, -0.3), (-0.3, 30.0, 50.0)),
         "push over speed": (terms.curve("acceleration", "speed", 0.0, 5.0, 5), (0.3, -0.2, 0.1, 0.2, -0.1)),
+        "push over closing speed": (terms.curve("acceleration", "closing_speed", -1.0, 1.0, 3), (0.3, -0.2, 0.2)),
+        "T over relative gap": (terms.curve("time_gap", "relative_gap", 0.6, 0.3, 4), (0.3, -0.2, 0.2, 0.1)),
         "push over phase": (terms.curve("acceleration", "time", 0.0, 4.0, 4, 16.0), (0.3, -0.2, 0.1, 0.2)),
     }
 

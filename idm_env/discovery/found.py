@@ -1,0 +1,96 @@
+"""A finding without a name, as a file with an effect: its equation, its parameters with intervals, its null."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from idm_env.discovery.march import CURVE
+from idm_env.discovery.model import Term
+from idm_env.discovery.slots import TARGETS
+from idm_env.discovery.words import ALONG, CHANGES
+from idm_env.effects.free import FEATURES
+
+FILE = "found_effect.py"
+"""Name of the file."""
+_HEAD = '''"""What `idm-env explain` found, and has no name for. {sentence}
+
+In Python: `Simulator(Lane(), (IDM(), {first}(), Brakes()))`, and `effects=[{first}()]` of an environment. In a
+`model.yaml`, with the path from where the command runs: `effects: [idm, "found_effect.py:{first}", brakes]`.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from idm_env import Effect, Parameter
+from idm_env.effects.free import feature_of
+from idm_env.effects.places import interpolate
+'''
+_CLASS = '''
+
+@dataclass(frozen=True)
+class {name}(Effect):
+    """{equation}: c is piecewise linear in x, the {noun} ({unit}){ends}.
+
+    95 % intervals: {intervals}.
+    """
+
+    kind: ClassVar[str] = "{kind}"
+    title: ClassVar[str] = "{title}"
+    equation: ClassVar[str] = "{equation}"
+    changes: ClassVar[str] = "{what}"
+    knots: ClassVar[tuple[float, ...]] = {knots}
+    declared: ClassVar[tuple[Parameter, ...]] = (
+{declared}
+    )
+
+    def {hook}:
+        """Return {returns}."""
+        x = feature_of(scene, driver, "{feature}", {period})
+        heights = [{heights}]
+        c = interpolate(x, self.knots, heights, {period})
+        return {result}
+'''
+
+
+def source(terms: Sequence[tuple[Term, Mapping[str, Mapping[str, Any]]]], sentence: str) -> str:
+    """Return the text of a file with one effect for every curve over a state, "" where there is none.
+
+    Args:
+        terms: What was added, and its parameters: estimate, low and high of each by name.
+        sentence: What is said of it.
+    """
+    curves = [(t, p) for t, p in terms if t.located and t.form == CURVE and t.fades]
+    if not curves:
+        return ""
+    classes = [_class(term, parameters) for term, parameters in curves]
+    return _HEAD.format(sentence=sentence, first=_name(curves[0][0])) + "".join(classes)
+
+
+def _name(term: Term) -> str:
+    return "".join(word.capitalize() for word in f"{term.what}_over_{term.coordinate}".split("_"))
+
+
+def _class(term: Term, parameters: Mapping[str, Mapping[str, Any]]) -> str:
+    first, distance, count = term.drawn
+    unit = term.parameters[0].unit
+    declared = [
+        f'        Parameter("{p.name}", "{p.symbol}", "{unit}", {parameters[p.name]["estimate"]!r}, {p.low}, {p.high}, '
+        "null=0.0),"
+        for p in term.parameters
+    ]
+    intervals = ", ".join(
+        f"{p.symbol} {parameters[p.name]['low']:.3g} to {parameters[p.name]['high']:.3g}" for p in term.parameters
+    )
+    inner = [f'p["{p.name}"]' for p in term.parameters]
+    added = term.what == "acceleration"
+    changed = ", ".join(f"{n}=driver.{n} * (1.0 + c)" for n in TARGETS.get(term.what, ()))
+    return _CLASS.format(
+        name=_name(term), equation=CHANGES[term.what][3].replace("k", "c"), noun=ALONG[term.coordinate],
+        unit=FEATURES[term.coordinate], ends=", and 0 beyond its ends", intervals=intervals,
+        kind=f"found_{term.what}_over_{term.coordinate}", title=f"{CHANGES[term.what][2]} by {ALONG[term.coordinate]}",
+        what=term.what, knots=tuple(float(first + distance * i) for i in range(count)), declared="\n".join(declared),
+        hook="accelerate(self, scene, driver, p)" if added else "adapt(self, driver, scene, p)",
+        returns="c (m/s²)" if added else "the driver in force", feature=term.coordinate, period=term.period or None,
+        heights=", ".join(("0.0 * x", *inner, "0.0 * x")), result="c" if added else f"driver._replace({changed})",
+    )  # fmt: skip

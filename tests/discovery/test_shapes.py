@@ -1,0 +1,123 @@
+"""An effect in a state of the driver that the catalogue has no name for: found as a shape, and written as a file."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import discovery as sets
+from idm_env.data import synthetic
+from idm_env.discovery import Discovery, crossed, discover, found, write_report
+from idm_env.discovery import model as terms
+from idm_env.discovery.compare import ERRORS
+from idm_env.discovery.march import PULSED, Catalogue
+from idm_env.discovery.model import Hypothesis, Term
+from idm_env.effects import IDM, Brakes, Effect
+from idm_env.effects.registry import read
+from idm_env.model_file import load_model
+from idm_env.roads import Lane
+from idm_env.simulator import Simulator
+
+FEW = {"runs": 10, "followers": 2, "seconds": 120.0}
+
+
+def hidden(kind: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> Discovery:
+    with monkeypatch.context() as patched:
+        patched.setattr(synthetic, "Platoon", sets.outside(synthetic.Platoon, kind))
+        trajectories, _ = synthetic.generate(seed, **FEW)  # type: ignore[arg-type]
+    return discover(trajectories)
+
+
+@pytest.fixture(scope="module")
+def closing() -> Discovery:
+    """Closing speeds count double above 2 m/s, for which the catalogue has no name."""
+    with pytest.MonkeyPatch.context() as patched:
+        return hidden("closing", 83, patched)
+
+
+def test_an_effect_without_a_name_is_a_shape(closing: Discovery) -> None:
+    report = closing.report
+    assert report["verdict"] == "shape", report["sentence"]
+    (entry,) = report["found"]
+    assert entry["effect"] is None and entry["label"] == "time_gap curve over closing_speed"
+    assert report["sentence"].startswith("The time gap is ") and "closing speed of" in report["sentence"]
+    assert report["helps"]["horizon_rmse_m"]["verdict"] == "better"
+    assert report["error"]["after"]["horizon_rmse_m"] < 0.75 * report["error"]["before"]["horizon_rmse_m"]
+
+
+def test_no_wrong_name_is_given_to_an_effect_in_two_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside a curve over one of them a bias of the gap and a curve over speed passed for findings."""
+    report = hidden("speed x gap", 84, monkeypatch).report
+    assert report["verdict"] == "shape", report["sentence"]
+    assert [f["label"] for f in report["found"]] == ["time_gap curve over gap"]
+
+
+def test_the_file_of_a_shape_is_the_model_that_was_judged(closing: Discovery, tmp_path: Path) -> None:
+    """Its effect, among the candidates of discovery's loop, leaves the errors that the report has."""
+    path = write_report(closing, tmp_path)[found.FILE]
+    effect = read(f"{path}:TimeGapOverClosingSpeed")()
+    term = terms.simple(effect)
+    base = closing.null.model
+    model = Hypothesis((*base.terms, term), Catalogue((*base.named, effect), base.catalogue.base, located=False))
+    records, kept = closing.records, closing.report["error"]["held_out_runs"]
+    fold = crossed.folds_of(records.runs, kept, closing.report["seed"])
+    values = crossed.values_of(closing.task, closing.final, records.runs, fold)
+    before = closing.judgement.before
+    assert before is not None and closing.task.noise is not None
+    errors = crossed.crossed(records, model, values, fold, closing.task.noise, whitened=before.whitened).summary()
+    after = closing.report["error"]["after"]
+    assert {key: errors[key] for key in ERRORS} == pytest.approx({key: after[key] for key in ERRORS}, rel=0.02)
+    estimates = [p["estimate"] for p in closing.report["found"][0]["parameters"].values()]
+    assert [p.default for p in effect.declared] == estimates and all(p.null == 0.0 for p in effect.declared)
+
+
+def test_a_model_may_name_the_file(closing: Discovery, tmp_path: Path) -> None:
+    path = write_report(closing, tmp_path)[found.FILE]
+    own = tmp_path / "own.yaml"
+    listed = f'[idm, "{path}:TimeGapOverClosingSpeed", brakes]'
+    own.write_text(f"configures: model\nschema: 1\neffects: {listed}\n")
+    given = load_model(own, trusted=True)
+    assert [e.name for e in given.effects] == ["idm", "found_time_gap_over_closing_speed", "brakes"]
+    assert [e.name for e in load_model(tmp_path / "model.yaml").effects][1] == "time_gap_over_closing_speed"
+
+
+def curve(what: str, coordinate: str) -> Term:
+    return terms.curve(what, coordinate, 0.5, terms.STATES[coordinate], 3)
+
+
+@pytest.mark.parametrize(("what", "coordinate"), list(product(PULSED, terms.STATES)))
+def test_every_shape_is_the_same_in_its_file_and_in_the_model(what: str, coordinate: str, tmp_path: Path) -> None:
+    term, heights = curve(what, coordinate), np.array([0.3, -0.2, 0.4])
+    told = {p.name: {"estimate": float(x), "low": 0.0, "high": 1.0}
+            for p, x in zip(term.parameters, heights, strict=True)}  # fmt: skip
+    path = tmp_path / found.FILE
+    path.write_text(found.source([(term, told)], "A sentence."), encoding="utf-8")
+    name = "".join(word.capitalize() for word in f"{what}_over_{coordinate}".split("_"))
+    of_file = read(f"{path}:{name}")()
+    of_model, numbers = terms.effects_of(Hypothesis((term,)), heights)
+    random = np.random.default_rng(0)
+    position = torch.from_numpy(np.cumsum(random.uniform(-40.0, -7.0, 60)))
+    speed = torch.from_numpy(random.uniform(0.0, 6.0, 60))
+
+    def accelerations(effects: tuple[Effect, ...], given: dict[str, dict[str, float]]) -> torch.Tensor:
+        simulator = Simulator(Lane(), (IDM(), *effects, Brakes()))
+        params = simulator.defaults(dtype=torch.float64)
+        for effect, numbers in given.items():
+            params[effect] = {k: torch.tensor(x, dtype=torch.float64) for k, x in numbers.items()}
+        state = simulator.state(position, speed, params)
+        after = simulator.step(state, {}, params)  # so that leaders have accelerations
+        return simulator.acceleration(after, {}, params)
+
+    mine, theirs = accelerations((of_file,), {}), accelerations(tuple(of_model), numbers)
+    assert torch.allclose(mine, theirs, rtol=0.0, atol=1e-9)
+    assert (mine - accelerations((), {})).abs().max() > 1e-5
+
+
+def test_what_has_a_place_or_a_time_is_no_file() -> None:
+    place = terms.interval("time_gap", "position", 700.0, 1000.0, 0.4)
+    told = {p.name: {"estimate": 0.1, "low": 0.0, "high": 1.0} for p in place.parameters}
+    assert found.source([(place, told)], "A sentence.") == ""
