@@ -28,7 +28,10 @@ def shown(value: Any) -> str:
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return ' Did you mean …?' for the nearest known word; when none is near, all words, or the best of many."""
     known, word = list(dict.fromkeys(known)), word[:200]
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    longer = [
+        k for k in known if len(word) > 2 and k.startswith(word)
+    ]  # a name cut short is nearer than one misspelled
+    close = longer if len(longer) == 1 else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     if not close and "." in word:
         close = difflib.get_close_matches(word.split(".")[-1], [k.split(".")[-1] for k in known], n=1, cutoff=0.4)
         close = [k for k in known if close and k.split(".")[-1] == close[0]][:1]

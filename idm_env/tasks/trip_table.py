@@ -80,8 +80,12 @@ def from_table(frame: Any, dtype: torch.dtype = torch.float32) -> Trips:
 
 def _columns(given: Any) -> dict[str, list[Any]]:
     if isinstance(given, (str, Path)):
-        with open(given, newline="", encoding="utf-8") as file:
-            given = list(csv.DictReader(file))
+        if not Path(given).is_file():
+            raise ValueError(f"trips = {shown(str(given))} is not a file. Give the path of a CSV file, or rows.")
+        try:
+            given = list(csv.DictReader(Path(given).read_text(encoding="utf-8").splitlines()))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"trips = {shown(str(given))} is not CSV in UTF-8: {error}. Save it as such.") from None
     if isinstance(given, Sequence) and not isinstance(given, str):
         if not given or not all(isinstance(row, Mapping) for row in given):
             raise ValueError(f"trips = {shown(given)} must be rows of {', '.join(COLUMNS)}, columns, or a CSV file.")

@@ -119,6 +119,9 @@ BAD: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "off_ramp = [500.0, 700.0] must begin behind the end of the on-ramp": (
         "open_highway", {"on_ramp": [400.0, 600.0], "off_ramp": [500.0, 700.0]}),
+    "trips = 'none.csv' is not a file": ("merge", {"trips": "none.csv"}),
+    "is not CSV in UTF-8": ("merge", {"trips": str(ROOT / "docs" / "ring.gif")}),
+    "keyword argument 'lanes'. Did you mean 'lanes_count'": ("approach", {"lanes": 3}),
     "lets nobody depart": ("merge", {"trips": {"per_hour": {1: 0}}}),
 }  # fmt: skip
 
