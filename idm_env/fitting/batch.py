@@ -58,16 +58,16 @@ class Batch:
         """
         samples = Samples.of(episodes)
         begin, end, steps = samples.bounds[:-1], samples.bounds[1:], int(samples.lengths.max())
-        at = np.minimum(begin + np.arange(steps)[:, None], end - 1)  # padded with its last sample
+        index = np.minimum(begin + np.arange(steps)[:, None], end - 1)  # padded with its last sample
 
         def rows(x: np.ndarray) -> Tensor:
-            return torch.as_tensor(x[at], dtype=dtype)
+            return torch.as_tensor(x[index], dtype=dtype)
 
         fine = substeps or max(1, math.ceil(samples.dt / INTEGRATION_STEP_S - 1e-6))
         # Everything is moved along with the driver, so that places are those of its own track at the start.
         driver = VEHICLES.index("driver")
         moved = torch.as_tensor(samples.place[begin] - samples.position[begin, driver], dtype=dtype)
-        position, speed, beside = rows(samples.position) + moved[:, None], rows(samples.speed), rows(samples.beside)
+        position, speed, adjacent = rows(samples.position) + moved[:, None], rows(samples.speed), rows(samples.beside)
         return cls(
             episodes=samples.episodes,
             dt=samples.dt,
@@ -80,7 +80,7 @@ class Batch:
             present=_held(rows(samples.present), fine),
             length=torch.as_tensor(samples.length, dtype=dtype),
             first_step=torch.as_tensor(np.round(samples.time[begin] / samples.dt * fine).astype(int)),
-            beside=(_between(beside[..., 0], fine), _between(beside[..., 1], fine), _held(beside[..., 2], fine)),
+            beside=(_between(adjacent[..., 0], fine), _between(adjacent[..., 1], fine), _held(adjacent[..., 2], fine)),
             substeps=fine,
         )
 
@@ -99,24 +99,24 @@ class Batch:
 
     def rows(self, index: Sequence[int]) -> Batch:
         """Return some of the rows, without the padding that they do not need."""
-        at = torch.as_tensor(list(index))
+        columns = torch.as_tensor(list(index))
         steps = max(len(self.episodes[i]) for i in index)
         fine = (steps - 1) * self.substeps + 1
         changes = {
-            name: getattr(self, name)[:length].index_select(1, at)
+            name: getattr(self, name)[:length].index_select(1, columns)
             for length, names in (
                 (steps, ("gap", "speed", "valid")),
                 (fine, ("position", "all_speed", "accel", "present")),
             )
             for name in names
         }
-        beside = [x[:fine].index_select(1, at) for x in self.beside]
+        adjacent = [x[:fine].index_select(1, columns) for x in self.beside]
         return dataclasses.replace(
             self,
             episodes=tuple(self.episodes[i] for i in index),
-            length=self.length[at],
-            first_step=self.first_step[at],
-            beside=(beside[0], beside[1], beside[2]),
+            length=self.length[columns],
+            first_step=self.first_step[columns],
+            beside=(adjacent[0], adjacent[1], adjacent[2]),
             **changes,
         )
 
@@ -128,17 +128,17 @@ class Batch:
 
     def start(self, simulator: Simulator, params: Params) -> State:
         """Return the measured state at the first sample, in the full shape that the parameters broadcast to."""
-        at, _ = self.columns(simulator)
-        position = self.position[0, :, at]
+        vehicles, _ = self.columns(simulator)
+        position = self.position[0, :, vehicles]
         # Of numpy: torch's own imports sympy at its first call, a CPU second.
         shape = np.broadcast_shapes(position.shape, *(x.shape for p in params.values() for x in p.values()))
         return simulator.state(
             position.expand(shape),
-            self.all_speed[0, :, at].expand(shape),
+            self.all_speed[0, :, vehicles].expand(shape),
             params,
-            length=self.length[:, at],
-            accel=self.accel[0, :, at].expand(shape),
-            present=self.present[0, :, at] if at != slice(1, 3) else None,
+            length=self.length[:, vehicles],
+            accel=self.accel[0, :, vehicles].expand(shape),
+            present=self.present[0, :, vehicles] if vehicles != slice(1, 3) else None,
             step=self.first_step,
         )
 
@@ -147,16 +147,16 @@ class Batch:
 
         Normals are drawn with ``seed``. DataError for an effect whose input no measurement has.
         """
-        at, driver = self.columns(simulator)
-        position = self.position[1:, :, at]
+        vehicles, driver = self.columns(simulator)
+        position = self.position[1:, :, vehicles]
         active = torch.arange(position.shape[-1]) != driver
         measured = {
             Replayed: Replayed(
                 position,
-                self.all_speed[1:, :, at],
-                self.accel[1:, :, at],
+                self.all_speed[1:, :, vehicles],
+                self.accel[1:, :, vehicles],
                 active.expand_as(position),
-                self.present[1:, :, at] if at != slice(1, 3) else None,
+                self.present[1:, :, vehicles] if vehicles != slice(1, 3) else None,
             ),
             Adjacent: Adjacent(*(x[:-1, :, None].expand_as(position) for x in self.beside)),
         }

@@ -92,11 +92,11 @@ class UtilityLogit(Choice):
 
     @cached_property
     def _free(self) -> tuple[Parameter, ...]:
-        known = {f"{e.name}.{p.name}": p for e in self.simulator.lane_change_models for p in e.parameters}
+        named = {f"{e.name}.{p.name}": p for e in self.simulator.lane_change_models for p in e.parameters}
         for name in self.free:
-            if name not in known:
-                raise ValueError(f"parameter '{name}' says nothing on lane changes. Take some of {', '.join(known)}.")
-        return tuple(known[name] for name in self.free)
+            if name not in named:
+                raise ValueError(f"parameter '{name}' says nothing on lane changes. Take some of {', '.join(named)}.")
+        return tuple(named[name] for name in self.free)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -278,11 +278,11 @@ def _standard_errors(model: Choice, theta: Tensor, decisions: Decisions, at_boun
 def folds(decisions: Decisions, count: int, seed: int) -> Tensor:
     """Return the fold of every vehicle, those who change and those who do not spread evenly over all of them."""
     changes = torch.zeros(len(decisions.vehicles)).index_add(0, decisions.vehicle, (decisions.chosen > 0).float())
-    drawn = torch.randperm(len(changes), generator=torch.Generator().manual_seed(seed))
-    order = drawn[torch.argsort(-(changes[drawn] > 0).int(), stable=True)]
-    found = torch.empty(len(changes), dtype=torch.int64)
-    found[order] = torch.arange(len(changes)) % count
-    return found
+    shuffle = torch.randperm(len(changes), generator=torch.Generator().manual_seed(seed))
+    order = shuffle[torch.argsort(-(changes[shuffle] > 0).int(), stable=True)]
+    fold = torch.empty(len(changes), dtype=torch.int64)
+    fold[order] = torch.arange(len(changes)) % count
+    return fold
 
 
 class HeldOut(NamedTuple):
@@ -297,20 +297,20 @@ def held_out(fitted: Sequence[Chosen], decisions: Decisions, fold: Tensor) -> li
 
     These fits begin where that to all drivers ended.
     """
-    found = []
+    results = []
     for all_drivers in fitted:
         model = all_drivers.model
-        told = torch.zeros(len(decisions), dtype=torch.float64)
+        scores = torch.zeros(len(decisions), dtype=torch.float64)
         probabilities = torch.zeros(len(decisions), 3, dtype=torch.float64)
         for k in range(int(fold.max()) + 1):
             mine = fold[decisions.vehicle] == k
             others = fit_choice(model, decisions.of(~mine), starts=[all_drivers.theta.tolist()], errors=False)
             with torch.no_grad():
                 seen = decisions.of(mine)
-                told[mine] = model.each(others.theta, seen)
+                scores[mine] = model.each(others.theta, seen)
                 probabilities[mine] = model.log_probabilities(others.theta, seen).exp()
-        found.append(HeldOut(told, probabilities))
-    return found
+        results.append(HeldOut(scores, probabilities))
+    return results
 
 
 def per_vehicle(decisions: Decisions, value: Tensor) -> Tensor:

@@ -42,8 +42,8 @@ class Estimates:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Declarations of what was fitted."""
-        known = catalogue(self.simulator.effects)
-        return tuple(known[name] for name in self.names)
+        declared = catalogue(self.simulator.effects)
+        return tuple(declared[name] for name in self.names)
 
     def own_for(self, groups: Sequence[str], pooled: Tensor) -> tuple[Tensor, list[str]]:
         """Return values [G, P] for ``groups``, and the groups that the fit has not seen.
@@ -55,12 +55,12 @@ class Estimates:
         return torch.stack(rows), [name for name in groups if name not in index]
 
     @classmethod
-    def of(cls, found: Fit) -> Estimates:
+    def of(cls, result: Fit) -> Estimates:
         """Return what one fit found."""
-        problem, told = found.problem, found.uncertainty
+        problem, errors = result.problem, result.uncertainty
         return cls(
-            problem.simulator, problem.batch.dt, problem.fixed, found.names, problem.groups, found.values(),
-            told.standard_error, told.at_bound, told.identified,
+            problem.simulator, problem.batch.dt, problem.fixed, result.names, problem.groups, result.values(),
+            errors.standard_error, errors.at_bound, errors.identified,
         )  # fmt: skip
 
     @classmethod
@@ -78,53 +78,53 @@ class Estimates:
         )  # fmt: skip
 
 
-def table(found: Fit, error: Errors, by: str) -> list[dict[str, Any]]:
+def table(result: Fit, error: Errors, by: str) -> list[dict[str, Any]]:
     """Return one row per group: episodes, gap RMSE (m), each parameter with its standard error, and what is doubtful.
 
     A driver is told by ``run_id`` and ``vehicle_id``, another ``group`` by its name. What is not identified is NaN.
     ``bounds`` and ``not_identified`` list parameters by name, separated by blanks.
     """
-    problem = found.problem
+    problem = result.problem
     count = torch.zeros(len(problem.groups)).index_add(0, problem.group, torch.ones(len(problem.batch)))
     square = torch.zeros(len(problem.groups), dtype=error.gap_rmse.dtype)
     rmse = (square.index_add(0, problem.group, error.gap_rmse.square()) / count).sqrt()
-    told = found.uncertainty
-    values, spread, bound, known = found.values(), told.standard_error, told.at_bound, told.identified
+    errors = result.uncertainty
+    values, spread, bound, identified = result.values(), errors.standard_error, errors.at_bound, errors.identified
     rows = []
     for g, group in enumerate(problem.groups):
         run, _, vehicle = group.rpartition("/")
         row: dict[str, Any] = {"run_id": run, "vehicle_id": vehicle} if by == "driver" else {"group": group}
         row |= {"episodes": int(count[g]), "gap_rmse_m": float(rmse[g])}
-        for i, name in enumerate(found.names):
-            row[name] = float(values[g, i]) if known[g, i] or bound[g, i] else math.nan
-            row[f"{name}_error"] = float(spread[g, i]) if known[g, i] and not bound[g, i] else math.nan
-        for what, which in {"bounds": bound[g], "not_identified": ~known[g] & ~bound[g]}.items():
-            row[what] = " ".join(name for name, yes in zip(found.names, which.tolist(), strict=True) if yes)
-        rows.append(row | {"converged": bool(found.converged[g])})
+        for i, name in enumerate(result.names):
+            row[name] = float(values[g, i]) if identified[g, i] or bound[g, i] else math.nan
+            row[f"{name}_error"] = float(spread[g, i]) if identified[g, i] and not bound[g, i] else math.nan
+        for what, which in {"bounds": bound[g], "not_identified": ~identified[g] & ~bound[g]}.items():
+            row[what] = " ".join(name for name, yes in zip(result.names, which.tolist(), strict=True) if yes)
+        rows.append(row | {"converged": bool(result.converged[g])})
     return rows
 
 
-def bounds(found: Estimates) -> list[dict[str, Any]]:
+def bounds(estimates: Estimates) -> list[dict[str, Any]]:
     """Return one row per parameter: median, 10 and 90 %, and how many groups have it on a bound or not identified."""
-    values = found.values
+    values = estimates.values
     rows = []
-    for i, (name, p) in enumerate(zip(found.names, found.parameters, strict=True)):
-        on = found.at_bound[:, i]
+    for i, (name, p) in enumerate(zip(estimates.names, estimates.parameters, strict=True)):
+        on = estimates.at_bound[:, i]
         lower = on & (values[:, i] < 0.5 * (p.low + p.high))
         low, middle, high = np.quantile(values[:, i].numpy(), [0.1, 0.5, 0.9]).tolist()
         rows.append({
             "parameter": name, "words": p.words, "symbol": p.symbol, "unit": p.unit,
             "median": middle, "p10": low, "p90": high, "low": p.low, "high": p.high,
             "groups": len(values), "on_low": int(lower.sum()), "on_high": int((on & ~lower).sum()),
-            "not_identified": int((~found.identified[:, i] & ~on).sum()),
+            "not_identified": int((~estimates.identified[:, i] & ~on).sum()),
         })  # fmt: skip
     return rows
 
 
 def sentence(rows: list[dict[str, Any]]) -> str:
     """Return which parameters sit on a bound for how many groups, most first."""
-    told = [f"{words} for {n} of {rows[0]['groups']}" for words, n in _on_bounds(rows) if n]
-    return f"On its bound: {', '.join(told)}." if told else "No parameter is on a bound."
+    parts = [f"{words} for {n} of {rows[0]['groups']}" for words, n in _on_bounds(rows) if n]
+    return f"On its bound: {', '.join(parts)}." if parts else "No parameter is on a bound."
 
 
 def _on_bounds(rows: list[dict[str, Any]]) -> list[tuple[str, int]]:
@@ -151,7 +151,7 @@ def over_fitting(rows: list[dict[str, Any]], fitted: float, held_out: float | No
     return f"Over-fitting: {', and '.join(signs)}. {cure}, or with a prior (idm_env.fitting.fit.fit(prior=...))."
 
 
-def blocks(found: Estimates, rows: Sequence[dict[str, Any]], shares: list[dict[str, Any]]) -> list[page.Block]:
+def blocks(estimates: Estimates, rows: Sequence[dict[str, Any]], shares: list[dict[str, Any]]) -> list[page.Block]:
     """Return the table of parameters with their shares at bounds, and the table of drivers.
 
     ``rows`` are those of the first ``MOST_ROWS`` drivers at least.
@@ -175,23 +175,23 @@ def blocks(found: Estimates, rows: Sequence[dict[str, Any]], shares: list[dict[s
         }
         for row in shares
     ]
-    several = len(found.groups) > MOST_ROWS
-    listed = [_row(found, row) for row in rows[:MOST_ROWS]]
+    several = len(estimates.groups) > MOST_ROWS
+    listed = [_row(estimates, row) for row in rows[:MOST_ROWS]]
     return [
         page.table(parameters),
         page.note("10 % and 90 %: so many of the groups lie below. Lowest and highest: where a parameter may lie."),
-        page.heading("One row per driver" if found.groups != ("all",) else "All drivers together"),
+        page.heading("One row per driver" if estimates.groups != ("all",) else "All drivers together"),
         page.table(listed),
         page.note(
             "After ±: standard error, which allows for correlated residuals, not for a wrong model. ⊣: on its bound, "
             "?: not identified by these data (standard error above half of the value). A click on a heading sorts. "
-            + (f"The first {MOST_ROWS} of {len(found.groups)} rows; all" if several else "The same rows")
+            + (f"The first {MOST_ROWS} of {len(estimates.groups)} rows; all" if several else "The same rows")
             + " are in drivers.csv."
         ),
     ]
 
 
-def _row(found: Estimates, row: dict[str, Any]) -> dict[str, Any]:
+def _row(estimates: Estimates, row: dict[str, Any]) -> dict[str, Any]:
     name = row["group"] if "group" in row else f"{row['run_id']}/{row['vehicle_id']}"
     shown: dict[str, Any] = {
         "driver": name, "episodes": row["episodes"], "gap RMSE (m)": page.Cell(
@@ -199,7 +199,7 @@ def _row(found: Estimates, row: dict[str, Any]) -> dict[str, Any]:
         ),
     }  # fmt: skip
     on, doubtful = (row["bounds"] or "").split(), (row["not_identified"] or "").split()
-    for name, p in zip(found.names, found.parameters, strict=True):
+    for name, p in zip(estimates.names, estimates.parameters, strict=True):
         value, spread = row[name], row[f"{name}_error"]
         unit = "" if p.unit == "1" else f" ({p.unit})"
         after = "⊣" if name in on else "" if spread is None else f"± {spread:.1g}"

@@ -220,8 +220,8 @@ def _phase(
     name: str, problem: Problem, own: Tensor, shared: Tensor, iterations: int, saved: storage.Store,
     on_progress: OnProgress | None,
 ) -> tuple[Progress, Normal]:  # fmt: skip
-    found = saved.get(name)
-    progress = Progress.begin(own, shared) if found is None else Progress(**found)
+    state = saved.get(name)
+    progress = Progress.begin(own, shared) if state is None else Progress(**state)
 
     def on_step(now: Progress, equations: Normal) -> None:
         saved.put(name, dataclasses.asdict(now))

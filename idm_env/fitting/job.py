@@ -80,12 +80,12 @@ class _Work(NamedTuple):
     def pieces(self, data: Sequence[Sequence[Episode] | FolderSlice], by: str, name: str) -> tuple[Piece, ...]:
         """Return the parts of a fit and where they are kept; one that is alone is kept step by step."""
         inputs = stamp(self.source.path), self.options.model and Path(self.options.model)
-        asked = dataclasses.replace(self.source, path=Path()), self.options, by, self.part
-        kept = self.out / storage.UNFINISHED
-        parts = Parts(kept / f"{name}-parts", storage.fingerprint(asked, *inputs), self.resume)
-        alone = kept / name if len(data) == 1 else None
+        request = dataclasses.replace(self.source, path=Path()), self.options, by, self.part
+        folder = self.out / storage.UNFINISHED
+        parts = Parts(folder / f"{name}-parts", storage.fingerprint(request, *inputs), self.resume)
+        checkpoint = folder / name if len(data) == 1 else None
         return tuple(
-            Piece(n, len(data), one, self.source, self.options, by, parts, alone, self.resume)
+            Piece(n, len(data), one, self.source, self.options, by, parts, checkpoint, self.resume)
             for n, one in enumerate(data)
         )
 
@@ -110,16 +110,16 @@ def _fit_file(work: _Work) -> dict[str, Any]:
     if options.held_out is not None:
         fitting, held = trajectories.split(options.held_out, seed=options.seed)
     chosen = source.episodes(fitting)
-    found = work.fit(pieces.cut(chosen, options.by, work.part), options.by, "fit")
-    held_out, left_out, pooled = None, list(chosen.left_out), found
+    joined = work.fit(pieces.cut(chosen, options.by, work.part), options.by, "fit")
+    held_out, left_out, pooled = None, list(chosen.left_out), joined
     if held is not None:
         if options.by != "all":
             pooled = work.fit([chosen], "all", "pooled", "held out: ")
-        held_out, lost = _held_out(source, options, held, found.estimates, pooled.estimates)
+        held_out, lost = _held_out(source, options, held, joined.estimates, pooled.estimates)
         left_out += lost
     data = {**trajectories.summary(), "left_out": [str(r) for r in chosen.left_out], "episodes": len(chosen)}
     data["account"] = page.account(by_kind(trajectories.repairs), by_kind(left_out))
-    result = _write(work, found, held_out, data, marks(trajectories, _drivers(chosen)).values())
+    result = _write(work, joined, held_out, data, marks(trajectories, _drivers(chosen)).values())
     pooled.parts.remove()
     return result
 
@@ -132,17 +132,17 @@ def _fit_folder(work: _Work) -> dict[str, Any]:
     if options.held_out is not None:
         raise ValueError("held_out cannot be drawn from a folder. Keep a file back, and simulate the model on it.")
     work.progress("reading", 0, 0, source.path.name)
-    found = work.fit(shares(source.path, work.part, source.columns), "driver", "fit")
-    tracks = [track for told in found.summaries for track in told["tracks"]]
-    return _write(work, found, None, pieces.account_of(found, source.path.name), tracks)
+    joined = work.fit(shares(source.path, work.part, source.columns), "driver", "fit")
+    tracks = [track for summary in joined.summaries for track in summary["tracks"]]
+    return _write(work, joined, None, pieces.account_of(joined, source.path.name), tracks)
 
 
 def _write(
-    work: _Work, found: JoinedFit, held_out: dict[str, Any] | None, data: dict[str, Any], tracks: Iterable[str]
+    work: _Work, joined: JoinedFit, held_out: dict[str, Any] | None, data: dict[str, Any], tracks: Iterable[str]
 ) -> dict[str, Any]:
     """Join the parts to the files that were promised, and return the report."""
-    out, options, estimates = work.out, work.options, found.estimates
-    error = found.errors.summary()
+    out, options, estimates = work.out, work.options, joined.estimates
+    error = joined.errors.summary()
     bounds, many = drivers.bounds(estimates), len(estimates.groups) > drivers.MOST_ROWS
     result: dict[str, Any] = {
         "schema": 1,
@@ -152,8 +152,8 @@ def _write(
         "fit": {
             **error,
             "groups": len(estimates.groups),
-            "converged": found.converged,
-            "iterations": found.iterations,
+            "converged": joined.converged,
+            "iterations": joined.iterations,
         },
         "held_out": held_out,
         "at_bounds": drivers.sentence(bounds),
@@ -165,19 +165,20 @@ def _write(
         "versions": page.versions(),
     }
     work.progress("writing", 0, 0, "the report")
-    found.parts.join(pieces.DRIVERS, out / "drivers.csv")
-    found.parts.join(pieces.PARAMETERS, out / "parameters.parquet")
+    joined.parts.join(pieces.DRIVERS, out / "drivers.csv")
+    joined.parts.join(pieces.PARAMETERS, out / "parameters.parquet")
     if not many:
         result["parameters"] = pl.read_parquet(out / "parameters.parquet", glob=False).to_dicts()
-    table = pl.scan_parquet(found.parts.tables(pieces.DRIVERS), glob=False).head(drivers.MOST_ROWS).collect().to_dicts()
+    rows = pl.scan_parquet(joined.parts.tables(pieces.DRIVERS), glob=False)
+    table = rows.head(drivers.MOST_ROWS).collect().to_dicts()
     model = dataclasses.replace(model_of(estimates, options.by), substeps=options.substeps)
     if len(estimates.groups) <= MOST_DRIVERS:
         model = dataclasses.replace(model, fitted_on={"source": data["source"], "tracks": sorted(set(tracks))})
     save_model(out / "model.yaml", model)
     storage.write_json(out / "report.json", result)
     title = f"{estimates.simulator.base.title} fitted to {data['source']}"
-    page.write_page(out / "report.html", title, _fit_page(result, found, table))
-    found.parts.remove()
+    page.write_page(out / "report.html", title, _fit_page(result, joined, table))
+    joined.parts.remove()
     return result
 
 
@@ -186,17 +187,17 @@ def _drivers(items: Episodes) -> list[tuple[str, str]]:
 
 
 def _held_out(
-    source: Source, options: Options, held: Trajectories, found: Estimates, pooled: Estimates
+    source: Source, options: Options, held: Trajectories, estimates: Estimates, pooled: Estimates
 ) -> tuple[dict[str, Any], tuple[Repair, ...]]:
     """Return the errors on runs that the fit has not seen, and what of them was left out."""
     items = source.episodes(held)
     batch = Batch.of(items, substeps=options.substeps)
     group, names = group_of(batch.episodes, options.by)
     problem = Problem(
-        dataclasses.replace(found.simulator, dt=batch.step), batch, found.names, (), group, names,
-        objective=options.objective, relative=options.relative, loss=options.loss, fixed=found.fixed,
+        dataclasses.replace(estimates.simulator, dt=batch.step), batch, estimates.names, (), group, names,
+        objective=options.objective, relative=options.relative, loss=options.loss, fixed=estimates.fixed,
     )  # fmt: skip
-    own, unseen = found.own_for(names, pooled.values[0])
+    own, unseen = estimates.own_for(names, pooled.values[0])
     error, _ = errors(problem, own, own[0, :0])
     return {
         **error.summary(),
@@ -206,29 +207,29 @@ def _held_out(
     }, items.left_out
 
 
-def model_of(found: Estimates, by: str = "driver") -> Model:
+def model_of(estimates: Estimates, by: str = "driver") -> Model:
     """Return estimates ``by`` groups as a model: their median as its parameters, every group as a driver of its own.
 
     Above ``MOST_DRIVERS`` groups it has the median only.
     """
 
     def named(row: torch.Tensor) -> dict[str, float]:
-        return dict(zip(found.names, row.tolist(), strict=True))
+        return dict(zip(estimates.names, row.tolist(), strict=True))
 
-    simulator = found.simulator
-    several = 1 < len(found.groups) <= MOST_DRIVERS
+    simulator = estimates.simulator
+    several = 1 < len(estimates.groups) <= MOST_DRIVERS
     return Model(
         effects=simulator.without("replay").effects if "replay" in simulator.by_name else simulator.effects,
-        parameters=nested({**named(found.values.median(0).values), **found.fixed}),
-        dt=found.dt,
+        parameters=nested({**named(estimates.values.median(0).values), **estimates.fixed}),
+        dt=estimates.dt,
         integration=simulator.integration,
-        drivers={g: nested(named(found.values[i])) for i, g in enumerate(found.groups)} if several else {},
+        drivers={g: nested(named(estimates.values[i])) for i, g in enumerate(estimates.groups)} if several else {},
         by=by,
     )
 
 
 def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, Any]]) -> list[page.Block]:
-    held, found = result["held_out"], joined.estimates
+    held, estimates = result["held_out"], joined.estimates
     lead = (
         f"{result['fit']['episodes']} episodes of {result['fit']['groups']} groups: mean gap RMSE "
         f"{result['fit']['gap_rmse_m']:.2f} m, speed RMSE {result['fit']['speed_rmse_mps']:.2f} m/s, in free "
@@ -237,7 +238,7 @@ def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, A
     if held is not None:
         lead += f" On {held['episodes']} episodes held out: {held['gap_rmse_m']:.2f} m."
     rows = [{"": "fitted", **result["fit"]}] + ([] if held is None else [{"": "held out", **held}])
-    drawn = joined.pictures
+    figures = joined.pictures
     several = (
         [page.note(f"Pictures are of the first of {len(joined.summaries)} parts.")] if joined.summaries[1:] else []
     )
@@ -252,10 +253,10 @@ def _fit_page(result: dict[str, Any], joined: JoinedFit, table: list[dict[str, A
             "an estimate: the data would have it beyond."
         ),
         *several,
-        *(block for title, one in zip(titles, drawn, strict=False) for block in (page.heading(title), one)),
+        *(block for title, one in zip(titles, figures, strict=False) for block in (page.heading(title), one)),
         page.heading("Parameters"),
-        *([pictures.parameters(found)] if len(found.groups) > 1 else []),
-        *drivers.blocks(found, table, result["bounds"]),
+        *([pictures.parameters(estimates)] if len(estimates.groups) > 1 else []),
+        *drivers.blocks(estimates, table, result["bounds"]),
         *_data_section(result),
     ]
 
@@ -277,10 +278,10 @@ def _data_section(result: dict[str, Any]) -> list[page.Block]:
 
 def _seen(model: Model, trajectories: Trajectories, items: Episodes, error: Errors) -> dict[str, Any]:
     """Return how many episodes are of tracks that the model was fitted on, the error on the others, and it in words."""
-    known = seen(trajectories, _drivers(items), model.fitted_on.get("tracks", ()))
-    new = torch.tensor([driver not in (known or ()) for driver in _drivers(items)])
+    overlap = seen(trajectories, _drivers(items), model.fitted_on.get("tracks", ()))
+    new = torch.tensor([driver not in (overlap or ()) for driver in _drivers(items)])
     count, others = int((~new).sum()), float(error.gap_rmse[new].mean()) if new.any() else None
-    if known is None:
+    if overlap is None:
         words = "of which the model does not say whether it was fitted on them."
     elif others is None:
         words = "fitted on these data: not a held-out figure."
@@ -292,8 +293,8 @@ def _seen(model: Model, trajectories: Trajectories, items: Episodes, error: Erro
     else:
         words = "on data that the model was not fitted on."
     return {
-        "source": model.fitted_on.get("source"), "episodes_fitted_on": None if known is None else count,
-        "gap_rmse_of_others_m": None if known is None else others, "words": words,
+        "source": model.fitted_on.get("source"), "episodes_fitted_on": None if overlap is None else count,
+        "gap_rmse_of_others_m": None if overlap is None else others, "words": words,
     }  # fmt: skip
 
 

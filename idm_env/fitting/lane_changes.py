@@ -91,10 +91,10 @@ class LaneChanges(NamedTuple):
         bins = min(5, max(2, self.decisions.changes // 5))
         order = risk.argsort()
         share = risk[order].cumsum(0) / risk.sum()
-        at = torch.bucketize(share, torch.linspace(0, 1, bins + 1, dtype=torch.float64)[1:-1])
+        bin_of = torch.bucketize(share, torch.linspace(0, 1, bins + 1, dtype=torch.float64)[1:-1])
         rows = []
         for k in range(bins):
-            mine = order[at == k]
+            mine = order[bin_of == k]
             if len(mine):
                 rows.append({
                     "decisions": len(mine), "lowest": float(risk[mine].min()), "highest": float(risk[mine].max()),
@@ -144,21 +144,21 @@ def _model(options: ChangeOptions) -> Model:
         model = load_model(Path(options.model))
     else:
         model = Model((base_named(options.base) if options.base else IDM(), Brakes()))
-    kept = tuple(e for e in model.effects if e.takes not in (Command, Record) and e.name != Mobil.kind)
-    return replace(model, effects=(*kept, Mobil(every=options.every)))
+    effects = tuple(e for e in model.effects if e.takes not in (Command, Record) and e.name != Mobil.kind)
+    return replace(model, effects=(*effects, Mobil(every=options.every)))
 
 
 def _params_of(model: Model) -> Any:
     """Return a function of ``"run/vehicle"``: the driver's own parameters where the model knows him."""
-    known: dict[str | None, Params] = {}
+    cache: dict[str | None, Params] = {}
 
-    def of(vehicle: str) -> Params:
+    def params(vehicle: str) -> Params:
         key = vehicle if model.by == "driver" and vehicle in model.drivers else None
-        if key not in known:
-            known[key] = model.params(key, dtype=torch.float64)
-        return known[key]
+        if key not in cache:
+            cache[key] = model.params(key, dtype=torch.float64)
+        return cache[key]
 
-    return of
+    return params
 
 
 def fit_lane_changes(
@@ -169,17 +169,17 @@ def fit_lane_changes(
     with storage.results(out, WRITTEN, (source.path, options.model)):
         progress("reading", 0, 0, source.path.name)
         trajectories = source.trajectories()
-        found = lane_changes(trajectories, options, progress)
+        fit = lane_changes(trajectories, options, progress)
         progress("writing", 0, 0, "the report")
-        result = _result(found, trajectories, options)
-        save_model(out / "model.yaml", found.model)
+        result = _result(fit, trajectories, options)
+        save_model(out / "model.yaml", fit.model)
         storage.write_json(out / "report.json", result)
-        page.write_page(out / "report.html", f"Lane changes of {trajectories.source}", _page(found, result))
+        page.write_page(out / "report.html", f"Lane changes of {trajectories.source}", _page(fit, result))
         return result
 
 
-def _result(found: LaneChanges, trajectories: Trajectories, options: ChangeOptions) -> dict[str, Any]:
-    decisions, compared = found.decisions, found.compared()
+def _result(fit: LaneChanges, trajectories: Trajectories, options: ChangeOptions) -> dict[str, Any]:
+    decisions, compared = fit.decisions, fit.compared()
     account = page.account(by_kind(trajectories.repairs), by_kind(decisions.left_out))
     left = int((decisions.chosen == 1).sum())
     return {
@@ -191,34 +191,34 @@ def _result(found: LaneChanges, trajectories: Trajectories, options: ChangeOptio
             "count": len(decisions), "changes": decisions.changes, "left": left, "right": decisions.changes - left,
             "vehicles": int(decisions.vehicle.unique().numel()),
         },
-        "parameters": found.mobil.table(),
+        "parameters": fit.mobil.table(),
         "models": compared,
-        "calibration": found.calibration(),
-        "sentence": _sentence(found, compared),
+        "calibration": fit.calibration(),
+        "sentence": _sentence(fit, compared),
         "versions": page.versions(),
     }  # fmt: skip
 
 
-def _sentence(found: LaneChanges, compared: list[dict[str, Any]]) -> str:
+def _sentence(fit: LaneChanges, compared: list[dict[str, Any]]) -> str:
     """Return what was found, in words that follow the figures."""
-    decisions = found.decisions
-    said = []
+    decisions = fit.decisions
+    verdicts = []
     for row in compared[1:]:
         gain, error = row["mobil_gains"], row["standard_error"]
         word = "better than" if gain > 1.96 * error else "worse than" if gain < -1.96 * error else "not told from"
-        said.append(f"{word} {row['model']} ({gain:+.1f} ± {error:.1f})")
-    unknown = [row["parameter"] for row in found.mobil.table() if not row["identified"]]
+        verdicts.append(f"{word} {row['model']} ({gain:+.1f} ± {error:.1f})")
+    unknown = [row["parameter"] for row in fit.mobil.table() if not row["identified"]]
     doubt = f" Not identified by these data: {', '.join(map(str, unknown))}." if unknown else ""
     few = (
         f" {decisions.changes} changes are few: take these numbers as a description." if decisions.changes < FEW else ""
     )
     return (
         f"{decisions.changes} lane changes in {len(decisions)} decisions. On drivers whom the fit has not seen, by "
-        f"log-likelihood, MOBIL is {' and '.join(said)}.{doubt}{few}"
+        f"log-likelihood, MOBIL is {' and '.join(verdicts)}.{doubt}{few}"
     )
 
 
-def _page(found: LaneChanges, result: dict[str, Any]) -> list[page.Block]:
+def _page(fit: LaneChanges, result: dict[str, Any]) -> list[page.Block]:
     names = {
         "model": "model", "parameters": "parameters", "fitted": "log-likelihood, fitted",
         "held_out": "log-likelihood, held out", "mobil_gains": "MOBIL gains", "standard_error": "± (over drivers)",
@@ -236,7 +236,7 @@ def _page(found: LaneChanges, result: dict[str, Any]) -> list[page.Block]:
         ),
         page.heading("Drivers that were held out"),
         page.table([{title: row[name] for name, title in names.items()} for row in result["models"]]),
-        _calibration_picture(found),
+        _calibration_picture(fit),
         page.table(result["calibration"]),
         page.heading("Data"),
         page.text(
@@ -249,12 +249,12 @@ def _page(found: LaneChanges, result: dict[str, Any]) -> list[page.Block]:
     ]
 
 
-def _calibration_picture(found: LaneChanges) -> page.Block:
+def _calibration_picture(fit: LaneChanges) -> page.Block:
     """Draw observed over expected changes, by bins, for all models."""
     figure, axes = page.figure(1, 1, size=(5.6, 3.6))
     axis, most = axes[0, 0], 1.0
-    for k, (chosen, colour) in enumerate(zip(found.fitted, ("#1e5adc", "#999999", "#d1495b"), strict=True)):
-        rows = found.calibration(k)
+    for k, (chosen, colour) in enumerate(zip(fit.fitted, ("#1e5adc", "#999999", "#d1495b"), strict=True)):
+        rows = fit.calibration(k)
         rate, seen = (np.array([row[n] / row["decisions"] * 100 for row in rows]) for n in ("expected", "observed"))
         error = np.array([np.sqrt(max(row["observed"], 1)) / row["decisions"] * 100 for row in rows])
         axis.errorbar(rate, seen, error, fmt="o-", ms=4, lw=1, color=colour, label=chosen.model.title)

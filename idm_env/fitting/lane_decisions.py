@@ -102,7 +102,7 @@ def recorded_decisions(
         raise DataError(f"{trajectories.source}: no column 'lane'. Lane changes need the lane of every row.")
     if first_lane not in ("left", "right"):
         raise DataError(f"first_lane = {first_lane!r} must be 'left' or 'right'.")
-    wanted = None if trajectories.drivers is None else {f"{r}/{v}" for r, v in trajectories.drivers}
+    drivers_taken = None if trajectories.drivers is None else {f"{r}/{v}" for r, v in trajectories.drivers}
     names: list[str] = []
     parts: list[tuple[Scene, Params, Tensor, Tensor, Tensor]] = []
     lost = {"without a lane": int(table["lane"].null_count()), "several lanes at once": 0, "beside another vehicle": 0}
@@ -110,12 +110,12 @@ def recorded_decisions(
         rows = table.filter((pl.col("run_id") == run) & pl.col("lane").is_not_null())
         if rows.height == 0:
             continue
-        found, ids = _on_clock(rows, run, trajectories.steps[run], every, ahead, first_lane)
-        mine = np.array([wanted is None or f"{run}/{v}" in wanted for v in ids])
+        clocked, ids = _on_clock(rows, run, trajectories.steps[run], every, ahead, first_lane)
+        mine = np.array([drivers_taken is None or f"{run}/{v}" in drivers_taken for v in ids])
         drivers = [params_of(f"{run}/{v}") for v in ids]
-        for begin in range(0, len(found.position), max(1, ROWS // len(ids))):
+        for begin in range(0, len(clocked.position), max(1, ROWS // len(ids))):
             times = slice(begin, begin + max(1, ROWS // len(ids)))
-            parts += _decided(found, times, mine, simulator, drivers, len(names), lost)
+            parts += _decided(clocked, times, mine, simulator, drivers, len(names), lost)
         names += [f"{run}/{v}" for v in ids]
     if not any(len(part[-1]) for part in parts):
         raise DataError(f"{trajectories.source}: no driver has a lane beside his own. Lane changes need several lanes.")
@@ -140,16 +140,16 @@ def _on_clock(
     step = np.round((time - time.min()) / dt).astype(int)
     ids = rows["vehicle_id"].unique(maintain_order=True).to_list()
     index = {v: i for i, v in enumerate(ids)}
-    at = step, np.array([index[v] for v in rows["vehicle_id"].to_list()])
+    cell = step, np.array([index[v] for v in rows["vehicle_id"].to_list()])
     shape = (int(step.max()) + 1, len(ids))
     numbers = np.unique(rows["lane"].to_numpy())
     rank = np.searchsorted(numbers, rows["lane"].to_numpy())
     lane = np.full(shape, -1)
-    lane[at] = len(numbers) - 1 - rank if first_lane == "left" else rank
+    lane[cell] = len(numbers) - 1 - rank if first_lane == "left" else rank
 
     def column(name: str) -> np.ndarray:
         values = np.full(shape, np.nan)
-        values[at] = rows[name].to_numpy().astype(float)
+        values[cell] = rows[name].to_numpy().astype(float)
         return values
 
     position, speed, length = column("position_m"), column("speed_mps"), column("length_m")
@@ -185,29 +185,29 @@ def _decided(
     first: int, lost: dict[str, int],
 ) -> list[tuple[Scene, Params, Tensor, Tensor, Tensor]]:  # fmt: skip
     """Return scene, parameters, possible sides, choices and vehicles of some times of a run."""
-    there = np.isfinite(run.position[times]) & np.isfinite(run.speed[times]) & (run.lane[times] >= 0)
-    if run.count == 1 or not there.any():
+    valid = np.isfinite(run.position[times]) & np.isfinite(run.speed[times]) & (run.lane[times] >= 0)
+    if run.count == 1 or not valid.any():
         return []
     # Slots are those who are there at one time: of a long record these are few.
-    slot = np.argsort(~there, axis=1, kind="stable")[:, : int(there.sum(1).max())]
+    slot = np.argsort(~valid, axis=1, kind="stable")[:, : int(valid.sum(1).max())]
 
     def cut(x: np.ndarray, fill: float = 0.0) -> Tensor:
-        return torch.as_tensor(np.take_along_axis(np.where(there, x[times], fill), slot, 1))
+        return torch.as_tensor(np.take_along_axis(np.where(valid, x[times], fill), slot, 1))
 
-    present = torch.as_tensor(np.take_along_axis(there, slot, 1))
+    present = torch.as_tensor(np.take_along_axis(valid, slot, 1))
     lane, before, after = (cut(x).long() for x in (run.lane, run.before, run.after))
-    made = simulator(_road(run))
+    sim = simulator(_road(run))
     own = _of_slots(params, torch.as_tensor(slot))
-    state = made.state(
+    state = sim.state(
         cut(run.position), cut(run.speed), own, length=cut(run.length, 1.0), accel=cut(run.accel),
         present=present.double(), lane=lane, step=torch.arange(len(slot)),
     )  # fmt: skip
-    view = made.road.view(state)
+    view = sim.road.view(state)
     assert isinstance(view, Linked)
     with torch.no_grad():
         order = view.order(state.present)
         sides = view.side(order, 1, state), view.side(order, -1, state)
-        scene = beside(made, view, sides, state, {}, own)
+        scene = beside(sim, view, sides, state, {}, own)
     possible = torch.stack([side.exists & (side.gap > 0) & (side.back_gap > 0) for side in sides], -1)
     # A driver has decided already where the lane he is in is not the one that he decided for.
     decides = present & torch.as_tensor(mine)[torch.as_tensor(slot)] & (before == lane) & (after >= 0)
@@ -251,8 +251,8 @@ def _joined(parts: list[Any]) -> Any:
     if isinstance(first, dict):
         return {name: _joined([part[name] for part in parts]) for name in first}
     if isinstance(first, tuple):
-        made = [_joined([part[i] for part in parts]) for i in range(len(first))]
-        return type(first)(*made) if hasattr(first, "_fields") else tuple(made)
+        fields = [_joined([part[i] for part in parts]) for i in range(len(first))]
+        return type(first)(*fields) if hasattr(first, "_fields") else tuple(fields)
     return first
 
 

@@ -51,12 +51,12 @@ class Source:
 
     def episodes(self, trajectories: Trajectories) -> Episodes:
         """Return the drivers behind leaders, cut to windows where asked."""
-        found = episodes(
+        items = episodes(
             trajectories, min_seconds=self.min_seconds, max_gap=self.max_gap, smooth=self.smooth, dt=self.dt
         )
         if self.window is None:
-            return found
-        return Episodes(tuple(windows(found, self.window)), found.left_out)
+            return items
+        return Episodes(tuple(windows(items, self.window)), items.left_out)
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,12 @@ class Options:
             raise ValueError(f"base = '{self.base}', and the model {self.model} has one. Leave one of them out.")
         saved = load_model(Path(self.model))
         simulator = Simulator(Lane(), behind_records(saved), dt=saved.dt, integration=saved.integration)
-        kept = {
+        fixed = {
             f"{effect}.{name}": float(value)
             for effect, parameters in saved.parameters.items() if effect != simulator.base.name
             for name, value in parameters.items()
         }  # fmt: skip
-        return simulator, kept
+        return simulator, fixed
 
 
 def behind_records(model: Model) -> tuple[Effect, ...]:

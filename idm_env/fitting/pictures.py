@@ -72,11 +72,11 @@ def _bands(axis: Any, x: np.ndarray, residual: np.ndarray, most: int = 40) -> No
     edges = np.linspace(x.min(), max(x.max(), x.min() + 1e-6), most + 1)
     index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, most - 1)
     enough = max(5, len(x) // (20 * most))
-    told = [b for b in range(most) if (index == b).sum() >= enough]
-    if not told:
+    bins = [b for b in range(most) if (index == b).sum() >= enough]
+    if not bins:
         return
-    middle = 0.5 * (edges[:-1] + edges[1:])[told]
-    levels = np.array([np.percentile(residual[index == b], [5, 25, 50, 75, 95]) for b in told]).T
+    middle = 0.5 * (edges[:-1] + edges[1:])[bins]
+    levels = np.array([np.percentile(residual[index == b], [5, 25, 50, 75, 95]) for b in bins]).T
     axis.fill_between(middle, levels[0], levels[4], color=SIMULATED, alpha=0.15, lw=0, label="5 … 95 %")
     axis.fill_between(middle, levels[1], levels[3], color=SIMULATED, alpha=0.3, lw=0, label="quartiles")
     axis.plot(middle, levels[2], color=SIMULATED, lw=1.5, label="median")
@@ -120,13 +120,13 @@ def _lane(episode: Episode) -> int:
     return -1 if lanes is None or not len(lanes) else int(np.median(lanes))
 
 
-def parameters(found: Estimates) -> page.Block:
+def parameters(estimates: Estimates) -> page.Block:
     """Draw the distribution over groups of every free parameter, or estimates with intervals for a few groups."""
-    names = found.names
+    names = estimates.names
     figure, axes = page.figure(1, len(names), size=(2.3 * len(names), 2.8))
-    values = found.values.numpy()
-    spread = found.standard_error.numpy()
-    for i, (name, p) in enumerate(zip(names, found.parameters, strict=True)):
+    values = estimates.values.numpy()
+    spread = estimates.standard_error.numpy()
+    for i, (name, p) in enumerate(zip(names, estimates.parameters, strict=True)):
         axis = axes[0, i]
         if len(values) > 12:
             axis.hist(values[:, i], bins=min(30, len(values) // 3), color="#2e6f9e")
@@ -137,7 +137,7 @@ def parameters(found: Estimates) -> page.Block:
             room = np.stack((values[:, i] - p.low, p.high - values[:, i])).clip(0.0)
             bars = np.minimum(half, room)
             axis.errorbar(np.arange(len(values)), values[:, i], bars, fmt="o", color="#2e6f9e", capsize=3)
-            axis.set_xticks(np.arange(len(values)), [g[:14] for g in found.groups], rotation=90, fontsize=7)
+            axis.set_xticks(np.arange(len(values)), [g[:14] for g in estimates.groups], rotation=90, fontsize=7)
         axis.set_title(f"{name.split('.')[1]} {p.symbol} ({p.unit})", fontsize=9)
         axis.grid(alpha=0.25)
     caption = "Estimates of all groups." if len(values) > 12 else "Estimates with 95 % intervals."

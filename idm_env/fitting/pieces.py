@@ -84,40 +84,40 @@ def _fit_piece(piece: Piece, on_progress: OnProgress) -> None:
         except DataError as wrong:
             parts.finish(number, {"lost": str(wrong), "share": str(piece.data)})
             return
-        summary = _told(trajectories, items.left_out)
+        summary = _summary(trajectories, items.left_out)
         summary["tracks"] = sorted(set(marks(trajectories, [(e.run_id, e.vehicle_id) for e in items]).values()))
         data: Sequence[Episode] = items
     else:
         data = piece.data
     simulator, fixed = options.simulator()
-    found = fit(
+    result = fit(
         data, by=piece.by, simulator=simulator, objective=options.objective, relative=options.relative,
         loss=options.loss, method=options.method, starts=options.starts, seed=options.seed, substeps=options.substeps,
         fixed=fixed, checkpoint=piece.checkpoint, resume=piece.resume, on_progress=on_progress,
     )  # fmt: skip
     on_progress("errors", 0, 0, "in free simulation")
-    error, simulated = errors(found.problem, found.own, found.shared)
-    parts.write(number, PARAMETERS, pl.DataFrame(found.table()))
-    parts.write(number, DRIVERS, pl.DataFrame(drivers.table(found, error, piece.by)).fill_nan(None))
+    error, simulated = errors(result.problem, result.own, result.shared)
+    parts.write(number, PARAMETERS, pl.DataFrame(result.table()))
+    parts.write(number, DRIVERS, pl.DataFrame(drivers.table(result, error, piece.by)).fill_nan(None))
     parts.write(number, ERRORS, pl.DataFrame({name: getattr(error, name).numpy() for name in Errors._fields}))
-    drawn = []
+    figures = []
     if number == 0:
-        drawn = [pictures.examples(found.problem, error, simulated), pictures.residuals(found.problem, simulated)]
-        drawn += pictures.space_time(found.problem, simulated)
+        figures = [pictures.examples(result.problem, error, simulated), pictures.residuals(result.problem, simulated)]
+        figures += pictures.space_time(result.problem, simulated)
     parts.finish(number, summary | {
-        "iterations": found.iterations, "converged": int(found.converged.sum()), "dt": found.problem.batch.dt,
-        "pictures": [{"text": b.text, "image": b.image, "narrow": b.narrow} for b in drawn],
+        "iterations": result.iterations, "converged": int(result.converged.sum()), "dt": result.problem.batch.dt,
+        "pictures": [{"text": b.text, "image": b.image, "narrow": b.narrow} for b in figures],
     })  # fmt: skip
 
 
-def _told(trajectories: Trajectories, left_out: Sequence[Repair]) -> dict[str, Any]:
+def _summary(trajectories: Trajectories, left_out: Sequence[Repair]) -> dict[str, Any]:
     """Return what a part of a folder is, so that all of them can be added up."""
 
     def plain(repairs: Sequence[Repair]) -> list[list[Any]]:
         return [[r.kind, r.count, r.text] for r in repairs]
 
-    kept = {k: v for k, v in trajectories.summary().items() if k not in ("source", "repairs")}
-    return {"data": kept, "repairs": plain(trajectories.repairs), "left_out": plain(left_out)}
+    data = {k: v for k, v in trajectories.summary().items() if k not in ("source", "repairs")}
+    return {"data": data, "repairs": plain(trajectories.repairs), "left_out": plain(left_out)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,25 +133,25 @@ class JoinedFit:
     @property
     def converged(self) -> int:
         """How many groups converged."""
-        return sum(told["converged"] for told in self.summaries)
+        return sum(summary["converged"] for summary in self.summaries)
 
     @property
     def iterations(self) -> int:
         """Most iterations of any piece."""
-        return max(told["iterations"] for told in self.summaries)
+        return max(summary["iterations"] for summary in self.summaries)
 
     @property
     def pictures(self) -> list[page.Block]:
         """Measured against simulated, residuals, and space and time, of the first piece that has them."""
-        return [page.Block("figure", **block) for told in self.summaries for block in told["pictures"]]
+        return [page.Block("figure", **block) for summary in self.summaries for block in summary["pictures"]]
 
 
 def join(parts: Parts, options: Options) -> JoinedFit:
     """Return what the pieces found. DataError if none found anything."""
-    told = parts.summaries()
-    good = [summary for summary in told if "lost" not in summary]
+    summaries = parts.summaries()
+    good = [summary for summary in summaries if "lost" not in summary]
     if not good:
-        raise DataError(f"no part can be fitted: {told[0]['lost']}" if told[1:] else told[0]["lost"])
+        raise DataError(f"no part can be fitted: {summaries[0]['lost']}" if summaries[1:] else summaries[0]["lost"])
     odd = next((s["dt"] for s in good if abs(s["dt"] - good[0]["dt"]) > 1e-9), None)
     if odd is not None:
         raise DataError(f"some runs have steps of {good[0]['dt']:g} s, others of {odd:g} s. Give one --dt.")
@@ -160,17 +160,17 @@ def join(parts: Parts, options: Options) -> JoinedFit:
     errors = pl.concat([pl.read_parquet(path, glob=False) for path in parts.tables(ERRORS)])
     estimates = drivers.Estimates.joined(table, simulator, good[0]["dt"], fixed)
     measures = Errors(*(torch.from_numpy(errors[name].to_numpy().copy()) for name in Errors._fields))
-    return JoinedFit(parts, estimates, measures, good, [summary for summary in told if "lost" in summary])
+    return JoinedFit(parts, estimates, measures, good, [summary for summary in summaries if "lost" in summary])
 
 
-def account_of(found: JoinedFit, source: str) -> dict[str, Any]:
+def account_of(joined: JoinedFit, source: str) -> dict[str, Any]:
     """Return what the parts of a folder are together, as ``Trajectories.summary`` says it of a file."""
-    data = [told["data"] for told in found.summaries]
+    data = [summary["data"] for summary in joined.summaries]
     repairs, left_out = Counted(), Counted()
-    for told in found.summaries:
-        repairs.add([Repair(*one) for one in told["repairs"]])
-        left_out.add([Repair(*one) for one in told["left_out"]])
-    left_out.add([Repair("part", 1, f"{told['share']} left out: {told['lost']}") for told in found.lost])
+    for summary in joined.summaries:
+        repairs.add([Repair(*one) for one in summary["repairs"]])
+        left_out.add([Repair(*one) for one in summary["left_out"]])
+    left_out.add([Repair("part", 1, f"{summary['share']} left out: {summary['lost']}") for summary in joined.lost])
     sums = ("rows", "runs", "vehicles", "followers", "vehicle_seconds")
     return {
         "source": source,
@@ -179,6 +179,6 @@ def account_of(found: JoinedFit, source: str) -> dict[str, Any]:
         "place": data[0]["place"],
         "repairs": [{"kind": r.kind, "count": r.count, "text": r.text} for r in repairs.repairs()],
         "left_out": [r.text for r in left_out.repairs()],
-        "episodes": len(found.errors.gap_rmse),
+        "episodes": len(joined.errors.gap_rmse),
         "account": page.account(by_kind(repairs.repairs()), by_kind(left_out.repairs())),
     }

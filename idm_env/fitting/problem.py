@@ -69,10 +69,10 @@ class Problem:
     prior: Prior | None = None
 
     def __post_init__(self) -> None:
-        known = catalogue(self.simulator.effects)
+        parameters = catalogue(self.simulator.effects)
         for name in (*self.own, *self.shared, *self.fixed):
-            if name not in known:
-                raise ValueError(f"unknown parameter '{name}'.{nearest(name, known)}")
+            if name not in parameters:
+                raise ValueError(f"unknown parameter '{name}'.{nearest(name, parameters)}")
         if self.prior is not None and self.loss != "mse":
             raise ValueError(f"a prior weighs squared residuals; loss = '{self.loss}' has none. Use 'mse'.")
         if abs(self.simulator.dt - self.batch.step) > 1e-9:
@@ -89,8 +89,8 @@ class Problem:
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """Declarations of the free parameters, own first."""
-        known = catalogue(self.simulator.effects)
-        return tuple(known[name] for name in self.own + self.shared)
+        declared = catalogue(self.simulator.effects)
+        return tuple(declared[name] for name in self.own + self.shared)
 
     @cached_property
     def bounds(self) -> tuple[Tensor, Tensor]:
@@ -133,8 +133,8 @@ class Problem:
     def params(self, values: dict[str, Tensor]) -> dict[str, dict[str, Tensor]]:
         """Return defaults with some parameters replaced, each by a tensor that broadcasts against rows × vehicles."""
         params = self.simulator.defaults(dtype=self.batch.gap.dtype)
-        kept = {name: torch.tensor(value, dtype=self.batch.gap.dtype) for name, value in self.fixed.items()}
-        for name, value in {**kept, **values}.items():
+        fixed = {name: torch.tensor(value, dtype=self.batch.gap.dtype) for name, value in self.fixed.items()}
+        for name, value in {**fixed, **values}.items():
             effect, parameter = name.split(".")
             params[effect][parameter] = value
         return params
@@ -150,8 +150,8 @@ class Problem:
         def keep(now: State) -> tuple[Tensor, Tensor]:
             return now.gap[..., driver], now.speed[..., driver]
 
-        _, kept = self.simulator.rollout(state, self._inputs, params, self.batch.steps, keep=keep)
-        return Simulated(*(x[self.batch.substeps - 1 :: self.batch.substeps] for x in kept))
+        _, samples = self.simulator.rollout(state, self._inputs, params, self.batch.steps, keep=keep)
+        return Simulated(*(x[self.batch.substeps - 1 :: self.batch.substeps] for x in samples))
 
     def rows(self, own: Tensor, shared: Tensor) -> dict[str, Tensor]:
         """Return the value of every free parameter for every row, from values per group."""
@@ -197,11 +197,11 @@ class Problem:
         """The compiled rollout of these drivers, or why there is none."""
         from idm_env.kernels import drivers
 
-        batch, (at, driver) = self.batch, self.batch.columns(self.simulator)
+        batch, (vehicles, driver) = self.batch, self.batch.columns(self.simulator)
         records = {"position": batch.position, "speed": batch.all_speed, "accel": batch.accel, "present": batch.present}
         start = batch.start(self.simulator, self.params({}))
         return drivers.prepared(
-            self.simulator, start, {n: x[:, :, at] for n, x in records.items()}, self._inputs, driver
+            self.simulator, start, {n: x[:, :, vehicles] for n, x in records.items()}, self._inputs, driver
         )  # fmt: skip
 
     @property
@@ -287,7 +287,7 @@ class Problem:
         }
         for i, direction in enumerate(directions.values()):
             direction[i] = 1.0
-        kept, along = linearised_rollout(
+        samples, along = linearised_rollout(
             self._tangent,
             lambda p: self.batch.start(self.simulator, p),
             self._inputs,
@@ -297,8 +297,8 @@ class Problem:
             lambda state: (state.gap[..., driver], state.speed[..., driver]),
         )
         every = self.batch.substeps
-        kept, along = ([x[every - 1 :: every] for x in both] for both in (kept, along))
-        return self.residual(Simulated(*kept)), self._weigh(*along)
+        samples, along = ([x[every - 1 :: every] for x in both] for both in (samples, along))
+        return self.residual(Simulated(*samples)), self._weigh(*along)
 
 
 def group_of(episodes: Sequence[Episode], by: str) -> tuple[Tensor, tuple[str, ...]]:
@@ -314,10 +314,10 @@ def group_of(episodes: Sequence[Episode], by: str) -> tuple[Tensor, tuple[str, .
     elif by in ("run_id", "vehicle_id", "leader_id"):
         labels = [str(getattr(e, by)) for e in episodes]
     else:
-        known = set.intersection(*(set(e.labels) for e in episodes)) | {"driver", "all", "run_id", "vehicle_id"}
-        if by not in known:
+        columns = set.intersection(*(set(e.labels) for e in episodes)) | {"driver", "all", "run_id", "vehicle_id"}
+        if by not in columns:
             raise DataError(
-                f"cannot group by '{by}': no such column that is constant for a driver.{nearest(by, known)}"
+                f"cannot group by '{by}': no such column that is constant for a driver.{nearest(by, columns)}"
             )
         labels = [e.labels[by] for e in episodes]
     number = {name: i for i, name in enumerate(dict.fromkeys(labels))}

@@ -147,9 +147,9 @@ def _tried(value: Tensor, gradient: Tensor, hessian: Tensor, damping: Tensor, bo
     """
     free = _free(value, gradient, box)
     low, high = torch.maximum(box.low, value - box.reach), torch.minimum(box.high, value + box.reach)
-    wanted = value + _solve(hessian, gradient, damping, free)
-    stopped = (wanted < low) | (wanted > high)
-    at_bound = torch.where(stopped, wanted.clamp(low, high) - value, 0.0)
+    target = value + _solve(hessian, gradient, damping, free)
+    stopped = (target < low) | (target > high)
+    at_bound = torch.where(stopped, target.clamp(low, high) - value, 0.0)
     left = gradient + (hessian @ at_bound[..., None])[..., 0]
     step = torch.where(stopped, at_bound, _solve(hessian, left, damping, free & ~stopped))
     return torch.minimum(torch.maximum(value + step, low), high)
@@ -232,15 +232,15 @@ def _together(
     """Try shares of one step of all parameters, and one of the own ones alone; keep what costs least in all."""
     own, shared, stiff = progress.own, progress.shared, problem.stiffness
     now = _with(prior, data, own)
-    alone = _own_tried(now, progress, problem.boxes[0])
-    trials = _shares(now, progress, alone - own, stiff, problem.boxes)
+    own_only = _own_tried(now, progress, problem.boxes[0])
+    trials = _shares(now, progress, own_only - own, stiff, problem.boxes)
     trial_shared = torch.cat((trials[1], shared))
-    trial_own, costs = _judged(problem, prior, torch.cat((trials[0], alone)), trial_shared)
+    trial_own, costs = _judged(problem, prior, torch.cat((trials[0], own_only)), trial_shared)
     # The last trial leaves φ where it is, and every group decides for itself.
     better = costs[-1:] < now.cost
     costs[-1:] = torch.where(better, costs[-1:], now.cost)
-    known = (stiff * shared.square()).sum()
-    total = float(now.cost.sum() + known)
+    stiffness_cost = (stiff * shared.square()).sum()
+    total = float(now.cost.sum() + stiffness_cost)
     sums = costs.sum(-1) + (stiff * trial_shared.square()).sum(-1)
     best = int(sums.argmin())
     gain = total - float(sums[best])
@@ -256,7 +256,7 @@ def _together(
     if gain > 0.0:
         data = problem.normal(own, shared)
     # Own parameters that gain little alone say nothing of a step of the shared ones that was refused.
-    told = (gain > 0.0 and best < len(SIZES)) or 0.0 <= promised <= tolerance * total or shared_damping > 1e6
+    decisive = (gain > 0.0 and best < len(SIZES)) or 0.0 <= promised <= tolerance * total or shared_damping > 1e6
     return dataclasses.replace(
         progress,
         own=own,
@@ -264,7 +264,7 @@ def _together(
         damping=_redamped(progress.damping, better),
         iteration=progress.iteration + 1,
         shared_damping=max(shared_damping, 1e-9),
-        finished=gain <= tolerance * total and told,
+        finished=gain <= tolerance * total and decisive,
     ), data
 
 
@@ -280,9 +280,9 @@ def _judged(problem: LeastSquares, prior: Known | None, own: Tensor, shared: Ten
 
 
 def _shares(
-    now: Normal, progress: Progress, alone: Tensor, stiff: Tensor, boxes: tuple[Box, Box]
+    now: Normal, progress: Progress, own_only: Tensor, stiff: Tensor, boxes: tuple[Box, Box]
 ) -> tuple[Tensor, Tensor]:
-    """Return own [K, G, P] and shared [K, Q] values after shares of a step; ``alone`` is that of own ones [1, G, P].
+    """Return own [K, G, P] and shared [K, Q] values after shares of a step; ``own_only`` is that of own ones [1, G, P].
 
     With the own parameters eliminated, ``S = Σ_g (H_φφ − H_φθ H_θθ⁻¹ H_θφ)`` is the matrix of the shared ones.
     """
@@ -296,6 +296,6 @@ def _shares(
     damping = torch.full_like(gradient[..., 0], progress.shared_damping)
     step = _tried(shared, gradient, matrix, damping, boxes[1]) - shared
     reach = boxes[0].reach
-    together = (alone - (follow @ step[:, None, :, None])[..., 0]).clamp(-reach, reach)
+    together = (own_only - (follow @ step[:, None, :, None])[..., 0]).clamp(-reach, reach)
     share = own.new_tensor(SIZES)[:, None]
     return boxes[0].clip(own + share[..., None] * together), boxes[1].clip(shared + share * step)

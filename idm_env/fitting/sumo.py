@@ -41,14 +41,14 @@ def write(path: Path, model: Model) -> None:
     lines, taken = [], set()
     for driver in (None, *model.drivers):
         values = model.params(driver, dtype=torch.float64)[law.name]
-        told = {"exponent": law.exponent, **{name: float(x) for name, x in values.items()}}
+        parameters = {"exponent": law.exponent, **{name: float(x) for name, x in values.items()}}
         name = stem = re.sub(r"[\s|\\'\";,:<>&]", "_", driver or "median")
         number = 1
         while name in taken:
             number += 1
             name = f"{stem}_{number}"
         taken.add(name)
-        numbers = " ".join(f'{attribute}="{told[parameter]:.6g}"' for attribute, parameter in ATTRIBUTES.items())
+        numbers = " ".join(f'{attribute}="{parameters[parameter]:.6g}"' for attribute, parameter in ATTRIBUTES.items())
         lines.append(f'    <vType id={quoteattr(name)} carFollowModel="IDM" {numbers} speedFactor="1" speedDev="0"/>')
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, "\n".join((_MARK, "<additional>", *lines, "</additional>", "")))

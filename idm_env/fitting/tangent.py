@@ -114,14 +114,14 @@ def linearised_rollout(
         tangents = torch.func.vmap(lambda d: torch.func.jvp(begin, (values,), (d,))[1])(along)
         state = start(params)
         slices = step.simulator.slices(inputs, steps)
-        kept: list[tuple[Tensor, ...]] = []
+        samples: list[tuple[Tensor, ...]] = []
         derivatives: list[tuple[Tensor, ...]] = []
         for t in range(steps):
             state, tangents = step(state, tangents, slices[t], params, names, along)
-            kept.append(read(state))
+            samples.append(read(state))
             derivatives.append(read(_with_floats(state, tangents)))
     return (
-        [torch.stack(column) for column in zip(*kept, strict=True)],
+        [torch.stack(column) for column in zip(*samples, strict=True)],
         [torch.stack(column) for column in zip(*derivatives, strict=True)],
     )
 

@@ -102,12 +102,12 @@ def integration_error(problem: Problem, own: Tensor, shared: Tensor) -> Tensor:
     coarse = dataclasses.replace(
         problem, batch=batch, simulator=dataclasses.replace(problem.simulator, dt=batch.step)
     )  # fmt: skip
-    here, there = (normal(p, own[None], shared[None]) for p in (problem, coarse))
+    fine, rough = (normal(p, own[None], shared[None]) for p in (problem, coarse))
     value = torch.cat((own, shared.expand(len(own), -1)), dim=-1)
     low, high = problem.bounds
     inside = ((value > low) & (value < high)).to(value.dtype)
-    hessian = there.hessian[0] * inside[:, :, None] * inside[:, None, :] + torch.diag_embed(1.0 - inside)
-    pull = (there.gradient[0] - here.gradient[0]) * inside
+    hessian = rough.hessian[0] * inside[:, :, None] * inside[:, None, :] + torch.diag_embed(1.0 - inside)
+    pull = (rough.gradient[0] - fine.gradient[0]) * inside
     moved = -scale * (_inverse(hessian) @ pull[..., None])[..., 0]
     return torch.minimum(torch.maximum(moved, low - high), high - low)
 

@@ -77,21 +77,21 @@ def panels(data: Any, *, ring_length: float | None = None) -> list[Panel]:
     rings = np.asarray(table["ring_length_m"], float) if "ring_length_m" in table.columns else np.full(count, np.nan)
     order = np.lexsort((time, vehicles, lanes, runs))
     edges = np.flatnonzero(_changes(runs[order]) | _changes(lanes[order]) | _changes(vehicles[order]))
-    found: dict[tuple[str, str], list[VehicleLine]] = {}
+    by_lane: dict[tuple[str, str], list[VehicleLine]] = {}
     lengths: dict[tuple[str, str], float | None] = {}
-    for at in np.split(order, edges[1:]):
-        key = str(runs[at[0]]), str(lanes[at[0]])
-        line = VehicleLine(str(vehicles[at[0]]), time[at], position[at], speed[at], bool(marked[at].any()))
-        found.setdefault(key, []).append(line)
-        known = rings[at][np.isfinite(rings[at])]
-        lengths[key] = ring_length or (float(known[0]) if len(known) else None)
-    several = len({run for run, _ in found}) > 1
-    made = []
-    for (run, lane), lines in found.items():
+    for rows in np.split(order, edges[1:]):
+        key = str(runs[rows[0]]), str(lanes[rows[0]])
+        line = VehicleLine(str(vehicles[rows[0]]), time[rows], position[rows], speed[rows], bool(marked[rows].any()))
+        by_lane.setdefault(key, []).append(line)
+        finite = rings[rows][np.isfinite(rings[rows])]
+        lengths[key] = ring_length or (float(finite[0]) if len(finite) else None)
+    several = len({run for run, _ in by_lane}) > 1
+    drawings = []
+    for (run, lane), lines in by_lane.items():
         where = [f"run {run}"] * several + [f"lane {lane}"] * (lane not in ("", "None", "nan"))
-        told = f"{len(lines)} vehicle{'s' if len(lines) > 1 else ''}"
-        made.append(Panel(", ".join([*where, told]), tuple(lines), lengths[run, lane]))
-    return sorted(made, key=lambda panel: -panel.points)
+        size = f"{len(lines)} vehicle{'s' if len(lines) > 1 else ''}"
+        drawings.append(Panel(", ".join([*where, size]), tuple(lines), lengths[run, lane]))
+    return sorted(drawings, key=lambda panel: -panel.points)
 
 
 def rollout_panel(
@@ -116,25 +116,25 @@ def lane_panels(
     first, vehicles last. A slot that makes another trip begins another line.
     """
     position, speed = (np.asarray(x.detach().cpu(), float) for x in (data.position, data.speed))
-    lanes, there = np.asarray(lane.detach().cpu()), np.asarray(present.detach().cpu()) > 0
+    lanes, on_road = np.asarray(lane.detach().cpu()), np.asarray(present.detach().cpu()) > 0
     time = dt * np.arange(1, len(position) + 1)
-    found: dict[int, list[VehicleLine]] = {}
+    by_lane: dict[int, list[VehicleLine]] = {}
     for i in range(position.shape[1]):
         # A piece ends where the lane changes, where nobody is there, and where a slot begins anew.
         back = np.diff(position[:, i], prepend=position[:1, i]) < -1.0
-        cut = _changes(lanes[:, i]) | _changes(there[:, i]) | back
-        for at in np.split(np.arange(len(time)), np.flatnonzero(cut)[1:]):
-            if there[at[0], i]:
+        cut = _changes(lanes[:, i]) | _changes(on_road[:, i]) | back
+        for steps in np.split(np.arange(len(time)), np.flatnonzero(cut)[1:]):
+            if on_road[steps[0], i]:
                 # One sample more, so that a change leaves no hole.
-                more = at if at[-1] + 1 == len(time) or back[at[-1] + 1] else np.append(at, at[-1] + 1)
-                more = more[there[more, i]]
+                more = steps if steps[-1] + 1 == len(time) or back[steps[-1] + 1] else np.append(steps, steps[-1] + 1)
+                more = more[on_road[more, i]]
                 line = VehicleLine(str(i), time[more], position[more, i], speed[more, i], i in marked)
-                found.setdefault(int(lanes[at[0], i]), []).append(line)
-    made = []
-    for k in sorted(found, reverse=True):
-        told = f"lane {k}, {len({line.name for line in found[k]})} vehicles"
-        made.append(Panel(told, tuple(found[k]), ring_length))
-    return made
+                by_lane.setdefault(int(lanes[steps[0], i]), []).append(line)
+    drawings = []
+    for k in sorted(by_lane, reverse=True):
+        title = f"lane {k}, {len({line.name for line in by_lane[k]})} vehicles"
+        drawings.append(Panel(title, tuple(by_lane[k]), ring_length))
+    return drawings
 
 
 def space_time(
@@ -167,12 +167,12 @@ def space_time(
         ImportError: If matplotlib is missing, with the command that installs it.
     """
     if isinstance(data, list):
-        drawn = data
+        pictures = data
     elif hasattr(data, "position") and hasattr(data, "speed"):
-        drawn = [rollout_panel(data, dt=dt, row=row, ring_length=ring_length, marked=marked)]
+        pictures = [rollout_panel(data, dt=dt, row=row, ring_length=ring_length, marked=marked)]
     else:
-        drawn = panels(data, ring_length=ring_length)
-    figure = figure_of(drawn[:most], title, fastest)
+        pictures = panels(data, ring_length=ring_length)
+    figure = figure_of(pictures[:most], title, fastest)
     legible(figure)
     return figure
 
@@ -277,9 +277,9 @@ def _packed(panel: Panel, stride: int, fastest: float) -> dict[str, Any]:
     time = _range([line.time for line in lines])
     place = _range(places)
     packed = []
-    for line, at in zip(lines, places, strict=True):
+    for line, along in zip(lines, places, strict=True):
         packed.append({
-            "name": line.name, "marked": line.marked, "time": _bits(line.time, *time), "place": _bits(at, *place),
+            "name": line.name, "marked": line.marked, "time": _bits(line.time, *time), "place": _bits(along, *place),
             "speed": _bits(line.speed, 0.0, fastest),
             "breaks": (np.flatnonzero(~line.whole(panel.ring_length)) + 1).tolist(),
         })  # fmt: skip
@@ -299,22 +299,22 @@ def _range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
     return low, high if high > low else low + 1.0
 
 
-def _fastest(drawn: Sequence[Panel]) -> float:
+def _fastest(pictures: Sequence[Panel]) -> float:
     """Return the end of the colours' scale (m/s): nearly the fastest, so that a few samples do not set it."""
-    speeds = np.concatenate([np.zeros(1), *(line.speed for panel in drawn for line in panel.lines)])
-    known = speeds[np.isfinite(speeds)]
-    return float(np.percentile(known, 99.5)) or float(known.max()) or 1.0
+    speeds = np.concatenate([np.zeros(1), *(line.speed for panel in pictures for line in panel.lines)])
+    finite = speeds[np.isfinite(speeds)]
+    return float(np.percentile(finite, 99.5)) or float(finite.max()) or 1.0
 
 
-def _stride(drawn: Sequence[Panel], most: int) -> int:
-    return max(1, -(-sum(panel.points for panel in drawn) // most))
+def _stride(pictures: Sequence[Panel], most: int) -> int:
+    return max(1, -(-sum(panel.points for panel in pictures) // most))
 
 
 def _thinned(line: VehicleLine, stride: int) -> VehicleLine:
     if stride == 1 or len(line.time) < 3:
         return line
-    at = np.unique(np.append(np.arange(0, len(line.time), stride), len(line.time) - 1))
-    return VehicleLine(line.name, line.time[at], line.position[at], line.speed[at], line.marked)
+    index = np.unique(np.append(np.arange(0, len(line.time), stride), len(line.time) - 1))
+    return VehicleLine(line.name, line.time[index], line.position[index], line.speed[index], line.marked)
 
 
 def _changes(values: np.ndarray) -> np.ndarray:

@@ -28,9 +28,9 @@ def legible(figure: Figure, numbers: dict[str, str] | None = None) -> dict[str, 
 
     axes = [axis for panel in figure.axes for axis in (panel.xaxis, panel.yaxis)]
     ticks = {axis: "".join(label.get_text() for label in axis.get_ticklabels()) for axis in axes}
-    texts = [found for found in figure.findobj(Text) if isinstance(found, Text)]
-    wanted = {c for text in texts for c in text.get_text() if not c.isspace()}
-    lacking = wanted - _glyphs(findfont(FontProperties()))
+    texts = [text for text in figure.findobj(Text) if isinstance(text, Text)]
+    characters = {c for text in texts for c in text.get_text() if not c.isspace()}
+    lacking = characters - _glyphs(findfont(FontProperties()))
     words = {word: number for number, word in (numbers or {}).items()}
     if not lacking:
         return numbers or {}
@@ -73,9 +73,9 @@ def _families(lacking: frozenset[str]) -> tuple[list[str], set[str]]:
     for entry in fontManager.ttflist:
         if not rest or any(word in entry.name.lower() for word in _UNFIT) or entry.name in chosen:
             continue
-        if found := rest & _glyphs(entry.fname):
+        if glyphs := rest & _glyphs(entry.fname):
             chosen.append(entry.name)
-            rest -= found
+            rest -= glyphs
     return chosen, rest
 
 

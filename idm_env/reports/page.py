@@ -88,8 +88,8 @@ def table(
 def _cell(value: Any, digits: int | None = None) -> dict[str, Any]:
     if isinstance(value, Cell):
         sorted_by, finite = value.value, value.value is not None and abs(value.value) < float("inf")
-        kept = sorted_by if finite else None
-        return {"text": value.text, "number": sorted_by is not None, "value": kept, "marked": value.marked}
+        sort_value = sorted_by if finite else None
+        return {"text": value.text, "number": sorted_by is not None, "value": sort_value, "marked": value.marked}
     cell: dict[str, Any] = {"number": False, "value": None, "marked": False}
     if isinstance(value, bool):
         return cell | {"text": "yes" if value else "no"}
@@ -197,19 +197,19 @@ def account(
     shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     files = f"{len(names)} bad file{'s' if len(names) > 1 else ''}: {shown}" if names else ""
     parts = (("repaired: ", counted(repairs)), ("left out: ", counted(left_out)), ("", files))
-    said = "; ".join(title + words for title, words in parts if words)
-    return f"Data: {said}." if said else "Data: nothing was repaired or left out."
+    summary = "; ".join(title + words for title, words in parts if words)
+    return f"Data: {summary}." if summary else "Data: nothing was repaired or left out."
 
 
 def versions() -> dict[str, str]:
     """Return the versions that a result depends on."""
-    found = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    releases = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
     for name in ("idm-env", "torch", "numpy", "polars", "scipy", "numba"):
         try:
-            found[name] = version(name)
+            releases[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            releases[name] = "not installed"
+    return releases
 
 
 def command_line() -> str:

@@ -34,13 +34,13 @@ def edie(drawn: Sequence[Panel], *, seconds: float = 60.0, metres: float = 100.0
         if len(times) < 2 or len(places) < 2:
             continue
         area = seconds * wide
-        for values, kept in ((step, density), (step * speed, flow)):
+        for values, totals in ((step, density), (step * speed, flow)):
             cells = np.histogram2d(time, place, bins=(times, places), weights=values)[0]
-            kept.append(cells.ravel() / area)
+            totals.append(cells.ravel() / area)
     if not density:
         raise ValueError(f"no cell of {seconds:g} s by {metres:g} m is whole. Give smaller seconds= or metres=.")
-    there = np.concatenate(density) > 0.0
-    return np.concatenate(density)[there], np.concatenate(flow)[there]
+    occupied = np.concatenate(density) > 0.0
+    return np.concatenate(density)[occupied], np.concatenate(flow)[occupied]
 
 
 def fundamental_diagram(
@@ -104,13 +104,13 @@ def animate(data: Any, *, dt: float = 0.1, ring_length: float | None = None, eve
         axes.set(xlim=(every_place.min(), every_place.max()), ylim=(-1, 1), yticks=[], xlabel=place_label(None))
 
     def picture(time: float) -> tuple[Any]:
-        there = [line for line in panel.lines if line.time[0] <= time <= line.time[-1]]
-        at = [min(int(np.searchsorted(line.time, time)), len(line.time) - 1) for line in there]
-        place = np.array([line.position[i] for line, i in zip(there, at, strict=True)])
+        lines = [line for line in panel.lines if line.time[0] <= time <= line.time[-1]]
+        samples = [min(int(np.searchsorted(line.time, time)), len(line.time) - 1) for line in lines]
+        place = np.array([line.position[i] for line, i in zip(lines, samples, strict=True)])
         angle = 2.0 * np.pi * place / (ring or 1.0)
         points = (np.cos(angle), np.sin(angle)) if ring else (place, np.zeros_like(place))
         dots.set_offsets(np.stack(points, axis=-1))
-        dots.set_array(np.array([line.speed[i] for line, i in zip(there, at, strict=True)]))
+        dots.set_array(np.array([line.speed[i] for line, i in zip(lines, samples, strict=True)]))
         axes.set_title(f"{time:.0f} s", fontsize=10)
         return (dots,)
 

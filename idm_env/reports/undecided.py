@@ -23,7 +23,7 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
     The report has the keys of every report of ``explain``; there is no model.
     """
     sentence = f"{trajectories.source} is one recording, so no run can be held out as a test set. {cure}"
-    found: dict[str, Any] = {
+    report: dict[str, Any] = {
         "verdict": "cannot_tell", "reason": "few_runs", "sentence": sentence, "details": [cure], "found": [],
         "known": [], "helps": {}, "ladder": None, "interval": None, "models": {}, "partial": None, "candidates": [],
         "shared": None,
@@ -38,8 +38,8 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
     with results(out, EXPLAINED, inputs) as folder:
         for name in EXPLAINED:  # a model of an earlier run would be taken for one of this
             (folder / name).unlink(missing_ok=True)
-        write_json(folder / "report.json", found)
-        drawn = page.picture(space_time(trajectories), "The recording: a line per vehicle, coloured by speed.")
-        blocks = [page.lead(sentence), page.lights(cards), drawn]
+        write_json(folder / "report.json", report)
+        picture = page.picture(space_time(trajectories), "The recording: a line per vehicle, coloured by speed.")
+        blocks = [page.lead(sentence), page.lights(cards), picture]
         page.write_page(folder / "report.html", "One recording cannot tell what IDM lacks", blocks)
-    return found
+    return report

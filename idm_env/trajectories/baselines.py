@@ -95,13 +95,13 @@ def bounded_spline(
     for begin in np.arange(clock[0], clock[-1] - OVERLAP_S, LONGEST_BLOCK_S):
         end = begin + LONGEST_BLOCK_S + OVERLAP_S
         data = (time_s >= begin - TINY) & (time_s <= end + TINY)
-        at = (clock >= begin - TINY) & (clock <= end + TINY)
-        if data.sum() < 2 or at.sum() < 2:
+        ticks = (clock >= begin - TINY) & (clock <= end + TINY)
+        if data.sum() < 2 or ticks.sum() < 2:
             continue
-        part = _bounded_block(time_s[data], position_m[data], clock[at], spacing, bound)
-        weight = np.clip(np.minimum(clock[at] - begin, end - clock[at]) / OVERLAP_S, 1e-3, 1.0)
+        part = _bounded_block(time_s[data], position_m[data], clock[ticks], spacing, bound)
+        weight = np.clip(np.minimum(clock[ticks] - begin, end - clock[ticks]) / OVERLAP_S, 1e-3, 1.0)
         for total, values in zip(sums, (1.0, part.position_m, part.speed_mps, part.accel_mps2), strict=True):
-            total[at] += weight * values
+            total[ticks] += weight * values
     return RegularMotion(clock, *(total / sums[0] for total in sums[1:]))
 
 

@@ -69,12 +69,12 @@ class FilePlan:
 
 def done(
     parts: Parts, number: int, tracks: list[TrackPiece], settings: FilterSettings, plan: FilePlan,
-    recent: Sequence[Filtered], told: dict[str, Any],
+    recent: Sequence[Filtered], remarks: dict[str, Any],
     on_stage: Callable[[float, str], None] = lambda share, words: None,
 ) -> list[Filtered]:  # fmt: skip
     """Do one chunk and write its part: the table, the parameters, and last the tallies, which mark it done.
 
-    ``told`` is what else is to be known of it. ``on_stage`` is called with the share that is done and what comes next.
+    ``remarks`` are what else is to be known of it. ``on_stage`` is called with the share that is done and what comes next.
     """
     others = baselines.available() if settings.baselines else ()
     stages = 2 + len(others)
@@ -108,7 +108,7 @@ def done(
             "overlaps": total,
             "new_overlaps": new,
             "calibration_seconds": calibration,
-            **told,
+            **remarks,
         },
     )
     return filtered
@@ -123,14 +123,14 @@ def _tally(motions: Sequence[RegularMotion], tracks: Sequence[TrackPiece], secon
 
 def _imitated(tracks: Sequence[TrackPiece], dt: float, fixed: bool) -> tuple[list[Filtered], list[dict[str, Any]]]:
     filtered, rows = [], []
-    for track, found in zip(tracks, paper.imitate(tracks, dt, fixed_parameters=fixed), strict=True):
-        clock = found.motion.time_s
+    for track, fit in zip(tracks, paper.imitate(tracks, dt, fixed_parameters=fixed), strict=True):
+        clock = fit.motion.time_s
         unknown = np.full((len(clock), 3), np.nan)
-        at = nearest(track, clock)
+        sample = nearest(track, clock)
         gap = np.full(len(clock), np.nan)
-        filtered.append(Filtered(track, found.motion, found.gap, unknown, track.leader[at], track.lane[at], gap))
+        filtered.append(Filtered(track, fit.motion, fit.gap, unknown, track.leader[sample], track.lane[sample], gap))
         names = {"run_id": track.run_id, "vehicle_id": track.vehicle_id, "piece": track.piece, "source": "imagined"}
-        rows.append(names | dict(zip(paper.NAMES, found.values.tolist(), strict=True)))
+        rows.append(names | dict(zip(paper.NAMES, fit.values.tolist(), strict=True)))
     return filtered, rows
 
 

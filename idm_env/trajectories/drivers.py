@@ -22,7 +22,7 @@ FARTHEST_M = 100.0
 
 def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]]) -> Episode | None:
     """Return the longest stretch behind one filtered leader as an episode, None if there is none of 10 s."""
-    found: tuple[int, int, Filtered] | None = None
+    longest: tuple[int, int, Filtered] | None = None
     clock = filtered.motion.time_s
     dt = float(clock[1] - clock[0]) if len(clock) > 1 else 0.1
     near = np.isfinite(filtered.gap) & (filtered.gap > 0) & (filtered.gap < FARTHEST_M)
@@ -31,11 +31,11 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
             inside = (clock[begin:end] >= lead.motion.time_s[0] - 1e-9) & (
                 clock[begin:end] <= lead.motion.time_s[-1] + 1e-9
             )
-            if inside.all() and (found is None or end - begin > found[1] - found[0]):
-                found = begin, end, lead
-    if found is None or (found[1] - found[0]) * dt < SHORTEST_S:
+            if inside.all() and (longest is None or end - begin > longest[1] - longest[0]):
+                longest = begin, end, lead
+    if longest is None or (longest[1] - longest[0]) * dt < SHORTEST_S:
         return None
-    begin, end, lead = found
+    begin, end, lead = longest
     part = slice(begin, end)
     time = clock[part]
     position, speed = filtered.motion.position_m[part], filtered.motion.speed_mps[part]
@@ -76,11 +76,11 @@ def fit_drivers(
     episodes = [e for e in (episode_of(f, leaders) for f in filtered) if e is not None]
     if not episodes:
         return None, []
-    simulator, kept = Options(model=model).simulator()
-    found = fit(
-        episodes, by="driver", simulator=simulator, fixed=kept, loss="mse", starts=1, iterations=iterations
+    simulator, fixed = Options(model=model).simulator()
+    result = fit(
+        episodes, by="driver", simulator=simulator, fixed=fixed, loss="mse", starts=1, iterations=iterations
     )  # fmt: skip
-    return found, episodes
+    return result, episodes
 
 
 def parameter_rows(
@@ -91,15 +91,15 @@ def parameter_rows(
     ``source`` is ``leader`` for a calibration behind the real leader; ``none`` marks a track that follows nobody for
     10 s: its parameters are empty, since an imagined leader explains any motion at any parameters.
     """
-    found, _ = fit_drivers(filtered, before, model)
+    result, _ = fit_drivers(filtered, before, model)
     values: dict[str, dict[str, Any]] = {}
-    if found is not None:
-        for g, group in enumerate(found.problem.groups):
+    if result is not None:
+        for g, group in enumerate(result.problem.groups):
             row: dict[str, Any] = {"source": "leader"}
             for i, p in enumerate(IDM.declared):
-                row[p.name] = float(found.own[g, i])
-                row[f"{p.name}_error"] = float(found.uncertainty.standard_error[g, i])
-                row[f"{p.name}_identified"] = bool(found.uncertainty.identified[g, i])
+                row[p.name] = float(result.own[g, i])
+                row[f"{p.name}_error"] = float(result.uncertainty.standard_error[g, i])
+                row[f"{p.name}_identified"] = bool(result.uncertainty.identified[g, i])
             values[group] = row
     empty: dict[str, Any] = {"source": "none"}
     for p in IDM.declared:

@@ -153,7 +153,7 @@ def _run(
         parts.remove()  # nothing of it could go on
         raise
     _chunks(spool, parts, settings, plan, bridge, executor, progress)
-    told = parts.summaries()
+    summaries = parts.summaries()
     scored = []
     if settings.task == "reconstruct":
         progress("scoring", 0, 0, "points left out of the file")
@@ -161,10 +161,10 @@ def _run(
     progress("writing", 0, 0, "the report")
     parts.join(TRAJECTORIES, out / "trajectories.parquet")
     parts.join(PARAMETERS, out / "parameters.parquet")
-    report = _report(spool, told, settings, plan) | {"left_out_points": scored}
-    drawn = pictures.space_time(out / "trajectories.parquet", spool, bridge)
+    report = _report(spool, summaries, settings, plan) | {"left_out_points": scored}
+    figures = pictures.space_time(out / "trajectories.parquet", spool, bridge)
     write_report(
-        out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet", glob=False), drawn
+        out, report, _shown(out, spool, bridge), pl.read_parquet(out / "parameters.parquet", glob=False), figures
     )
     parts.remove()
     return report
@@ -217,12 +217,12 @@ def _strand(strand: _Strand, progress: OnProgress) -> None:
         if parts.done(number):
             recent += chunks.restored(parts, number, tracks)
         else:
-            told = {
+            remarks = {
                 "left_out": pieces.left_out,
                 "notes": pieces.notes,
             }
             recent += chunks.done(
-                parts, number, tracks, settings, strand.plan, recent, told,
+                parts, number, tracks, settings, strand.plan, recent, remarks,
                 lambda share, words, b=begin, e=end: progress(  # type: ignore[misc]
                     settings.task, b + int(share * (e - b)), borders[-1], words
                 ),
@@ -263,9 +263,9 @@ def _any_track(spool: Spool, bridge: float | None) -> list[tuple[np.ndarray, np.
     lost: list[tuple[str, str]] = []
     for number in range(spool.chunks):
         pieces = Pieces(spool.shelf.table(number), bridge)
-        found = [(t.time_s, t.position_m) for t in pieces]
-        if found:
-            return found
+        tracks = [(t.time_s, t.position_m) for t in pieces]
+        if tracks:
+            return tracks
         lost += pieces.left_out
     name, why = lost[0]
     raise DataError(f"{spool.source}: no track can be used ({len(lost)} left out; {name}: {why}).")

@@ -49,19 +49,19 @@ class Driven:
 
 
 def drive(
-    wanted: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], dt: float, highest: float, lowest: float
+    motions: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], dt: float, highest: float, lowest: float
 ) -> list[Driven]:
     """Drive every track through the simulator by the imagined gaps that its wanted motion asks for.
 
-    ``wanted`` are positions (m), speeds (m/s) and accelerations (m/s²), each [K], of ballistic steps. Each gap is found
+    ``motions`` are positions (m), speeds (m/s) and accelerations (m/s²), each [K], of ballistic steps. Each gap is found
     at the speed that the simulator has at that step, so nothing but the bounds changes an acceleration: it never
     exceeds ``highest`` nor what the engine gives at that speed, never falls below ``lowest``, and the vehicle never
     reverses. Where a bound did change it, the lost distance is made up gently (``CATCH_UP``).
     """
     sim = simulator(dt)
-    steps = max(len(a) for _, _, a in wanted)
-    goal = torch.zeros(3, steps, len(wanted), 1, dtype=torch.float64)
-    for i, columns in enumerate(wanted):
+    steps = max(len(a) for _, _, a in motions)
+    goal = torch.zeros(3, steps, len(motions), 1, dtype=torch.float64)
+    for i, columns in enumerate(motions):
         for c, values in enumerate(columns):
             goal[c, : len(values), i, 0] = torch.as_tensor(values)
     params = sim.defaults(dtype=torch.float64)
@@ -72,7 +72,7 @@ def drive(
     goal[0] -= origin
     state = sim.state(torch.zeros_like(origin), goal[1, 0].clamp_min(0.0), params)
     still = torch.zeros_like(origin)
-    kept = torch.empty(4, steps, len(wanted), dtype=torch.float64)
+    driven = torch.empty(4, steps, len(motions), dtype=torch.float64)
     with torch.no_grad():
         for k in range(steps):
             behind = CATCH_UP[0] * (goal[0, k] - state.position) + CATCH_UP[1] * (goal[1, k] - state.speed)
@@ -80,8 +80,8 @@ def drive(
             accel = goal[2, k] + behind.clamp(-HURRY_MPS2, HURRY_MPS2)
             accel = torch.minimum(accel.clamp(lowest, highest), engine)
             gap = gap_for(accel, state.speed, still, driver)
-            kept[0, k], kept[1, k], kept[3, k] = (x[:, 0] for x in (state.position + origin, state.speed, gap))
+            driven[0, k], driven[1, k], driven[3, k] = (x[:, 0] for x in (state.position + origin, state.speed, gap))
             state = sim.step(state, {"imagined": Imagined(gap, still)}, params)
-            kept[2, k] = state.accel[:, 0]
-    arrays = kept.numpy()
-    return [Driven(*(column[: len(a), i].copy() for column in arrays)) for i, (_, _, a) in enumerate(wanted)]
+            driven[2, k] = state.accel[:, 0]
+    arrays = driven.numpy()
+    return [Driven(*(column[: len(a), i].copy() for column in arrays)) for i, (_, _, a) in enumerate(motions)]

@@ -32,16 +32,16 @@ def score(spool: Spool, plan: FilePlan, settings: FilterSettings) -> list[dict[s
     tracks = [t for table in spool.picked(_chosen(len(spool.vehicles))) for t in Pieces(table, None) if len(t) >= 5]
     if not tracks:
         return []
-    given, out = zip(*(thinned(track) for track in tracks), strict=True)
+    halves, out = zip(*(thinned(track) for track in tracks), strict=True)
     if plan.noise is None:
-        ours = [f.motion for f in paper.imitate(given, plan.dt, fixed_parameters=settings.fixed_parameters)]
+        ours = [f.motion for f in paper.imitate(halves, plan.dt, fixed_parameters=settings.fixed_parameters)]
     else:
-        ours = [f.motion for f in recipe(list(given), plan.dt, plan.noise, plan.choices)]
+        ours = [f.motion for f in recipe(list(halves), plan.dt, plan.noise, plan.choices)]
     motions = {OURS[settings.recipe]: ours}
     for name in baselines.available() if settings.baselines else ():
-        motions[name] = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in given]
-    spacing = float(np.median(np.concatenate([np.diff(t.time_s) for t in given])))
-    return [_row(name, found, tracks, out, spacing) for name, found in motions.items()]
+        motions[name] = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in halves]
+    spacing = float(np.median(np.concatenate([np.diff(t.time_s) for t in halves])))
+    return [_row(name, motion, tracks, out, spacing) for name, motion in motions.items()]
 
 
 def _chosen(count: int) -> list[int]:
@@ -56,8 +56,8 @@ def _row(
     name: str, motions: list[RegularMotion], tracks: list[TrackPiece], out: tuple[np.ndarray, ...], spacing: float
 ) -> dict[str, Any]:
     apart = np.concatenate([
-        motion.at(track.time_s[at]) - track.position_m[at]
-        for motion, track, at in zip(motions, tracks, out, strict=True)
+        motion.at(track.time_s[index]) - track.position_m[index]
+        for motion, track, index in zip(motions, tracks, out, strict=True)
     ])  # fmt: skip
     return {
         "method": name,

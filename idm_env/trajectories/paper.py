@@ -65,8 +65,8 @@ class RealLeader(Effect):
         """Return the scene with the given leader."""
         ahead: Ahead = scene.input(self.name)
         gap = (ahead.rear - scene.position).clamp_min(NEAREST_M)
-        there = torch.ones_like(scene.leader.present)
-        return scene._replace(leader=Neighbour(gap, ahead.speed, torch.zeros_like(ahead.speed), there))
+        present = torch.ones_like(scene.leader.present)
+        return scene._replace(leader=Neighbour(gap, ahead.speed, torch.zeros_like(ahead.speed), present))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,21 +93,21 @@ def imitate(
     """
     clocks = [clock_of(track, dt) for track in tracks]
     by_length = sorted(range(len(tracks)), key=lambda i: len(clocks[i]))
-    found: dict[int, Imitated] = {}
+    fits: dict[int, Imitated] = {}
     while by_length:
         # The longest one left, and as many of like length as fit beside it.
         many = max(TOGETHER // len(clocks[by_length[-1]]), 1)
         some, by_length = by_length[-many:], by_length[:-many]
         done = _imitated([tracks[i] for i in some], [clocks[i] for i in some], dt, iterations, fixed_parameters)
-        found.update(zip(some, done, strict=True))
-    return [found[i] for i in range(len(tracks))]
+        fits.update(zip(some, done, strict=True))
+    return [fits[i] for i in range(len(tracks))]
 
 
 def _imitated(
     tracks: Sequence[TrackPiece], clocks: Sequence[np.ndarray], dt: float, iterations: int, fixed: bool
 ) -> list[Imitated]:
     targets = [track.position_m - track.position_m[0] for track in tracks]
-    at = [
+    steps = [
         np.clip(np.round((track.time_s - clock[0]) / dt).astype(np.int64), 0, len(clock) - 1)
         for track, clock in zip(tracks, clocks, strict=True)
     ]
@@ -116,20 +116,20 @@ def _imitated(
     bounds = {"imagined.gap": GAP_BOUNDS, "imagined.closing_speed": CLOSING_BOUNDS} | ({} if fixed else FIVE)
     ahead = Imagined(gap, torch.zeros_like(gap))
     driven = _descended(
-        ImaginedLeader(), ahead, np.tile(START, (len(tracks), 1)), speed0, dt, at, targets, bounds, iterations
+        ImaginedLeader(), ahead, np.tile(START, (len(tracks), 1)), speed0, dt, steps, targets, bounds, iterations
     )
     values = np.stack([driven.params[f"idm.{name}"] for name in NAMES], axis=-1)
-    found = []
+    fits = []
     for i, (track, clock) in enumerate(zip(tracks, clocks, strict=True)):
         own = slice(0, len(clock))
         # The acceleration of a step starts at its own speed.
         position, speed, accel = driven.position[own, i], driven.speed[own, i], driven.accel[1:][own, i]
         imagined = driven.inputs["imagined.gap"][own, i], driven.inputs["imagined.closing_speed"][own, i]
-        loss = float(np.abs(position[at[i]] - targets[i]).mean())
-        found.append(
+        loss = float(np.abs(position[steps[i]] - targets[i]).mean())
+        fits.append(
             Imitated(RegularMotion(clock, position + track.position_m[0], speed, accel), values[i], *imagined, loss)
         )
-    return found
+    return fits
 
 
 def follow(
@@ -142,16 +142,16 @@ def follow(
     and speed (m/s), ``speed0`` the first speed (m/s).
     """
     origin = position_m[0]
-    at, target = np.arange(len(position_m)), position_m - origin
+    steps, target = np.arange(len(position_m)), position_m - origin
     ahead = _ahead(rear_m - origin, pace)
-    found = _descended(RealLeader(), ahead, START[None], [speed0], dt, [at], [target], FIVE, iterations)
-    return np.array([found.params[f"idm.{name}"][0] for name in NAMES])
+    result = _descended(RealLeader(), ahead, START[None], [speed0], dt, [steps], [target], FIVE, iterations)
+    return np.array([result.params[f"idm.{name}"][0] for name in NAMES])
 
 
 def drive(values: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
     """Return the distances [K] that the five values drive from 0 at ``speed0``, behind a leader as in ``follow``."""
-    found = _descended(RealLeader(), _ahead(rear_m, pace), values[None], [speed0], dt, [], [], {}, 0)
-    return found.position[:-1, 0]
+    result = _descended(RealLeader(), _ahead(rear_m, pace), values[None], [speed0], dt, [], [], {}, 0)
+    return result.position[:-1, 0]
 
 
 def _ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:
@@ -160,9 +160,9 @@ def _ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:
 
 def _descended(
     leader: Effect, ahead: Imagined | Ahead, values: np.ndarray, speed0: Sequence[float], dt: float,
-    at: Sequence[np.ndarray], targets: Sequence[np.ndarray], bounds: Bounds, iterations: int,
+    steps: Sequence[np.ndarray], targets: Sequence[np.ndarray], bounds: Bounds, iterations: int,
 ) -> DescentResult:  # fmt: skip
-    """Fit rows of ``values`` [N, 5] and of the input ``ahead`` (steps, N, 1) to distances at the steps ``at`` [N]."""
+    """Fit rows of ``values`` [N, 5] and of the input ``ahead`` (steps, N, 1) to distances at ``steps`` [N]."""
     from idm_env.kernels.descent import Observed, descend
 
     simulator = Simulator(Lane(), (IDM(sharpness=1.0), leader, Brakes(sharpness=1.0)), dt, "euler")
@@ -171,9 +171,9 @@ def _descended(
     params["brakes"]["max_decel"] = torch.tensor(MAX_DECEL, dtype=torch.float64)
     speed = torch.tensor(speed0, dtype=torch.float64)[:, None]
     state = simulator.state(torch.zeros_like(speed), speed, params)
-    sizes = [len(x) for x in at]
+    sizes = [len(x) for x in steps]
     observed = Observed(
-        np.concatenate([np.empty(0, np.int64), *at]), np.repeat(np.arange(len(at)), sizes),
+        np.concatenate([np.empty(0, np.int64), *steps]), np.repeat(np.arange(len(steps)), sizes),
         np.concatenate([[], *targets]), np.repeat([1.0 / size for size in sizes], sizes),
     )  # fmt: skip
     return descend(

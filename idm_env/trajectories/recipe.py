@@ -182,10 +182,10 @@ def _ties(
             ties.setdefault(m.follower, []).append((steps, back))
         else:
             clock = around.clocks[m.leader]
-            at = np.clip(np.round((around.clocks[m.follower][steps] - clock[0]) / (clock[1] - clock[0])), 0, None)
-            at = np.minimum(at.astype(int), len(clock) - 1)
-            ahead = positions[m.leader][at] - gap[wrong] + SMALLEST_GAP_M
-            ties.setdefault(m.leader, []).append((at, ahead))
+            ticks = np.clip(np.round((around.clocks[m.follower][steps] - clock[0]) / (clock[1] - clock[0])), 0, None)
+            ticks = np.minimum(ticks.astype(int), len(clock) - 1)
+            ahead = positions[m.leader][ticks] - gap[wrong] + SMALLEST_GAP_M
+            ties.setdefault(m.leader, []).append((ticks, ahead))
     return ties
 
 

@@ -29,11 +29,11 @@ MOST_LISTED = 100
 
 def write_report(
     out: Path, report: dict[str, Any], shown: Sequence[tuple[TrackPiece, RegularMotion]], parameters: pl.DataFrame,
-    drawn: Sequence[page.Block] = (),
+    figures: Sequence[page.Block] = (),
 ) -> None:  # fmt: skip
     """Write ``report.json`` and ``report.html`` with the table of methods, pictures before and after, and histograms.
 
-    ``drawn`` are pictures in space and time.
+    ``figures`` are pictures in space and time.
 
     Numbers that are not finite become null in JSON, which knows none.
     """
@@ -44,8 +44,8 @@ def write_report(
         blocks.append(page.text(_noise(report["noise"])))
     if report["left_out_points"]:
         blocks += _left_out_points(report["left_out_points"])
-    if drawn:
-        blocks += [page.heading("In space and time"), *drawn]
+    if figures:
+        blocks += [page.heading("In space and time"), *figures]
     blocks += [page.heading("Methods on these data"), methods(report["methods"])]
     blocks.append(
         page.note(
@@ -168,17 +168,17 @@ def _parameters(parameters: pl.DataFrame) -> list[page.Block]:
         return []
     rows = []
     for p in IDM.declared:
-        known = parameters.filter(pl.col(p.name).is_not_null())
-        low, middle, high = np.percentile(known[p.name].to_numpy(), [25, 50, 75])
-        told = known[f"{p.name}_identified"].drop_nulls()
+        finite = parameters.filter(pl.col(p.name).is_not_null())
+        low, middle, high = np.percentile(finite[p.name].to_numpy(), [25, 50, 75])
+        identified = finite[f"{p.name}_identified"].drop_nulls()
         rows.append(
             {
                 "parameter": f"{p.symbol} {p.name}", "unit": p.unit, "median": float(middle),
                 "quartiles": f"{low:.2f} – {high:.2f}",
-                "told by the data": f"{100 * told.to_numpy().mean():.0f} %" if len(told) else "–",
+                "told by the data": f"{100 * identified.to_numpy().mean():.0f} %" if len(identified) else "–",
             }
         )  # fmt: skip
-    words = f"Driver parameters of {known.height} tracks. Dark: the data tell the value to within a half of itself."
+    words = f"Driver parameters of {finite.height} tracks. Dark: the data tell the value to within a half of itself."
     return [
         page.heading("Driver parameters"),
         page.table(rows, digits={"median": 2}),
@@ -193,9 +193,9 @@ def parameter_histograms(parameters: pl.DataFrame) -> Figure:
         values = parameters[p.name].drop_nulls().to_numpy()
         bins = np.linspace(values.min(), max(values.max(), values.min() + 1e-6), 25)
         axis.hist(values, bins, color=BEFORE, label="all")
-        told = parameters.filter(pl.col(f"{p.name}_identified") & pl.col(p.name).is_not_null())[p.name].to_numpy()
-        if len(told):
-            axis.hist(told, bins, color=AFTER, label="told by the data")
+        identified = parameters.filter(pl.col(f"{p.name}_identified") & pl.col(p.name).is_not_null())[p.name].to_numpy()
+        if len(identified):
+            axis.hist(identified, bins, color=AFTER, label="told by the data")
         axis.set_xlabel(f"{p.symbol}: {p.name.replace('_', ' ')} ({p.unit})", fontsize=9)
         axis.tick_params(labelsize=8)
     figure.axes[0].set_ylabel("tracks", fontsize=9)

@@ -85,11 +85,11 @@ class Tally:
 
     def compare(self, motion: RegularMotion, truth: RegularMotion) -> None:
         """Count errors against a truth on the same clock; samples whose true value is NaN do not count."""
-        known = np.isfinite(truth.speed_mps) & np.isfinite(truth.accel_mps2) & np.isfinite(truth.position_m)
-        self.compared += int(known.sum())
-        self.position_square += float(((motion.position_m - truth.position_m)[known] ** 2).sum())
-        self.speed_square += float(((motion.speed_mps - truth.speed_mps)[known] ** 2).sum())
-        self.accel_error_square += float(((motion.accel_mps2 - truth.accel_mps2)[known] ** 2).sum())
+        finite = np.isfinite(truth.speed_mps) & np.isfinite(truth.accel_mps2) & np.isfinite(truth.position_m)
+        self.compared += int(finite.sum())
+        self.position_square += float(((motion.position_m - truth.position_m)[finite] ** 2).sum())
+        self.speed_square += float(((motion.speed_mps - truth.speed_mps)[finite] ** 2).sum())
+        self.accel_error_square += float(((motion.accel_mps2 - truth.accel_mps2)[finite] ** 2).sum())
 
     def merge(self, other: Tally) -> None:
         """Add another tally, of another chunk."""

@@ -89,13 +89,13 @@ class TrackObservations:
     def of(cls, time_s: np.ndarray, position_m: np.ndarray, dt: float, steps: int | None = None) -> TrackObservations:
         """Put samples on the clock ``time_s[0] + k dt``; a sample between ticks is seen from the tick before it."""
         since = (time_s - time_s[0]) / dt
-        at = np.floor(since + 1e-6).astype(np.int64)
-        rest = np.maximum(since - at, 0.0) * dt
+        ticks = np.floor(since + 1e-6).astype(np.int64)
+        rest = np.maximum(since - ticks, 0.0) * dt
         rest[rest < 1e-6] = 0.0
         look = np.stack([np.ones_like(rest), rest, 0.5 * rest * rest, np.ones_like(rest)], axis=1)
         count = int(np.ceil(since[-1] - 1e-6)) + 1 if steps is None else steps
         origin = float(position_m[0])
-        return cls(count, dt, origin, at, look, position_m - origin, np.ones(len(at), bool))
+        return cls(count, dt, origin, ticks, look, position_m - origin, np.ones(len(ticks), bool))
 
     def start(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and covariance before the first sample: the mean speed over 3 s, give or take 10 m/s."""
@@ -152,10 +152,10 @@ def smooth(observed: TrackObservations, noise: PositionNoise, choices: Choices =
     mean, cov, push = _fitted(observed, noise, choices, None)
     for _ in range(6):
         broken = _broken(mean, choices)
-        if not any(len(at) for at, _, _ in broken):
+        if not any(len(steps) for steps, _, _ in broken):
             break
-        for at, which, value in broken:
-            observed = observed.bounded(at, which, np.full(len(at), value))
+        for steps, which, value in broken:
+            observed = observed.bounded(steps, which, np.full(len(steps), value))
         mean, cov, push = _fitted(observed, noise, choices, push)
     sigma = np.sqrt(np.maximum(np.einsum("kii->ki", cov)[:, :3], 0.0))
     return Smoothed(

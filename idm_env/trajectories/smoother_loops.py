@@ -62,8 +62,8 @@ def _update(state, cov, look, value, variance, along):
 
 
 @compiled
-def likelihood(steps, at, look, value, variance, start, spread, dt, keep, fade, push, drift):
-    """Return the log-likelihood of observations (sorted by their step ``at``) under the linear Gaussian model."""
+def likelihood(steps, ticks, look, value, variance, start, spread, dt, keep, fade, push, drift):
+    """Return the log-likelihood of observations (sorted by ``ticks``) under the linear Gaussian model."""
     state, cov = start.copy(), spread.copy()
     next_state, next_cov = np.empty(N), np.empty((N, N))
     rows, along = np.empty((N, N)), np.empty(N)
@@ -73,7 +73,7 @@ def likelihood(steps, at, look, value, variance, start, spread, dt, keep, fade, 
             _predict(state, cov, dt, keep, fade, push, drift, next_state, next_cov, rows)
             state, next_state = next_state, state
             cov, next_cov = next_cov, cov
-        while o < len(at) and at[o] == k:
+        while o < len(ticks) and ticks[o] == k:
             total += _update(state, cov, look[o], value[o], variance[o], along)
             o += 1
     return total
@@ -102,7 +102,7 @@ def _gain(cov, cross, out, low):
 
 
 @compiled
-def smooth(at, look, value, variance, start, spread, dt, keep, fade, push, drift, mean, cov, jerk_square):
+def smooth(ticks, look, value, variance, start, spread, dt, keep, fade, push, drift, mean, cov, jerk_square):
     """Fill the smoothed ``mean`` [K, 4], ``cov`` [K, 4, 4] and E[w²] of the jerk's push after every step [K].
 
     ``push`` [K] is the prior variance of every step's change of acceleration. Returns the log-likelihood.
@@ -120,7 +120,7 @@ def smooth(at, look, value, variance, start, spread, dt, keep, fade, push, drift
                 mean[k - 1], cov[k - 1], dt, keep, fade, push[k - 1], drift, ahead_mean[k], ahead_cov[k], part
             )  # fmt: skip
         mean[k], cov[k] = ahead_mean[k], ahead_cov[k]
-        while o < len(at) and at[o] == k:
+        while o < len(ticks) and ticks[o] == k:
             total += _update(mean[k], cov[k], look[o], value[o], variance[o], along)
             o += 1
     half = 0.5 * dt * dt
@@ -180,12 +180,12 @@ def adapt(jerk_square, push, half_window, degrees, scale):
 
 
 @compiled
-def reweigh(at, look, value, mean, cov, white, degrees, robust, variance):
+def reweigh(ticks, look, value, mean, cov, white, degrees, robust, variance):
     """Fill ``variance`` of the observations marked ``robust`` with those of Student-t noise of ``degrees``."""
-    for o in range(len(at)):
+    for o in range(len(ticks)):
         if not robust[o]:
             continue
-        k = at[o]
+        k = ticks[o]
         error, spread = value[o], 0.0
         for i in range(N):
             error -= look[o, i] * mean[k, i]

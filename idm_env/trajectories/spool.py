@@ -101,11 +101,11 @@ class Spool:
 
     def strands(self) -> list[tuple[int, ...]]:
         """Return the chunks that have to be done one after the other, because a run goes on from one to the next."""
-        found: list[list[int]] = []
+        strands: list[list[int]] = []
         for number, begin in enumerate(self.shelf.borders[:-1]):
             goes_on = begin and self.vehicles[begin][0] == self.vehicles[begin - 1][0]
-            found[-1].append(number) if goes_on else found.append([number])
-        return [tuple(strand) for strand in found]
+            strands[-1].append(number) if goes_on else strands.append([number])
+        return [tuple(strand) for strand in strands]
 
     def picked(self, indices: Sequence[int]) -> Iterator[Table]:
         """Yield the tables of single vehicles."""
@@ -123,16 +123,16 @@ class Spool:
             self._counted.add(repairs)
             usable, repairs = prepare.rows(piece, self.source, ring_length, filled)
             self._counted.add(repairs)
-            kept = usable.filter(pl.col("position_m").is_not_null())
-            if lost := usable.height - kept.height:
+            rows = usable.filter(pl.col("position_m").is_not_null())
+            if lost := usable.height - rows.height:
                 self._counted.add([Repair("no position", lost, f"{lost} rows without a position were left out.")])
-            if kept.height == 0:
+            if rows.height == 0:
                 continue
-            sample += [kept] if sum(some.height for some in sample) < BUCKET_ROWS else []
+            sample += [rows] if sum(some.height for some in sample) < BUCKET_ROWS else []
             files.append(self.folder / f"raw-{len(files):05d}.parquet")
-            kept = kept.select(pl.col(name) for name in KEPT if name in kept.columns)
-            storage.write(files[-1], kept.write_parquet)
-            parts.append(_indexed(kept))
+            rows = rows.select(pl.col(name) for name in KEPT if name in rows.columns)
+            storage.write(files[-1], rows.write_parquet)
+            parts.append(_indexed(rows))
         filled.check(self.source)
         index = _merged(parts)
         vehicles = directions.against(index.filter(~pl.col("ring")), self.source)
@@ -201,9 +201,9 @@ class Spool:
             files.append(self.folder / f"led-{bucket:05d}.parquet")
             storage.write(files[-1], frame.select(*KEY, "chunk", "step", "leader_id").write_parquet)
             _remove(parts)
-        found = self._partition(files, "led", pl.col("chunk"))
+        by_chunk = self._partition(files, "led", pl.col("chunk"))
         followers = 0
-        for chunk, parts in found.items():
+        for chunk, parts in by_chunk.items():
             ticks = pl.read_parquet(parts, glob=False).sort(*clean.NAMES, "step")
             ticks, repairs = leaders.steady(ticks)
             self._counted.add(repairs)
@@ -218,7 +218,7 @@ class Spool:
         self, files: Sequence[Path], name: str, bucket: pl.Expr, index: pl.DataFrame | None = None
     ) -> dict[int, list[Path]]:
         """Bring the rows of files together, a file per bucket and file, and remove them; return the new ones."""
-        found: dict[int, list[Path]] = {}
+        by_bucket: dict[int, list[Path]] = {}
         for n, path in enumerate(files):
             frame = pl.read_parquet(path, glob=False)
             if index is not None:
@@ -227,9 +227,9 @@ class Spool:
             for (key,), part in frame.partition_by("bucket", as_dict=True, include_key=False).items():
                 target = self.folder / f"{name}-{key:05d}-{n:05d}.parquet"
                 storage.write(target, part.write_parquet)
-                found.setdefault(key, []).append(target)
+                by_bucket.setdefault(key, []).append(target)
             path.unlink()
-        return found
+        return by_bucket
 
 
 def read_table(path: str | Path, layout: str = "auto") -> Table:

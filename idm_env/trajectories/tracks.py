@@ -71,8 +71,8 @@ class Table:
     def vehicles(self) -> list[tuple[str, str, int, int]]:
         """Return (run, vehicle, first row, rows) of every vehicle, in order of the time at which it appears."""
         rows = self.frame.with_row_index("row").group_by("run_id", "vehicle_id", maintain_order=True)
-        found = rows.agg(pl.col("row").first(), pl.len().alias("count"), pl.col("time_s").first().alias("begin"))
-        return found.sort("run_id", "begin", maintain_order=True).select("run_id", "vehicle_id", "row", "count").rows()
+        table = rows.agg(pl.col("row").first(), pl.len().alias("count"), pl.col("time_s").first().alias("begin"))
+        return table.sort("run_id", "begin", maintain_order=True).select("run_id", "vehicle_id", "row", "count").rows()
 
 
 class Pieces:
@@ -98,10 +98,10 @@ class Pieces:
     def of(self, vehicles: list[tuple[str, str, int, int]]) -> Iterator[TrackPiece]:
         """Yield the tracks of some vehicles, as ``vehicles`` lists them."""
         for run, vehicle, first, count in vehicles:
-            at = slice(first, first + count)
+            rows = slice(first, first + count)
             whole = TrackPiece(
-                run, vehicle, 0, self._columns["time_s"][at], self._columns["position_m"][at],
-                float(self._length[first]), self._leader[at], self._lane[at],
+                run, vehicle, 0, self._columns["time_s"][rows], self._columns["position_m"][rows],
+                float(self._length[first]), self._leader[rows], self._lane[rows],
             )  # fmt: skip
             yield from self._usable(whole)
 
@@ -145,11 +145,11 @@ def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
     """
     far = np.maximum(SMALLEST_JUMP_M, HIGHEST_SPEED_MPS * np.diff(time))
     away = np.abs(np.diff(position)) > far
-    for at in np.flatnonzero(away):
-        around = slice(max(0, at - 4), at + 1), slice(at + 1, at + 6)
+    for place in np.flatnonzero(away):
+        around = slice(max(0, place - 4), place + 1), slice(place + 1, place + 6)
         before, after = (np.median(position[part]) for part in around)
         between = np.median(time[around[1]]) - np.median(time[around[0]])
-        away[at] = abs(after - before) > max(SMALLEST_JUMP_M, HIGHEST_SPEED_MPS * between)
+        away[place] = abs(after - before) > max(SMALLEST_JUMP_M, HIGHEST_SPEED_MPS * between)
     return away
 
 
