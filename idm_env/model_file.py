@@ -223,21 +223,21 @@ def make_effects(descriptions: Iterable[str | Mapping[str, Any] | Effect]) -> tu
     """
     if isinstance(descriptions, (str, Mapping)) or not isinstance(descriptions, Iterable):
         raise ValueError(f"effects = {shown(descriptions)} must be a list, such as [idm, brakes].")
-    made = []
+    effects = []
     for description in descriptions:
         if isinstance(description, Effect):
-            made.append(description)
+            effects.append(description)
         elif isinstance(description, str):
-            made.append(catalogue.make(description))
+            effects.append(catalogue.make(description))
         elif isinstance(description, Mapping) and "effect" in description:
             choices = {str(k): v for k, v in description.items() if k != "effect"}
             try:
-                made.append(catalogue.make(_text("effect", description["effect"]), **choices))
+                effects.append(catalogue.make(_text("effect", description["effect"]), **choices))
             except (TypeError, ArithmeticError) as error:
                 raise ValueError(f"effect {shown(description)} has a choice of a wrong type ({error}).") from None
         else:
             raise ValueError(f"effect {shown(description)} must be a name or a mapping with the key 'effect'.")
-    return tuple(made)
+    return tuple(effects)
 
 
 def numbers(values: Mapping[str, Any]) -> Numbers:
@@ -245,20 +245,20 @@ def numbers(values: Mapping[str, Any]) -> Numbers:
     return {e: {n: number(f"{e}.{n}", x) for n, x in part.items()} for e, part in nested(values).items()}
 
 
-def nested(values: Mapping[str, Any], of: str = "parameters") -> dict[str, dict[str, Any]]:
-    """Return parameters as effect → parameter → value, from that or from full names with a dot; ``of`` is the key.
+def nested(values: Mapping[str, Any], section: str = "parameters") -> dict[str, dict[str, Any]]:
+    """Return parameters as effect → parameter → value, from that or from full names with a dot; ``section`` is the key.
 
     ValueError for anything else, and for a parameter given twice.
     """
     result: dict[str, dict[str, Any]] = {}
-    for key, value in _mapping(of, values).items():
+    for key, value in _mapping(section, values).items():
         if isinstance(value, Mapping):
             part, effect = {str(name): x for name, x in value.items()}, str(key)
         elif "." in str(key):
             effect, name = str(key).split(".", 1)
             part = {name: value}
         else:
-            raise ValueError(f"{of}.{shown(key)} = {shown(value)} must be a mapping, such as {{time_gap: 1.2}}.")
+            raise ValueError(f"{section}.{shown(key)} = {shown(value)} must be a mapping, such as {{time_gap: 1.2}}.")
         for name in part:
             if name in result.get(effect, {}):
                 raise ValueError(f"parameter {shown(f'{effect}.{name}')} is given twice. Remove one of them.")
@@ -291,10 +291,10 @@ def _text(name: str, value: Any) -> str:
     return value
 
 
-def _known(content: Mapping[str, Any], known: Iterable[str], what: str) -> None:
+def _known(content: Mapping[str, Any], names: Iterable[str], what: str) -> None:
     for key in content:
-        if key not in known:
-            raise ValueError(f"unknown {what} {shown(key)}.{nearest(str(key), known)}")
+        if key not in names:
+            raise ValueError(f"unknown {what} {shown(key)}.{nearest(str(key), names)}")
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
@@ -364,7 +364,7 @@ def _harmless(yaml: Any, text: str, loader: Any) -> None:
             continue
         if not isinstance(event, yaml.NodeEvent):
             continue
-        known = keys[-1] if keys and waits[-1] else None
+        siblings = keys[-1] if keys and waits[-1] else None
         if keys:
             waits[-1] = not waits[-1]
         if isinstance(event, yaml.CollectionStartEvent):
@@ -374,12 +374,12 @@ def _harmless(yaml: Any, text: str, loader: Any) -> None:
                 raise ValueError(f"{line}: nested deeper than {DEEPEST}.")
         elif event.style is None and len(event.value) > LONGEST:
             raise ValueError(f"{line}: a value of {len(event.value)} characters; quote it.")
-        elif known is not None and not event.value.isprintable():
+        elif siblings is not None and not event.value.isprintable():
             raise ValueError(f"{line}: key {shown(event.value)} must be printable: errors name it. Rename it.")
-        elif known is not None and event.value in known:
+        elif siblings is not None and event.value in siblings:
             raise ValueError(f"{line}: key {shown(event.value)} is there twice. Remove one of them.")
-        elif known is not None:
-            known.add(event.value)
+        elif siblings is not None:
+            siblings.add(event.value)
 
 
 def _yaml() -> Any:

@@ -117,18 +117,18 @@ class Simulator(CarFollowingStep):
             fast = backends.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)
             # NaN that an effect of one's own has made is told by the step itself.
             if fast is not None and not (self.own and bool(fast[0].speed.isnan().any())):
-                last, kept_of_all = fast
-                return last, None if kept_of_all is None else Trajectory(*kept_of_all)
+                last, columns = fast
+                return last, None if columns is None else Trajectory(*columns)
         slices = self.slices(inputs, steps)
 
         def run(state: State, begin: int, end: int) -> tuple[State, list[tuple[Tensor, ...]]]:
-            kept = []
+            samples = []
             for t in range(begin, end):
                 state = self.step(state, slices[t], params)
-                kept.append(() if keep is None else keep(state))
-            return state, kept
+                samples.append(() if keep is None else keep(state))
+            return state, samples
 
-        kept: list[tuple[Tensor, ...]] = []
+        samples: list[tuple[Tensor, ...]] = []
         stride = checkpoint_every or max(steps, 1)
         for begin in range(0, steps, stride):
             end = min(begin + stride, steps)
@@ -136,13 +136,13 @@ class Simulator(CarFollowingStep):
                 state, part = checkpoint(run, state, begin, end, use_reentrant=False, preserve_rng_state=False)
             else:
                 state, part = run(state, begin, end)
-            kept += part
-        if not kept:
+            samples += part
+        if not samples:
             raise ValueError(f"steps = {steps}: a rollout needs at least one step.")
         if keep is None:
             return state, None
-        columns = (torch.stack(column) for column in zip(*kept, strict=True))
-        first = kept[0]
+        columns = (torch.stack(column) for column in zip(*samples, strict=True))
+        first = samples[0]
         return state, type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
 
     @property
@@ -161,10 +161,10 @@ class Simulator(CarFollowingStep):
         state = state._replace(step=state.step - state.step.remainder(self.decides_after))
         with torch.inference_mode(False), torch.no_grad():
             numbers = {e: {n: torch.as_tensor(x) for n, x in values.items()} for e, values in params.items()}
-            copied, given, values = (
+            copied, inputs_now, values = (
                 mapped(lambda x: x.detach().clone(), each) for each in (state, self.slices(inputs, 1)[0], numbers)
             )
-            Simulator.step(self, copied, given, values)  # type: ignore[arg-type]
+            Simulator.step(self, copied, inputs_now, values)  # type: ignore[arg-type]
         self.__dict__["_tried"] = True
 
     def advance(self, state: State, inputs: Inputs, params: Params) -> State:
@@ -195,10 +195,10 @@ class Compiled(Simulator):
         plain = Simulator(self.road, self.effects, self.dt, self.integration)
         # Filled here, because the tracer does not enter the lock of a cached property.
         _ = plain.by_name, plain._following, plain._hooks, plain._needs, plain._unspoken
-        made: Callable[[State, Inputs, Params], State] = torch.compile(
+        compiled: Callable[[State, Inputs, Params], State] = torch.compile(
             plain.step, backend=self.backend, dynamic=self.dynamic, fullgraph=True
         )
-        return made
+        return compiled
 
     def step(self, state: State, inputs: Inputs, params: Params) -> State:
         """Return the state Δt later, as ``Simulator.step`` to rounding."""

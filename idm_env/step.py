@@ -257,8 +257,8 @@ class CarFollowingStep:
         for effect in self.effects:
             held = effect.initial_memory(scene, driver, dict(params[effect.name]))
             if held is not None:
-                drawn = effect.draws and seed is not None
-                memory[effect.name] = normals(f"{effect.name} at the start", seed or 0, held) if drawn else held
+                random = effect.draws and seed is not None
+                memory[effect.name] = normals(f"{effect.name} at the start", seed or 0, held) if random else held
         if self.looks_back:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
         if self.sees_lanes:
@@ -269,8 +269,8 @@ class CarFollowingStep:
     def scene(self, state: State, inputs: Inputs) -> Scene:
         """Return what this step looks like to every vehicle."""
         road = self.road.view(state)
-        there = road.leader_present(state.present, state.speed)
-        leader = road.leader(state.gap, state.speed, state.accel, there)
+        led = road.leader_present(state.present, state.speed)
+        leader = road.leader(state.gap, state.speed, state.accel, led)
         scene = Scene(
             position=state.position,
             speed=state.speed,
@@ -326,8 +326,8 @@ class CarFollowingStep:
         accel, seen, driver = self.wanted(scene, params)
         for effect in self._hooks["limit"]:
             view = scene if effect.sees_truth else seen
-            given = self._unspoken.get(effect.name) or params[effect.name]
-            accel = effect.limit(accel, view, driver, given)  # type: ignore[arg-type]
+            own = self._unspoken.get(effect.name) or params[effect.name]
+            accel = effect.limit(accel, view, driver, own)  # type: ignore[arg-type]
         return accel, driver
 
     def acceleration(self, state: State, inputs: Inputs, params: Params) -> Tensor:
@@ -343,8 +343,8 @@ class CarFollowingStep:
         accel, scene, driver = self._respond(state, inputs, params)
         displacement, speed, accel = INTEGRATORS[self.integration](state.speed, accel, self.dt)
         if state.present is not None:  # whoever is not there stands still, whatever he wants or is commanded
-            there = state.present > 0
-            displacement, speed, accel = (torch.where(there, x, 0.0) for x in (displacement, speed, accel))
+            on_road = state.present > 0
+            displacement, speed, accel = (torch.where(on_road, x, 0.0) for x in (displacement, speed, accel))
         motion = Motion(displacement, state.position + displacement, speed, accel, state.present)
         for effect in self._hooks["place"]:
             motion = effect.place(motion, scene, params[effect.name])  # type: ignore[arg-type]
@@ -404,8 +404,8 @@ def euler(speed: Tensor, accel: Tensor, dt: float) -> tuple[Tensor, Tensor, Tens
 def normals(what: str, seed: int, like: Tensor, *leading: int) -> Tensor:
     """Return standard normals (…leading, *like.shape), the same for the same seed and ``what`` they are for."""
     generator = torch.Generator().manual_seed(zlib.crc32(f"{seed} {what}".encode()))
-    drawn = torch.randn((*leading, *like.shape), generator=generator, dtype=torch.float64)
-    return drawn.to(device=like.device, dtype=like.dtype)
+    values = torch.randn((*leading, *like.shape), generator=generator, dtype=torch.float64)
+    return values.to(device=like.device, dtype=like.dtype)
 
 
 def half_ahead(scene: Scene) -> Scene:

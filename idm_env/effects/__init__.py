@@ -140,11 +140,11 @@ def base_named(kind: str) -> CarFollowing:
 
     ValueError, in one line, for what is none.
     """
-    made = make(kind) if ":" in kind or kind in ALL else None
-    if not isinstance(made, CarFollowing):
+    law = make(kind) if ":" in kind or kind in ALL else None
+    if not isinstance(law, CarFollowing):
         laws = [name for name, effect in ALL.items() if issubclass(effect, CarFollowing)]
         raise ValueError(f"base {shown(kind)} is no car-following law. There are: {', '.join(laws)}.")
-    return made
+    return law
 
 
 def named(text: str) -> str:
@@ -167,11 +167,11 @@ def make(kind: str, **choices: object) -> Effect:
         raise ValueError(f"unknown effect {shown(kind)}.{nearest(str(kind), ALL)}")
     cls = ALL[kind]
     hints = get_type_hints(cls) if choices else {}
-    known = {field.name: hints[field.name] for field in fields(cls)} if choices else {}
+    choice_types = {field.name: hints[field.name] for field in fields(cls)} if choices else {}
     for choice, value in choices.items():
-        if choice not in known:
-            raise ValueError(f"effect '{kind}' has no choice {shown(choice)}.{nearest(choice, known)}")
-        if not _fits(value, known[choice]):
+        if choice not in choice_types:
+            raise ValueError(f"effect '{kind}' has no choice {shown(choice)}.{nearest(choice, choice_types)}")
+        if not _fits(value, choice_types[choice]):
             hint = cls.__dataclass_fields__[choice].type
             raise ValueError(f"effect '{kind}': {choice} = {shown(value)} must be of the kind {hint}, and finite.")
     return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in choices.items()})  # type: ignore[arg-type]

@@ -29,8 +29,8 @@ class Control(Effect):
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the command where active."""
         command: Command = scene.input(self.name)
-        given = torch.minimum(command.accel, accel) if self.careful else command.accel
-        return torch.where(command.active, given, accel)
+        command_accel = torch.minimum(command.accel, accel) if self.careful else command.accel
+        return torch.where(command.active, command_accel, accel)
 
 
 @dataclass(frozen=True)

@@ -128,10 +128,10 @@ class Effect:
             raise TypeError(
                 f"effect {cls.__name__}: needs = {sorted(unknown)} is unknown. A scene has {', '.join(sorted(NEEDED))}."
             )
-        for promise, known in (("sought", Sought), ("beyond", Neighbour)):
-            if (value := getattr(cls, promise)) not in get_args(known):
+        for promise, kinds in (("sought", Sought), ("beyond", Neighbour)):
+            if (value := getattr(cls, promise)) not in get_args(kinds):
                 raise TypeError(
-                    f"effect {cls.__name__}: {promise} = {value!r} is none of {', '.join(map(repr, get_args(known)))}."
+                    f"effect {cls.__name__}: {promise} = {value!r} is none of {', '.join(map(repr, get_args(kinds)))}."
                 )
         if "changes" in vars(cls):
             told = f"effect {cls.__name__}: `changes` is called `acts_on` now. Rename it; the old name goes with 0.2."
@@ -232,12 +232,12 @@ class CarFollowing(Effect):
             return
         lacks = [
             what
-            for what, there in (
+            for what, present in (
                 ("equation: override accelerate", cls.accelerate is not CarFollowing.accelerate),
                 ("driver: override driver", cls.driver is not CarFollowing.driver),
                 ("parameters: declare some", cls.declared or cls.parameters is not Effect.parameters),
             )
-            if not there
+            if not present
         ]
         if lacks:
             raise TypeError(f"car-following law {cls.__name__} has no {'; no '.join(lacks)}.")

@@ -122,8 +122,8 @@ class FVDM(CarFollowing):
         x = (leader.gap - driver.min_gap - driver.extra_gap) * (1.0 + level) / (v0 * driver.time_gap)
         slower = (1.0 - torch.tanh(x - self.offset)) * (1.0 / (1.0 + level)) * leader.present
         near = (2.0 - leader.gap * (1.0 / self.reach)).clamp(0.0, 1.0) * leader.present
-        wanted = p["sensitivity"] * (v0 * (1.0 - slower) - scene.speed)
-        return wanted + p["speed_gain"] * (leader.speed - scene.speed) * near
+        target = p["sensitivity"] * (v0 * (1.0 - slower) - scene.speed)
+        return target + p["speed_gain"] * (leader.speed - scene.speed) * near
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class ConstantTimeGap(OfFiveParameters):
         too_far = leader.gap - driver.min_gap - driver.extra_gap - v * driver.time_gap
         follow = p["gap_gain"] * too_far + p["speed_gain"] * (leader.speed - v) + p["feed_forward"] * leader.accel
         cruise = self.cruise_gain * (driver.desired_speed - v)
-        wanted = cruise - torch.relu(cruise - follow) * leader.present
-        wanted = torch.minimum(torch.maximum(wanted, -driver.comfort_decel), driver.max_accel)
+        target = cruise - torch.relu(cruise - follow) * leader.present
+        target = torch.minimum(torch.maximum(target, -driver.comfort_decel), driver.max_accel)
         # The implicit step of the lag, as in the effect ``lag``.
-        return wanted + (scene.accel - wanted) * (p["lag"] / (p["lag"] + scene.dt))
+        return target + (scene.accel - target) * (p["lag"] / (p["lag"] + scene.dt))

@@ -38,8 +38,8 @@ def inverse_square(gap: Tensor) -> Tensor:
 
 def interaction(driver: Driver, speed: Tensor, gap: Tensor, lead_speed: Tensor) -> Tensor:
     """``(s* / s)²`` (dimensionless), the interaction term of IDM."""
-    wanted = desired_gap(driver, speed, speed - lead_speed)
-    return wanted * wanted * inverse_square(gap)
+    desired = desired_gap(driver, speed, speed - lead_speed)
+    return desired * desired * inverse_square(gap)
 
 
 def soft_floor(x: Tensor, floor: Tensor | float, sharpness: float) -> Tensor:
@@ -58,10 +58,10 @@ def gap_for(accel: Tensor, speed: Tensor, closing_speed: Tensor, driver: Driver)
 
     Where IDM accelerates so at no gap, because what is under the root is not positive, that is 10⁶ s*, and at most FAR.
     """
-    wanted = desired_gap(driver, speed, closing_speed)
+    desired = desired_gap(driver, speed, closing_speed)
     square = (speed / driver.desired_speed).square()
     left = 1.0 - square * square - accel / driver.max_accel
-    return (wanted / torch.sqrt(left.clamp_min(1e-12))).clamp_max(FAR)
+    return (desired / torch.sqrt(left.clamp_min(1e-12))).clamp_max(FAR)
 
 
 def equilibrium_gap(driver: Driver, speed: Tensor) -> Tensor:
@@ -81,8 +81,8 @@ def equilibrium_speed(gap: Tensor, driver: Mapping[str, Tensor], exponent: float
         high = driver["desired_speed"].expand_as(gap).clone()
         for _ in range(60):
             middle = 0.5 * (low + high)
-            wanted = (driver["min_gap"] + middle * driver["time_gap"]) / gap.clamp(0.1, FAR)
-            free = 1.0 - (middle / driver["desired_speed"]) ** exponent > wanted * wanted
+            ratio = (driver["min_gap"] + middle * driver["time_gap"]) / gap.clamp(0.1, FAR)
+            free = 1.0 - (middle / driver["desired_speed"]) ** exponent > ratio * ratio
             low, high = torch.where(free, middle, low), torch.where(free, high, middle)
         return 0.5 * (low + high)
 
@@ -143,6 +143,6 @@ class IDM(OfFiveParameters):
         else:
             brake = 2.0 * torch.sqrt(driver.max_accel * driver.comfort_decel)
             closing = scene.speed - scene.leader.speed
-            wanted = driver.min_gap + scene.speed * driver.time_gap + scene.speed * closing / brake + driver.extra_gap
-            term = (soft_floor(wanted, 0.0, self.sharpness) / scene.leader.gap) ** 2
+            desired = driver.min_gap + scene.speed * driver.time_gap + scene.speed * closing / brake + driver.extra_gap
+            term = (soft_floor(desired, 0.0, self.sharpness) / scene.leader.gap) ** 2
         return driver.max_accel * (1.0 - free - term * scene.leader.present)

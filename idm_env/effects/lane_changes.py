@@ -195,9 +195,9 @@ class GapAcceptance(Effect):
             )
             most = p["safe_decel"] + desire * torch.relu(p["most_decel"] - p["safe_decel"])
 
-            def eased(wanted: Tensor, speed: Tensor, gap: Tensor, lead_speed: Tensor) -> Tensor:
+            def eased(accel: Tensor, speed: Tensor, gap: Tensor, lead_speed: Tensor) -> Tensor:
                 less = interaction(driver, speed, gap, lead_speed) - interaction(closer, speed, gap, lead_speed)
-                return wanted + driver.max_accel * less
+                return accel + driver.max_accel * less
 
             own = eased(side.wanted, scene.speed, side.leader.gap, side.leader.speed)
             other = eased(side.with_me, side.follower.speed, side.follower.gap, scene.speed)
@@ -227,11 +227,11 @@ class LaneCommand(Effect):
         """Return a utility that outweighs every driver's."""
         here, left, right = _lanes(scene)
         command: Tensor = scene.input(self.name)
-        given = command.isfinite()
-        side = torch.where(given, command, 0.0)
+        active = command.isfinite()
+        side = torch.where(active, command, 0.0)
 
-        def utility(wanted: Tensor) -> Tensor:
-            return torch.where(given, torch.where(wanted > 0, COMMANDED, -COMMANDED), 0.0) + 0.0 * scene.speed
+        def utility(direction: Tensor) -> Tensor:
+            return torch.where(active, torch.where(direction > 0, COMMANDED, -COMMANDED), 0.0) + 0.0 * scene.speed
 
         return Wish(
             utility(side),

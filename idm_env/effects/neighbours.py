@@ -203,6 +203,6 @@ class Lateral(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the friction (m/s²)."""
-        beside: Adjacent = scene.input(self.name)
-        nearness = torch.exp(-beside.distance.abs() / self.reach) * beside.present
-        return -p["gain"] * torch.relu(scene.speed - beside.speed) * nearness
+        adjacent: Adjacent = scene.input(self.name)
+        nearness = torch.exp(-adjacent.distance.abs() / self.reach) * adjacent.present
+        return -p["gain"] * torch.relu(scene.speed - adjacent.speed) * nearness

@@ -17,7 +17,7 @@ def same_class(a: type[Effect], b: type[Effect]) -> bool:
     return a is b or (a.__qualname__ == b.__qualname__ and _file(a) == _file(b))
 
 
-def entered(effect: type[Effect], known: dict[str, type[Effect]]) -> type[Effect]:
+def entered(effect: type[Effect], catalogue: dict[str, type[Effect]]) -> type[Effect]:
     """Enter a class among the known ones.
 
     ValueError for one without a name, with another's, or that cannot be made without arguments.
@@ -26,7 +26,7 @@ def entered(effect: type[Effect], known: dict[str, type[Effect]]) -> type[Effect
         raise ValueError(f"{effect!r} is no class of effects. Register the class, such as register(MyEffect).")
     if not effect.kind:
         raise ValueError(f'effect {effect.__name__} has no name. Give it one: kind = "my_effect".')
-    taken = known.get(effect.kind)
+    taken = catalogue.get(effect.kind)
     if taken is not None and not same_class(taken, effect):
         raise ValueError(f"the name '{effect.kind}' of {effect.__name__} is that of {taken.__name__}. Give it another.")
     try:
@@ -37,7 +37,7 @@ def entered(effect: type[Effect], known: dict[str, type[Effect]]) -> type[Effect
         raise ValueError(
             f"effect '{effect.kind}' cannot be made without arguments ({_said(error)}). Give its fields defaults."
         ) from None
-    known[effect.kind] = effect
+    catalogue[effect.kind] = effect
     return effect
 
 
@@ -54,13 +54,13 @@ def read(where: str) -> type[Effect]:
     The file is run for that, unless this process has imported it. ValueError, in one line, where there is no such
     class, and for whatever the file raises, ``sys.exit()`` included.
     """
-    module, found = member(where, "effect")
-    if not (isinstance(found, type) and issubclass(found, Effect)):
+    module, effect = member(where, "effect")
+    if not (isinstance(effect, type) and issubclass(effect, Effect)):
         mine = {k: v for k, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__}
         able = ", ".join(k for k, v in mine.items() if issubclass(v, Effect)) or "none"
         place, _, name = where.rpartition(":")
         raise ValueError(f"effect {where}: {place} has no class {name} of effects. It has: {able}.")
-    return found
+    return effect
 
 
 def member(where: str, kind: str) -> tuple[ModuleType, object]:
@@ -84,8 +84,8 @@ def imported(place: str) -> ModuleType | None:
         return sys.modules.get(place)
     try:
         full = Path(place).resolve()
-        if (known := sys.modules.get(_name_of(full))) is not None:
-            return known
+        if (module := sys.modules.get(_name_of(full))) is not None:
+            return module
         for module in list(sys.modules.values()):
             file = getattr(module, "__dict__", {}).get("__file__") or ""
             if file.endswith(full.name) and not module.__name__.startswith(_PREFIX) and Path(file).resolve() == full:

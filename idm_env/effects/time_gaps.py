@@ -122,9 +122,9 @@ class Relaxation(Effect):
         ratio = scene.speed / driver.desired_speed
         square = ratio * ratio
         free = torch.sqrt((1.0 - square * square).clamp_min(0.1))
-        wanted = driver.min_gap + scene.speed * time_gap + driver.extra_gap
-        kept = (scene.leader.gap * free / wanted.clamp_min(0.1)).clamp(0.2, 2.0)
-        return 1.0 + (kept - 1.0) * scene.leader.present
+        desired = driver.min_gap + scene.speed * time_gap + driver.extra_gap
+        ratio = (scene.leader.gap * free / desired.clamp_min(0.1)).clamp(0.2, 2.0)
+        return 1.0 + (ratio - 1.0) * scene.leader.present
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return m = q."""

@@ -31,12 +31,12 @@ def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @functools.wraps(method)
-    def call(self: Any, *given: Any, **named: Any) -> Any:
+    def call(self: Any, *args: Any, **named: Any) -> Any:
         if named or torch.compiler.is_compiling() or compat.transforming():
-            return method(self, *given, **named)
+            return method(self, *args, **named)
         who = f"effect '{self.name}': {name}"
-        seen = [_Limited.of(x, self.looks_back, who) if isinstance(x, Scene) else x for x in given]
-        leaves = dict(leaf for x in given for leaf in _leaves(x))
+        seen = [_Limited.of(x, self.looks_back, who) if isinstance(x, Scene) else x for x in args]
+        leaves = dict(leaf for x in args for leaf in _leaves(x))
         recorded = any(hasattr(x, "suspected") for x in leaves.values())
         before = {k: x._version for k, x in leaves.items() if not recorded and not x.is_inference()}
         try:
@@ -47,16 +47,16 @@ def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
             raise ValueError(f"{who} fails: {' '.join(str(error).split())} ({type(error).__name__}).") from error
         if isinstance(result, Scene) and isinstance(result.history, _Limited):
             result = result._replace(history=result.history.past)
-        made = {k: x for k, x in _leaves(result) if not any(x is other for other in leaves.values())}
+        results = {k: x for k, x in _leaves(result) if not any(x is other for other in leaves.values())}
         if recorded:
-            for x in made.values():
+            for x in results.values():
                 if hasattr(x, "suspected"):
                     x.suspected()
             return result
         changed = next((k for k, version in before.items() if leaves[k]._version != version), None)
         if changed is not None:
             raise ValueError(f"{who} changes {changed} in place, which others read, too. Return a new tensor.")
-        _check(who, RETURNS[name], result, made, leaves)
+        _check(who, RETURNS[name], result, results, leaves)
         return result
 
     return call
@@ -76,13 +76,13 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
                 yield from _leaves(x, f"{inner}.{key}")
 
 
-def _check(who: str, kind: type, result: Any, made: Mapping[str, Any], given: Mapping[str, Tensor]) -> None:
+def _check(who: str, kind: type, result: Any, results: Mapping[str, Any], leaves: Mapping[str, Tensor]) -> None:
     plain = isinstance(result, (int, float))
     if not isinstance(result, kind) and not (kind is Tensor and plain):
         raise ValueError(f"{who} returned {type(result).__name__}, and it must return {kind.__name__}.")
     others = ("scene.inputs", "scene.memory")
-    room = torch.broadcast_shapes(*(x.shape for k, x in given.items() if not k.startswith(others)))
-    for key, x in {"": torch.tensor(float(result))}.items() if plain else made.items():
+    room = torch.broadcast_shapes(*(x.shape for k, x in leaves.items() if not k.startswith(others)))
+    for key, x in {"": torch.tensor(float(result))}.items() if plain else results.items():
         part = key.partition(".")[2]
         if not _fits(x.shape, room):
             raise ValueError(
@@ -91,24 +91,24 @@ def _check(who: str, kind: type, result: Any, made: Mapping[str, Any], given: Ma
             )
         if not x.is_floating_point() or not bool(x.isnan().any()):
             continue
-        bad = x.isnan() & _judged(part.partition("_")[0], given)
-        if not bool(bad.any()) or any(g.is_floating_point() and bool(g.isnan().any()) for g in given.values()):
+        bad = x.isnan() & _judged(part.partition("_")[0], leaves)
+        if not bool(bad.any()) or any(g.is_floating_point() and bool(g.isnan().any()) for g in leaves.values()):
             continue
-        at = bad.expand(torch.broadcast_shapes(bad.shape, room)).nonzero()[0]
-        vehicle, time = (f" for vehicle {int(at[-1])}" if len(at) else ""), given.get("scene.time")
+        index = bad.expand(torch.broadcast_shapes(bad.shape, room)).nonzero()[0]
+        vehicle, time = (f" for vehicle {int(index[-1])}" if len(index) else ""), leaves.get("scene.time")
         when = "" if time is None else f" at {float(time.reshape(-1)[0]):.4g} s"
         raise ValueError(f"{who} returned {part + ' ' if part else ''}nan{vehicle}{when}. It must return numbers.")
 
 
-def _judged(side: str, given: Mapping[str, Tensor]) -> Tensor:
+def _judged(side: str, leaves: Mapping[str, Tensor]) -> Tensor:
     """Return whose results must be numbers: many an equation has a root or a logarithm of a gap, so not where it is 0.
 
     Overlaps are told as crashes. Of a lane beside (``side``) only what exists counts.
     """
     counts = torch.ones((), dtype=torch.bool)
-    for key, x in given.items():
-        beside = key.split(".")[1] if key.startswith(("scene.left.", "scene.right.")) else side
-        if beside == side and key.endswith((".gap", ".exists")):
+    for key, x in leaves.items():
+        place = key.split(".")[1] if key.startswith(("scene.left.", "scene.right.")) else side
+        if place == side and key.endswith((".gap", ".exists")):
             counts = counts & (x > 0)
     return counts
 
@@ -141,8 +141,8 @@ class _Limited:
                 f"{self._who} looks {most:g} s back, and its looks_back is "
                 f"{self._most:g} s. Let looks_back return the most that it needs."
             )
-        found: Scene = self.past.at(scene._replace(history=self.past), seconds)
-        return found._replace(history=scene.history)
+        past: Scene = self.past.at(scene._replace(history=self.past), seconds)
+        return past._replace(history=scene.history)
 
     def pushed(self, scene: Scene) -> Any:
         """Return the buffer after this step."""

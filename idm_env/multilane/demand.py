@@ -79,12 +79,12 @@ def evenly(
     return departs, again, lane
 
 
-def spread(given: Trips, shape: tuple[int, ...]) -> Trips:
+def spread(schedule: Trips, shape: tuple[int, ...]) -> Trips:
     """Return the trips with this shape ``(…, vehicles)``."""
-    return Trips(*(x.expand(shape).contiguous() for x in given))
+    return Trips(*(x.expand(shape).contiguous() for x in schedule))
 
 
-def waiting(stepping: CarFollowingStep, given: Trips, params: Params, *, length: Tensor | float = 5.0) -> State:
+def waiting(stepping: CarFollowingStep, schedule: Trips, params: Params, *, length: Tensor | float = 5.0) -> State:
     """Return a road on which nobody is yet: everybody waits for his trip.
 
     ValueError for a road without a beginning, or a lane that does not exist.
@@ -92,23 +92,23 @@ def waiting(stepping: CarFollowingStep, given: Trips, params: Params, *, length:
     road = stepping.road
     if not isinstance(road, Lanes) or road.ring is not None:
         raise ValueError("trips need a road that begins somewhere: Lanes(count), or Lanes(count, length=…).")
-    begin = road.at_lane(given.lane.clamp(0, road.count - 1), given.speed, "begins")
+    begin = road.at_lane(schedule.lane.clamp(0, road.count - 1), schedule.speed, "begins")
     state = stepping.state(
-        begin, given.speed, params, length=length, lane=given.lane, present=torch.zeros_like(begin)
+        begin, schedule.speed, params, length=length, lane=schedule.lane, present=torch.zeros_like(begin)
     )  # fmt: skip
-    return state._replace(trips=given)
+    return state._replace(trips=schedule)
 
 
-def due(given: Trips, time: Tensor) -> Tensor:
+def due(schedule: Trips, time: Tensor) -> Tensor:
     """Return how many trips of every slot should have begun by a time (s)."""
-    more = torch.where(given.again.isinf(), 0.0, (time - given.departs) / given.again).floor().clamp_min(0.0)
-    return torch.where(time >= given.departs, 1 + more.long(), 0)
+    more = torch.where(schedule.again.isinf(), 0.0, (time - schedule.departs) / schedule.again).floor().clamp_min(0.0)
+    return torch.where(time >= schedule.departs, 1 + more.long(), 0)
 
 
 def counts(stepping: CarFollowingStep, state: State) -> Counts:
     """Return what became of all trips; ValueError for a state without any."""
     if state.trips is None or state.present is None:
-        raise ValueError("this state has no trips. Make it with population.waiting(…).")
+        raise ValueError("this state has no trips. Make it with multilane.demand.waiting(…).")
     now = due(state.trips, stepping.time(state)).expand(state.speed.shape)
     begun, left = (x.expand(state.speed.shape) for x in (state.trips.entered, state.trips.left))
     inside = state.present.expand(state.speed.shape) > 0
@@ -167,19 +167,19 @@ def _entered(
     through speed and gap, not through who enters when.
     """
     assert state.trips is not None and state.links is not None and state.present is not None
-    road, given = stepping.road, state.trips
+    road, schedule = stepping.road, state.trips
     assert isinstance(road, Lanes)
-    waits = (state.present <= 0) & (due(given, stepping.time(state)) > given.entered) & now
+    waits = (state.present <= 0) & (due(schedule, stepping.time(state)) > schedule.entered) & now
     if not sure(waits.any()):
         return state
     view = road.view(state)
     assert isinstance(view, Linked)
     lanes = torch.arange(road.count, device=state.speed.device)
-    first, some = _first(waits, given, lanes)
+    first, some = _first(waits, schedule, lanes)
     last, followed = _last(view, state, lanes)
     begins = torch.tensor(road.table("begins"), dtype=state.speed.dtype, device=state.speed.device).expand(some.shape)
     gap = torch.where(followed, _of(state.position, last) - _of(state.length, last) - begins, FAR)
-    ahead, asked = _of(state.speed, last), _of(given.speed.expand_as(state.speed), first)
+    ahead, desired = _of(state.speed, last), _of(schedule.speed.expand_as(state.speed), first)
     driver = stepping.base.driver(dict(params[stepping.base.name]))
     least, time_gap, brake = (
         _of(x.expand_as(state.speed), first) for x in (driver.min_gap, driver.time_gap, driver.comfort_decel)
@@ -188,9 +188,9 @@ def _entered(
     def fits(v: Tensor) -> Tensor:
         return (gap >= least + v * time_gap) & ((v.square() - ahead.square()) <= 2.0 * brake * (gap - least))
 
-    fast = fits(asked) | ~followed
-    slow = torch.minimum(asked, ahead)
-    speed = torch.where(fast, asked, slow)
+    fast = fits(desired) | ~followed
+    slow = torch.minimum(desired, ahead)
+    speed = torch.where(fast, desired, slow)
     goes = some & (fast | fits(slow))
     if state.moving is not None:  # whoever is still leaving a lane is in the way there
         goes = goes & (_rear_of_leaving(state, lanes) - begins >= least + speed * time_gap)
@@ -201,8 +201,8 @@ def _entered(
 def _rear_of_leaving(state: State, lanes: Tensor) -> Tensor:
     """Return where the last of those ends who are still leaving each lane (m)."""
     assert state.moving is not None and state.present is not None
-    there = still_changing(state) & (state.present > 0)
-    mine = there.unsqueeze(-2) & (state.moving.origin.unsqueeze(-2) == lanes.unsqueeze(-1))
+    leaving = still_changing(state) & (state.present > 0)
+    mine = leaving.unsqueeze(-2) & (state.moving.origin.unsqueeze(-2) == lanes.unsqueeze(-1))
     return torch.where(mine, (state.position - state.length).unsqueeze(-2), FAR).amin(-1)
 
 
@@ -222,11 +222,11 @@ def _of(x: Tensor, slots: Tensor) -> Tensor:
     return x.gather(-1, slots)
 
 
-def _first(waits: Tensor, given: Trips, lanes: Tensor) -> tuple[Tensor, Tensor]:
+def _first(waits: Tensor, schedule: Trips, lanes: Tensor) -> tuple[Tensor, Tensor]:
     """Return the slot of each lane's first in the queue, and whether there is one; of equals the lowest slot."""
-    more = torch.where(given.entered > 0, given.entered * given.again, 0.0)
-    when = torch.where(waits, given.departs + more, torch.inf)
-    mine = waits.unsqueeze(-2) & (given.lane.expand_as(waits).unsqueeze(-2) == lanes.unsqueeze(-1))
+    more = torch.where(schedule.entered > 0, schedule.entered * schedule.again, 0.0)
+    when = torch.where(waits, schedule.departs + more, torch.inf)
+    mine = waits.unsqueeze(-2) & (schedule.lane.expand_as(waits).unsqueeze(-2) == lanes.unsqueeze(-1))
     each = torch.where(mine, when.unsqueeze(-2), torch.inf)
     own = torch.arange(waits.shape[-1], device=lanes.device)
     best = torch.where(mine & (each == each.amin(-1, keepdim=True)), own, waits.shape[-1]).amin(-1)
@@ -237,11 +237,11 @@ def _last(view: Linked, state: State, lanes: Tensor) -> tuple[Tensor, Tensor]:
     """Return the slot of each lane's last vehicle, and whether there is one."""
     present = state.present
     assert present is not None
-    there = present > 0
+    present = present > 0
     follower = view.links_now.follower
-    own = torch.arange(there.shape[-1], device=lanes.device)
-    alone = there & ((follower == own) | ~there.gather(-1, follower))
-    mine = alone.unsqueeze(-2) & (view.links_now.lane.unsqueeze(-2) == lanes.unsqueeze(-1))
+    own = torch.arange(present.shape[-1], device=lanes.device)
+    last = present & ((follower == own) | ~present.gather(-1, follower))
+    mine = last.unsqueeze(-2) & (view.links_now.lane.unsqueeze(-2) == lanes.unsqueeze(-1))
     return torch.where(mine, own, 0).amax(-1), mine.any(-1)
 
 

@@ -145,11 +145,11 @@ def _one_side(
     stepping: CarFollowingStep, view: Sideways, side: Side, state: State, scene: Scene, now: Tensor, params: Params
 ) -> Beside:
     """Return a lane beside: the driver behind its leader, and its follower behind the driver, in each driver's slot."""
-    there = side.led.to(scene.speed.dtype)
-    leader, second = view.follow(state, scene.leader, side.leader, side.gap, there)
+    led = side.led.to(scene.speed.dtype)
+    leader, second = view.follow(state, scene.leader, side.leader, side.gap, led)
     # What is nearer: the leader there or the end of that lane; behind an end there is nobody.
     nearest = view.before_end(leader, side.ends)
-    second = second._replace(present=second.present * (nearest.gap == leader.gap).to(there.dtype))
+    second = second._replace(present=second.present * (nearest.gap == leader.gap).to(led.dtype))
     n = side.follower
     behind = Neighbour(
         side.back_gap,
@@ -158,7 +158,7 @@ def _one_side(
         side.followed.to(scene.speed.dtype),
     )
     own = scene._replace(leader=nearest, second_leader=scene.second_leader and second, behind=scene.behind and behind)
-    wanted = stepping.wanted(own, params)[0]
+    accel = stepping.wanted(own, params)[0]
     exists, ends = side.exists.to(scene.speed.dtype), _room(stepping, own, side.ends, params)
     if stepping.rooms:
         exists = torch.where(ends > 0, exists, 0.0)
@@ -177,7 +177,7 @@ def _one_side(
         exists=exists,
         leader=nearest,
         follower=behind,
-        wanted=wanted,
+        wanted=accel,
         with_me=with_me * behind.present,
         without_me=view.at(now, n) * behind.present,
         ends=ends,

@@ -118,14 +118,14 @@ class Sideways(Ending):
         return nearer(leader, ends if self.room() is not None else None)
 
     def follow(
-        self, state: State, leaders: Neighbour, slot: Any, gap: Tensor, there: Tensor
+        self, state: State, leaders: Neighbour, slot: Any, gap: Tensor, present: Tensor
     ) -> tuple[Neighbour, Neighbour]:
         """Return the vehicle in a slot as a leader at a gap (m), and its own leader as the second one.
 
-        ``leaders`` is everybody's leader; ``there`` is 0 where the slot is nobody's.
+        ``leaders`` is everybody's leader; ``present`` is 0 where the slot is nobody's.
         """
         speed = state.speed
-        present = there.to(speed.dtype)
+        present = present.to(speed.dtype)
         some = present > 0
         leader = Neighbour(
             torch.where(some, gap, FAR),

@@ -109,29 +109,29 @@ class Road(abc.ABC):
 
     def leader(self, gap: Tensor, speed: Tensor, accel: Tensor, present: Tensor) -> Neighbour:
         """Return the leader as seen by every vehicle; ``present`` is ``leader_present``'s."""
-        there = present > 0
+        visible = present > 0
         return Neighbour(
-            gap, torch.where(there, self.ahead(speed), speed), torch.where(there, self.ahead(accel), 0.0), present
+            gap, torch.where(visible, self.ahead(speed), speed), torch.where(visible, self.ahead(accel), 0.0), present
         )
 
     def second_leader(self, leader: Neighbour, length: Tensor, speed: Tensor) -> Neighbour:
         """Return the leader's leader, with the gap between bumpers: ``s1 + length[leader] + s[leader]`` (m)."""
         present = leader.present * self.ahead(leader.present.expand_as(speed))
-        there = present > 0
+        visible = present > 0
         return Neighbour(
-            torch.where(there, leader.gap + self.ahead(length) + self.ahead(leader.gap), FAR),
-            torch.where(there, self.ahead(leader.speed), speed),
-            torch.where(there, self.ahead(leader.accel), 0.0),
+            torch.where(visible, leader.gap + self.ahead(length) + self.ahead(leader.gap), FAR),
+            torch.where(visible, self.ahead(leader.speed), speed),
+            torch.where(visible, self.ahead(leader.accel), 0.0),
             present,
         )
 
     def behind(self, leader: Neighbour, speed: Tensor, accel: Tensor) -> Neighbour:
         """Return the vehicle whose leader is this one, with *its* gap (m)."""
         present = self.leads(speed) * self.back(leader.present.expand_as(speed))
-        there = present > 0
+        visible = present > 0
         return Neighbour(
-            torch.where(there, self.back(leader.gap), FAR),
-            torch.where(there, self.back(speed), speed),
-            torch.where(there, self.back(accel), 0.0),
+            torch.where(visible, self.back(leader.gap), FAR),
+            torch.where(visible, self.back(speed), speed),
+            torch.where(visible, self.back(accel), 0.0),
             present,
         )

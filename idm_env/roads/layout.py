@@ -139,10 +139,10 @@ class LaneLayout:
 
     def open_between(self, lane: Tensor, to: Tensor, position: Tensor, length: Tensor) -> Tensor:
         """Return whether a vehicle may change from a lane to one beside it here (bool); ``to`` may not exist."""
-        there = (to >= 0) & (to < self.count)
+        open_here = (to >= 0) & (to < self.count)
         if not self.ends:
-            return there
+            return open_here
         for each in (lane, to.clamp(0, self.count - 1)):
             opens, closes = (self.at_lane(each, position, name) for name in ("opens", "closes"))
-            there = there & within(position, length, opens, closes)
-        return there
+            open_here = open_here & within(position, length, opens, closes)
+        return open_here

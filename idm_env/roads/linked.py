@@ -51,9 +51,9 @@ def without_absent(links: Links, present: Tensor | None) -> Links:
     if present is None:
         return links
     own = torch.arange(present.shape[-1], device=present.device).expand_as(present)
-    there = present > 0
+    on_road = present > 0
     leader, follower = (
-        torch.where(there & there.gather(-1, slot), slot, own) for slot in (links.leader, links.follower)
+        torch.where(on_road & on_road.gather(-1, slot), slot, own) for slot in (links.leader, links.follower)
     )
     return links._replace(leader=leader, follower=follower)
 
@@ -143,10 +143,10 @@ class Linked(Sideways):
         ahead = which - which.remainder(n) + mine
         two = torch.stack([position.reshape(-1)[i] for i in (ahead, which)], -1)
         gap = two[:, 0] - length.reshape(-1)[ahead] - two[:, 1]
-        alone = ahead == which
+        leading_self = ahead == which
         if self.road.ring is None:
-            return torch.where(alone, FAR, gap)
-        return gap + laps(two, torch.stack((torch.zeros_like(which), alone.long()), -1), self.road.ring)[:, 1]
+            return torch.where(leading_self, FAR, gap)
+        return gap + laps(two, torch.stack((torch.zeros_like(which), leading_self.long()), -1), self.road.ring)[:, 1]
 
     def room(self) -> Tensor | None:
         """Return how far each vehicle's lane goes on (m), None where no lane ends."""
@@ -169,8 +169,8 @@ class Linked(Sideways):
         order = Order.of(position, lane, motion.present, self.road.count, self.road.ring)
         leader, follower = order.links()
         changed = lane != before.lane
-        for there in (state.present, motion.present):
-            changed = changed if there is None else changed & (there > 0)
+        for mask in (state.present, motion.present):
+            changed = changed if mask is None else changed & (mask > 0)
         links = before._replace(lane=lane, leader=leader, follower=follower, changed=before.changed + changed)
         fresh = Linked(self.road, links, position).gaps(position, state.length)
         return torch.where(leader == before.leader, gap, fresh), links
@@ -179,16 +179,16 @@ class Linked(Sideways):
 
     def leader(self, gap: Tensor, speed: Tensor, accel: Tensor, present: Tensor) -> Neighbour:
         """Return the leader, the end of the lane or whoever is still leaving it: which is nearest."""
-        found = super().leader(gap, speed, accel, present)
+        nearest = super().leader(gap, speed, accel, present)
         if self.shadow is None:
-            return found
+            return nearest
         way = self._to_shadow()
-        first = way < found.gap
+        first = way < nearest.gap
         return Neighbour(
-            torch.where(first, way, found.gap),
-            torch.where(first, self.at(speed, self.shadow), found.speed),
-            torch.where(first, self.at(accel, self.shadow), found.accel),
-            torch.where(first, 1.0, found.present),
+            torch.where(first, way, nearest.gap),
+            torch.where(first, self.at(speed, self.shadow), nearest.speed),
+            torch.where(first, self.at(accel, self.shadow), nearest.accel),
+            torch.where(first, 1.0, nearest.present),
         )
 
     def second_leader(self, leader: Neighbour, length: Tensor, speed: Tensor) -> Neighbour:
@@ -218,28 +218,28 @@ class Linked(Sideways):
     def _leaving(self, state: State) -> Order:
         """Return those who are still leaving a lane, in order."""
         assert state.moving is not None
-        there = still_changing(state)
+        leaving = still_changing(state)
         if state.present is not None:
-            there = there & (state.present > 0)
+            leaving = leaving & (state.present > 0)
         origin, position = state.moving.origin, state.position
-        return Order.of(position, origin, there.to(position.dtype), self.road.count, self.road.ring)
+        return Order.of(position, origin, leaving.to(position.dtype), self.road.count, self.road.ring)
 
     def with_leaving(self, state: State, sides: tuple[Side, Side]) -> tuple[Side, Side]:
         """Return the lanes beside with those who are still leaving them, wherever they are nearer."""
-        order, found = self._leaving(state), []
+        order, lanes = self._leaving(state), []
         for side, step in zip(sides, (1, -1), strict=True):
             a = order.around(self.to(step), state.position)
             other = self.look(
                 state, side.exists, a.leader, a.follower, a.led, a.followed, a.to_leader, a.to_follower, side.ends
             )
             ahead, behind = other.gap < side.gap, other.back_gap < side.back_gap
-            found.append(side._replace(
+            lanes.append(side._replace(
                 leader=torch.where(ahead, other.leader, side.leader), led=side.led | ahead,
                 follower=torch.where(behind, other.follower, side.follower), followed=side.followed | behind,
                 gap=torch.where(ahead, other.gap, side.gap),
                 back_gap=torch.where(behind, other.back_gap, side.back_gap),
             ))  # fmt: skip
-        return found[0], found[1]
+        return lanes[0], lanes[1]
 
     def on_the_way(self, before: State, after: State, claim: Claim, steps: int) -> State:
         """Return the state after a decision in which those who were granted a change take some steps for it."""
@@ -324,12 +324,12 @@ class Linked(Sideways):
         own = torch.arange(claim.lane.shape[-1], device=claim.lane.device).expand_as(claim.lane)
         to_left = claim.signals > 0
         asks = (claim.signals != 0) & torch.where(to_left, left.followed, right.followed)
-        asked = torch.where(asks, torch.where(to_left, left.follower, right.follower), own)
+        target = torch.where(asks, torch.where(to_left, left.follower, right.follower), own)
         way = torch.where(to_left, left.back_gap, right.back_gap) + state.length
         shape = tuple(claim.lane.shape)
-        nearest = asks & (way == _most(shape, asked, torch.where(asks, way, FAR), "amin"))
+        nearest = asks & (way == _most(shape, target, torch.where(asks, way, FAR), "amin"))
         count = own.shape[-1]
-        first = torch.full_like(own, count).scatter_reduce(-1, asked, torch.where(nearest, own, count), "amin")
+        first = torch.full_like(own, count).scatter_reduce(-1, target, torch.where(nearest, own, count), "amin")
         return torch.where((first < count) & ~claim.granted, first, own)
 
     def changed(self, state: State, claim: Claim) -> State:
@@ -357,5 +357,5 @@ def _most(room: tuple[int, ...], key: Tensor, value: Tensor, how: Literal["amax"
         worst = worst + value.max()
     elif value.is_floating_point():
         worst = worst + value.min()
-    found = worst.expand(room).clone().scatter_reduce(-1, key, value, how)
-    return found.gather(-1, key)
+    extreme = worst.expand(room).clone().scatter_reduce(-1, key, value, how)
+    return extreme.gather(-1, key)

@@ -53,18 +53,18 @@ class Order(NamedTuple):
         """Return leader and follower of every slot."""
         own = torch.arange(self.slots.shape[-1], device=self.slots.device).expand_as(self.slots)
         lane = self.lane.gather(-1, self.slots)
-        there = lane >= 0
-        joined = (lane[..., 1:] == lane[..., :-1]) & there[..., 1:]
-        none = torch.zeros_like(joined[..., :1]) if joined.shape[-1] else torch.zeros_like(there[..., :1])
+        on_lane = lane >= 0
+        joined = (lane[..., 1:] == lane[..., :-1]) & on_lane[..., 1:]
+        none = torch.zeros_like(joined[..., :1]) if joined.shape[-1] else torch.zeros_like(on_lane[..., :1])
         led, followed = torch.cat((joined, none), -1), torch.cat((none, joined), -1)
         leader, follower = self.slots.roll(-1, -1), self.slots.roll(1, -1)
         if self.ring is None:
             leader, follower = torch.where(led, leader, self.slots), torch.where(followed, follower, self.slots)
         else:
             low, high = self._ends(lane)
-            first, last = (self._slot(at) for at in (low, high - 1))
-            leader = torch.where(led, leader, torch.where(there, first, self.slots))
-            follower = torch.where(followed, follower, torch.where(there, last, self.slots))
+            first, last = (self._slot(index) for index in (low, high - 1))
+            leader = torch.where(led, leader, torch.where(on_lane, first, self.slots))
+            follower = torch.where(followed, follower, torch.where(on_lane, last, self.slots))
         return own.scatter(-1, self.slots, leader), own.scatter(-1, self.slots, follower)
 
     def _ends(self, lane: Tensor) -> tuple[Tensor, Tensor]:
@@ -73,8 +73,8 @@ class Order(NamedTuple):
         low = torch.searchsorted(keys, (lane * self.width).contiguous())
         return low, torch.searchsorted(keys, ((lane + 1) * self.width).contiguous())
 
-    def _slot(self, at: Tensor) -> Tensor:
-        return self.slots.gather(-1, at.clamp(0, self.slots.shape[-1] - 1))
+    def _slot(self, index: Tensor) -> Tensor:
+        return self.slots.gather(-1, index.clamp(0, self.slots.shape[-1] - 1))
 
     def around(self, lane: Tensor, position: Tensor) -> Around:
         """Return who would be ahead of and behind every vehicle on these lanes, which are not its own.
@@ -84,10 +84,10 @@ class Order(NamedTuple):
         own = torch.arange(self.slots.shape[-1], device=self.slots.device).expand_as(self.slots)
         low, high = self._ends(lane)
         query = (lane * self.width + self.place).contiguous()
-        at = torch.searchsorted(self.keys.contiguous(), query, right=True)
+        index = torch.searchsorted(self.keys.contiguous(), query, right=True)
         some = high > low
-        before, after = some & (at < high), some & (at > low)
-        leader, follower = self._slot(at), self._slot(at - 1)
+        before, after = some & (index < high), some & (index > low)
+        leader, follower = self._slot(index), self._slot(index - 1)
         zero = torch.zeros_like(position)
         if self.ring is None:
             leader, follower = torch.where(before, leader, own), torch.where(after, follower, own)

@@ -74,7 +74,7 @@ def done(
 ) -> list[Filtered]:  # fmt: skip
     """Do one chunk and write its part: the table, the parameters, and last the tallies, which mark it done.
 
-    ``remarks`` are what else is to be known of it. ``on_stage`` is called with the share that is done and what comes next.
+    ``remarks`` are what else is to be known of it. ``on_stage`` is called with the share done and what comes next.
     """
     others = baselines.available() if settings.baselines else ()
     stages = 2 + len(others)

@@ -53,7 +53,7 @@ def drive(
 ) -> list[Driven]:
     """Drive every track through the simulator by the imagined gaps that its wanted motion asks for.
 
-    ``motions`` are positions (m), speeds (m/s) and accelerations (m/s²), each [K], of ballistic steps. Each gap is found
+    ``motions`` are positions (m), speeds (m/s) and accelerations (m/s²), each [K], of ballistic steps. A gap is found
     at the speed that the simulator has at that step, so nothing but the bounds changes an acceleration: it never
     exceeds ``highest`` nor what the engine gives at that speed, never falls below ``lowest``, and the vehicle never
     reverses. Where a bound did change it, the lost distance is made up gently (``CATCH_UP``).

@@ -105,8 +105,8 @@ class ParameterFitting:
                 raise ValueError(f"parameter '{name}' is not free here. Free: {', '.join(self.free)}.")
         with torch.no_grad():
             for name, value in values.items():
-                wanted = torch.as_tensor(value, dtype=torch.float64)
-                self._leaves[name].copy_(unconstrain(self._declared[name], wanted))
+                number = torch.as_tensor(value, dtype=torch.float64)
+                self._leaves[name].copy_(unconstrain(self._declared[name], number))
         for leaf in self._leaves.values():
             # A gradient at the old values would move the new ones at an optimiser's next step.
             leaf.grad = None
@@ -173,10 +173,10 @@ class ParameterFitting:
         """Return the values of one group as an ``idm_env.model_file.Model``, for ``save_model`` and ``effects=``."""
         from idm_env.model_file import Model, numbers
 
-        found = {name: float(value[group].detach()) for name, value in self.values().items()}
+        estimates = {name: float(value[group].detach()) for name, value in self.values().items()}
         simulator = self.problem.simulator
         effects = tuple(e for e in simulator.effects if e.takes not in _OTHERS and not e.draws)
-        return Model(effects, numbers({**self.fixed, **found}), simulator.dt, simulator.integration)
+        return Model(effects, numbers({**self.fixed, **estimates}), simulator.dt, simulator.integration)
 
 
 def _task_of(env: Any) -> tuple[Task, Params]:
@@ -197,10 +197,10 @@ def _episodes(trajectories: Any, dt: float) -> list[Any]:
         trajectories = load(trajectories)
     if isinstance(trajectories, Trajectories):
         return list(episodes(trajectories, smooth=True, dt=dt))
-    found = list(trajectories)
-    if not found or not all(isinstance(e, Episode) for e in found):
+    items = list(trajectories)
+    if not items or not all(isinstance(e, Episode) for e in items):
         raise ValueError("trajectories must be a file, idm_env.data.Trajectories, or a sequence of episodes.")
-    return [dataclasses.replace(e) for e in found]
+    return [dataclasses.replace(e) for e in items]
 
 
 def _value(params: Params, name: str, default: float) -> float:
@@ -211,5 +211,5 @@ def _value(params: Params, name: str, default: float) -> float:
 
 def _fixed(simulator: Simulator, params: Params, free: Sequence[str]) -> dict[str, float]:
     """Return the environment's values of whatever is not free; where vehicles differ, their mean."""
-    known = catalogue(simulator.effects)
-    return {name: _value(params, name, p.default) for name, p in known.items() if name not in free}
+    declared = catalogue(simulator.effects)
+    return {name: _value(params, name, p.default) for name, p in declared.items() if name not in free}
