@@ -104,23 +104,23 @@ def adjoint(graph: Graph, outputs: Sequence[Node], seeds: Sequence[Node]) -> dic
     """Return the adjoint of every leaf that the outputs depend on: Σ seed · ∂output/∂leaf."""
     order = [node for node in ordered(outputs) if not node.boolean]
     moving = _moving(order)
-    found: dict[Node, Node] = {}
+    parts: dict[Node, Node] = {}
 
     def give(node: Node, part: Node) -> None:
         if node in moving:
-            found[node] = graph.add(found[node], part) if node in found else part
+            parts[node] = graph.add(parts[node], part) if node in parts else part
 
     for output, seed in zip(outputs, seeds, strict=True):
         give(output, seed)
     for node in reversed(order):
-        g = found.get(node)
+        g = parts.get(node)
         if g is None or not node.args or node.op == "input":
             continue
         graph.note = node.note
         for index, part in RULES[node.op](graph, node, g):
             if node.args[index] in moving:
                 give(node.args[index], part)
-    return {node: g for node, g in found.items() if node.op == "input"}
+    return {node: g for node, g in parts.items() if node.op == "input"}
 
 
 def _moving(order: Sequence[Node]) -> set[Node]:

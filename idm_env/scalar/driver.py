@@ -61,11 +61,11 @@ class DriverProgram:
         self._recording = recording
         names = list(recording.respond)
         assert recording.accel is not None
-        made = [recording.accel, *recording.respond.values(), *recording.sense]
-        self._known = {graph.input(*s): graph.constant(v) for s, v in fixed.items()} | self._gaps(made)
-        made = replaced(graph, made, self._known)
-        self._accel, sense = made[0], made[1 + len(names) :]
-        self._respond = dict(zip(names, made[1:], strict=False))
+        nodes = [recording.accel, *recording.respond.values(), *recording.sense]
+        self._known = {graph.input(*s): graph.constant(v) for s, v in fixed.items()} | self._gaps(nodes)
+        nodes = replaced(graph, nodes, self._known)
+        self._accel, sense = nodes[0], nodes[1 + len(names) :]
+        self._respond = dict(zip(names, nodes[1:], strict=False))
         after = self._closure(sense)
         self.seen: list[tuple[int, int]] = []
         self.agos: list[Node] = []
@@ -84,14 +84,14 @@ class DriverProgram:
     def _closure(self, sense: list[Node]) -> dict[str, Node]:
         """Return gap, speed and all states that these depend on, after a step."""
         after: dict[str, Node] = {}
-        wanted = ["gap", "speed"]
-        while wanted:
-            name = wanted.pop(0)
+        queue = ["gap", "speed"]
+        while queue:
+            name = queue.pop(0)
             if name not in after:
                 after[name] = self._expression(name)
                 nodes = [after[name]]
                 nodes += sense if any(n.op == "past" for n in ordered(nodes)) else []
-                wanted += [s.name for s in inputs_of(nodes) if self._is_state(s)]
+                queue += [s.name for s in inputs_of(nodes) if self._is_state(s)]
         return after
 
     def _is_state(self, slot: Leaf) -> bool:
@@ -131,7 +131,7 @@ class DriverProgram:
 
     def _looks(self, nodes: Sequence[Node]) -> dict[Node, Node]:
         """Return every look at the past as a row that the loop fills."""
-        known: dict[Node, Node] = {}
+        rows: dict[Node, Node] = {}
         for node in ordered(nodes):
             if node.op != "past":
                 continue
@@ -141,9 +141,9 @@ class DriverProgram:
             if steps not in self.agos:
                 self.agos.append(steps)
             assert isinstance(node.label, int)
-            known[node] = self.graph.input(f"past {len(self.seen)}")
+            rows[node] = self.graph.input(f"past {len(self.seen)}")
             self.seen.append((node.label, self.agos.index(steps)))
-        return known
+        return rows
 
     # -- what there is -------------------------------------------------------------------------------------------
 
@@ -190,8 +190,8 @@ class DriverProgram:
 
     def _adjoint(self, nodes: Mapping[str, Node]) -> dict[str, Node]:
         seeds = [self.graph.input(f"on {name}", level=DYNAMIC) for name in nodes]
-        found = adjoint(self.graph, list(nodes.values()), seeds)
-        return {leaf.label.name: g for leaf, g in found.items() if isinstance(leaf.label, Leaf) and not leaf.label.shift
+        parts = adjoint(self.graph, list(nodes.values()), seeds)
+        return {leaf.label.name: g for leaf, g in parts.items() if isinstance(leaf.label, Leaf) and not leaf.label.shift
                 and self._flows(leaf.label.name)}  # fmt: skip
 
     def respond_back(self) -> dict[str, Node]:
@@ -205,8 +205,8 @@ class DriverProgram:
     def hoist_back(self) -> dict[str, Node]:
         """Return what falls on the parameters from the hoisted rows."""
         seeds = [self.graph.input(f"on {name}", level=STATIC) for name in self.constants_of_time]
-        found = adjoint(self.graph, self.hoist, seeds)
-        return {leaf.label.name: g for leaf, g in found.items() if isinstance(leaf.label, Leaf)}
+        parts = adjoint(self.graph, self.hoist, seeds)
+        return {leaf.label.name: g for leaf, g in parts.items() if isinstance(leaf.label, Leaf)}
 
     # -- forwards ------------------------------------------------------------------------------------------------
 
@@ -222,8 +222,8 @@ class DriverProgram:
     def narrow(self) -> list[Node]:
         """The few numbers that most of a step flows through, each after those that it needs."""
         memories = [x for n, x in zip(self._names, self._after, strict=True) if n.startswith("memory of ")]
-        wanted = {x for x in (self._accel, *memories) if x.args and x.level == DYNAMIC}
-        return [x for x in ordered([*self._after, self._accel]) if x in wanted]
+        places = {x for x in (self._accel, *memories) if x.args and x.level == DYNAMIC}
+        return [x for x in ordered([*self._after, self._accel]) if x in places]
 
     @property
     def whole(self) -> tuple[list[Node], list[Node]]:
@@ -248,8 +248,8 @@ class _Carrying:
                 self.made.sense[signal] = along
         for i, node in enumerate(narrow):
             self._tangents[f"narrow {i}"] = self._along(node)
-        found = {n: self._along(x) for n, x in zip(program.states, after, strict=True) if n in program.moving}
-        self.made.carry = {n: x or self.graph.constant(0.0) for n, x in found.items()}
+        carry = {n: self._along(x) for n, x in zip(program.states, after, strict=True) if n in program.moving}
+        self.made.carry = {n: x or self.graph.constant(0.0) for n, x in carry.items()}
         self._hoist()
 
     def _along(self, node: Node) -> Node | None:
@@ -261,9 +261,9 @@ class _Carrying:
         inner.pop(node, None)
         (local,) = replaced(graph, [node], inner)
         total: Node | None = None
-        found = adjoint(graph, [local], [graph.constant(1.0)]) if local.op != "constant" else {}
-        leaves = sorted(found, key=lambda leaf: str(leaf.label))
-        slopes = replaced(graph, [found[leaf] for leaf in leaves], self._inside)
+        parts = adjoint(graph, [local], [graph.constant(1.0)]) if local.op != "constant" else {}
+        leaves = sorted(parts, key=lambda leaf: str(leaf.label))
+        slopes = replaced(graph, [parts[leaf] for leaf in leaves], self._inside)
         source = False
         for leaf, slope in zip(leaves, slopes, strict=True):
             slot = leaf.label
@@ -300,11 +300,11 @@ class _Carrying:
         return self._rows[slope]
 
     def _hoist(self) -> None:
-        made = self.made
-        nodes = [*made.slopes, *made.sources.values(), *made.sense.values(), *made.carry.values()]
-        cut, made.hoist = hoisted(self.graph, nodes, "fixed")
+        tangents = self.made
+        nodes = [*tangents.slopes, *tangents.sources.values(), *tangents.sense.values(), *tangents.carry.values()]
+        cut, tangents.hoist = hoisted(self.graph, nodes, "fixed")
         rest = iter(cut)
-        made.slopes = [next(rest) for _ in made.slopes]
-        made.sources = {at: next(rest) for at in made.sources}
-        made.sense = {at: next(rest) for at in made.sense}
-        made.carry = {at: next(rest) for at in made.carry}
+        tangents.slopes = [next(rest) for _ in tangents.slopes]
+        tangents.sources = {key: next(rest) for key in tangents.sources}
+        tangents.sense = {key: next(rest) for key in tangents.sense}
+        tangents.carry = {key: next(rest) for key in tangents.carry}

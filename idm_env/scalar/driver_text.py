@@ -113,19 +113,19 @@ class DriverText:
     @cached_property
     def layout(self) -> RowLayout:
         """Return where everything is."""
-        at = {name: begin * self._distance for name, (begin, _) in self._groups.items()}
+        begins = {name: begin * self._distance for name, (begin, _) in self._groups.items()}
         count = {f"n_{name}": many for name, (_, many) in self._groups.items()}
-        known = {**at, **count, "n_parameters": len(self.program.parameters), "n_moving": len(self.program.moving)}
         directions, distance = len(self._directions), self._distance
         block = len(self._block) * distance
-        known |= {
+        numbers = {
+            **begins, **count, "n_parameters": len(self.program.parameters), "n_moving": len(self.program.moving),
             "blocks": len(self._rows) * distance, "block": block, "n_blocks": directions,
             "size": len(self._rows) * distance + directions * block + distance,
             "tangent_signals": (len(self.program.moving) + self.made.targets) * distance,
             "n_moving_signals": len(self.made.sense),
             "tangent_past": (len(self.program.moving) + self.made.targets + len(self.made.sense)) * distance,
         }  # fmt: skip
-        return RowLayout(*(known.get(name, 0) for name in RowLayout._fields))
+        return RowLayout(*(numbers.get(name, 0) for name in RowLayout._fields))
 
     @cached_property
     def phases(self) -> tuple[str, ...]:
@@ -151,33 +151,33 @@ class DriverText:
         return "\n\n".join([assignments(names), *functions])
 
     def _all(self, adjoint: bool) -> dict[str, tuple[str, list[Write], str]]:
-        p, made = self.program, self.made
+        p, tangents = self.program, self.made
         hoist = _writes([(_named(n), x) for n, x in zip(p.constants_of_time, p.hoist, strict=True)])
         hoist += _writes([(f"AGO_{i}", x) for i, x in enumerate(p.agos)])
-        slopes = _writes([(_named(f"slope {i}"), x) for i, x in enumerate(made.slopes)])
-        slopes += [Write(f"w[{self._source(*at)} + j]", x) for at, x in made.sources.items()]
-        found: dict[str, tuple[str, list[Write], str]] = {
+        slopes = _writes([(_named(f"slope {i}"), x) for i, x in enumerate(tangents.slopes)])
+        slopes += [Write(f"w[{self._source(*place)} + j]", x) for place, x in tangents.sources.items()]
+        phases: dict[str, tuple[str, list[Write], str]] = {
             "hoist": ("What depends on parameters alone.", hoist, "exact"),
             "sense": ("What the past keeps.", _writes([(f"SIGNAL_{i}", x) for i, x in p.sense.items()]), "exact"),
             "respond": ("States after the step.", _writes([(_named(n), x) for n, x in p.after.items()]), "exact"),
             "fix": (
                 "Slopes that depend on parameters alone.",
-                _writes([(_named(f"fixed{i}"), x) for i, x in enumerate(made.hoist)]),
+                _writes([(_named(f"fixed{i}"), x) for i, x in enumerate(tangents.hoist)]),
                 "swift",
             ),
             "linearise": ("Slopes of a step.", slopes, "swift"),
             "carry_sense": (
                 "What the past keeps of one direction.",
-                [Write(f"h[OF_TANGENT_SIGNAL_{i} + j]", x) for i, x in made.sense.items()],
+                [Write(f"h[OF_TANGENT_SIGNAL_{i} + j]", x) for i, x in tangents.sense.items()],
                 "beside",
             ),
             "carry": (
                 "Tangents of one direction after the step.",
-                [Write(f"h[OF_{_named(f'tangent {n}')} + j]", x) for n, x in made.carry.items()],
+                [Write(f"h[OF_{_named(f'tangent {n}')} + j]", x) for n, x in tangents.carry.items()],
                 "beside",
             ),
         }
-        return found | (self._back() if adjoint else {})
+        return phases | (self._back() if adjoint else {})
 
     def _source(self, target: int, direction: int) -> str:
         place = self._block[f"SOURCE_{target}"] + direction * len(self._block)
@@ -204,8 +204,8 @@ def _writes(pairs: list[tuple[str, Node]]) -> list[Write]:
     return [Write(f"w[{name} + j]", node) for name, node in pairs]
 
 
-def _added(found: dict[str, Node]) -> list[Write]:
-    return [Write(f"w[{_named(f'on {name}')} + j]", node, adds=True) for name, node in found.items()]
+def _added(nodes: dict[str, Node]) -> list[Write]:
+    return [Write(f"w[{_named(f'on {name}')} + j]", node, adds=True) for name, node in nodes.items()]
 
 
 __all__ = ["ADJOINT", "TANGENTS", "VALUES", "DriverText", "RowLayout"]

@@ -73,11 +73,11 @@ class Graph:
     def node(self, op: str, *args: Node, label: Leaf | float | int | None = None, level: int | None = None) -> Node:
         """Return the node of this operation on these nodes."""
         key = (op, *(id(a) for a in args), label, type(label))
-        found = self._known.get(key)
-        if found is None:
+        node = self._known.get(key)
+        if node is None:
             level = max((a.level for a in args), default=CONSTANT) if level is None else level
-            found = self._known[key] = Node(op, args, label, level, self.note)
-        return found
+            node = self._known[key] = Node(op, args, label, level, self.note)
+        return node
 
     def constant(self, value: float) -> Node:
         """Return a constant."""
@@ -165,8 +165,8 @@ class Graph:
     def again(self, node: Node, args: Sequence[Node]) -> Node:
         """Return the same operation on other nodes."""
         if node.op in ("add", "sub", "mul", "neg", "div", "pow", "select"):
-            made: Node = getattr(self, node.op)(*args)
-            return made
+            result: Node = getattr(self, node.op)(*args)
+            return result
         return self.node(node.op, *args, label=node.label, level=node.level if node.op == "past" else None)
 
     def shifted(self, node: Node, by: int) -> Node:
@@ -219,8 +219,8 @@ def ordered(outputs: Iterable[Node]) -> list[Node]:
 
 def inputs_of(outputs: Sequence[Node]) -> list[Leaf]:
     """Return the slots that the outputs read, in order."""
-    found = [node.label for node in ordered(outputs) if node.op == "input"]
-    return sorted({slot for slot in found if isinstance(slot, Leaf)})
+    slots = [node.label for node in ordered(outputs) if node.op == "input"]
+    return sorted({slot for slot in slots if isinstance(slot, Leaf)})
 
 
 def hoisted(graph: Graph, outputs: Sequence[Node], name: str = "hoisted") -> tuple[list[Node], list[Node]]:
@@ -233,13 +233,13 @@ def hoisted(graph: Graph, outputs: Sequence[Node], name: str = "hoisted") -> tup
     for node in order:
         if node.level == STATIC and (node.op in COSTLY or any(a in costly for a in node.args)):
             costly.add(node)
-    wanted: list[Node] = []
+    rows: list[Node] = []
     for node in order:
         if node.level == DYNAMIC:
-            wanted += [a for a in node.args if a in costly and a not in wanted]
-    wanted += [node for node in outputs if node in costly and node not in wanted]
-    places = {node: graph.input(f"{name}{i}", level=STATIC) for i, node in enumerate(wanted)}
-    return replaced(graph, outputs, places), wanted
+            rows += [a for a in node.args if a in costly and a not in rows]
+    rows += [node for node in outputs if node in costly and node not in rows]
+    places = {node: graph.input(f"{name}{i}", level=STATIC) for i, node in enumerate(rows)}
+    return replaced(graph, outputs, places), rows
 
 
 def replaced(graph: Graph, outputs: Sequence[Node], places: Mapping[Node, Node]) -> list[Node]:

@@ -43,13 +43,13 @@ def _serving(place: Path) -> Path | None:
             if not each.is_dir():
                 each.mkdir(mode=0o700, exist_ok=True)  # Path.mkdir makes parents as the umask says
         with tempfile.TemporaryFile(dir=place):
-            found = place.resolve()
-        reason = exposed(found)
+            directory = place.resolve()
+        reason = exposed(directory)
     except (OSError, RuntimeError):  # a link to itself is a RuntimeError before Python 3.13
         return None
     if reason is not None:
         _log.warning("idm_env leaves the cache %s alone, since what lies there is run: %s", place, reason)
-    return found if reason is None else None
+    return directory if reason is None else None
 
 
 def exposed(place: Path) -> str | None:
@@ -61,11 +61,11 @@ def exposed(place: Path) -> str | None:
     if not hasattr(os, "getuid"):
         return None
     for each in (place, *place.parents):
-        found = each.stat()
-        if found.st_uid not in (0, os.getuid()):
-            return f"{each} belongs to user {found.st_uid}. Set IDM_ENV_CACHE to a folder of your own."
-        if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and (each == place or not found.st_mode & stat.S_ISVTX):
-            return f"others may write to {each} (mode {found.st_mode & 0o777:o}). Run: chmod go-w {each}"
+        status = each.stat()
+        if status.st_uid not in (0, os.getuid()):
+            return f"{each} belongs to user {status.st_uid}. Set IDM_ENV_CACHE to a folder of your own."
+        if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and (each == place or not status.st_mode & stat.S_ISVTX):
+            return f"others may write to {each} (mode {status.st_mode & 0o777:o}). Run: chmod go-w {each}"
     return None
 
 

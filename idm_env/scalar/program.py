@@ -55,7 +55,7 @@ class Program:
         everything = [*recording.sense, *respond.values(), *close.values()]
         if Leaf("step") in inputs_of(everything):
             respond["step"] = graph.add(graph.input("step"), graph.constant(1.0))
-        names = [f"{phase} {name}" for phase, made in (("respond", respond), ("close", close)) for name in made]
+        names = [f"{phase} {name}" for phase, nodes in (("respond", respond), ("close", close)) for name in nodes]
         nodes = [*recording.sense, *respond.values(), *close.values()]
         nodes, self.recalls, times = _recalled(graph, nodes)
         cut, self.hoist = hoisted(graph, [*nodes, *times])
@@ -136,13 +136,13 @@ class Program:
         """Return the adjoint of one phase; nothing flows through how long ago something was."""
         if phase == "recall":
             return Backward({}, {}, {})
-        made = {name: node for name, node in self.named(phase).items() if self._flows(name)}
-        seeds = [self.graph.input(f"on {name}") for name in made]
-        found = adjoint(self.graph, list(made.values()), seeds)
-        assigned: dict[Leaf, Node] = {Leaf(name): self.graph.constant(0.0) for name in made if name in self.moving}
+        nodes = {name: node for name, node in self.named(phase).items() if self._flows(name)}
+        seeds = [self.graph.input(f"on {name}") for name in nodes]
+        parts = adjoint(self.graph, list(nodes.values()), seeds)
+        assigned: dict[Leaf, Node] = {Leaf(name): self.graph.constant(0.0) for name in nodes if name in self.moving}
         added: dict[Leaf, Node] = {}
         sent: dict[Leaf, Node] = {}
-        for node, g in found.items():
+        for node, g in parts.items():
             slot = node.label
             assert isinstance(slot, Leaf)
             if not self._flows(slot.name):
@@ -158,8 +158,8 @@ class Program:
     def hoist_backward(self) -> dict[Leaf, Node]:
         """Return what falls on the parameters from the hoisted rows."""
         seeds = [self.graph.input(f"on {name}", level=STATIC) for name in self.constants_of_time]
-        found = adjoint(self.graph, self.hoist, seeds)
-        return {node.label: g for node, g in found.items() if isinstance(node.label, Leaf)}
+        parts = adjoint(self.graph, self.hoist, seeds)
+        return {node.label: g for node, g in parts.items() if isinstance(node.label, Leaf)}
 
     def _flows(self, name: str) -> bool:
         """Whether derivatives are carried to what has this name."""
@@ -175,18 +175,18 @@ class Program:
     @cached_property
     def needed_again(self) -> tuple[str, ...]:
         """States that must be known to compute those of ``needed_backward``, and the past, once more."""
-        made = {**self.respond, **self.close}
-        wanted = set(self.needed_backward) | {s.name for s in inputs_of(self.sense)} & set(self.states)
+        nodes = {**self.respond, **self.close}
+        states = set(self.needed_backward) | {s.name for s in inputs_of(self.sense)} & set(self.states)
         while True:
-            read = {s.name for name in wanted for s in inputs_of([made[name]])}
+            read = {s.name for name in states for s in inputs_of([nodes[name]])}
             if "displacement" in read:
-                read |= {s.name for s in inputs_of([made["displacement"]])}
+                read |= {s.name for s in inputs_of([nodes["displacement"]])}
             if "position after" in read:
                 read |= {"position"}
-            more = wanted | (read & set(self.states))
-            if more == wanted:
-                return tuple(name for name in self.states if name in wanted)
-            wanted = more
+            more = states | (read & set(self.states))
+            if more == states:
+                return tuple(name for name in self.states if name in states)
+            states = more
 
 
 def _recalled(graph: Graph, nodes: list[Node]) -> tuple[list[Node], list[Recall], list[Node]]:

@@ -38,13 +38,13 @@ class Form:
     @classmethod
     def of(cls, state: State, inputs: Mapping[str, Any]) -> Form:
         """Return the form of a state and inputs."""
-        found = []
+        forms = []
         for effect, value in sorted(inputs.items()):
             fields = {"": value} if isinstance(value, Tensor) else value._asdict()
-            given = {name: x for name, x in fields.items() if x is not None}
-            found.append((effect, tuple(given), tuple(x.dtype == torch.bool for x in given.values())))
+            parts = {name: x for name, x in fields.items() if x is not None}
+            forms.append((effect, tuple(parts), tuple(x.dtype == torch.bool for x in parts.values())))
         memories = tuple(sorted(name for name in state.memory if name != delay_buffer.PAST))
-        return cls(tuple(found), memories, state.present is not None)
+        return cls(tuple(forms), memories, state.present is not None)
 
     @property
     def flags(self) -> tuple[str, ...]:
@@ -185,11 +185,10 @@ class _Recorder(CarFollowingStep):
         graph.note = ""
 
         now["displacement"] = value_of(graph, motion.displacement)
-        known: Any = Scalar(graph, graph.input("displacement")), Scalar(graph, graph.input("position after"))
-        known = motion._replace(displacement=known[0], position=known[1])
+        leaves: Any = Scalar(graph, graph.input("displacement")), Scalar(graph, graph.input("position after"))
         if motion.present is not state.present:
             self.recording.close["present"] = value_of(graph, motion.present)
-        return super()._gaps(state, known)
+        return super()._gaps(state, motion._replace(displacement=leaves[0], position=leaves[1]))
 
 
 def record(simulator: CarFollowingStep, form: Form, graph: Graph | None = None) -> Recording:
@@ -199,7 +198,7 @@ def record(simulator: CarFollowingStep, form: Form, graph: Graph | None = None) 
     ``Untraceable`` names the effect and the function for which that cannot be done.
     """
     # A search tries what it likes, and effects that are switched off there must leave nothing behind.
-    told = graph is None
+    judged = graph is None
     graph = Graph() if graph is None else graph
     recording = Recording(graph)
     recorder = _Recorder(
@@ -211,14 +210,14 @@ def record(simulator: CarFollowingStep, form: Form, graph: Graph | None = None) 
     )
 
     state = state_of(form, graph)
-    given = Parameters(recorder, graph)
+    params = Parameters(recorder, graph)
     try:
-        after = recorder.step(state, inputs_of_form(form, graph), given)  # type: ignore[arg-type]
-        suspects = tuple(dict.fromkeys(graph.suspects)) if told else ()
-        scene, driver = recorder.scene(state, {}), recorder._following.driver(given[recorder._following.name])  # type: ignore[arg-type]
+        after = recorder.step(state, inputs_of_form(form, graph), params)  # type: ignore[arg-type]
+        suspects = tuple(dict.fromkeys(graph.suspects)) if judged else ()
+        scene, driver = recorder.scene(state, {}), recorder._following.driver(params[recorder._following.name])  # type: ignore[arg-type]
         for effect in simulator.effects:
             if effect.name in form.memories:
-                held = effect.initial_memory(scene, driver, given[effect.name])  # type: ignore[arg-type]
+                held = effect.initial_memory(scene, driver, params[effect.name])  # type: ignore[arg-type]
                 recording.begin[effect.name] = value_of(graph, held)
     except Untraceable:
         raise
@@ -257,14 +256,14 @@ def state_of(form: Form, graph: Graph) -> State:
 
 def inputs_of_form(form: Form, graph: Graph) -> dict[str, Any]:
     """Return inputs of names."""
-    made: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
     for effect, fields, truths in form.inputs:
         values: dict[str, Any] = {}
         for name, truth in zip(fields, truths, strict=True):
             node = graph.input(slot_name(effect, name))
             values[name] = Scalar(graph, graph.compare("gt", node, graph.constant(0.5)) if truth else node)
-        made[effect] = values[""] if "" in values else _Given(values)
-    return made
+        inputs[effect] = values[""] if "" in values else _Given(values)
+    return inputs
 
 
 class _Given:

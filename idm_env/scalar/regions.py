@@ -33,14 +33,14 @@ class Regions(Graph):
             if key in scope:
                 return scope[key]
         level = max((a.level for a in args), default=CONSTANT) if level is None else level
-        made = Node(op, args, label, level, self.note)
+        node = Node(op, args, label, level, self.note)
         # Inputs and constants cost nothing to read and belong to nobody.
         free = op in ("input", "constant")
-        (self._scopes[0] if free else self._scopes[-1])[key] = made
-        self.serial[made] = len(self.serial)
+        (self._scopes[0] if free else self._scopes[-1])[key] = node
+        self.serial[node] = len(self.serial)
         if len(self._scopes) > 1 and not free:
-            self.region[made] = len(self.guards) - 1
-        return made
+            self.region[node] = len(self.guards) - 1
+        return node
 
     @contextmanager
     def within(self, flag: str) -> Iterator[int]:
@@ -73,8 +73,8 @@ class _Tabled(dict[str, Any]):
 
     def table(self, x: Any) -> Scalar:
         """Return the curve at x."""
-        at = value_of(self._graph, x)
-        return Scalar(self._graph, self._graph.node("table", at, label=self._number, level=DYNAMIC))
+        place = value_of(self._graph, x)
+        return Scalar(self._graph, self._graph.node("table", place, label=self._number, level=DYNAMIC))
 
 
 class Flagged:

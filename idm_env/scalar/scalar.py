@@ -101,10 +101,10 @@ def _apply(name: str, args: Any, kwargs: dict[str, Any]) -> Scalar:
     elif not kind.is_floating_point:
         raise _refused(graph, f"torch.{plain} to {kind}")
     args = [x for x in args if not isinstance(x, torch.dtype)]
-    given = {k: _node(graph, v) if isinstance(v, (Scalar, torch.Tensor)) else v for k, v in kwargs.items()
+    keywords = {k: _node(graph, v) if isinstance(v, (Scalar, torch.Tensor)) else v for k, v in kwargs.items()
              if k not in ("dtype", "device", "out") and not (k == "inplace" and v is False)}  # fmt: skip
     try:
-        return Scalar(graph, FUNCTIONS[plain](graph, *(_node(graph, a) for a in args), **given))
+        return Scalar(graph, FUNCTIONS[plain](graph, *(_node(graph, a) for a in args), **keywords))
     except TypeError as error:
         raise _refused(graph, f"torch.{plain} in a form that is not recorded ({error})") from None
 

@@ -31,8 +31,8 @@ class Constants:
 
     def index(self, value: float) -> int:
         """Return the place of a constant in ``k``."""
-        for i, known in enumerate(self.values):
-            if known == value and type(known) is type(value) and str(known) == str(value):
+        for i, constant in enumerate(self.values):
+            if constant == value and type(constant) is type(value) and str(constant) == str(value):
                 return i
         self.values.append(value)
         return len(self.values) - 1
@@ -86,9 +86,9 @@ def body(writes: Sequence[Write], read: Read, constants: Constants) -> Body:
     note = ""
 
     def constant(value: float) -> str:
-        at = constants.index(value)
-        used[f"k{at}"] = at
-        return f"k{at}"
+        index = constants.index(value)
+        used[f"k{index}"] = index
+        return f"k{index}"
 
     for node in ordered([write.node for write in writes]):
         arguments = [names[a] for a in node.args]
@@ -115,13 +115,13 @@ def body(writes: Sequence[Write], read: Read, constants: Constants) -> Body:
     return Body(used, [*loads, *lines])
 
 
-def function(name: str, doc: str, made: Body, compiler: str, arrays: tuple[str, ...] = ("w",)) -> str:
+def function(name: str, doc: str, content: Body, compiler: str, arrays: tuple[str, ...] = ("w",)) -> str:
     """Return the text of one phase: a compiled function that loops over ``m`` vehicles."""
-    given = ", ".join(f"{array}_" for array in arrays)
-    text = [f"@{compiler}", f"def {name}({given}, m, k_):", f'    """{doc}"""']
+    parameters = ", ".join(f"{array}_" for array in arrays)
+    text = [f"@{compiler}", f"def {name}({parameters}, m, k_):", f'    """{doc}"""']
     text += [f"    {array} = carray({array}_, SIZE)" for array in (*arrays, "k")]
-    text += [f"    {n} = k[{i}]" for n, i in made.constants.items()]
-    text += ["    for j in range(m):", *(f"        {line}" for line in made.lines)]
+    text += [f"    {n} = k[{i}]" for n, i in content.constants.items()]
+    text += ["    for j in range(m):", *(f"        {line}" for line in content.lines)]
     return "\n".join([*text, ""])
 
 

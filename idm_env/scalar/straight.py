@@ -45,14 +45,14 @@ class Straight:
             if self._is_kept(node) and node not in self._kept:
                 self._kept[node] = f"c[{len(self._kept)}]"
         names: dict[Node, str] = dict(self._kept)
-        made = self._print([n for n in live if n not in self._kept], names)
-        return [*made, *(f"{place} = {self._name(node, names)}" for place, node in writes)]
+        text = self._print([n for n in live if n not in self._kept], names)
+        return [*text, *(f"{place} = {self._name(node, names)}" for place, node in writes)]
 
     def constants(self) -> list[str]:
         """Return lines that compute what the printed lines need of parameters alone; call it last."""
-        wanted = list(self._kept)
+        nodes = list(self._kept)
         names: dict[Node, str] = {}
-        return self._print(self._live(wanted, stop=False), names, self._kept)
+        return self._print(self._live(nodes, stop=False), names, self._kept)
 
     @staticmethod
     def _is_kept(node: Node) -> bool:
@@ -90,9 +90,9 @@ class Straight:
                 for m in merges[region]:
                     outside, within = (self._name(m.args[k], names) for k in (2, 1))
                     names[m] = name = (fixed or {}).get(m, f"t{graph.serial[m]}")
-                    kept = name.startswith("c[")
-                    lines.append(f"{name} = {outside}" if kept else f"{name} = Merged({outside})")
-                    block = [*block, f"{name} = {within}" if kept else f"{name}.become({within})"]
+                    constant = name.startswith("c[")
+                    lines.append(f"{name} = {outside}" if constant else f"{name} = Merged({outside})")
+                    block = [*block, f"{name} = {within}" if constant else f"{name}.become({within})"]
                 guard = self._name(node.args[0], names)
                 lines += [f"with when({guard}):  # {block_note(node)}", *(f"    {x}" for x in block)]
                 continue

@@ -58,11 +58,11 @@ class TileText:
     @staticmethod
     def _chain(slots: set[Leaf]) -> set[Leaf]:
         """Add the nearer vehicles over which a number is handed on to those further away."""
-        found = set()
+        chain = set()
         for s in slots:
             sign = 1 if s.shift > 0 else -1
-            found |= {Leaf(s.name, sign * k) for k in range(1, abs(s.shift) + 1)}
-        return found
+            chain |= {Leaf(s.name, sign * k) for k in range(1, abs(s.shift) + 1)}
+        return chain
 
     # -- where things are ----------------------------------------------------------------------------------------
 
@@ -93,21 +93,21 @@ class TileText:
     def looks(self) -> dict[str, list[tuple[int, int, int]]]:
         """Return, by phase, the copies to make before it: (1 from the leader, −1 from behind; row to fill; source)."""
         fixed = [s for s in self._neighbours if s.name in self.program.statics]
-        made = {"static": self._looks(fixed)}
-        known = set(fixed)
+        copies = {"static": self._looks(fixed)}
+        rows = set(fixed)
         for phase in PHASES:
-            near = [s for s in self._chain_of(phase) if s not in known]
+            near = [s for s in self._chain_of(phase) if s not in rows]
             if phase != "close":
-                known |= set(near)
-            made[phase] = self._looks(near)
-        return made
+                rows |= set(near)
+            copies[phase] = self._looks(near)
+        return copies
 
     def _looks(self, slots: list[Leaf]) -> list[tuple[int, int, int]]:
-        found = []
+        copies = []
         for s in slots:
             step = 1 if s.shift > 0 else -1
-            found.append((step, self.at(self._row(s)), self.at(self._row(Leaf(s.name, s.shift - step)))))
-        return found
+            copies.append((step, self.at(self._row(s)), self.at(self._row(Leaf(s.name, s.shift - step)))))
+        return copies
 
     def sends(self) -> dict[str, list[tuple[int, int, int]]]:
         """Return, by phase, the adjoints to send after it: (shift, row that is sent, row of the adjoint it adds to)."""
@@ -130,15 +130,15 @@ class TileText:
 
         ``constants.values`` are complete once both texts were made; those of the forward text come first.
         """
-        made = self._back_phases() if backward else self._phases()
-        made = {name: phase for name, phase in made.items() if phase[1]}
+        phases = self._back_phases() if backward else self._phases()
+        phases = {name: phase for name, phase in phases.items() if phase[1]}
         rows = assignments((name, f"{i} * ROW") for i, name in enumerate(self._rows))
         compiler = "swift" if backward else "exact"
         functions = [
             function(name, doc, body(writes, self._read_slot, self.constants), compiler)
-            for name, (doc, writes) in made.items()
+            for name, (doc, writes) in phases.items()
         ]
-        return "\n\n".join([rows, *functions]), tuple(made)
+        return "\n\n".join([rows, *functions]), tuple(phases)
 
     def _phases(self) -> dict[str, tuple[str, list[Write]]]:
         p = self.program
@@ -156,7 +156,7 @@ class TileText:
 
     def _back_phases(self) -> dict[str, tuple[str, list[Write]]]:
         hoist = [Write(f"w[ON_{row(s)} + j]", x, adds=True) for s, x in self.program.hoist_backward().items()]
-        made = {"hoist_back": ("Adjoint of what depends on parameters alone.", hoist)}
+        phases = {"hoist_back": ("Adjoint of what depends on parameters alone.", hoist)}
         for phase in PHASES:
             back = self._back[phase]
             # An adjoint that only passes through stays where it is.
@@ -164,8 +164,8 @@ class TileText:
             writes = [Write(f"w[ON_{self._row(s)} + j]", x) for s, x in back.assigned.items() if s not in passing]
             writes += [Write(f"w[ON_{self._row(s)} + j]", x, adds=True) for s, x in back.added.items()]
             writes += [Write(f"w[SENT_{row(s)} + j]", x) for s, x in back.sent.items()]
-            made[f"{phase}_back"] = (f"Adjoint of {phase}.", writes)
-        return made
+            phases[f"{phase}_back"] = (f"Adjoint of {phase}.", writes)
+        return phases
 
     def _row(self, slot: Leaf) -> str:
         # By the time that gaps are closed, positions are those after the step.

@@ -92,18 +92,18 @@ class Wishes:
         graph = Graph()
         view = _Sides(Chains(road.closed), graph)
         stepping = CarFollowingStep(view, simulator.effects, simulator.dt, simulator.integration)
-        given, state = Parameters(stepping, graph), state_of(form, graph)
+        params, state = Parameters(stepping, graph), state_of(form, graph)
         inputs: Mapping[str, Any] = inputs_of_form(form, graph)
         try:
             left, right = (view.side(name, state) for name in SIDES)
-            scene = beside(stepping, view, (left, right), state, inputs, given)  # type: ignore[arg-type]
-            wish = wished(stepping, scene, given)
-            found = preferred(left, right, wish, road.handed == "left")  # type: ignore[arg-type]
+            scene = beside(stepping, view, (left, right), state, inputs, params)  # type: ignore[arg-type]
+            wish = wished(stepping, scene, params)
+            preference = preferred(left, right, wish, road.handed == "left")  # type: ignore[arg-type]
             if graph.suspects:  # effects of the user's own: their NaN is told by who is blocked
-                found = found._replace(blocked=_or_nan((left, right), wish, found.blocked))
+                preference = preference._replace(blocked=_or_nan((left, right), wish, preference.blocked))
             # Who signals is asked for only where somebody looks.
-            told = found if simulator.sees_mergers else found[:-1]
-            self.outputs: tuple[Node, ...] = tuple(value_of(graph, x) for x in told)
+            outputs = preference if simulator.sees_mergers else preference[:-1]
+            self.outputs: tuple[Node, ...] = tuple(value_of(graph, x) for x in outputs)
         except Untraceable:
             raise
         except Exception as error:  # as in ``record``
@@ -116,11 +116,11 @@ class Wishes:
 
     def text(self) -> str:
         """Return rows and the one phase as text; constants are complete afterwards."""
-        at = {slot: f"{i} * ROW" for i, slot in enumerate(self.slots)}
+        places = {slot: f"{i} * ROW" for i, slot in enumerate(self.slots)}
         names = {slot: row(slot) for slot in self.slots}
         results = [f"BEST_{name.upper()}" for name in Preference._fields[: len(self.outputs)]]
-        lines = [f"{names[slot]} = {place}" for slot, place in at.items()]
-        lines += [f"{name} = {len(at) + i} * ROW" for i, name in enumerate(results)]
+        lines = [f"{names[slot]} = {place}" for slot, place in places.items()]
+        lines += [f"{name} = {len(places) + i} * ROW" for i, name in enumerate(results)]
         writes = [Write(f"w[{name} + j]", node) for name, node in zip(results, self.outputs, strict=True)]
-        made = body(writes, lambda slot: f"w[{names[slot]} + j]", self.constants)
-        return "\n".join([*lines, "", "", function("wish", "What every driver would do.", made, "exact")])
+        content = body(writes, lambda slot: f"w[{names[slot]} + j]", self.constants)
+        return "\n".join([*lines, "", "", function("wish", "What every driver would do.", content, "exact")])
