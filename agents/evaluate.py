@@ -331,8 +331,8 @@ def shown(
     chosen: dict[str, Any] = {**environment, "warmup_pool": 0, "max_episode_steps": -1, **keywords}
     task = task_of(environment)
     if isinstance(task, RingTask):
-        # The shock comes as long after the policy has taken over as in the test.
-        chosen |= {"length": 250.0, "shock_after": task.shock_after + human * task.step_time}
+        # Shocks come as long after the policy has taken over as in the test.
+        chosen |= {"length": 250.0, "shock_after": [x + human * task.step_time for x in task.shocks]}
     env = DiffIDMEnv(**chosen)
     observation, _ = env.reset(seed=seed)
     past = None

@@ -5,7 +5,7 @@
     python benchmarks/agents.py table [--out runs/benchmark]
     python benchmarks/agents.py picture [--out runs/benchmark]
     python benchmarks/agents.py takeover [--out runs/benchmark]
-    python benchmarks/agents.py unshocked [--only ring-brakes-distil]
+    python benchmarks/agents.py shocks [--only ring-brakes-distil]
 
 ``reference`` has what learns nothing, ``run`` the searches and the seeds of each best trial (or of the one that is
 given, without a search). Every training is one process with one thread and one file of results; what is done is
@@ -83,7 +83,13 @@ from idm_env.model_file import read_yaml  # noqa: E402
 
 LIMIT = 150.0
 """CPU seconds after which a training ends that has updates left."""
-TESTS = ("failsafe", "failsafe-shock", "brakes", "brakes-shock", "follow")
+SHOCKS: dict[str, dict[str, Any]] = {
+    "": {"shock": 0.0},
+    "-shock": {"shock": 4.0},
+    "-two-shocks": {"shock": 5.0, "shock_after": [60.0, 120.0]},
+}
+"""What the human opposite does, by how the names of tests end: nothing, brake once, or harder and twice."""
+TESTS = (*(ring + shock for ring in ("failsafe", "brakes") for shock in SHOCKS), "follow")
 """Of the reference rows (``tests``)."""
 SEARCH_SEEDS, SEEDS = (100, 101), tuple(range(10))
 
@@ -479,19 +485,17 @@ def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> N
     )  # fmt: skip
 
 
-def unshocked_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
-    """Print what the last checkpoints do on the thirty fresh rings of their test without its shock."""
+def shocks_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+    """Print what the last checkpoints do on the thirty fresh rings of their test, by its shocks."""
     rows = []
     for config in configs:
         for path in (p for seed in seeds for p in sorted((out / config).glob(f"trial*/seed{seed}/training/last.pt"))):
             policy, content = common.load(path)
             test = as_judged(content["environment"], content["training"]["arguments"]["judged_in"])
-            found = evaluate(policy, {**test, "shock": 0.0}, draws=FRESH)
-            rows.append([config, *path.parts[-4:-2], *ring(found), "yes" if found["passed"] else "no"])
-    table(
-        ("agent", "trial", "seed", "worst ratio", "worst deviation", "smallest time gap", "collisions, of 30 rings",
-         "passes"), rows,
-    )  # fmt: skip
+            found = [evaluate(policy, {**test, **shock}, draws=FRESH) for shock in SHOCKS.values()]
+            figures = ["/".join(ring(x)) + (", passes" if x["passed"] else "") for x in found]
+            rows.append([config, *path.parts[-4:-2], *figures])
+    table(("agent", "trial", "seed", *(name or "no shock" for name in SHOCKS)), rows)
 
 
 def environment_of(config: str) -> Row:
@@ -555,14 +559,9 @@ def tests() -> dict[str, Row]:
     """Return the environments by name: rings behind a failsafe or with real brakes, with a shock or without; follow."""
     guarded = environment_of("ring-apg")
     free = {**guarded, "failsafe": 0.0, "max_command": [-4.5, 2.6]}
-    shock = {"shock": 4.0}
-    return {
-        "failsafe": guarded,
-        "failsafe-shock": {**guarded, **shock},
-        "brakes": free,
-        "brakes-shock": {**free, **shock},
-        "follow": environment_of("follow-apg"),
-    }
+    rings = {"failsafe": guarded, "brakes": free}
+    made = {ring + name: {**own, **shock} for ring, own in rings.items() for name, shock in SHOCKS.items()}
+    return {**made, "follow": environment_of("follow-apg")}
 
 
 def begun(environment: Row, folder: Path, updates: int) -> list[Policy]:
@@ -594,7 +593,7 @@ def on_ring(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
     for name, family in families(environment).items():
         made[name] = lambda family=family: tried(family(), environment)
     # Trained on the ring without a shock, as agents are.
-    training = {k: v for k, v in environment.items() if k != "shock"}
+    training = {k: v for k, v in environment.items() if not k.startswith("shock")}
     for name, updates in BEGUN.items():
         made[name] = lambda updates=updates: tried(
             networks(begun(training, folder, updates), UNTRAINED_NAMES), environment
@@ -630,7 +629,7 @@ def reference(out: Path, names: Sequence[str]) -> None:
         environment, folder = tests()[name], out / "reference" / name
         columns[name] = {}
         # With and without a shock policies are trained alike.
-        trained = out / "reference" / name.removesuffix("-shock")
+        trained = out / "reference" / name.split("-")[0]
         makers = on_ring if environment["task"] == "ring" else behind_leader
         for i, (row, make) in enumerate(makers(environment, trained / "one_update").items()):
             print(f"{name}: {row}", flush=True)
@@ -715,7 +714,7 @@ def main() -> None:
     import argparse
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["reference", "run", "table", "picture", "takeover", "unshocked"])
+    parser.add_argument("what", choices=["reference", "run", "table", "picture", "takeover", "shocks"])
     parser.add_argument("--only", nargs="*", default=list(SEARCH))
     parser.add_argument("--tests", nargs="*", default=list(TESTS), choices=TESTS, help="of the reference rows")
     parser.add_argument("--trial", type=int, help="train the seeds of this trial, without a search")
@@ -731,8 +730,8 @@ def main() -> None:
         picture(options.out, SEEDS, ROOT / "docs" / "agents_survival.png")
     elif options.what == "takeover":
         takeover_table(options.out, rings, seeds)
-    elif options.what == "unshocked":
-        unshocked_table(options.out, rings, seeds)
+    elif options.what == "shocks":
+        shocks_table(options.out, rings, seeds)
     elif options.what == "reference":
         reference(options.out.resolve(), options.tests)
     else:

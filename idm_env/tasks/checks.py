@@ -16,7 +16,7 @@ _WEAKEST, _STRONGEST = 1e-3, 100.0
 
 
 class Range(NamedTuple):
-    """Where an option of a task may lie, ends included, in its unit; a whole number, or one number or two ends.
+    """Where an option of a task may lie, ends included, in its unit: a whole number, one number or two ends, or several.
 
     Above are values for which nobody has a use, and that would take time and memory without an end.
     """
@@ -26,10 +26,14 @@ class Range(NamedTuple):
     unit: str = ""
     whole: bool = False
     ends: bool = False
+    several: bool = False
 
     def check(self, name: str, value: Any) -> None:
         """Raise ValueError, in one line, for what lies outside or is no such number."""
-        if self.whole:
+        if self.several and isinstance(value, Sequence) and not isinstance(value, str):
+            for i, one in enumerate(value):
+                at_least(f"{name}[{i}]", one, self.low, self.unit, self.high)
+        elif self.whole:
             whole(name, value, int(self.low), int(self.high))
         elif self.ends:
             span(name, value, self.low, self.unit, self.high)

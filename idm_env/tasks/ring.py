@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
@@ -20,7 +21,7 @@ from idm_env.tasks.crash import floored
 from idm_env.tasks.features import Feature, feature
 from idm_env.tasks.random import Draw
 from idm_env.types import Command, Inputs, Params, State
-from idm_env.validation import one_of
+from idm_env.validation import one_of, shown
 
 STARTS = ("uniform", "wave")
 SCALES = (5.0, 1.0, 10.0)
@@ -57,9 +58,9 @@ class RingTask(Task):
         tailgating_below: Time gap below which it counts (s). An agent holds about that gap: leave a margin.
         fuel: Weight of the fuel term (s/mL); 0 leaves it out.
         fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
-        shock: Deceleration (m/s²) with which one human driver brakes once in an episode, whatever is ahead: as hard as
+        shock: Deceleration (m/s²) with which one human driver brakes in an episode, whatever is ahead: as hard as
             the brakes allow, by a command in place of the driver's acceleration; 0 is no shock.
-        shock_after: Time from the beginning of the episode to the shock (s).
+        shock_after: Time from the beginning of the episode to the shock (s), or those of several, such as [60, 120].
         shock_seconds: How long it lasts (s), in whole steps.
         shock_vehicle: Who brakes; None is the human opposite the first agent, half the ring away (or the next one
             behind, where that is an agent too).
@@ -78,7 +79,7 @@ class RingTask(Task):
         "tailgating_below": Range(0.1, 60.0, "s"),
         "fuel": Range(0.0, 1e6),
         "shock": Range(0.0, 100.0, "m/s²"),
-        "shock_after": Range(0.0, 1e6, "s"),
+        "shock_after": Range(0.0, 1e6, "s", several=True),
         "shock_seconds": Range(0.0, 1e4, "s"),
         "shock_vehicle": Range(0, 100_000, whole=True),
     }
@@ -92,7 +93,7 @@ class RingTask(Task):
     fuel: float = 0.0
     fuel_model: str = "kamal"
     shock: float = 0.0
-    shock_after: float = 120.0
+    shock_after: float | Sequence[float] = 120.0
     shock_seconds: float = 2.0
     shock_vehicle: int | None = None
 
@@ -107,6 +108,11 @@ class RingTask(Task):
         one_of("start", self.start, STARTS)
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
         at_least("shock_seconds", self.shock_seconds, self.simulator.dt, "s")
+        if any(later - sooner < self.shock_seconds for sooner, later in pairwise(self.shocks)) or not self.shocks:
+            raise ValueError(
+                f"shock_after = {shown(self.shock_after)} must be a time, or several, each at least shock_seconds = "
+                f"{self.shock_seconds:g} s after the one before, such as [60, 120]."
+            )
         if self.shock or self.shock_vehicle is not None:
             self._check_shocked()
 
@@ -125,6 +131,11 @@ class RingTask(Task):
                 f"shock_vehicle = {vehicle} must be a human driver of vehicles 0 … {self.vehicles - 1}; agents control "
                 f"{', '.join(map(str, self.agents))}."
             )
+
+    @property
+    def shocks(self) -> tuple[float, ...]:
+        """When a human driver brakes, where there is a shock (s)."""
+        return tuple(self.shock_after) if isinstance(self.shock_after, Sequence) else (self.shock_after,)
 
     @cached_property
     def shocked(self) -> int:
@@ -197,8 +208,9 @@ class RingTask(Task):
         if not self.shock:
             return inputs
         step, dt = world.state.step.unsqueeze(-1), self.simulator.dt
-        first = round(self.shock_after / dt)
-        now = (step >= first) & (step < first + round(self.shock_seconds / dt))
+        lasts = round(self.shock_seconds / dt)
+        since = [step - round(begin / dt) for begin in self.shocks]
+        now = reduce(torch.logical_or, [(x >= 0) & (x < lasts) for x in since])
         who = self.constant("shocked", self._is_shocked, step.device, torch.bool)
         given, brakes = inputs["control"], now & who
         return {**inputs, "control": Command(torch.where(brakes, -self.shock, given.accel), given.active | brakes)}

@@ -121,6 +121,10 @@ def test_in_a_shock_one_human_brakes_for_its_time_whatever_is_ahead():
         braked = change[:, row, 11] < -0.39
         assert braked.nonzero().flatten().tolist() == list(range(first, first + 10))
         torch.testing.assert_close(change[first : first + 10, row, 11], torch.full((10,), -0.4, dtype=torch.float64))
+    twice = shocked_speeds(shock_after=[1.0, 2.5])[0].detach()
+    braked = (twice[1:, 0, 11] - twice[:-1, 0, 11]) < -0.39
+    assert braked.nonzero().flatten().tolist() == [*range(10, 20), *range(25, 28)]
+    assert bool((twice[30:36, 0, 11] == 0.0).all()), "he stands until the second is over"
     # Who drives ahead does not feel it, who follows does.
     felt = (shocked_speeds(shock_after=60.0)[0] - speeds).detach()[:, 0]
     assert float(felt[:, :11].abs().max()) == 0.0
@@ -147,6 +151,9 @@ def test_the_driver_opposite_is_no_agent_and_a_wrong_one_is_told():
     for keywords, message in (
         ({"shock": -1.0}, "shock = -1"),
         ({"shock": 4.0, "shock_seconds": 0.0}, "shock_seconds = 0"),
+        ({"shock": 4.0, "shock_after": [60.0, -1.0]}, r"shock_after\[1\] = -1"),
+        ({"shock": 4.0, "shock_after": [60.0, 61.0]}, "each at least shock_seconds = 2 s after the one before"),
+        ({"shock": 4.0, "shock_after": []}, "must be a time, or several"),
         ({"shock": 4.0, "controlled": "all"}, "needs a human driver"),
         ({"shock": 4.0, "shock_vehicle": 0}, "shock_vehicle = 0 must be a human driver"),
         ({"shock": 4.0, "shock_vehicle": 22}, "shock_vehicle = 22 must be a human driver"),
