@@ -152,12 +152,13 @@ class Critic(nn.Module):
 
 
 def human_scenes(environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 1500) -> Tensor:
-    """Return what the critic sees, every tenth step, while human drivers keep the wheel."""
+    """Return what the critic sees, every tenth Δt or decision after it, while human drivers keep the wheel."""
     env = environments.make_env(with_road(environment), count, output="numpy")
     seen = [env.reset(seed=seed)[0]]
-    for step in range(steps):
+    held = env.task.held
+    for step in range(0, steps, held):
         observation = env.step(None)[0]
-        if step % 10 == 0:
+        if step % 10 < held:
             seen.append(observation)
     return Sighted(nn.Identity(), len(env.task.agents)).scene(torch.as_tensor(np.concatenate(seen)))
 

@@ -17,7 +17,9 @@ class Control(Effect):
     """An agent's acceleration in place of the driver's, wherever its command is active.
 
     Input ``control``: a ``Command(accel, active)``. Power, lag and brakes still act on it. A ``careful`` command counts
-    only as far as the driver himself would go: ``min(command, driver)``.
+    only as far as the driver himself would go: ``min(command, driver)``. One that is ``added`` counts beside him:
+    ``command + driver``, so that no command is human driving (Johannink et al. 2019, ICRA, "Residual reinforcement
+    learning for robot control").
     """
 
     kind: ClassVar[str] = "control"
@@ -25,11 +27,13 @@ class Control(Effect):
     adds: ClassVar[bool] = False
     rank: ClassVar[int] = 35
     careful: bool = False
+    added: bool = False
 
     def limit(self, accel: Tensor, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the command where active."""
         command: Command = scene.input(self.name)
-        command_accel = torch.minimum(command.accel, accel) if self.careful else command.accel
+        command_accel = command.accel + accel if self.added else command.accel
+        command_accel = torch.minimum(command_accel, accel) if self.careful else command_accel
         return torch.where(command.active, command_accel, accel)
 
 

@@ -99,6 +99,8 @@ class OpenLanesTask(LanesTask):
     Args:
         entry_speed: Speed at which vehicles ask to enter (m/s).
         careful: Whether a command counts only as far as the driver himself would go: ``min(command, driver)``.
+        added: Whether commands are added to what the driver would do: zeros are then human driving, and a new policy
+            is a driver. With ``careful`` only those below 0 count; without a ``failsafe``, which judges whole commands.
         classes: Drivers who are not as all others: ``{"truck": {"share": 0.2, "length": 12.0, "parameters":
             {"idm.desired_speed": 24.0}}}``, shares of those who enter, length in metres.
         trips: Who departs when, in place of the inflow: a table, rows or a CSV file with the columns of
@@ -127,6 +129,7 @@ class OpenLanesTask(LanesTask):
     max_command: float | Sequence[float] = 2.0
     entry_speed: float = 20.0
     careful: bool = True
+    added: bool = False
     classes: Mapping[str, Any] | None = None
     trips: Any = None
     limits: Sequence[Mapping[str, Any]] = ()
@@ -136,6 +139,10 @@ class OpenLanesTask(LanesTask):
         if self.table is not None:
             object.__setattr__(self, "vehicles", len(self.table.depart))
         super().__post_init__()
+        if self.added and self.failsafe:
+            raise ValueError(
+                f"failsafe = {self.failsafe:g} judges whole commands, and added = True gives parts of them. Leave one out."
+            )
         if self.table is not None:
             self._check_table(self.table)
             return
@@ -224,9 +231,9 @@ class OpenLanesTask(LanesTask):
 
     @property
     def as_driver(self) -> float:
-        """A careful command of the driver's own maximum, which never holds him back."""
+        """A careful command of the driver's own maximum, which never holds him back; none, where it is added."""
         most = self.params(torch.float64, "cpu")[self.simulator.base.name].get("max_accel")
-        return min(1.0, float(most.max()) / self.command_limits[1]) if self.careful and most is not None else 0.0
+        return min(1.0, float(most.max()) / self.command_limits[1]) if self.careful and not self.added and most is not None else 0.0
 
     @property
     def usual_steps(self) -> int:
@@ -236,7 +243,7 @@ class OpenLanesTask(LanesTask):
     @property
     def machinery(self) -> tuple[Effect, ...]:  # type: ignore[override]
         """Effects through which agents act."""
-        return (Control(careful=self.careful), *super().machinery[1:], *self.rules)
+        return (Control(careful=self.careful, added=self.added), *super().machinery[1:], *self.rules)
 
     @cached_property
     def _slots(self) -> tuple[tuple[float, float], ...]:

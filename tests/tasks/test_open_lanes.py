@@ -116,6 +116,24 @@ def test_behind_a_failsafe_or_a_careful_driver_an_agent_stops_before_its_lane_en
         assert float(state.position[0, 0]) == pytest.approx(place, abs=0.01)
 
 
+@pytest.mark.parametrize(("careful", "counts"), [(False, (1.0, 0.0, -1.0)), (True, (0.0, 0.0, -1.0))])
+def test_an_added_command_counts_beside_the_driver(careful: bool, counts: tuple[float, ...]) -> None:
+    """Zeros are human driving to the last bit; of a careful agent what is above them counts for nothing."""
+    task = make_task("merge", vehicles=40, controlled=0.5, added=True, careful=careful, max_command=0.5)
+    params = task.params(torch.float64, "cpu")
+    world = task.reset(Draw.of(torch.arange(2), torch.zeros(2, dtype=torch.int64)), params)
+    assert world.state.present is not None
+    there = task.pick(world.state.present)
+    human = task.step(world, None, None, params)
+    for action, counted in zip((1.0, 0.0, -1.0), counts, strict=True):
+        after = task.step(world, task.command(torch.full_like(there, action)), None, params)
+        more = task.pick(after.state.accel) - task.pick(human.state.accel)
+        torch.testing.assert_close(more, 0.5 * counted * there, rtol=0, atol=1e-12 if counted else 0)
+    assert task.as_driver == 0.0
+    with pytest.raises(ValueError, match="failsafe = 3 judges whole commands"):
+        make_task("merge", added=True, failsafe=3.0)
+
+
 @pytest.mark.parametrize(("name", "effects"), [("merge", []), ("bottleneck", []), ("merge", ["courtesy"])])
 def test_behind_a_failsafe_nobody_crashes_whatever_agents_command(name: str, effects: list[str]) -> None:
     """Among drivers who cut in, or let in, and where lanes end."""
