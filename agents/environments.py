@@ -85,7 +85,7 @@ def restore(env: DiffIDMVectorEnv, saved: Mapping[str, Any]) -> Tensor:
 def human_driving(
     environment: Mapping[str, Any], seed: int, count: int = 16, steps: int = 1500
 ) -> tuple[Tensor, Tensor]:
-    """Return what agents observe while human drivers keep the wheel for ``steps`` of Δt, and actions that do as they do.
+    """Return what agents observe while human drivers keep the wheel for ``steps`` of Δt, and actions that do as much.
 
     Shapes ``(samples, features)`` and ``(samples,)``; actions would command what drivers do, clipped. Where an action
     is held that is their mean acceleration. Whoever is not on the road, from one decision to the next, is no sample.

@@ -16,7 +16,7 @@ _WEAKEST, _STRONGEST = 1e-3, 100.0
 
 
 class Range(NamedTuple):
-    """Where an option of a task may lie, ends included, in its unit: a whole number, one number or two ends, or several.
+    """Where an option of a task may lie, ends included, in its unit; a whole number, one number, two ends, or several.
 
     Above are values for which nobody has a use, and that would take time and memory without an end.
     """

@@ -231,9 +231,13 @@ class OpenLanesTask(LanesTask):
 
     @property
     def as_driver(self) -> float:
-        """A careful command of the driver's own maximum, which never holds him back; none, where it is added."""
+        """A careful command of the driver's own maximum, which never holds him back; 0 where it is added to his."""
         most = self.params(torch.float64, "cpu")[self.simulator.base.name].get("max_accel")
-        return min(1.0, float(most.max()) / self.command_limits[1]) if self.careful and not self.added and most is not None else 0.0
+        return (
+            min(1.0, float(most.max()) / self.command_limits[1])
+            if self.careful and not self.added and most is not None
+            else 0.0
+        )
 
     @property
     def usual_steps(self) -> int:

@@ -65,7 +65,7 @@ def test_policies_that_drive_together_drive_as_alone(monkeypatch):
 
 def test_apg_learns_in_traffic_that_flows(quick, monkeypatch):
     """Gradients go through vehicles that enter, change lanes and leave."""
-    monkeypatch.setattr(common, "human_driving", partial(human_driving, count=2, steps=60))
+    monkeypatch.setattr(common, "human_driving", partial(human_driving, count=2, steps=600))
     environment = {**FREE, "vehicles": 24, "max_episode_steps": 60}
     history = apg.train(apg.Arguments(**{**quick, "environment": environment, "updates": 2}, count=2, window=20))
     assert [row["updates"] for row in history] == [0, 1, 2]
@@ -88,7 +88,7 @@ def test_a_ring_of_twice_the_vehicles_is_twice_as_long(monkeypatch):
 def test_nobody_learns_from_who_is_not_on_the_road(monkeypatch):
     """Neither clones nor normalisation, nor PPO's batches; an agent's episode ends with its trip."""
     chosen = {**FREE, "controlled": 0.2, "max_episode_steps": 50}
-    seen, actions = human_driving(chosen, 5, count=2, steps=40)
+    seen, actions = human_driving(chosen, 5, count=2, steps=400)
     at = task_of(chosen).bounds.names.index("present")
     assert 0 < len(seen) == len(actions) < 0.9 * 2 * 40 * 8 and bool((seen[:, at] == 1.0).all())
     rows = ppo.Shared(make_env(chosen, 2, output="numpy"))
@@ -120,7 +120,7 @@ def test_a_clone_of_held_actions_learns_what_they_came_to():
 
 def test_ppo_learns_one_policy_for_all_agents_of_an_environment(quick, monkeypatch):
     """Every agent is a row of its own, with what it observes; the team's reward goes to all."""
-    monkeypatch.setattr(common, "human_driving", partial(human_driving, count=2, steps=60))
+    monkeypatch.setattr(common, "human_driving", partial(human_driving, count=2, steps=600))
     environment = {**FREE, "vehicles": 24, "controlled": [4, 5, 6], "max_episode_steps": 30}
     vector = make_env(environment, 2, output="numpy")
     rows = ppo.Shared(vector)
