@@ -141,7 +141,7 @@ class OpenLanesTask(LanesTask):
         super().__post_init__()
         if self.added and self.failsafe:
             raise ValueError(
-                f"failsafe = {self.failsafe:g} judges whole commands, and added = True gives parts of them. Leave one out."
+                f"failsafe = {self.failsafe:g} judges whole commands, and added = True gives parts. Leave one out."
             )
         if self.table is not None:
             self._check_table(self.table)
