@@ -611,7 +611,7 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
     # The picture is as long as it was asked for, whatever the limit of an episode.
     env: Any = DiffIDMEnv(**{**load_environment(config), "max_episode_steps": -1})
     env.reset(seed=seed)
-    dt = env.task.simulator.dt
+    dt = env.task.step_time  # of a step of the environment, for which an action is held
     kept, lanes, there = [], [], []
     steps = max(1, round(seconds / dt))
     for step in range(steps):

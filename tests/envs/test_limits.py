@@ -1,14 +1,18 @@
 """How long episodes are: the spec says it, every number asked for is honoured, and what cannot be is an error."""
 
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
 import idm_env  # noqa: F401
+from idm_env.cli import commands as cli
 from idm_env.envs.gym import DiffIDMEnv
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.envs.vector import DiffIDMVectorEnv
+from idm_env.jobs import progress
 
 USUAL = {
     "ring": 3000,
@@ -99,11 +103,20 @@ def test_the_cost_of_a_crash_knows_the_episodes_length():
 
 def test_a_picture_is_as_long_as_it_was_asked_for(tmp_path, monkeypatch):
     # The usual 3000 steps are no limit of it: plot's ring is drawn over 400 s.
-    from idm_env.cli import commands as cli
-    from idm_env.jobs import progress
-
     monkeypatch.setattr(cli, "_work_begins", lambda: None)
     path = tmp_path / "ring.yaml"
     path.write_text("configures: environment\ntask: ring\nvehicles: 3\nlength: 60.0\nwarmup: 1\n")
     (panel,) = cli._rollout_panels(path, 310.0, 0, progress.silent)
     assert [len(line.time) for line in panel.lines] == [3100] * 3
+
+
+def test_a_picture_of_a_task_whose_actions_are_held_is_as_long_as_it_was_asked_for(monkeypatch):
+    """Its lines lie at the seconds of the environment: a vehicle's way over them is its speed."""
+    monkeypatch.setattr(cli, "_work_begins", lambda: None)
+    config = Path(__file__).resolve().parents[2] / "configs" / "motorway.yaml"
+    panels = cli._rollout_panels(config, 20.0, 0, progress.silent)
+    lines = [line for panel in panels for line in panel.lines if len(line.time) > 5]
+    assert lines and max(line.time[-1] for line in lines) == 20.0
+    for line in lines:
+        driven = np.diff(line.position) / np.diff(line.time)
+        assert np.all(np.abs(driven - 0.5 * (line.speed[1:] + line.speed[:-1])) < 1.0)
