@@ -134,7 +134,7 @@ def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Seque
     torch.set_num_threads(1)
     with one_line():
         found = parse(kind, agent, argv)
-        with storage.folder_lock(found.out):
+        with storage.alone(found.out):
             return train(found)
 
 

@@ -245,20 +245,20 @@ def numbers(values: Mapping[str, Any]) -> Numbers:
     return {e: {n: number(f"{e}.{n}", x) for n, x in part.items()} for e, part in nested(values).items()}
 
 
-def nested(values: Mapping[str, Any], section: str = "parameters") -> dict[str, dict[str, Any]]:
-    """Return parameters as effect → parameter → value, from that or from full names with a dot; ``section`` is the key.
+def nested(values: Mapping[str, Any], of: str = "parameters") -> dict[str, dict[str, Any]]:
+    """Return parameters as effect → parameter → value, from that or from full names with a dot; ``of`` is the key.
 
     ValueError for anything else, and for a parameter given twice.
     """
     result: dict[str, dict[str, Any]] = {}
-    for key, value in _mapping(section, values).items():
+    for key, value in _mapping(of, values).items():
         if isinstance(value, Mapping):
             part, effect = {str(name): x for name, x in value.items()}, str(key)
         elif "." in str(key):
             effect, name = str(key).split(".", 1)
             part = {name: value}
         else:
-            raise ValueError(f"{section}.{shown(key)} = {shown(value)} must be a mapping, such as {{time_gap: 1.2}}.")
+            raise ValueError(f"{of}.{shown(key)} = {shown(value)} must be a mapping, such as {{time_gap: 1.2}}.")
         for name in part:
             if name in result.get(effect, {}):
                 raise ValueError(f"parameter {shown(f'{effect}.{name}')} is given twice. Remove one of them.")

@@ -265,7 +265,7 @@ def test_a_store_that_is_killed_while_it_is_made_or_removed_is_still_ours(tmp_pa
     with pytest.raises(KeyboardInterrupt):
         store.remove()
     monkeypatch.undo()
-    assert storage.Store(folder, "b", False).names() == []
+    assert storage.Store(folder, "b", False).kept() == []
 
 
 def damaged(path: Path) -> dict[str, bytes]:

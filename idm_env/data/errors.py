@@ -61,8 +61,8 @@ class Counted:
 def nearest(name: str, names: Iterable[str], cutoff: float = 0.5) -> str | None:
     """Return the most similar of `names`, ignoring case, or None if none is similar."""
     by_lower = {other.lower(): other for other in names}
-    found = difflib.get_close_matches(name.lower(), list(by_lower), n=1, cutoff=cutoff)
-    return by_lower[found[0]] if found else None
+    matches = difflib.get_close_matches(name.lower(), list(by_lower), n=1, cutoff=cutoff)
+    return by_lower[matches[0]] if matches else None
 
 
 def listed(names: Iterable[str], most: int = 12) -> str:
@@ -72,9 +72,9 @@ def listed(names: Iterable[str], most: int = 12) -> str:
     return shown if len(all_names) <= most else f"{shown} and {len(all_names) - most} more"
 
 
-def missing_column(name: str, columns: Iterable[str], source: str, known: Iterable[str] = ()) -> DataError:
-    """Return the error for a column that a file lacks, suggesting the nearest name that is not itself `known`."""
+def missing_column(name: str, columns: Iterable[str], source: str, others: Iterable[str] = ()) -> DataError:
+    """Return the error for a column that a file lacks, suggesting the nearest name that is none of `others`."""
     names = list(columns)
-    guess = nearest(name, set(names) - set(known))
+    guess = nearest(name, set(names) - set(others))
     cure = f"did you mean {guess!r}? Rename it." if guess else f"the file has: {listed(names)}."
     return DataError(f"{source}: column {name!r} is missing; {cure}")

@@ -41,13 +41,13 @@ def marks(trajectories: Trajectories, drivers: Iterable[Track]) -> dict[Track, s
     return by_track
 
 
-def seen(trajectories: Trajectories, drivers: Iterable[Track], known: Iterable[str]) -> set[Track] | None:
-    """Return the drivers whose tracks have these ``known`` marks, whatever run and vehicle are called here.
+def seen(trajectories: Trajectories, drivers: Iterable[Track], old_marks: Iterable[str]) -> set[Track] | None:
+    """Return the drivers whose tracks have these ``old_marks``, whatever run and vehicle are called here.
 
     None where no mark can be read: there is none, or another version wrote them.
     """
     times, places, owner, count = [], [], [], 0
-    for mark in filter(_READABLE.fullmatch, known):
+    for mark in filter(_READABLE.fullmatch, old_marks):
         every, first, *values = (int(x) for x in mark.split())
         times.append(first + every * np.arange(len(values)))
         places.append(np.array(values, float))

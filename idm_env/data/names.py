@@ -112,7 +112,7 @@ def check_columns(columns: list[str], source: str) -> None:
     """Raise DataError if the table lacks a required column, or seems to misspell an optional one."""
     for name in REQUIRED:
         if name not in columns:
-            error = missing_column(name, columns, source, known=TIDY)
+            error = missing_column(name, columns, source, others=TIDY)
             raise DataError(f"{error} Or name it: {guessed(columns)}")
     others = [name for name in columns if name not in TIDY]
     for name in TIDY:

@@ -30,7 +30,7 @@ def followed(
     return mean[..., 2:], covariance[..., 2:, 2:]
 
 
-def futures(
+def drawn(
     drivers: MeasuredDrivers,
     settings: DriftSettings,
     theta: np.ndarray,
@@ -94,33 +94,33 @@ def _wider(value: Any) -> Any:
     return type(value)(*(None if x is None else x.unsqueeze(1) for x in value))
 
 
-def crps(draws: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def crps(drawn: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return the continuous ranked probability score of draws [n, …], without the bias of few draws.
 
     ``E|X − y| − ½ E|X − X'|`` (Gneiting, Raftery 2007, JASA 102); of a single draw the absolute error.
     """
-    n = len(draws)
-    first = np.abs(draws - truth).mean(0)
+    n = len(drawn)
+    first = np.abs(drawn - truth).mean(0)
     if n == 1:
         return np.asarray(first)
-    ranked = np.sort(draws, 0)
+    ranked = np.sort(drawn, 0)
     weight = (2.0 * np.arange(1, n + 1) - n - 1.0).reshape(-1, *(1,) * truth.ndim)
     return np.asarray(first - (weight * ranked).sum(0) / (n * (n - 1.0)))
 
 
-def log_score(draws: np.ndarray, truth: np.ndarray, least: float = 0.1) -> np.ndarray:
+def log_score(drawn: np.ndarray, truth: np.ndarray, least: float = 0.1) -> np.ndarray:
     """Return minus the log density of the truth under a normal of the draws' mean and variance: small is good.
 
     ``least`` is added as a standard deviation, since all draws may agree that a car stands.
     """
-    variance = draws.var(0, ddof=1) + least**2
-    return np.asarray(0.5 * (math.log(2.0 * math.pi) + np.log(variance) + (truth - draws.mean(0)) ** 2 / variance))
+    variance = drawn.var(0, ddof=1) + least**2
+    return np.asarray(0.5 * (math.log(2.0 * math.pi) + np.log(variance) + (truth - drawn.mean(0)) ** 2 / variance))
 
 
-def covers(draws: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+def covers(drawn: np.ndarray, truth: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
     """Return whether the central band of ``share`` of the draws holds the truth, and the band's width."""
-    low, high = np.quantile(draws, [0.5 - 0.5 * share, 0.5 + 0.5 * share], axis=0)
+    low, high = np.quantile(drawn, [0.5 - 0.5 * share, 0.5 + 0.5 * share], axis=0)
     return (truth >= low) & (truth <= high), high - low
 
 
-__all__ = ["covers", "crps", "followed", "futures", "log_score"]
+__all__ = ["covers", "crps", "drawn", "followed", "log_score"]

@@ -57,7 +57,7 @@ def scores(
         drivers = MeasuredDrivers(estimate.drivers.simulator, batch, raw, IDM_NAMES)
         theta = np.broadcast_to(np.median(estimate.theta, 0), (len(smooth), len(IDM_NAMES))).copy()
         levels = forecast.followed(drivers, estimate.settings, theta)
-        gap, _ = forecast.futures(drivers, estimate.settings, theta, levels, starts, longest, DRAWS, seed)
+        gap, _ = forecast.drawn(drivers, estimate.settings, theta, levels, starts, longest, DRAWS, seed)
         for ahead in HORIZONS_S:
             steps = round(ahead / dt)
             truth = np.array([measured[r].gap_m[t + steps] for r, t in starts])

@@ -34,7 +34,7 @@ def feature_of(scene: Scene, driver: Driver, feature: str, period: float | None)
 
     The relative gap is ``min(s / (s0 + T v), 3)``.
     """
-    kept = driver.min_gap + driver.extra_gap + driver.time_gap * scene.speed
+    desired = driver.min_gap + driver.extra_gap + driver.time_gap * scene.speed
     values = {
         "position": scene.position,
         "time": scene.time,
@@ -42,7 +42,7 @@ def feature_of(scene: Scene, driver: Driver, feature: str, period: float | None)
         "gap": scene.leader.gap,
         "closing_speed": scene.speed - scene.leader.speed,
         "lead_accel": scene.leader.accel,
-        "relative_gap": (scene.leader.gap / kept).clamp(0.0, FREE),
+        "relative_gap": (scene.leader.gap / desired).clamp(0.0, FREE),
     }
     return along(values[feature], period)
 

@@ -207,23 +207,23 @@ def _held_out(
     }, items.left_out
 
 
-def model_of(estimates: Estimates, by: str = "driver") -> Model:
+def model_of(found: Estimates, by: str = "driver") -> Model:
     """Return estimates ``by`` groups as a model: their median as its parameters, every group as a driver of its own.
 
     Above ``MOST_DRIVERS`` groups it has the median only.
     """
 
     def named(row: torch.Tensor) -> dict[str, float]:
-        return dict(zip(estimates.names, row.tolist(), strict=True))
+        return dict(zip(found.names, row.tolist(), strict=True))
 
-    simulator = estimates.simulator
-    several = 1 < len(estimates.groups) <= MOST_DRIVERS
+    simulator = found.simulator
+    several = 1 < len(found.groups) <= MOST_DRIVERS
     return Model(
         effects=simulator.without("replay").effects if "replay" in simulator.by_name else simulator.effects,
-        parameters=nested({**named(estimates.values.median(0).values), **estimates.fixed}),
-        dt=estimates.dt,
+        parameters=nested({**named(found.values.median(0).values), **found.fixed}),
+        dt=found.dt,
         integration=simulator.integration,
-        drivers={g: nested(named(estimates.values[i])) for i, g in enumerate(estimates.groups)} if several else {},
+        drivers={g: nested(named(found.values[i])) for i, g in enumerate(found.groups)} if several else {},
         by=by,
     )
 

@@ -406,7 +406,7 @@ def persistent(
         steps = round(horizon / drivers.batch.dt)
         able = [i for i, (_, t) in enumerate(starts) if t >= steps]
         earlier = [(starts[i][0], starts[i][1] - steps) for i in able]
-        s, v = forecast.futures(drivers, nothing.settings, theta, zero, earlier, horizon, 1)
+        s, v = forecast.drawn(drivers, nothing.settings, theta, zero, earlier, horizon, 1)
         for n, i in enumerate(able):
             r, t = starts[i]
             gap[steps - 1, 0, i] += drivers.batch.episodes[r].gap_m[t] - s[-1, 0, n]
@@ -444,7 +444,7 @@ def table(path: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[
     rows = Rows(kept, starts)
     plain = MeasuredDrivers(simulator(dt), batch, batch, IDM_NAMES)
     nothing = estimate(plain.simulator, training, IDM_NAMES, theta, spread=0.0, rounds=1)
-    ahead = forecast.futures(plain, nothing.settings, mine, still_levels(plain), starts, HORIZONS[-1], 1)
+    ahead = forecast.drawn(plain, nothing.settings, mine, still_levels(plain), starts, HORIZONS[-1], 1)
     rows.score("IDM", *ahead)
     steps = np.full((round(HORIZONS[-1] / dt), 1, 1), 1.0)
     rows.score(
@@ -475,7 +475,7 @@ def table(path: pathlib.Path, draws: int, choose: bool, noises: dict[str, tuple[
             for known in KNOWN if choose else KNOWN[:1]:
                 settings = dataclasses.replace(estimated.settings, spread=np.full(len(IDM_NAMES), known))
                 levels = forecast.followed(drivers, settings, mine)
-                ahead = forecast.futures(drivers, settings, mine, levels, starts, HORIZONS[-1], draws)
+                ahead = forecast.drawn(drivers, settings, mine, levels, starts, HORIZONS[-1], draws)
                 rows.score(f"{label}, drivers within {known:g}", *ahead)
     return f"{len(kept)} drivers, {len(starts)} forecasts\n{rows.table()}"
 
