@@ -83,9 +83,9 @@ class _Moved(ModuleType):
         if name.startswith("__"):  # asked by importlib and inspect
             raise AttributeError(name)
         now = f"idm_env.{_MOVED[self.__name__.rpartition('.')[2]]}"
-        found = getattr(importlib.import_module(now), name)
+        value = getattr(importlib.import_module(now), name)
         warnings.warn(f"{self.__name__} has moved. Import {name} from {now}.", DeprecationWarning, stacklevel=2)
-        return found
+        return value
 
 
 def _end(number: int, frame: object) -> None:

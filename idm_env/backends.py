@@ -47,14 +47,13 @@ def rollout(*call: Any) -> Any:
     if _off.get() is not None:
         return None
     for place in _entered:
-        found = _function(place)(*call)
-        if found is not None:
-            return found
+        if (result := _function(place)(*call)) is not None:
+            return result
     return None
 
 
 @cache
 def _function(place: str) -> Callable[..., Any]:
     module, _, name = place.partition(":")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return found
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return function

@@ -36,7 +36,7 @@ class SymbolTable(Protocol):
 
     known: dict[str, tuple[Any, ...]]
 
-    def enter(self, *made: Any) -> Any: ...  # noqa: D102
+    def enter(self, *symbol: Any) -> Any: ...  # noqa: D102
 
 
 class _KeptCode:
@@ -59,11 +59,11 @@ class _KeptCode:
         context.refresh()
         name = self._name(f"{signature} {context.codegen().magic_tuple()}")
 
-        def rebuilt(kept: bytes) -> Any:
-            calls, made = pickle.loads(kept)
+        def rebuilt(content: bytes) -> Any:
+            calls, parts = pickle.loads(content)
             for call in calls:
                 self._links.enter(*call)  # type: ignore[union-attr]
-            return CompileResult._rebuild(context, *made)
+            return CompileResult._rebuild(context, *parts)
 
         return self._store.load(name, rebuilt)
 
@@ -73,9 +73,9 @@ class _KeptCode:
         if compiled.library.has_dynamic_globals or not all(loop.can_cache for loop in compiled.lifted):
             return
         name = self._name(f"{signature} {compiled.codegen.magic_tuple()}")
-        known = {} if self._links is None else self._links.known
-        symbols = [f.name for f in compiled.library._final_module.functions if f.is_declaration] if known else []
-        self._store.save(name, dumps(([known[s] for s in symbols if s in known], compiled._reduce())))
+        links = {} if self._links is None else self._links.known
+        symbols = [f.name for f in compiled.library._final_module.functions if f.is_declaration] if links else []
+        self._store.save(name, dumps(([links[s] for s in symbols if s in links], compiled._reduce())))
 
     def flush(self) -> None:
         """Nothing: what is stale has another name."""
@@ -91,9 +91,9 @@ def compiled_loop(
     """
     import numba
 
-    made: Any = numba.njit(**options)(function)
-    made._cache = _KeptCode(name, store, links)
-    return made
+    loop: Any = numba.njit(**options)(function)
+    loop._cache = _KeptCode(name, store, links)
+    return loop
 
 
 def address_of(loop: Any, kinds: tuple[Any, ...]) -> tuple[int, Any]:
@@ -102,8 +102,10 @@ def address_of(loop: Any, kinds: tuple[Any, ...]) -> tuple[int, Any]:
     Why: numba gives addresses of callbacks only, whose types stand in the text. Tried: numba 0.60.0 and 0.68.1.
     """
     loop.compile(kinds)
-    made = loop.overloads[kinds]
-    return made.library.get_pointer_to_function(made.fndesc.llvm_cfunc_wrapper_name), made.signature.return_type
+    overload = loop.overloads[kinds]
+    return overload.library.get_pointer_to_function(
+        overload.fndesc.llvm_cfunc_wrapper_name
+    ), overload.signature.return_type
 
 
 def compiled_callback(
@@ -112,10 +114,10 @@ def compiled_callback(
     """Return a function compiled as ``numba.cfunc`` does, with an ``address``; see ``compiled_loop``."""
     from numba.core import ccallback, sigutils
 
-    made: Any = ccallback.CFunc(function, sigutils.normalize_signature(signature), locals={}, options=options)
-    made._cache = _KeptCode(name, store, None)
-    made.compile()
-    return made
+    callback: Any = ccallback.CFunc(function, sigutils.normalize_signature(signature), locals={}, options=options)
+    callback._cache = _KeptCode(name, store, None)
+    callback.compile()
+    return callback
 
 
 class Uncompiled:
@@ -138,11 +140,11 @@ def ray_at_home() -> Iterator[None]:
     one, into that of the network. Only its switch for systems without clusters keeps it, which is read when ray is
     imported. Tried: Ray 2.60.0.
     """
-    given = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+    variables = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
     if "ray" not in sys.modules:  # later only those processes would hear of it that are begun now
-        given["RAY_AUTH_MODE"] = os.environ.get("RAY_AUTH_MODE", "token")
+        variables["RAY_AUTH_MODE"] = os.environ.get("RAY_AUTH_MODE", "token")
     with ExitStack() as stack:
-        stack.enter_context(patch.dict(os.environ, given))
+        stack.enter_context(patch.dict(os.environ, variables))
         if (constants := sys.modules.get("ray._private.ray_constants")) is not None:
             stack.enter_context(patch.object(constants, "ENABLE_RAY_CLUSTER", False))
         yield
@@ -193,8 +195,8 @@ def compile_error() -> type[Exception]:
     """
     import torch
 
-    found: type[Exception] = torch._dynamo.exc.TorchDynamoException
-    return found
+    error: type[Exception] = torch._dynamo.exc.TorchDynamoException
+    return error
 
 
 def transforming() -> bool:

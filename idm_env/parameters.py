@@ -145,15 +145,17 @@ def check(effects: Iterable[HasParameters], params: Params) -> None:
     A parameter's null is always accepted, also where it lies outside the bounds of the search.
     """
     effects = tuple(effects)
-    known = catalogue(effects)
+    declared = catalogue(effects)
     names = {e.name for e in effects}
     for effect, values in params.items():
         if effect not in names:
             raise ValueError(f"unknown effect {shown(effect)} in parameters.{nearest(effect, names)}")
         for name in values:
-            if f"{effect}.{name}" not in known:
-                raise ValueError(f"unknown parameter {shown(f'{effect}.{name}')}.{nearest(f'{effect}.{name}', known)}")
-    for full, p in known.items():
+            if f"{effect}.{name}" not in declared:
+                raise ValueError(
+                    f"unknown parameter {shown(f'{effect}.{name}')}.{nearest(f'{effect}.{name}', declared)}"
+                )
+    for full, p in declared.items():
         effect, name = full.split(".")
         if effect not in params or name not in params[effect]:
             raise ValueError(f"parameter '{full}' is missing. Start from simulator.defaults() and change what differs.")

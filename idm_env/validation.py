@@ -25,29 +25,29 @@ def shown(value: Any) -> str:
         return f"a very large {type(value).__name__}"
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
+def nearest(word: str, words: Iterable[str]) -> str:
     """Return ' Did you mean …?' for the nearest known word; when none is near, all words, or the best of many."""
-    known, word = list(dict.fromkeys(known)), word[:200]
+    words, word = list(dict.fromkeys(words)), word[:200]
     longer = [
-        k for k in known if len(word) > 2 and k.startswith(word)
+        k for k in words if len(word) > 2 and k.startswith(word)
     ]  # a name cut short is nearer than one misspelled
-    close = longer if len(longer) == 1 else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    close = longer if len(longer) == 1 else difflib.get_close_matches(word, words, n=1, cutoff=0.5)
     if not close and "." in word:
-        close = difflib.get_close_matches(word.split(".")[-1], [k.split(".")[-1] for k in known], n=1, cutoff=0.4)
-        close = [k for k in known if close and k.split(".")[-1] == close[0]][:1]
+        close = difflib.get_close_matches(word.split(".")[-1], [k.split(".")[-1] for k in words], n=1, cutoff=0.4)
+        close = [k for k in words if close and k.split(".")[-1] == close[0]][:1]
     if close:
         return f" Did you mean '{close[0]}'?"
-    if len(known) > MOST_LISTED:
-        like = difflib.get_close_matches(word, known, n=MOST_LISTED // 2, cutoff=0.0)
-        return f" Of {len(known)} known ones the nearest are {', '.join(like)}."
-    return f" Known: {', '.join(sorted(known)) or 'none'}."
+    if len(words) > MOST_LISTED:
+        like = difflib.get_close_matches(word, words, n=MOST_LISTED // 2, cutoff=0.0)
+        return f" Of {len(words)} known ones the nearest are {', '.join(like)}."
+    return f" Known: {', '.join(sorted(words)) or 'none'}."
 
 
-def one_of(name: str, value: Any, known: Iterable[str]) -> str:
+def one_of(name: str, value: Any, words: Iterable[str]) -> str:
     """Return a value that is one of some words. ValueError for any other."""
-    known = list(known)
-    if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{name} = {shown(value)} is unknown.{nearest(str(shown(value)).strip(chr(39)), known)}")
+    words = list(words)
+    if not isinstance(value, str) or value not in words:
+        raise ValueError(f"{name} = {shown(value)} is unknown.{nearest(str(shown(value)).strip(chr(39)), words)}")
     return value
 
 
@@ -89,6 +89,6 @@ def within(name: str, value: Any, low: float, high: float, unit: str = "") -> fl
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         unit = f" {unit}" if unit else ""
-        told = f"{value:g}" if isinstance(value, float) else shown(value)
-        raise ValueError(f"{name} = {told}{unit} is outside [{low:g}, {high:g}]{unit}.")
+        number = f"{value:g}" if isinstance(value, float) else shown(value)
+        raise ValueError(f"{name} = {number}{unit} is outside [{low:g}, {high:g}]{unit}.")
     return float(value)
