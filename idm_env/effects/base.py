@@ -9,7 +9,7 @@ import math
 import re
 import warnings
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -32,6 +32,15 @@ NEEDED = frozenset({"second_leader", "behind", "merger", "lane"})
 
 P = dict[str, Tensor]
 """The parameters of one effect: name → tensor."""
+
+
+class Mark(NamedTuple):
+    """What stands on a ``lane`` (None: on all) from ``begin`` to ``end`` (m), and whether one must stop before it."""
+
+    lane: int | None
+    begin: float
+    end: float
+    stops: bool
 
 
 @dataclass(frozen=True)
@@ -214,6 +223,10 @@ class Effect:
         is no hook, and goes with one; the effect ``needs`` the lane.
         """
         return None
+
+    def marks(self, time: float, p: P) -> tuple[Mark, ...]:
+        """Return what stands on the road at a time (s) and is drawn, for scalar parameters; usually nothing."""
+        return ()
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor | None:
         """Return the memory before the first step, or None for an effect without one."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import references
-from idm_env.effects.base import Effect, P
+from idm_env.effects.base import Effect, Mark, P
 from idm_env.effects.idm import interaction
 from idm_env.parameters import Parameter
 from idm_env.types import FAR, Driver, Scene, Wish
@@ -109,6 +109,11 @@ class LaneClosure(Effect):
         """Return how far it is to the beginning of a stretch ahead; 0 in a stretch."""
         return self._room(scene, 0.0)
 
+    def marks(self, time: float, p: P) -> tuple[Mark, ...]:
+        """Return the stretches that are closed at this time (s)."""
+        rows = (row for row in self.closures if row[3] <= time < row[4])
+        return tuple(Mark(int(lane), begin, end, True) for lane, begin, end, _, _ in rows)
+
     def _room(self, scene: Scene, inside: float) -> Tensor:
         room = torch.full_like(scene.position, FAR)
         for lane, begin, end, since, until in self.closures:
@@ -152,6 +157,11 @@ class Signal(Effect):
         """Return the time since it became green (s), and whether it is red."""
         since = torch.remainder(time - p["offset"], p["cycle"])
         return since, since >= p["cycle"] - p["red"]
+
+    def marks(self, time: float, p: P) -> tuple[Mark, ...]:
+        """Return its line, where there is a red at all."""
+        place, red = float(p["place"]), bool(self.phase(torch.tensor(time), p)[1])
+        return (Mark(None, place, place, red),) if p["red"] > 0 else ()
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return what drivers brake for somebody who stands at the line while it is red (m/s²)."""

@@ -187,7 +187,7 @@ class DiffIDMEnv(Face, gymnasium.Env):
 
         if self._viewer is None:
             self._viewer = Viewer(self.render_mode, self.metadata["render_fps"])
-        picture: np.ndarray | None = self._viewer.show(self.task, self.state)
+        picture: np.ndarray | None = self._viewer.show(self.task, self.state, 0, self.batch.episode_params())
         return picture
 
     def close(self) -> None:

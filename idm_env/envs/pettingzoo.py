@@ -209,7 +209,8 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
             self._viewer = Viewer(self.render_mode, max(1, round(1.0 / self.task.step_time)))
         if not self.batch.begun:
             raise RuntimeError("there is nothing to see before reset. Call reset() first.")
-        picture: np.ndarray | None = self._viewer.show(self.task, self.batch.glance().state)
+        state, params = self.batch.glance().state, self.batch.episode_params()
+        picture: np.ndarray | None = self._viewer.show(self.task, state, 0, params)
         return picture
 
     def close(self) -> None:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from idm_env.effects.base import Mark
 from idm_env.extras import needed
 from idm_env.reports.diagrams import COLOURS, space_time
-from idm_env.types import State
+from idm_env.types import Params, State
 
 if TYPE_CHECKING:
     from idm_env.tasks import Task
@@ -34,7 +36,8 @@ _MOST_LANES = 8
 """Lanes beyond these are drawn over the first ones again."""
 _ASPHALT, _GROUND, _INK, _MARK = (70, 74, 82), (244, 243, 238), (30, 32, 36), (30, 90, 220)
 _CHANGE, _CRASH, _PAINT = (208, 60, 150), (255, 210, 0), (226, 226, 220)
-COLOURS_DRAWN = (_ASPHALT, _GROUND, _INK, _MARK, _CHANGE, _CRASH, _PAINT)
+_CLOSED, _STOP, _PASS = (150, 130, 120), (225, 25, 25), (40, 200, 110)
+COLOURS_DRAWN = (_ASPHALT, _GROUND, _INK, _MARK, _CHANGE, _CRASH, _PAINT, _CLOSED, _STOP, _PASS)
 """Colours of a picture besides those of speeds (red, green, blue)."""
 _CHANGE_SHOWN = 1.0
 """How long an arrow shows that a vehicle has changed lanes (s)."""
@@ -68,6 +71,16 @@ def _around(task: Task, values: dict[str, np.ndarray], ring: float | None) -> No
 def _crashed(values: dict[str, np.ndarray]) -> np.ndarray:
     """Return which vehicles touch the one ahead."""
     return np.asarray((values["gap"] <= 0.0) & (values["present"] > 0))
+
+
+def _marks(task: Task, state: State, row: int, params: Params) -> list[Mark]:
+    """Return what stands on the road of one row of a state."""
+    now = float(state.step.expand(len(state.speed))[row]) * task.simulator.dt
+    marks: list[Mark] = []
+    for effect in task.simulator.effects if params else ():
+        own = params[effect.name].items()
+        marks += effect.marks(now, {name: (x[row] if x.dim() else x).detach().reshape(-1)[0] for name, x in own})
+    return marks
 
 
 @dataclass(frozen=True)
@@ -140,8 +153,11 @@ class Viewer:
         self._pygame.font.init()
         self._font, self._small = (self._pygame.font.Font(None, size) for size in (24, 20))
 
-    def show(self, task: Task, state: State, row: int = 0) -> np.ndarray | None:
-        """Return the picture of one row of a state as ``(height, width, 3)`` uint8, or show it in the window."""
+    def show(self, task: Task, state: State, row: int = 0, params: Params | None = None) -> np.ndarray | None:
+        """Return the picture of one row of a state as ``(height, width, 3)`` uint8, or show it in the window.
+
+        With the ``params`` of its episodes, what stands on the road is drawn, too.
+        """
         ring = state.links is None and task.road.lap(state) is not None
         lane, lanes = np.array(task.lanes), min(max(task.lanes) + 1, _MOST_LANES)
         outline = task.road.outline
@@ -166,7 +182,7 @@ class Viewer:
         if ring:
             self._ring(canvas, task, values, fastest)
         else:
-            self._lane(canvas, task, values, fastest, view)
+            self._lane(canvas, task, values, fastest, view, _marks(task, state, row, params or {}))
         self._legend(canvas, task, state, row, values, fastest, 1.0 if ring else view.wider)
         if self._mode == "human":
             self._display(canvas)
@@ -207,7 +223,10 @@ class Viewer:
         for position in values["position"][crashed]:
             self._crash(canvas, place(position)[0])
 
-    def _lane(self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float, view: _View) -> None:
+    def _lane(
+        self, canvas: Any, task: Task, values: dict[str, np.ndarray], fastest: float, view: _View,
+        marks: Sequence[Mark],
+    ) -> None:  # fmt: skip
         draw = self._pygame.draw
         outline = task.road.outline
         lap = None if outline is None else outline.ring
@@ -230,6 +249,8 @@ class Viewer:
             x = view.x(post)
             draw.line(canvas, _INK, (x, view.bottom + 3), (x, view.bottom + 9))
             self._text(canvas, f"{post if lap is None else post % lap:.0f} m", (x, view.bottom + 20))
+        for standing in marks:
+            self._stands(canvas, standing, view)
         for i in np.flatnonzero(values["present"] > 0):
             x = view.x(values["position"][i] - 0.5 * values["length"][i])
             y = view.y(int(values["lane"][i]) % view.lanes)
@@ -244,6 +265,18 @@ class Viewer:
                 draw.polygon(canvas, _CHANGE, [(x, tip), (x - 5, tip - 7 * side), (x + 5, tip - 7 * side)])
         for i in np.flatnonzero(_crashed(values)):
             self._crash(canvas, (view.x(values["position"][i]), view.y(int(values["lane"][i]) % view.lanes)))
+
+    def _stands(self, canvas: Any, mark: Mark, view: _View) -> None:
+        """Draw a stretch that is closed, or a line: in red where one must stop, else in green."""
+        top, bottom = float(_TOP), view.bottom
+        if mark.lane is not None:
+            middle = view.y(view.lanes - 1 - mark.lane)
+            top, bottom = middle - 0.5 * view.lane, middle + 0.5 * view.lane
+        left, right = (min(max(view.x(m), 0.0), float(WIDE)) for m in (mark.begin, mark.end))
+        if right > left:
+            self._pygame.draw.rect(canvas, _CLOSED, (left, top, right - left, bottom - top))
+        if view.back <= mark.begin <= view.front:
+            self._pygame.draw.line(canvas, _STOP if mark.stops else _PASS, (left, top), (left, bottom), 4)
 
     def _crash(self, canvas: Any, at: tuple[float, float]) -> None:
         """Draw a cross where two vehicles touch."""

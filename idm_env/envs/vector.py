@@ -197,7 +197,8 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         shown = self.num_envs if self.render_mode == "rgb_array" else 1
         while len(self._viewers) < shown:
             self._viewers.append(Viewer(self.render_mode, self.metadata["render_fps"]))
-        pictures = [viewer.show(self.task, self.state, row) for row, viewer in enumerate(self._viewers[:shown])]
+        params, viewers = self.batch.episode_params(), enumerate(self._viewers[:shown])
+        pictures = [viewer.show(self.task, self.state, row, params) for row, viewer in viewers]
         return tuple(pictures) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -219,6 +219,27 @@ def test_a_crash_is_marked_where_it_happens(task):
     assert marked(state) == 0 and 100 < marked(state._replace(gap=gap)) < 600
 
 
+def test_a_signal_and_a_closed_lane_are_drawn_while_they_hold():
+    """The line is red for 30 s of 60 and green for as long; a stretch is closed from 2 to 4 s."""
+    env = gym.make("DiffIDM-v0", task="approach", render_mode="rgb_array")
+    env.reset(seed=1)
+    red, green = (np.array(c) for c in ((225, 25, 25), (40, 200, 110)))
+    lit = []
+    for _ in range(60):
+        env.step(env.action_space.sample() * 0)
+        picture = env.render()
+        lit.append(tuple((picture == c).all(-1).any() for c in (red, green)))
+    assert lit.count((True, False)) == lit.count((False, True)) == 30
+    closures = [{"lane": 1, "begin": 100.0, "end": 200.0, "since": 2.0, "until": 4.0}]
+    env = gym.make("DiffIDM-v0", task="open_highway", closures=closures, render_mode="rgb_array")
+    env.reset(seed=1)
+    closed = []
+    for _ in range(5):
+        env.step(env.action_space.sample() * 0)
+        closed.append(int((env.render() == np.array([150, 130, 120])).all(-1).sum()))
+    assert closed[0] == closed[3] == closed[4] == 0 and closed[1] > 100 and closed[2] > 100
+
+
 def test_axes_begin_at_0_with_the_offset_in_the_label():
     """A clock of seconds since 1970, and places far from an origin, would fill the axis with digits."""
     table = pl.DataFrame(rows("a", 1, 2)).with_columns(pl.col("time_s") + 1113433186.0, pl.col("position_m") - 8420.0)
