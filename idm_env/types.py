@@ -247,6 +247,15 @@ class Driver(NamedTuple):
     extra_gap: Tensor | float = 0.0
 
 
+class Mark(NamedTuple):
+    """What stands on a ``lane`` (None: on all) from ``begin`` to ``end`` (m), and whether one must stop before it."""
+
+    lane: int | None
+    begin: float
+    end: float
+    stops: bool
+
+
 class Command(NamedTuple):
     """Input of the effect ``control``: commanded acceleration (m/s²) and where it is in force (bool)."""
 

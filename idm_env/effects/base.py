@@ -9,14 +9,14 @@ import math
 import re
 import warnings
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple, get_args
+from typing import ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from idm_env.effects.watched import RETURNS, watched
 from idm_env.parameters import Parameter
-from idm_env.types import Driver, Motion, Scene, Wish
+from idm_env.types import Driver, Mark, Motion, Scene, Wish
 
 Hook = Literal["perceive", "adapt", "accelerate", "limit", "place", "change"]
 HOOKS: tuple[Hook, ...] = ("perceive", "adapt", "accelerate", "limit", "place", "change")
@@ -32,15 +32,6 @@ NEEDED = frozenset({"second_leader", "behind", "merger", "lane"})
 
 P = dict[str, Tensor]
 """The parameters of one effect: name → tensor."""
-
-
-class Mark(NamedTuple):
-    """What stands on a ``lane`` (None: on all) from ``begin`` to ``end`` (m), and whether one must stop before it."""
-
-    lane: int | None
-    begin: float
-    end: float
-    stops: bool
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import references
-from idm_env.effects.base import Effect, Mark, P
+from idm_env.effects.base import Effect, P
 from idm_env.effects.idm import interaction
 from idm_env.parameters import Parameter
-from idm_env.types import FAR, Driver, Scene, Wish
+from idm_env.types import FAR, Driver, Mark, Scene, Wish
 
 EVERY_LANE = -1
 """Stands for all lanes of a road."""

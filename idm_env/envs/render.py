@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from idm_env.effects.base import Mark
 from idm_env.extras import needed
 from idm_env.reports.diagrams import COLOURS, space_time
-from idm_env.types import Params, State
+from idm_env.types import Mark, Params, State
 
 if TYPE_CHECKING:
     from idm_env.tasks import Task
