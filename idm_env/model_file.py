@@ -135,7 +135,7 @@ def load_model(path: str | Path, *, trusted: bool = False) -> Model:
 
 
 def _model(content: dict[str, Any]) -> Model:
-    _known(content, _MODEL_KEYS, "key")
+    _check_keys(content, _MODEL_KEYS, "key")
     if content.get("configures", "model") != "model":
         raise ValueError(
             f"configures = {shown(content['configures'])}, and a model is wanted. Write 'configures: model'."
@@ -160,7 +160,7 @@ def _model(content: dict[str, Any]) -> Model:
 
 
 def _fitted_on(value: Any) -> dict[str, Any]:
-    _known(_mapping("fitted_on", value), ("source", "tracks"), "key of fitted_on")
+    _check_keys(_mapping("fitted_on", value), ("source", "tracks"), "key of fitted_on")
     tracks = value.get("tracks", [])
     if not isinstance(tracks, list):
         raise ValueError("fitted_on.tracks must be a list of marks, as fit writes it. Remove fitted_on if in doubt.")
@@ -291,7 +291,7 @@ def _text(name: str, value: Any) -> str:
     return value
 
 
-def _known(content: Mapping[str, Any], names: Iterable[str], what: str) -> None:
+def _check_keys(content: Mapping[str, Any], names: Iterable[str], what: str) -> None:
     for key in content:
         if key not in names:
             raise ValueError(f"unknown {what} {shown(key)}.{nearest(str(key), names)}")

@@ -27,7 +27,7 @@ class Trajectory(NamedTuple):
     gap: Tensor
 
 
-def _kept(state: State) -> Trajectory:
+def _trajectory(state: State) -> Trajectory:
     return Trajectory(state.position, state.speed, state.accel, state.gap)
 
 
@@ -94,7 +94,7 @@ class Simulator(CarFollowingStep):
         steps: int,
         *,
         checkpoint_every: int = 0,
-        keep: Callable[[State], tuple[Tensor, ...]] | None = _kept,
+        keep: Callable[[State], tuple[Tensor, ...]] | None = _trajectory,
         seed: int | None = None,
     ) -> tuple[State, Any]:
         """Repeat ``step``; return the last state and what ``keep`` takes of every state after a step, time first.
@@ -111,7 +111,7 @@ class Simulator(CarFollowingStep):
         """
         if seed is not None:
             inputs = self.drawn(state.speed, inputs, steps, seed)
-        if steps > 0 and keep in (_kept, None):
+        if steps > 0 and keep in (_trajectory, None):
             self._covered(inputs, steps)
             self.tried(state, inputs, params)
             fast = backends.rollout(self, state, inputs, params, steps, checkpoint_every, keep is not None)

@@ -88,7 +88,7 @@ class RecordColumns:
         second_at = lead.position_m + self._gap_of(leader_rows) + self._length_of(second_rows)
         behind_rows = self.around.behind[rows]
         behind_at = position - length - self._gap_of(behind_rows)
-        beside_rows = self.around.adjacent[rows]
+        side_rows = self.around.adjacent[rows]
         return {
             "position_m": position,
             "speed_mps": speed,
@@ -96,7 +96,7 @@ class RecordColumns:
             "leader": lead,
             "second_leader": self._record(second_rows, second_at, dt, smooth, speed, lead.position_m + FAR_M),
             "behind": self._record(behind_rows, behind_at, dt, smooth, speed, position - FAR_M),
-            "adjacent": self._record(beside_rows, self._beside(rows, beside_rows), dt, smooth, speed, position + FAR_M),
+            "adjacent": self._record(side_rows, self._adjacent(rows, side_rows), dt, smooth, speed, position + FAR_M),
         }
 
     def _gap_of(self, rows: np.ndarray) -> np.ndarray:
@@ -105,7 +105,7 @@ class RecordColumns:
     def _length_of(self, rows: np.ndarray) -> np.ndarray:
         return np.where(rows >= 0, self.length[rows], DEFAULT_LENGTH_M)
 
-    def _beside(self, rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+    def _adjacent(self, rows: np.ndarray, others: np.ndarray) -> np.ndarray:
         """Return where the vehicles beside are, on the nearer side of the ring where there is one."""
         away = self.position[others] - self.position[rows]
         if self.ring is not None:

@@ -167,7 +167,7 @@ class Likelihood:
         steps = (linear.to, linear.by_state, linear.by_level, path.gap, path.speed)
         measured = (np.ascontiguousarray(x.numpy()) for x in (batch.gap, batch.speed))
         self.length = np.array([len(e) for e in batch.episodes])
-        self.given = (self.length, *measured, *map(np.ascontiguousarray, steps))
+        self.records = (self.length, *measured, *map(np.ascontiguousarray, steps))
 
     def centred(self, theta: np.ndarray) -> Likelihood:
         """Return the same with levels of log θ counted from ``theta`` [rows, p]: no step changes by that."""
@@ -185,11 +185,11 @@ class Likelihood:
 
     def __call__(self, s: DriftSettings) -> float:
         """Return the log-likelihood of all records."""
-        return float(loops.likelihood(*(*self.given, *self._settings(s), SKIPPED)).sum())
+        return float(loops.likelihood(*(*self.records, *self._settings(s), SKIPPED)).sum())
 
     def filtered(self, s: DriftSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return filtered means and covariances and smoothed means [T, rows, …] of gap, speed and levels."""
-        moments: tuple[np.ndarray, np.ndarray, np.ndarray] = loops.smooth(*(*self.given, *self._settings(s)))
+        moments: tuple[np.ndarray, np.ndarray, np.ndarray] = loops.smooth(*(*self.records, *self._settings(s)))
         return moments
 
 

@@ -35,7 +35,7 @@ def entered(effect: type[Effect], catalogue: dict[str, type[Effect]]) -> type[Ef
         raise
     except BaseException as error:
         raise ValueError(
-            f"effect '{effect.kind}' cannot be made without arguments ({_said(error)}). Give its fields defaults."
+            f"effect '{effect.kind}' cannot be made without arguments ({_reason(error)}). Give its fields defaults."
         ) from None
     catalogue[effect.kind] = effect
     return effect
@@ -74,7 +74,7 @@ def member(where: str, kind: str) -> tuple[ModuleType, object]:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise ValueError(f"{kind} {where}: {place} cannot be read ({_said(error)}).") from None
+        raise ValueError(f"{kind} {where}: {place} cannot be read ({_reason(error)}).") from None
     return module, vars(module).get(name)  # a module's own __getattr__ may import
 
 
@@ -123,5 +123,5 @@ def _name_of(path: Path) -> str:
     return _PREFIX + hashlib.sha256(str(path).encode() + path.read_bytes()).hexdigest()[:16]
 
 
-def _said(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

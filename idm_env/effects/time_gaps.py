@@ -117,7 +117,7 @@ class Relaxation(Effect):
         Parameter("memory_time", "τ", "s", 15.0, 2.0, 200.0, role="shape", starts=(8.0, 30.0)),
     )
 
-    def _kept(self, scene: Scene, driver: Driver, time_gap: Tensor) -> Tensor:
+    def _relative_gap(self, scene: Scene, driver: Driver, time_gap: Tensor) -> Tensor:
         """Return q: the gap relative to that of an equilibrium with ``time_gap``."""
         ratio = scene.speed / driver.desired_speed
         square = ratio * ratio
@@ -128,7 +128,7 @@ class Relaxation(Effect):
 
     def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return m = q."""
-        return self._kept(scene, driver, driver.time_gap)
+        return self._relative_gap(scene, driver, driver.time_gap)
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the time gap in force."""
@@ -138,7 +138,7 @@ class Relaxation(Effect):
         """Relax m towards q, counted from the time gap that the driver would keep without this memory."""
         level = scene.memory[self.name]
         own = driver.time_gap / (1.0 + p["strength"] * (level - 1.0))
-        return level + (self._kept(scene, driver, own) - level) * -torch.expm1(-scene.dt / p["memory_time"])
+        return level + (self._relative_gap(scene, driver, own) - level) * -torch.expm1(-scene.dt / p["memory_time"])
 
 
 @dataclass(frozen=True)

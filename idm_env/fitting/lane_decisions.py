@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from idm_env.data import DataError, Repair, Trajectories
-from idm_env.multilane.incentives import beside
+from idm_env.multilane.incentives import lane_scene
 from idm_env.roads import End, Lanes
 from idm_env.roads.linked import Linked
 from idm_env.simulator import Simulator
@@ -207,7 +207,7 @@ def _decided(
     with torch.no_grad():
         order = view.order(state.present)
         sides = view.side(order, 1, state), view.side(order, -1, state)
-        scene = beside(sim, view, sides, state, {}, own)
+        scene = lane_scene(sim, view, sides, state, {}, own)
     possible = torch.stack([side.exists & (side.gap > 0) & (side.back_gap > 0) for side in sides], -1)
     # A driver has decided already where the lane he is in is not the one that he decided for.
     decides = present & torch.as_tensor(mine)[torch.as_tensor(slot)] & (before == lane) & (after >= 0)

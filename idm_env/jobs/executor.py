@@ -101,7 +101,7 @@ class Serial:
             except Exception as error:
                 if stopped:  # not the part, but whoever watches
                     raise
-                failed.append((number, _told(error)))
+                failed.append((number, _reason(error)))
                 continue
             yield number, result
         _raise(failed, parts)
@@ -198,7 +198,7 @@ def _flow(
             elif kind == "storage" or (len(parts) == 1 and isinstance(result, Exception)):
                 raise result
             else:
-                failed.append((number, _told(result) if isinstance(result, Exception) else result))
+                failed.append((number, _reason(result) if isinstance(result, Exception) else result))
     finally:
         workers.close(list(flying))
     _raise(failed, parts)
@@ -224,11 +224,11 @@ def _work(payload: bytes) -> tuple[str, Any]:
         try:
             pickle.loads(pickle.dumps(error))
         except Exception:
-            return "failed", _told(error)
-        return "failed", error if isinstance(error, Exception) else _told(error)
+            return "failed", _reason(error)
+        return "failed", error if isinstance(error, Exception) else _reason(error)
 
 
-def _told(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     words = " ".join(str(error).split())
     return words if isinstance(error, ValueError) and words else f"{type(error).__name__}: {words}".rstrip(": ")
 

@@ -94,8 +94,8 @@ class _Lines:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._phase = ""
-        self._at = (0, 0)
-        self._began = self._said = time.monotonic()
+        self._counts = (0, 0)
+        self._began = self._line = time.monotonic()
 
     def begin(self) -> None:
         """Say nothing yet: the first line of a log that ends at once is its error."""
@@ -104,21 +104,21 @@ class _Lines:
         now = time.monotonic()
         if phase != self._phase:
             self.end()
-            self._phase, self._began, self._said = phase, now, now
-        self._at = (done, total)
-        if total and 0 < done < total and now - self._said >= LOG_SECONDS:
-            self._said = now
+            self._phase, self._began, self._line = phase, now, now
+        self._counts = (done, total)
+        if total and 0 < done < total and now - self._line >= LOG_SECONDS:
+            self._line = now
             left = _clock((now - self._began) * (total - done) / done)
             self._console.print(
                 f"{phase} {done}/{total}, {left} left {_words(words)}".rstrip(), soft_wrap=True, markup=False
             )
 
     def end(self) -> None:
-        done, total = self._at
+        done, total = self._counts
         if self._phase and total:
             took = _clock(time.monotonic() - self._began)
             self._console.print(f"{self._phase} {done}/{total} in {took}", soft_wrap=True, markup=False)
-        self._phase, self._at = "", (0, 0)
+        self._phase, self._counts = "", (0, 0)
 
     def stop(self) -> None:
         """Nothing is left to clear."""

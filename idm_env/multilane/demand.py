@@ -178,11 +178,11 @@ def _entered(
     first, some = _first(waits, schedule, lanes)
     last, followed = _last(view, state, lanes)
     begins = torch.tensor(road.table("begins"), dtype=state.speed.dtype, device=state.speed.device).expand(some.shape)
-    gap = torch.where(followed, _of(state.position, last) - _of(state.length, last) - begins, FAR)
-    ahead, desired = _of(state.speed, last), _of(schedule.speed.expand_as(state.speed), first)
+    gap = torch.where(followed, state.position.gather(-1, last) - state.length.gather(-1, last) - begins, FAR)
+    ahead, desired = state.speed.gather(-1, last), schedule.speed.expand_as(state.speed).gather(-1, first)
     driver = stepping.base.driver(dict(params[stepping.base.name]))
     least, time_gap, brake = (
-        _of(x.expand_as(state.speed), first) for x in (driver.min_gap, driver.time_gap, driver.comfort_decel)
+        x.expand_as(state.speed).gather(-1, first) for x in (driver.min_gap, driver.time_gap, driver.comfort_decel)
     )
 
     def fits(v: Tensor) -> Tensor:
@@ -216,10 +216,6 @@ class _Entry(NamedTuple):
     begins: Tensor
     gap: Tensor
     speed: Tensor
-
-
-def _of(x: Tensor, slots: Tensor) -> Tensor:
-    return x.gather(-1, slots)
 
 
 def _first(waits: Tensor, schedule: Trips, lanes: Tensor) -> tuple[Tensor, Tensor]:

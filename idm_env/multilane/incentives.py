@@ -98,7 +98,7 @@ def _larger(a: Tensor | None, b: Tensor | None) -> Tensor | None:
     return b if a is None else a if b is None else torch.maximum(a, b)
 
 
-def beside(
+def lane_scene(
     stepping: CarFollowingStep, view: Sideways, sides: tuple[Side, Side], state: State, inputs: Inputs, params: Params
 ) -> Scene:
     """Return the scene with the driver's own lane, and those on his left and right."""
@@ -121,13 +121,13 @@ def beside(
         ends=_room(stepping, scene, view.goes_on(), params),
     )
     left, right = (
-        _one_side(stepping, view, side, state, _beside(scene, step), now, params)
+        _one_side(stepping, view, side, state, _on_lane(scene, step), now, params)
         for side, step in zip(sides, (1.0, -1.0), strict=True)
     )
     return scene._replace(here=here, left=left, right=right)
 
 
-def _beside(scene: Scene, step: float) -> Scene:
+def _on_lane(scene: Scene, step: float) -> Scene:
     """Return the scene as it would be on the lane ``step`` to the left."""
     return scene if scene.lane is None else scene._replace(lane=scene.lane + step)
 
@@ -169,10 +169,10 @@ def _one_side(
         nearest.accel,
         nearest.present,
     )
-    follower = _of(view, scene, n)._replace(leader=me, second_leader=scene.second_leader and mine)
+    follower = _gather(view, scene, n)._replace(leader=me, second_leader=scene.second_leader and mine)
     if scene.lane is not None:  # he is on it already
         follower = follower._replace(lane=view.at(state.memory[LANE], n))
-    with_me = stepping.wanted(follower, _of(view, dict(params), n))[0]
+    with_me = stepping.wanted(follower, _gather(view, dict(params), n))[0]
     return Beside(
         exists=exists,
         leader=nearest,
@@ -184,15 +184,15 @@ def _one_side(
     )
 
 
-def _of(view: Sideways, tree: Any, slots: Any) -> Any:
+def _gather(view: Sideways, tree: Any, slots: Any) -> Any:
     """Return, in every slot, what belongs to another slot."""
     if hasattr(tree, "dim"):
         return view.at(tree, slots)
     if isinstance(tree, Mapping):
-        return {name: _of(view, x, slots) for name, x in tree.items()}
+        return {name: _gather(view, x, slots) for name, x in tree.items()}
     if isinstance(tree, tuple) and hasattr(tree, "_fields"):
-        return type(tree)(*(_of(view, x, slots) for x in tree))  # type: ignore[call-arg]
+        return type(tree)(*(_gather(view, x, slots) for x in tree))  # type: ignore[call-arg]
     return tree
 
 
-__all__ = ["NOW", "beside", "on_lanes", "seen_merging", "wished"]
+__all__ = ["NOW", "lane_scene", "on_lanes", "seen_merging", "wished"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 
-from idm_env.multilane.incentives import beside, on_lanes, seen_merging, wished
+from idm_env.multilane.incentives import lane_scene, on_lanes, seen_merging, wished
 from idm_env.roads.adjacent import preferred
 from idm_env.roads.linked import Linked, still_changing, without_absent
 from idm_env.step import CarFollowingStep
@@ -30,7 +30,7 @@ def decided(stepping: CarFollowingStep, state: State, inputs: Inputs, params: Pa
         order = view.order(state.present)
         sides = view.side(order, 1, state), view.side(order, -1, state)
         seen = sides if state.moving is None else view.with_leaving(state, sides)
-        wish = wished(stepping, beside(stepping, view, seen, state, inputs, params), params)
+        wish = wished(stepping, lane_scene(stepping, view, seen, state, inputs, params), params)
         claim = view.chosen(sides, preferred(*seen, wish, view.road.handed == "left"), due)
     after = view.changed(state, claim)
     if view.road.duration:

@@ -111,18 +111,18 @@ class Linked(Sideways):
         """Return the follower's x; one's own without a follower."""
         return self._look(x, self.links_now.follower, self.links_now.leader)
 
-    def _there(self, slot: Tensor, x: Tensor) -> Tensor:
+    def _linked(self, slot: Tensor, x: Tensor) -> Tensor:
         if self.road.ring is not None:
             return torch.ones_like(slot, dtype=x.dtype)
         return (slot != torch.arange(slot.shape[-1], device=slot.device)).to(x.dtype)
 
     def led(self, x: Tensor) -> Tensor:
         """Return 1 for every vehicle with a leader: on a ring for all, be it oneself."""
-        return self._there(self.links_now.leader, x)
+        return self._linked(self.links_now.leader, x)
 
     def leads(self, x: Tensor) -> Tensor:
         """Return 1 for every vehicle with a follower: on a ring for all, be it oneself."""
-        return self._there(self.links_now.follower, x)
+        return self._linked(self.links_now.follower, x)
 
     def gaps(self, position: Tensor, length: Tensor, circumference: Tensor | float | None = None) -> Tensor:
         """Return ``position[leader] − length[leader] − position`` (m), laps added on a ring; FAR without a leader.

@@ -62,8 +62,8 @@ class DriverProgram:
         names = list(recording.respond)
         assert recording.accel is not None
         nodes = [recording.accel, *recording.respond.values(), *recording.sense]
-        self._known = {graph.input(*s): graph.constant(v) for s, v in fixed.items()} | self._gaps(nodes)
-        nodes = replaced(graph, nodes, self._known)
+        self._fixed = {graph.input(*s): graph.constant(v) for s, v in fixed.items()} | self._gaps(nodes)
+        nodes = replaced(graph, nodes, self._fixed)
         self._accel, sense = nodes[0], nodes[1 + len(names) :]
         self._respond = dict(zip(names, nodes[1:], strict=False))
         after = self._closure(sense)
@@ -118,7 +118,7 @@ class DriverProgram:
     def _gap(self, close: Node) -> Node:
         """Return a gap after the step from everybody's motion: the driver's own, and the records'."""
         graph = self.graph
-        moved: dict[Node, Node] = self._known | self._gaps([close])
+        moved: dict[Node, Node] = self._fixed | self._gaps([close])
         for slot in inputs_of([close]):
             node = graph.input(*slot)
             if slot == Leaf("displacement"):
@@ -216,7 +216,7 @@ class DriverProgram:
         Most of a step flows through few numbers (the acceleration, new memories). Derivatives are taken up to these and
         beyond them, so that each direction costs a handful of products.
         """
-        return _Carrying(self, names).made
+        return _Carrying(self, names).result
 
     @property
     def narrow(self) -> list[Node]:
@@ -235,7 +235,7 @@ class _Carrying:
     """Builds ``Tangents``."""
 
     def __init__(self, program: DriverProgram, names: tuple[str, ...]) -> None:
-        self.program, self.names, self.made = program, names, Tangents()
+        self.program, self.names, self.result = program, names, Tangents()
         self.graph = program.graph
         after, sense = program.whole
         narrow = program.narrow
@@ -245,11 +245,11 @@ class _Carrying:
         for signal, node in zip(program.signals, sense, strict=True):
             along = self._along(node)
             if along is not None:
-                self.made.sense[signal] = along
+                self.result.sense[signal] = along
         for i, node in enumerate(narrow):
             self._tangents[f"narrow {i}"] = self._along(node)
         carry = {n: self._along(x) for n, x in zip(program.states, after, strict=True) if n in program.moving}
-        self.made.carry = {n: x or self.graph.constant(0.0) for n, x in carry.items()}
+        self.result.carry = {n: x or self.graph.constant(0.0) for n, x in carry.items()}
         self._hoist()
 
     def _along(self, node: Node) -> Node | None:
@@ -271,7 +271,7 @@ class _Carrying:
             if slot.shift or (slope.op == "constant" and slope.label == 0.0):
                 continue
             if slot.name in self.names:
-                self.made.sources[self.made.targets, self.names.index(slot.name)] = slope
+                self.result.sources[self.result.targets, self.names.index(slot.name)] = slope
                 source = True
                 continue
             tangent = self._tangent_of(slot.name)
@@ -279,15 +279,15 @@ class _Carrying:
                 part = graph.mul(self._row(slope), tangent)
                 total = part if total is None else graph.add(total, part)
         if source:
-            part = graph.input(f"source {self.made.targets}")
+            part = graph.input(f"source {self.result.targets}")
             total = part if total is None else graph.add(total, part)
-            self.made.targets += 1
+            self.result.targets += 1
         return total
 
     def _tangent_of(self, name: str) -> Node | None:
         if name.startswith("narrow "):
             return self._tangents[name]
-        lasts = name.startswith("past ") and self.program.seen[int(name.split()[1])][0] in self.made.sense
+        lasts = name.startswith("past ") and self.program.seen[int(name.split()[1])][0] in self.result.sense
         return self.graph.input(f"tangent {name}") if lasts or name in self.program.moving else None
 
     def _row(self, slope: Node) -> Node:
@@ -295,12 +295,12 @@ class _Carrying:
         if slope.level in (CONSTANT, STATIC) or slope.op == "input":
             return slope
         if slope not in self._rows:
-            self._rows[slope] = self.graph.input(f"slope {len(self.made.slopes)}")
-            self.made.slopes.append(slope)
+            self._rows[slope] = self.graph.input(f"slope {len(self.result.slopes)}")
+            self.result.slopes.append(slope)
         return self._rows[slope]
 
     def _hoist(self) -> None:
-        tangents = self.made
+        tangents = self.result
         nodes = [*tangents.slopes, *tangents.sources.values(), *tangents.sense.values(), *tangents.carry.values()]
         cut, tangents.hoist = hoisted(self.graph, nodes, "fixed")
         rest = iter(cut)

@@ -69,7 +69,7 @@ class DriverText:
     ) -> None:
         self.program = p = program
         self.constants = Constants()
-        self.made = p.tangents(directions) if directions else Tangents()
+        self.tangents = p.tangents(directions) if directions else Tangents()
         self._distance = distance
         self._rows: list[str] = []
         self._groups: dict[str, tuple[int, int]] = {}
@@ -86,14 +86,14 @@ class DriverText:
             self._group("on_hoisted", [_named(f"on {n}") for n in p.constants_of_time])
             self._group("on_past", [f"ON_PAST_{i}" for i in range(len(p.seen))])
             self._group("on_signals", [f"ON_SIGNAL_{i}" for i in p.signals])
-        self._group("fixed", [_named(f"fixed{i}") for i in range(len(self.made.hoist))])
-        self._group("slopes", [_named(f"slope {i}") for i in range(len(self.made.slopes))])
+        self._group("fixed", [_named(f"fixed{i}") for i in range(len(self.tangents.hoist))])
+        self._group("slopes", [_named(f"slope {i}") for i in range(len(self.tangents.slopes))])
         self._block = {
             name: i
             for i, name in enumerate(
                 [_named(f"tangent {n}") for n in p.moving]
-                + [f"SOURCE_{i}" for i in range(self.made.targets)]
-                + [f"TANGENT_SIGNAL_{i}" for i in self.made.sense]
+                + [f"SOURCE_{i}" for i in range(self.tangents.targets)]
+                + [f"TANGENT_SIGNAL_{i}" for i in self.tangents.sense]
                 + [f"TANGENT_PAST_{i}" for i, _ in self.moving_past]
             )
         }
@@ -103,7 +103,7 @@ class DriverText:
     @cached_property
     def moving_past(self) -> list[tuple[int, int]]:
         """What directions see of the past: (place among what is seen, place among moving signals)."""
-        moving = list(self.made.sense)
+        moving = list(self.tangents.sense)
         return [(i, moving.index(s)) for i, (s, _) in enumerate(self.program.seen) if s in moving]
 
     def _group(self, group: str, names: list[str]) -> None:
@@ -121,9 +121,9 @@ class DriverText:
             **begins, **count, "n_parameters": len(self.program.parameters), "n_moving": len(self.program.moving),
             "blocks": len(self._rows) * distance, "block": block, "n_blocks": directions,
             "size": len(self._rows) * distance + directions * block + distance,
-            "tangent_signals": (len(self.program.moving) + self.made.targets) * distance,
-            "n_moving_signals": len(self.made.sense),
-            "tangent_past": (len(self.program.moving) + self.made.targets + len(self.made.sense)) * distance,
+            "tangent_signals": (len(self.program.moving) + self.tangents.targets) * distance,
+            "n_moving_signals": len(self.tangents.sense),
+            "tangent_past": (len(self.program.moving) + self.tangents.targets + len(self.tangents.sense)) * distance,
         }  # fmt: skip
         return RowLayout(*(numbers.get(name, 0) for name in RowLayout._fields))
 
@@ -151,7 +151,7 @@ class DriverText:
         return "\n\n".join([assignments(names), *functions])
 
     def _all(self, adjoint: bool) -> dict[str, tuple[str, list[Write], str]]:
-        p, tangents = self.program, self.made
+        p, tangents = self.program, self.tangents
         hoist = _writes([(_named(n), x) for n, x in zip(p.constants_of_time, p.hoist, strict=True)])
         hoist += _writes([(f"AGO_{i}", x) for i, x in enumerate(p.agos)])
         slopes = _writes([(_named(f"slope {i}"), x) for i, x in enumerate(tangents.slopes)])

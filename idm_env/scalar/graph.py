@@ -25,7 +25,7 @@ class TimeStep(float):
     """
 
     @staticmethod
-    def _kept(name: str) -> Callable[..., Any]:
+    def _method(name: str) -> Callable[..., Any]:
         def method(self: float, *others: Any) -> Any:
             if not all(isinstance(x, (int, float)) for x in others):
                 return NotImplemented
@@ -33,9 +33,9 @@ class TimeStep(float):
 
         return method
 
-    __add__, __radd__, __sub__, __rsub__ = map(_kept, ("__add__", "__radd__", "__sub__", "__rsub__"))
-    __mul__, __rmul__, __truediv__, __rtruediv__ = map(_kept, ("__mul__", "__rmul__", "__truediv__", "__rtruediv__"))
-    __neg__, __pow__ = map(_kept, ("__neg__", "__pow__"))
+    __add__, __radd__, __sub__, __rsub__ = map(_method, ("__add__", "__radd__", "__sub__", "__rsub__"))
+    __mul__, __rmul__, __truediv__, __rtruediv__ = map(_method, ("__mul__", "__rmul__", "__truediv__", "__rtruediv__"))
+    __neg__, __pow__ = map(_method, ("__neg__", "__pow__"))
 
 
 class Leaf(NamedTuple):
@@ -68,15 +68,15 @@ class Graph:
     note: str = ""
     suspects: list[Node] = field(default_factory=list)
     """What effects of the user's own have made, which may be NaN."""
-    _known: dict[tuple[object, ...], Node] = field(default_factory=dict)
+    _nodes: dict[tuple[object, ...], Node] = field(default_factory=dict)
 
     def node(self, op: str, *args: Node, label: Leaf | float | int | None = None, level: int | None = None) -> Node:
         """Return the node of this operation on these nodes."""
         key = (op, *(id(a) for a in args), label, type(label))
-        node = self._known.get(key)
+        node = self._nodes.get(key)
         if node is None:
             level = max((a.level for a in args), default=CONSTANT) if level is None else level
-            node = self._known[key] = Node(op, args, label, level, self.note)
+            node = self._nodes[key] = Node(op, args, label, level, self.note)
         return node
 
     def constant(self, value: float) -> Node:

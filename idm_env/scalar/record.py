@@ -262,11 +262,11 @@ def inputs_of_form(form: Form, graph: Graph) -> dict[str, Any]:
         for name, truth in zip(fields, truths, strict=True):
             node = graph.input(slot_name(effect, name))
             values[name] = Scalar(graph, graph.compare("gt", node, graph.constant(0.5)) if truth else node)
-        inputs[effect] = values[""] if "" in values else _Given(values)
+        inputs[effect] = values[""] if "" in values else _Parts(values)
     return inputs
 
 
-class _Given:
+class _Parts:
     """An input of several parts: whatever was not given is None, as in the tuples that effects know."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:

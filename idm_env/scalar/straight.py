@@ -31,31 +31,31 @@ class Straight:
     def __init__(self, graph: Regions, read: Read) -> None:
         self._graph, self._read = graph, read
         self.varying = Constants()
-        self._kept: dict[Node, str] = {}
+        self._cells: dict[Node, str] = {}
 
     @property
     def kept(self) -> int:
         """Numbers in ``c``."""
-        return len(self._kept)
+        return len(self._cells)
 
     def lines(self, writes: Sequence[tuple[str, Node]]) -> list[str]:
         """Return lines that compute and write what changes with every step."""
         live = self._live([node for _, node in writes], stop=True)
         for node in live:
-            if self._is_kept(node) and node not in self._kept:
-                self._kept[node] = f"c[{len(self._kept)}]"
-        names: dict[Node, str] = dict(self._kept)
-        text = self._print([n for n in live if n not in self._kept], names)
+            if self._is_fixed(node) and node not in self._cells:
+                self._cells[node] = f"c[{len(self._cells)}]"
+        names: dict[Node, str] = dict(self._cells)
+        text = self._print([n for n in live if n not in self._cells], names)
         return [*text, *(f"{place} = {self._name(node, names)}" for place, node in writes)]
 
     def constants(self) -> list[str]:
         """Return lines that compute what the printed lines need of parameters alone; call it last."""
-        nodes = list(self._kept)
+        nodes = list(self._cells)
         names: dict[Node, str] = {}
-        return self._print(self._live(nodes, stop=False), names, self._kept)
+        return self._print(self._live(nodes, stop=False), names, self._cells)
 
     @staticmethod
-    def _is_kept(node: Node) -> bool:
+    def _is_fixed(node: Node) -> bool:
         return node.level < DYNAMIC and node.op not in ("constant", "input") and not node.boolean
 
     def _live(self, outputs: Sequence[Node], stop: bool) -> list[Node]:
@@ -66,7 +66,7 @@ class Straight:
             if node in seen:
                 continue
             seen.add(node)
-            if not (stop and self._is_kept(node)):
+            if not (stop and self._is_fixed(node)):
                 stack += node.args
         return sorted(seen, key=self._graph.serial.__getitem__)
 

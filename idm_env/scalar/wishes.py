@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from idm_env.multilane.incentives import beside, wished
+from idm_env.multilane.incentives import lane_scene, wished
 from idm_env.roads.adjacent import Preference, Side, Sideways, preferred, within
 from idm_env.roads.chains import Chains
 from idm_env.roads.lanes import Lanes
@@ -96,7 +96,7 @@ class Wishes:
         inputs: Mapping[str, Any] = inputs_of_form(form, graph)
         try:
             left, right = (view.side(name, state) for name in SIDES)
-            scene = beside(stepping, view, (left, right), state, inputs, params)  # type: ignore[arg-type]
+            scene = lane_scene(stepping, view, (left, right), state, inputs, params)  # type: ignore[arg-type]
             wish = wished(stepping, scene, params)
             preference = preferred(left, right, wish, road.handed == "left")  # type: ignore[arg-type]
             if graph.suspects:  # effects of the user's own: their NaN is told by who is blocked

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Effect, LaneCommand, MandatoryChange, Mobil, make
 from idm_env.multilane import demand
-from idm_env.multilane.incentives import beside
+from idm_env.multilane.incentives import lane_scene
 from idm_env.roads import Lane, Lanes, lane_drop, off_ramp, on_ramp
 from idm_env.simulator import Simulator
 from idm_env.types import State
@@ -198,7 +198,7 @@ def test_hypothetical_pairs_are_answered_by_the_simulators_own_effects() -> None
     lane = Simulator(Lane(), FOLLOWING)
     view = simulator.road.view(state)
     sides = view.side(view.order(None), 1, state), view.side(view.order(None), -1, state)  # type: ignore[attr-defined]
-    scene = beside(simulator, view, sides, state, {}, params)  # type: ignore[arg-type]
+    scene = lane_scene(simulator, view, sides, state, {}, params)  # type: ignore[arg-type]
     place, which = state.position[0], state.links.lane[0]  # type: ignore[union-attr]
 
     def lone(slots: list[int], who: int) -> Tensor:
@@ -233,7 +233,7 @@ def test_mobils_rule_is_the_published_one() -> None:
     simulator, state, params = mixed(Lanes(2), 10, 250.0, batch=1, seed=3)
     view = simulator.road.view(state)
     sides = view.side(view.order(None), 1, state), view.side(view.order(None), -1, state)  # type: ignore[attr-defined]
-    scene = beside(simulator, view, sides, state, {}, params)  # type: ignore[arg-type]
+    scene = lane_scene(simulator, view, sides, state, {}, params)  # type: ignore[arg-type]
     values = {"politeness": 0.5, "threshold": 0.2, "safe_decel": 3.0, "keep_right": 0.3}
     p = {name: torch.tensor(value, dtype=DTYPE) for name, value in values.items()}
     wish = Mobil().change(scene, None, p)  # type: ignore[arg-type]

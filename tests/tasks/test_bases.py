@@ -53,7 +53,7 @@ def test_every_task_takes_every_law(name: str, how: str, drivers: Path) -> None:
 @pytest.mark.parametrize("law", BASES)
 def test_lane_changes_are_judged_by_the_law_that_is_there(law: str) -> None:
     """Where only one lane is free ahead, a driver of each law wants it for what this law gains there."""
-    from idm_env.multilane.incentives import beside, wished
+    from idm_env.multilane.incentives import lane_scene, wished
     from idm_env.roads import Lanes
     from idm_env.simulator import Simulator
 
@@ -64,7 +64,7 @@ def test_lane_changes_are_judged_by_the_law_that_is_there(law: str) -> None:
     view = simulator.road.view(state)
     order = view.order(None)  # type: ignore[attr-defined]
     sides = view.side(order, 1, state), view.side(order, -1, state)  # type: ignore[attr-defined]
-    wish = wished(simulator, beside(simulator, view, sides, state, {}, params), params)  # type: ignore[arg-type]
+    wish = wished(simulator, lane_scene(simulator, view, sides, state, {}, params), params)  # type: ignore[arg-type]
     alone = simulator.state(position[1:], speed[1:], params, lane=torch.tensor([0]))
     free = simulator.wanted(simulator.scene(alone, {}), params)[0]
     here = simulator.wanted(simulator.scene(state, {}), params)[0]
