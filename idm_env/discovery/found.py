@@ -38,7 +38,7 @@ class {name}(Effect):
     kind: ClassVar[str] = "{kind}"
     title: ClassVar[str] = "{title}"
     equation: ClassVar[str] = "{equation}"
-    changes: ClassVar[str] = "{what}"
+    acts_on: ClassVar[str] = "{what}"
     knots: ClassVar[tuple[float, ...]] = {knots}
     declared: ClassVar[tuple[Parameter, ...]] = (
 {declared}
