@@ -195,8 +195,7 @@ def compile_error() -> type[Exception]:
     """
     import torch
 
-    error: type[Exception] = torch._dynamo.exc.TorchDynamoException
-    return error
+    return torch._dynamo.exc.TorchDynamoException
 
 
 def transforming() -> bool:

@@ -195,10 +195,7 @@ class Compiled(Simulator):
         plain = Simulator(self.road, self.effects, self.dt, self.integration)
         # Filled here, because the tracer does not enter the lock of a cached property.
         _ = plain.by_name, plain._following, plain._hooks, plain._needs, plain._unspoken
-        compiled: Callable[[State, Inputs, Params], State] = torch.compile(
-            plain.step, backend=self.backend, dynamic=self.dynamic, fullgraph=True
-        )
-        return compiled
+        return torch.compile(plain.step, backend=self.backend, dynamic=self.dynamic, fullgraph=True)
 
     def step(self, state: State, inputs: Inputs, params: Params) -> State:
         """Return the state Δt later, as ``Simulator.step`` to rounding."""

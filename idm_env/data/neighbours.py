@@ -29,8 +29,7 @@ def find(table: pl.DataFrame) -> Neighbours:
     )
     leader = joined["found"].cast(pl.Int64).fill_null(NONE).to_numpy()
     second = np.where(leader >= 0, leader[leader], NONE)
-    behind = _behind(leader, table["gap_m"].to_numpy())
-    return Neighbours(leader, second, behind, _adjacent(rows, leader))
+    return Neighbours(leader, second, _behind(leader, table["gap_m"].to_numpy()), _adjacent(rows, leader))
 
 
 def _behind(leader: np.ndarray, gap: np.ndarray) -> np.ndarray:

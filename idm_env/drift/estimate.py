@@ -149,8 +149,7 @@ class Estimate:
     @property
     def theta(self) -> np.ndarray:
         """Every driver's most likely own log θ [rows, p]."""
-        own = self.path.theta + self.path.level[0, :, : len(self.drivers.free)]
-        return np.clip(own, *self.drivers.bounds)
+        return np.clip(self.path.theta + self.path.level[0, :, : len(self.drivers.free)], *self.drivers.bounds)
 
 
 def usual(free: Sequence[str]) -> np.ndarray:
@@ -189,8 +188,7 @@ class Likelihood:
 
     def filtered(self, s: DriftSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return filtered means and covariances and smoothed means [T, rows, …] of gap, speed and levels."""
-        moments: tuple[np.ndarray, np.ndarray, np.ndarray] = loops.smooth(*(*self.records, *self._settings(s)))
-        return moments
+        return loops.smooth(*(*self.records, *self._settings(s)))
 
 
 def estimate(

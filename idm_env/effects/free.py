@@ -81,8 +81,7 @@ class Curve(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the curve's acceleration (m/s²)."""
-        x = feature_of(scene, driver, self.feature, self.period)
-        return curve(x, p, "knot", self.knots, self.period)
+        return curve(feature_of(scene, driver, self.feature, self.period), p, "knot", self.knots, self.period)
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,7 @@ class Noise(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return σ ξ (m/s²)."""
-        noise: Tensor = p["sigma"] * scene.input(self.name)
-        return noise
+        return p["sigma"] * scene.input(self.name)
 
 
 def _memory_time(default: float) -> Parameter:

@@ -213,8 +213,7 @@ class Problem:
 
     def sum_groups(self, x: Tensor) -> Tensor:
         """Sum [S, rows, ...] over the rows of every group: [S, G, ...]."""
-        total = x.new_zeros(x.shape[0], len(self.groups), *x.shape[2:])
-        return total.index_add(1, self.group, x)
+        return x.new_zeros(x.shape[0], len(self.groups), *x.shape[2:]).index_add(1, self.group, x)
 
     def row_normal(self, own: Tensor, shared: Tensor) -> tuple[Normal, Tensor]:
         """Linearise and return the equations of every row, and its weight in the loss [S, rows].

@@ -294,8 +294,7 @@ class _Team:
         from concurrent.futures import BrokenExecutor
 
         try:
-            answer: tuple[str, Any] = handle.result()
-            return answer
+            return handle.result()
         except BrokenExecutor:
             self.close()
             raise _LostError(f"the process that worked on it died {ATTEMPTS} times", False) from None
@@ -397,8 +396,7 @@ class _Cluster:
 
     def result(self, handle: Any) -> tuple[str, Any]:
         try:
-            answer: tuple[str, Any] = self._ray.get(handle)
-            return answer
+            return self._ray.get(handle)
         except self._ray.exceptions.RayError as error:
             words = f"the worker or node that worked on it was lost ({type(error).__name__})"
             raise _LostError(words, True) from None

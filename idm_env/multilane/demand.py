@@ -194,8 +194,7 @@ def _entered(
     goes = some & (fast | fits(slow))
     if state.moving is not None:  # whoever is still leaving a lane is in the way there
         goes = goes & (_rear_of_leaving(state, lanes) - begins >= least + speed * time_gap)
-    entry = _Entry(goes, first, last, followed, begins, gap, speed)
-    return _placed(stepping, state, params, entry)
+    return _placed(stepping, state, params, _Entry(goes, first, last, followed, begins, gap, speed))
 
 
 def _rear_of_leaving(state: State, lanes: Tensor) -> Tensor:

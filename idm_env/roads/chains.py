@@ -57,8 +57,7 @@ class Chains(Road):
 
     def gaps(self, position: Tensor, length: Tensor, circumference: Tensor | float | None = None) -> Tensor:
         """Return ``position[leader] − length[leader] − position`` (m), FAR at the front of a lane."""
-        gap = self.ahead(position) - self.ahead(length) - position
-        return torch.where(self.led(position) > 0, gap, FAR)
+        return torch.where(self.led(position) > 0, self.ahead(position) - self.ahead(length) - position, FAR)
 
 
 @dataclass(frozen=True, eq=False)

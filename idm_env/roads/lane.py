@@ -31,5 +31,4 @@ class Lane(Road):
         """Return ``position[i−1] − length[i−1] − position[i]`` (m). ValueError for a circumference."""
         if circumference is not None:
             raise ValueError(f"an open lane has no circumference, and {circumference} was given. Use Ring().")
-        gap = self.ahead(position) - self.ahead(length) - position
-        return torch.where(self.led(position) > 0, gap, FAR)
+        return torch.where(self.led(position) > 0, self.ahead(position) - self.ahead(length) - position, FAR)

@@ -357,5 +357,4 @@ def _most(room: tuple[int, ...], key: Tensor, value: Tensor, how: Literal["amax"
         worst = worst + value.max()
     elif value.is_floating_point():
         worst = worst + value.min()
-    extreme = worst.expand(room).clone().scatter_reduce(-1, key, value, how)
-    return extreme.gather(-1, key)
+    return worst.expand(room).clone().scatter_reduce(-1, key, value, how).gather(-1, key)

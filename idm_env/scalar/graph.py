@@ -165,8 +165,7 @@ class Graph:
     def again(self, node: Node, args: Sequence[Node]) -> Node:
         """Return the same operation on other nodes."""
         if node.op in ("add", "sub", "mul", "neg", "div", "pow", "select"):
-            result: Node = getattr(self, node.op)(*args)
-            return result
+            return getattr(self, node.op)(*args)
         return self.node(node.op, *args, label=node.label, level=node.level if node.op == "past" else None)
 
     def shifted(self, node: Node, by: int) -> Node:

@@ -50,9 +50,7 @@ class Straight:
 
     def constants(self) -> list[str]:
         """Return lines that compute what the printed lines need of parameters alone; call it last."""
-        nodes = list(self._cells)
-        names: dict[Node, str] = {}
-        return self._print(self._live(nodes, stop=False), names, self._cells)
+        return self._print(self._live(list(self._cells), stop=False), {}, self._cells)
 
     @staticmethod
     def _is_fixed(node: Node) -> bool:

@@ -52,8 +52,7 @@ class TileText:
         self._rows += names
 
     def _read(self, phase: str) -> list[Node]:
-        back = self._back[phase]
-        return [*self.program.outputs(phase), *back.nodes]
+        return [*self.program.outputs(phase), *self._back[phase].nodes]
 
     @staticmethod
     def _chain(slots: set[Leaf]) -> set[Leaf]:

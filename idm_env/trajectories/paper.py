@@ -150,8 +150,7 @@ def follow(
 
 def drive(values: np.ndarray, speed0: float, rear_m: np.ndarray, pace: np.ndarray, dt: float) -> np.ndarray:
     """Return the distances [K] that the five values drive from 0 at ``speed0``, behind a leader as in ``follow``."""
-    result = _descended(RealLeader(), _ahead(rear_m, pace), values[None], [speed0], dt, [], [], {}, 0)
-    return result.position[:-1, 0]
+    return _descended(RealLeader(), _ahead(rear_m, pace), values[None], [speed0], dt, [], [], {}, 0).position[:-1, 0]
 
 
 def _ahead(rear_m: np.ndarray, pace: np.ndarray) -> Ahead:
