@@ -36,7 +36,7 @@ NOW = _Now()
 def seen_merging(view: Linked, state: State, who: Tensor, due: Tensor) -> State:
     """Return the state in which drivers remember who signals (slots, own for nobody), where they have decided.
 
-    ``who`` (integers) and ``due`` (bool) have the state's shape ``(…, vehicles)``.
+    ``who`` (integers) has the shape ``(…, vehicles)``, to which ``due`` (bool) broadcasts.
     """
     gap, speed = view.to_slot(state.position, state.length, who), view.at(state.speed, who)
     some = (gap > 0) & (gap < 0.5 * FAR)

@@ -109,29 +109,29 @@ class Road(abc.ABC):
 
     def leader(self, gap: Tensor, speed: Tensor, accel: Tensor, present: Tensor) -> Neighbour:
         """Return the leader as seen by every vehicle; ``present`` is ``leader_present``'s."""
-        visible = present > 0
+        exists = present > 0
         return Neighbour(
-            gap, torch.where(visible, self.ahead(speed), speed), torch.where(visible, self.ahead(accel), 0.0), present
+            gap, torch.where(exists, self.ahead(speed), speed), torch.where(exists, self.ahead(accel), 0.0), present
         )
 
     def second_leader(self, leader: Neighbour, length: Tensor, speed: Tensor) -> Neighbour:
         """Return the leader's leader, with the gap between bumpers: ``s1 + length[leader] + s[leader]`` (m)."""
         present = leader.present * self.ahead(leader.present.expand_as(speed))
-        visible = present > 0
+        exists = present > 0
         return Neighbour(
-            torch.where(visible, leader.gap + self.ahead(length) + self.ahead(leader.gap), FAR),
-            torch.where(visible, self.ahead(leader.speed), speed),
-            torch.where(visible, self.ahead(leader.accel), 0.0),
+            torch.where(exists, leader.gap + self.ahead(length) + self.ahead(leader.gap), FAR),
+            torch.where(exists, self.ahead(leader.speed), speed),
+            torch.where(exists, self.ahead(leader.accel), 0.0),
             present,
         )
 
     def behind(self, leader: Neighbour, speed: Tensor, accel: Tensor) -> Neighbour:
         """Return the vehicle whose leader is this one, with *its* gap (m)."""
         present = self.leads(speed) * self.back(leader.present.expand_as(speed))
-        visible = present > 0
+        exists = present > 0
         return Neighbour(
-            torch.where(visible, self.back(leader.gap), FAR),
-            torch.where(visible, self.back(speed), speed),
-            torch.where(visible, self.back(accel), 0.0),
+            torch.where(exists, self.back(leader.gap), FAR),
+            torch.where(exists, self.back(speed), speed),
+            torch.where(exists, self.back(accel), 0.0),
             present,
         )

@@ -63,9 +63,9 @@ class Lanes(LaneLayout, Road):
             raise ValueError(f"lane {worst} does not exist: this road has lanes 0 to {self.count - 1}.")
         lane = lane.to(torch.int64).expand_as(position)
         if self.ring is not None:
-            room = length.detach() if present is None else length.detach() * present
+            lengths = length.detach() if present is None else length.detach() * present
             taken = torch.zeros((*lane.shape[:-1], self.count), dtype=length.dtype, device=length.device)
-            taken = taken.scatter_add(-1, lane, room.expand(lane.shape))
+            taken = taken.scatter_add(-1, lane, lengths.expand(lane.shape))
             if bool((taken >= self.ring).any()):
                 raise ValueError(
                     f"vehicles of {float(taken.max()):g} m in all do not fit a lane of {self.ring:g} m. Take fewer "
