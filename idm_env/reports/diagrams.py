@@ -113,7 +113,7 @@ def lane_panels(
     """Return one panel per lane of a rollout on several, the left one first; whoever changes goes on in another panel.
 
     ``data`` is what a rollout keeps, ``lane`` (0 on the right) and ``present`` (0 or 1) are of the same shape: time
-    first, vehicles last. A slot that makes another trip begins another line.
+    first, vehicles last. A slot that makes another trip is another vehicle.
     """
     position, speed = (np.asarray(x.detach().cpu(), float) for x in (data.position, data.speed))
     lanes, on_road = np.asarray(lane.detach().cpu()), np.asarray(present.detach().cpu()) > 0
@@ -123,12 +123,14 @@ def lane_panels(
         # A piece ends where the lane changes, where nobody is there, and where a slot begins anew.
         back = np.diff(position[:, i], prepend=position[:1, i]) < -1.0
         cut = _changes(lanes[:, i]) | _changes(on_road[:, i]) | back
+        trip = np.cumsum(_changes(on_road[:, i]) & on_road[:, i] | back)
         for steps in np.split(np.arange(len(time)), np.flatnonzero(cut)[1:]):
             if on_road[steps[0], i]:
                 # One sample more, so that a change leaves no hole.
                 more = steps if steps[-1] + 1 == len(time) or back[steps[-1] + 1] else np.append(steps, steps[-1] + 1)
                 more = more[on_road[more, i]]
-                line = VehicleLine(str(i), time[more], position[more, i], speed[more, i], i in marked)
+                name = str(i) if trip[steps[0]] == 1 else f"{i}, trip {trip[steps[0]]}"
+                line = VehicleLine(name, time[more], position[more, i], speed[more, i], i in marked)
                 by_lane.setdefault(int(lanes[steps[0], i]), []).append(line)
     drawings = []
     for k in sorted(by_lane, reverse=True):

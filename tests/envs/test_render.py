@@ -186,7 +186,8 @@ def test_lanes_have_a_panel_each_and_changes_go_on_in_another():
     left, right = lane_panels(rollout, lane, there, dt=1.0, marked=[1])
     assert left.title.startswith("lane 1") and right.title.startswith("lane 0")
     assert [(x.name, len(x.time), x.marked) for x in left.lines] == [("1", 12, True)]
-    assert sorted((x.name, len(x.time)) for x in right.lines) == [("0", 5), ("0", 15), ("1", 9), ("2", 12)]
+    assert sorted((x.name, len(x.time)) for x in right.lines) == [("0", 15), ("0, trip 2", 5), ("1", 9), ("2", 12)]
+    assert right.title == "lane 0, 4 vehicles"
     assert right.lines[2].time[-1] == left.lines[0].time[0] == 9.0  # a change leaves no hole
 
 
