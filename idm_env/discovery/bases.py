@@ -14,11 +14,15 @@ from idm_env.discovery.compare import Comparison, ErrorChange, compare
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
-from idm_env.discovery.verdict import improves, mean_ratio
+from idm_env.discovery.verdict import HOLDS, improves, mean_ratio
 from idm_env.effects import ALL, BASES, CarFollowing, base_named, make
 
 LEAST = 0.03
 """Least fall of the geometric mean of the errors for which a law is named first: it is chosen among several."""
+
+
+SCREENED = ("gap_rmse_m", "horizon_rmse_m")
+"""Errors that tell by themselves which laws are far from the null."""
 
 
 class Law(NamedTuple):
@@ -29,7 +33,7 @@ class Law(NamedTuple):
     errors: Judged
     against: dict[str, Comparison]
     at_best: bool = False
-    """Whether its errors are those of the very data that it was fitted to, which are too large already."""
+    """Whether it and the null have errors of the very data that they are fitted to, far larger ones already."""
 
     @property
     def own(self) -> tuple[str, ...]:
@@ -62,7 +66,7 @@ class Law(NamedTuple):
 
 
 def compared(
-    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], tuple[Judged, bool]], seed: int,
+    null: Hypothesis, first: Judged, judged: Callable[[Hypothesis], tuple[Judged, Judged]], seed: int,
     on_law: Callable[[int, int, str], None],
 ) -> list[Law]:  # fmt: skip
     """Return all laws, that of the null first.
@@ -70,7 +74,8 @@ def compared(
     Args:
         null: The law that is completed, with what is known beside it.
         first: Its errors.
-        judged: Calibrates and judges a model; also returns whether on the very data that it was fitted to.
+        judged: Calibrates and judges a model; also returns the null's errors that these are to be compared with:
+            ``first``, or where a law ``is_far`` those of the very data that both are fitted to.
         seed: Of the bootstrap.
         on_law: Called before each with its number, how many there are, and its title.
     """
@@ -84,9 +89,18 @@ def compared(
     for i, model in enumerate(models):
         law = model.catalogue.base
         on_law(1 + i, 1 + len(models), law.title)
-        errors, at_best = judged(model)
-        laws.append(Law(law, model, errors, compare(first, errors, seed), at_best))
+        errors, of_null = judged(model)
+        laws.append(Law(law, model, errors, compare(of_null, errors, seed), of_null is not first))
     return laws
+
+
+def is_far(law: Judged, null: Judged) -> bool:
+    """Tell whether a law errs so much more than the null that it needs no cross-fitting.
+
+    That is by more than ``HOLDS`` in all of ``SCREENED``, each fitted to the very data that are judged.
+    """
+    errors, others = law.summary(), null.summary()
+    return all(errors[key] > HOLDS * others[key] for key in SCREENED)
 
 
 def personal(null: Hypothesis) -> Hypothesis:

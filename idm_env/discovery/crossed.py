@@ -44,6 +44,11 @@ def values_of(task: Task, solution: Solution, runs: Sequence[str], fold: np.ndar
     return result
 
 
+def lean(model: Hypothesis) -> Hypothesis:
+    """Return a model that has nothing but its law with a loop of its own, which does not ask for absent effects."""
+    return model if model.terms else Hypothesis((), replace(model.catalogue, effects=(), located=False))
+
+
 @dataclass(frozen=True, eq=False)
 class _Fold:
     """Drivers of one fold, the others' population, and log θ [2, G, P] by weight, from each half of their time.
@@ -82,18 +87,20 @@ def crossed(
         values: φ [folds, Q] without the runs of each fold.
         fold: Fold of every run.
         noise: Of predictions 5 s ahead, the same for all models that are compared.
-        start: log θ [G, P] to begin with, beside the law's usual values.
+        start: log θ [G, P] of the model as it is calibrated on all of their time, if it is.
         pooled: Whether every driver is the population's middle.
         whitened: Which calibration serves predictions 5 s ahead, the same for all models that are compared. None, for
             the null, takes that of whitened ones, against which drivers' noise weighs least, if it leaves not
             ``CLEARLY`` more.
     """
-    rows, own = whole(records), model.catalogue.own
-    task, theta = judge.unweighed(records, model, values.mean(0), first_prior(own), start=start)
+    rows, own, model = whole(records), model.catalogue.own, lean(model)
+    known = start is not None
+    task, theta = judge.unweighed(records, model, values.mean(0), first_prior(own), start=start, calibrated=known)
     second = judge.halves(rows)
     halves = [replace(rows, valid=part).settled() for part in (rows.valid & ~second, second)]
     middle = Frozen(model, values.mean(0))
-    near = np.stack([
+    # Where every driver is the population's middle, no driver needs to be fitted to half of his time.
+    near = np.stack([theta, theta]) if pooled else np.stack([
         solve(replace(task, rows=half), middle, theta, EMPTY, iterations=10, tolerance=1e-4).theta for half in halves
     ])  # fmt: skip
     of_row = fold[rows.run]
@@ -119,12 +126,17 @@ def crossed(
     return judge.Judged(rows, gap, speed, ahead, short.record, bool(whitened))
 
 
-def at_best(records: Records, model: Hypothesis, values: np.ndarray) -> tuple[judge.Judged, np.ndarray]:
+def at_best(
+    records: Records, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None
+) -> tuple[judge.Judged, np.ndarray]:
     """Return a model's errors on the very data that it is fitted to, and log θ [G, P]; values [Q].
 
-    With parameters that did not see what is judged its gaps err more: what is too much here needs no cross-fitting.
+    A model whose errors are far above another's even so needs no cross-fitting. ``start`` is as in ``crossed``.
     """
-    theta = judge.unweighed(records, model, values, first_prior(model.catalogue.own))[1]
+    model = lean(model)
+    theta = judge.unweighed(
+        records, model, values, first_prior(model.catalogue.own), start=start, calibrated=start is not None
+    )[1]
     return judge.judge(records, model, values, theta), theta
 
 

@@ -36,7 +36,7 @@ from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, Round, decide
 from idm_env.discovery.solve import Solution, Task
-from idm_env.discovery.verdict import HOLDS, Reason, Refusal, Verdict
+from idm_env.discovery.verdict import Reason, Refusal, Verdict
 from idm_env.effects import (
     ALL,
     CANDIDATES,
@@ -303,19 +303,20 @@ def _finish(
     judgement, last = _judgement(searching, decided, kept, fit_records, alike, (first, before), seed)
     laws = []
 
-    def alone(model: Hypothesis) -> tuple[judge.Judged, bool]:
-        assert before is not None
-        if not adapt:
-            errors = own(model, null.values, None)[1]
-            assert errors is not None
-            return errors, False
-        best, theta = crossed.at_best(prepared, model, null.values)
-        if best.summary()["gap_rmse_m"] > HOLDS * before.summary()["gap_rmse_m"]:
-            return best, True
-        values = crossed.values_of(searching.task, null, prepared.runs, fold)
-        return crossed.crossed(prepared, model, values, fold, noise(), theta, whitened=whitened), False
-
     if before is not None:
+        best = crossed.at_best(prepared, null.model, null.values, first.theta)[0] if adapt else before
+
+        def alone(model: Hypothesis) -> tuple[judge.Judged, judge.Judged]:
+            if not adapt:
+                errors = own(model, null.values, None)[1]
+                assert errors is not None
+                return errors, before
+            at_best, theta = crossed.at_best(prepared, model, null.values)
+            if bases.is_far(at_best, best):
+                return at_best, best
+            values = crossed.values_of(searching.task, null, prepared.runs, fold)
+            return crossed.crossed(prepared, model, values, fold, noise(), theta, whitened=whitened), before
+
         laws = bases.compared(null.model, before, alone, seed, on_law)
         judgement = judgement.beside(bases.best_of(laws))
     final = judgement.compared if judgement.added and judgement.compared is not None else null

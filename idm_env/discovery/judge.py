@@ -99,11 +99,12 @@ def calibrate(
 
 def unweighed(
     records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, rows: Rows | None = None,
-    start: np.ndarray | None = None,
+    start: np.ndarray | None = None, calibrated: bool = False,
 ) -> tuple[Task, np.ndarray]:  # fmt: skip
     """Return the task of a calibration and its first fit: log θ [G, P] with a prior that hardly weighs anything.
 
-    From two starts, the prior's centre and ``start`` [G, P]; every group keeps the better one.
+    From two starts, the prior's centre and ``start`` [G, P]; every group keeps the better one. From ``start`` alone
+    where that is of a model already ``calibrated`` on these records.
     """
     rows = (whole(records) if rows is None else rows).settled()
     frozen, empty = Frozen(model, values), np.zeros(0)
@@ -111,7 +112,7 @@ def unweighed(
     centre = np.tile(prior.centre, (task.groups, 1))
     fits = [
         solve(task, frozen, x, empty, iterations=25, tolerance=1e-5)
-        for x in (centre, *([] if start is None else [start]))
+        for x in ([] if calibrated else [centre]) + ([] if start is None else [start])
     ]
     costs = np.stack([cost_of(task, f.theta[None], f.linear.residual[None])[0] for f in fits])
     return task, np.where((costs.argmin(0) == 0)[:, None], fits[0].theta, fits[-1].theta)
