@@ -94,8 +94,10 @@ def crossed(
             ``CLEARLY`` more.
     """
     rows, own, model = whole(records), model.catalogue.own, lean(model)
-    known = start is not None
-    task, theta = judge.unweighed(records, model, values.mean(0), first_prior(own), start=start, calibrated=known)
+    is_calibrated = start is not None
+    task, theta = judge.unweighed(
+        records, model, values.mean(0), first_prior(own), start=start, calibrated=is_calibrated
+    )
     second = judge.halves(rows)
     halves = [replace(rows, valid=part).settled() for part in (rows.valid & ~second, second)]
     middle = Frozen(model, values.mean(0))

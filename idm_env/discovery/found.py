@@ -9,7 +9,7 @@ from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import Term
 from idm_env.discovery.slots import TARGETS
 from idm_env.discovery.words import ALONG, CHANGES
-from idm_env.effects.free import FEATURES
+from idm_env.effects.free import FEATURES, PER
 
 FILE = "found_effect.py"
 """Name of the file."""
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from idm_env import Effect, Parameter
-from idm_env.effects.free import feature_of
+from idm_env.effects.free import {features}
 from idm_env.effects.places import interpolate
 '''
 _CLASS = '''
@@ -48,7 +48,7 @@ class {name}(Effect):
         """Return {returns}."""
         x = feature_of(scene, driver, "{feature}", {period})
         heights = [{heights}]
-        c = interpolate(x, self.knots, heights, {period})
+        c = interpolate(x, self.knots, heights, {period}){share}
         return {result}
 '''
 
@@ -64,11 +64,16 @@ def source(terms: Sequence[tuple[Term, Mapping[str, Mapping[str, Any]]]], senten
     if not curves:
         return ""
     classes = [_class(term, parameters) for term, parameters in curves]
-    return _HEAD.format(sentence=sentence, first=_name(curves[0][0])) + "".join(classes)
+    features = "feature_of, share_of" if any(t.by for t, _ in curves) else "feature_of"
+    return _HEAD.format(sentence=sentence, first=_name(curves[0][0]), features=features) + "".join(classes)
 
 
 def _name(term: Term) -> str:
-    return "".join(word.capitalize() for word in f"{term.what}_over_{term.coordinate}".split("_"))
+    return "".join(word.capitalize() for word in _kind(term).split("_"))
+
+
+def _kind(term: Term) -> str:
+    return f"{term.what}_over_{term.coordinate}" + (f"_by_{term.by}" if term.by else "")
 
 
 def _class(term: Term, parameters: Mapping[str, Mapping[str, Any]]) -> str:
@@ -83,12 +88,16 @@ def _class(term: Term, parameters: Mapping[str, Mapping[str, Any]]) -> str:
         f"{p.symbol} {parameters[p.name]['low']:.3g} to {parameters[p.name]['high']:.3g}" for p in term.parameters
     )
     inner = [f'p["{p.name}"]' for p in term.parameters]
+    ends, share = ", and 0 beyond its ends", ""
+    if term.by:
+        ends += f", times the {ALONG[term.by]} over {PER[term.by]:g} {FEATURES[term.by]}, −2 to 2"
+        share = f' * share_of(scene, driver, "{term.by}")'
     added = term.what == "acceleration"
     changed = ", ".join(f"{n}=driver.{n} * (1.0 + c)" for n in TARGETS.get(term.what, ()))
     return _CLASS.format(
         name=_name(term), equation=CHANGES[term.what][3].replace("k", "c"), noun=ALONG[term.coordinate],
-        unit=FEATURES[term.coordinate], ends=", and 0 beyond its ends", intervals=intervals,
-        kind=f"found_{term.what}_over_{term.coordinate}", title=f"{CHANGES[term.what][2]} by {ALONG[term.coordinate]}",
+        unit=FEATURES[term.coordinate], ends=ends, share=share, intervals=intervals,
+        kind=f"found_{_kind(term)}", title=f"{CHANGES[term.what][2]} by {ALONG[term.coordinate]}",
         what=term.what, knots=tuple(float(first + distance * i) for i in range(count)), declared="\n".join(declared),
         hook="accelerate(self, scene, driver, p)" if added else "adapt(self, driver, scene, p)",
         returns="c (m/s²)" if added else "the driver in force", feature=term.coordinate, period=term.period or None,

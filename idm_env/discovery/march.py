@@ -27,7 +27,7 @@ from idm_env.discovery import march_loops
 from idm_env.discovery.slots import SETS, TARGETS, Push
 from idm_env.discovery.slots import Slot as Changed
 from idm_env.effects import IDM, Brakes, CarFollowing, Effect
-from idm_env.effects.free import FEATURES
+from idm_env.effects.free import FEATURES, PER
 from idm_env.parameters import Parameter
 from idm_env.roads import Lane
 from idm_env.scalar import library
@@ -143,12 +143,16 @@ class Catalogue:
         """Return where a table begins in φ."""
         return len(self.index) + ROOM * self.tables[name]
 
-    def shape(self, what: str, coordinate: str, label: str) -> tuple[str, dict[str, float]]:
-        """Return which effect stands for a change of ``what`` over a coordinate in a slot, and what φ says of it."""
+    def shape(self, what: str, coordinate: str, label: str, by: str = "") -> tuple[str, dict[str, float]]:
+        """Return which effect stands for a change of ``what`` over a coordinate in a slot, and what φ says of it.
+
+        ``by`` is the state that the change is proportional to, "" for none.
+        """
         changed = TARGETS.get(what, ())
         slots = {e.targets if isinstance(e, Changed) else (): e for e in _slots(label)}
         effect = slots[next((t for t in slots if set(t) & set(changed)), ())]
         told = {"over": float(list(FEATURES).index(coordinate))} if coordinate else {}
+        told |= {"by": 1.0 + list(PER).index(by)} if by else {}
         told |= {n: float(n in changed) for n in (effect.targets if isinstance(effect, Changed) else ())}
         return effect.name, {f"{effect.name}.{name}": value for name, value in told.items()}
 

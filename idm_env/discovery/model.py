@@ -23,7 +23,8 @@ class Term:
     ``effect`` is the catalogue's name or None for what is only located; ``what`` and ``coordinate`` say what changes
     and over which coordinate; ``form`` is NONE, CURVE or INTERVAL; ``knots`` (first, distance, count) of a curve.
     ``starts`` are values of all parameters to start a search from; ``made`` is the effect with its static choices. A
-    curve that ``fades`` is nothing from a knot's distance beyond its ends on: nobody was seen there.
+    curve that ``fades`` is nothing from a knot's distance beyond its ends on: nobody was seen there. ``by`` a
+    state it is proportional to that.
     """
 
     label: str
@@ -39,6 +40,7 @@ class Term:
     smoothness: float = 0.0
     made: Effect | None = None
     fades: bool = False
+    by: str = ""
 
     @property
     def size(self) -> int:
@@ -146,7 +148,7 @@ class Hypothesis:
             else:
                 phi[..., at + 2] = EDGES[term.coordinate]
             if term.located:
-                for name, weight in self.catalogue.shape(term.what, term.coordinate, str(slot))[1].items():
+                for name, weight in self.catalogue.shape(term.what, term.coordinate, str(slot), term.by)[1].items():
                     phi[..., self.catalogue.index[name]] = weight
         phi[..., self.entries] = values
         return phi
@@ -173,7 +175,7 @@ class Frozen(Hypothesis):
 
 SPREAD = 0.3
 """Prior width of a curve's knots, in units of what it changes: m/s², or relative."""
-STATES = {"speed": 3.0, "gap": 6.0, "closing_speed": 1.0, "lead_accel": 0.4, "relative_gap": 0.2}
+STATES = {"speed": 3.0, "gap": 4.0, "closing_speed": 1.0, "lead_accel": 0.4, "relative_gap": 0.2}
 """Coordinates of the state, with the distance of a curve's knots: it ends where nobody was seen."""
 EDGES = {"position": 5.0, "time": 0.5, "speed": 0.5, "gap": 1.0, "closing_speed": 0.2, "lead_accel": 0.1}
 """Half-width over which an interval of a located effect sets in."""
@@ -270,16 +272,19 @@ def interval(what: str, coordinate: str, begin: float, end: float, amount: float
 
 
 def curve(
-    what: str, coordinate: str, first: float, distance: float, count: int, period: float = 0.0, label: str = ""
-) -> Term:
-    """Return an unnamed piecewise-linear change of ``what`` over a coordinate."""
+    what: str, coordinate: str, first: float, distance: float, count: int, period: float = 0.0, label: str = "",
+    by: str = "",
+) -> Term:  # fmt: skip
+    """Return an unnamed piecewise-linear change of ``what`` over a coordinate, proportional to the state ``by``."""
+    label = label or f"{what} curve over {coordinate}" + (f" by {by}" if by else "")
     unit = "m/s²" if what == "acceleration" else "1"
     size = (-5.0, 5.0) if what == "acceleration" else (-0.9, 3.0)
     parameters = tuple(Parameter(f"knot_{i}", f"c{i}", unit, 0.0, *size, null=0.0) for i in range(count))
     return Term(
-        label or f"{what} curve over {coordinate}", None, parameters, ((0.0,) * count,), what=what,
+        label, None, parameters, ((0.0,) * count,), what=what,
         coordinate=coordinate, form=twin.CURVE, knots=(first, distance, count), period=period,
         smoothness=0.3 if what == "acceleration" else 0.5, fades=coordinate in STATES,
+        by=by,
     )  # fmt: skip
 
 
@@ -344,10 +349,10 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
         return [(_made(term, knots), dict(zip(names, map(float, numbers), strict=True)))]
     given = {f"knot_{i}": float(h) for i, h in enumerate(heights)}
     if term.what == "acceleration":
-        return [(catalogue.Curve(feature=term.coordinate, knots=knots, period=period), given)]
+        return [(catalogue.Curve(feature=term.coordinate, knots=knots, period=period, by=term.by), given)]
     targets = {"accel_and_decel": ("max_accel", "comfort_decel")}.get(term.what, (term.what,))
     return [
-        (catalogue.DriverCurve(target=t, feature=term.coordinate, knots=knots, period=period), given)  # type: ignore[arg-type]
+        (catalogue.DriverCurve(target=t, feature=term.coordinate, knots=knots, period=period, by=term.by), given)  # type: ignore[arg-type]
         for t in targets
     ]
 

@@ -122,19 +122,30 @@ def westfall_young(gains: np.ndarray, seed: int = 0, run: np.ndarray | None = No
     and a tiny gain that is the same in all runs does not outdo it. Under the null, a unit's gain is as likely positive
     as negative. With few runs all 2^R flips are taken, otherwise a sample; the smallest p-value of runs is 2^−R.
     """
-    candidates, count = gains.shape
-    run = np.arange(count) if run is None else run
+    run = np.arange(gains.shape[1]) if run is None else run
     statistic = _flipped(gains, seed, run)
     highest = statistic.max(1)
     p_value = (highest[:, None] >= statistic[0] - 1e-12).mean(0)
-    mean = gains.mean(1)
-    # Of the mean over units, robust against their dependence within runs.
-    runs = len(np.unique(run))
+    mean, width = _mean_of(gains, run)
+    return Tested(p_value, mean, np.stack([mean - width, mean + width], axis=1))
+
+
+def _mean_of(gains: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return means over units [K] and half their 95 % intervals, robust against dependence within runs."""
+    candidates, count = gains.shape
+    runs, mean = len(np.unique(run)), gains.mean(1)
     off = np.zeros((candidates, int(run.max(initial=0)) + 1))
     np.add.at(off.T, run, (gains - mean[:, None]).T)
     error = np.sqrt((off**2).sum(1) * runs / (runs - 1)) / count if runs > 1 else np.full(candidates, np.inf)
-    width = student.ppf(0.975, max(runs - 1, 1)) * error
-    return Tested(p_value, mean, np.stack([mean - width, mean + width], axis=1))
+    return mean, student.ppf(0.975, max(runs - 1, 1)) * error
+
+
+def rivals(gains: np.ndarray, winner: int, run: np.ndarray) -> list[int]:
+    """Return which candidates [K, units] gain beyond chance, and not less than ``winner`` beyond chance, best first."""
+    less, width = _mean_of(gains[winner] - gains, run)
+    own, own_width = _mean_of(gains, run)
+    near = [i for i in np.argsort(-own) if i != winner and own[i] > own_width[i] and less[i] <= width[i]]
+    return [int(i) for i in near]
 
 
 def _flipped(gains: np.ndarray, seed: int, run: np.ndarray) -> np.ndarray:
@@ -216,10 +227,10 @@ def contrast_of(solution: Solution, task: Task, label: str) -> Contrast:
 
     Single knots say less: drivers' own parameters move a curve up and down as a whole, and its contrasts stay.
     """
-    at = solution.model.where(label)
-    values, (spread, noise, times) = solution.values[at], _variances(solution, task)
+    entries = solution.model.where(label)
+    values, (spread, noise, times) = solution.values[entries], _variances(solution, task)
     wide = np.zeros((len(values), len(values)))
-    for matrix, factor in ((spread[at, at], times), (noise[at, at], 1.96)):
+    for matrix, factor in ((spread[entries, entries], times), (noise[entries, entries], 1.96)):
         own = np.diag(matrix)
         wide = np.maximum(wide, factor * np.sqrt(np.maximum(own[:, None] + own - matrix - matrix.T, 0.0)))
     off = np.subtract.outer(values, values)

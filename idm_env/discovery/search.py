@@ -21,6 +21,7 @@ from idm_env.discovery.solve import Linear, Solution, Task, finish, linearise, p
 from idm_env.discovery.units import Units, units
 from idm_env.effects import Effect
 from idm_env.effects.base import Sought
+from idm_env.effects.free import PER
 from idm_env.jobs.progress import OnProgress
 from idm_env.jobs.storage import Store
 
@@ -109,7 +110,12 @@ class Search:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [units].
 
         Shapes are sought in the ``first`` round only: beside an effect, a curve is what that one lacks of the true one.
+        Beside a shape only surfaces over its state and another are tried.
         """
+        if not first and (shape := solution.model.terms[-1]).fades:
+            self.on_progress(f"round {number}", 0, 1, f"{shape.label} by another state")
+            before = held_out(self.task, solution)
+            return self._curves(solution, places.respond(self.task, solution), before, number, _surfaces(shape)), before
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
         wanted = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
@@ -209,6 +215,24 @@ class Search:
         effects = [self.base.catalogue.by_name[n] for n in self.names]
         return [e for e in effects if e.sought == what]
 
+    def _curves(
+        self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int, curves: Sequence[Term]
+    ) -> list[Scored]:
+        """Score curves by their linear response, and those that promise most by a fit."""
+        have, result = {t.label for t in solution.model.terms}, []
+        looked = [(t, *_line(responses, t)) for t in curves if t.label not in have]
+        looked.sort(key=lambda one: -one[2].mean())
+        for i, (term, start, gains) in enumerate(looked):
+            faint = gains.mean() < WORTH and (term.effect is None or term.what != "acceleration")
+            if faint or i >= RACED:
+                result.append(Scored(term, None, gains))
+                continue
+            low, high = term.parameters[0].low, term.parameters[0].high
+            begin = start if term.made is None else np.array([term.made.strength_of(float(x)) for x in start])
+            starts = [np.append(solution.values, np.clip(begin, 0.9 * low, 0.9 * high))]
+            result.append(self._nested(solution, term, before, f"{number}/{term.label}", starts))
+        return result
+
     # -- where and when ----------------------------------------------------------------------------------------------
 
     def _places(
@@ -238,18 +262,8 @@ class Search:
             gains = np.where(found.stable, one.gains, found.gains)
             result.append(Scored(term, one.solution, gains, found.stable))
 
-        def curve_of(*wanted: Term) -> None:
-            looked = [(t, *_line(responses, t)) for t in wanted if t.label not in have]
-            looked.sort(key=lambda one: -one[2].mean())
-            for i, (term, start, gains) in enumerate(looked):
-                faint = gains.mean() < WORTH and (term.effect is None or term.what != "acceleration")
-                if faint or i >= RACED:
-                    result.append(Scored(term, None, gains))
-                    continue
-                low, high = term.parameters[0].low, term.parameters[0].high
-                begin = start if term.made is None else np.array([term.made.strength_of(float(x)) for x in start])
-                starts = [np.append(solution.values, np.clip(begin, 0.9 * low, 0.9 * high))]
-                result.append(self._nested(solution, term, before, f"{number}/{term.label}", starts))
+        def curve_of(*curves: Term) -> None:
+            result.extend(self._curves(solution, responses, before, number, curves))
 
         position = _knots(responses.coordinates["position"], 80.0, 48, period)
         for effect in self._sought("profile"):
@@ -273,7 +287,7 @@ class Search:
         curve_of(terms.curve("time_gap", "time", *ramp, label="time_gap ramp"))
         curve_of(terms.curve("acceleration", "time", *_knots(time, 8.0, 24)))
         if first:
-            knots = {c: _knots(responses.coordinates[c], step, 10) for c, step in terms.STATES.items()}
+            knots = {c: _knots(responses.coordinates[c], step, 16) for c, step in terms.STATES.items()}
             curve_of(*(terms.curve(what, c, *knots[c]) for what, c in product(places.WHATS, knots)))
         cycle, gains = places.best_period(responses, "acceleration")
         term = terms.curve("acceleration", "time", 0.0, cycle / 8, 8, cycle, label="acceleration over phase")
@@ -287,9 +301,17 @@ class Search:
         return result
 
 
+def _surfaces(shape: Term) -> list[Term]:
+    """Return curves like a shape, each proportional to another state: with the shape, a surface over both."""
+    others = [state for state in PER if state != shape.coordinate]
+    return [terms.curve(shape.what, shape.coordinate, *shape.knots, by=state) for state in others]
+
+
 def _line(responses: places.Responses, term: Term) -> tuple[np.ndarray, np.ndarray]:
     """Return a curve's knots by its linear response, and honest gains of units."""
     basis = places.hats(responses.coordinates[term.coordinate], *term.knots, term.period)
+    if term.by:
+        basis = basis * np.clip(responses.coordinates[term.by] / PER[term.by], -2.0, 2.0)[..., None]
     spread = term.smoothness if term.made is None else terms.SPREAD
     return places.linear_curve(responses, term.what, basis, spread)
 

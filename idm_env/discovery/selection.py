@@ -92,7 +92,7 @@ def decide(searching: Search, null: Solution, seed: int) -> Decided:
     """
     at, null = searching.weighed(null)
     null, steps, rounds = _rounds(searching, null, seed)
-    if len(steps) == len(rounds) - 1:
+    if len(steps) == len(rounds) - 1 and not (steps and _is_shape(steps[-1])):
         pair = _pairs(searching, steps[-1] if steps else null, rounds[-1], seed)
         if pair is not None:
             rounds.append(pair)
@@ -126,7 +126,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
     steps: list[Solution] = []
     rounds: list[Round] = []
     for number in range(1, MOST_ROUNDS + 2):
-        if len(steps) == MOST_ROUNDS or (steps and (_is_shape(now) or _at_floor(searching, now))):
+        if len(steps) == MOST_ROUNDS or (steps and (_is_whole(now) or _at_floor(searching, now))):
             break
         scored, before = searching.round(now, number, not steps)
         scored = [s for s in scored if not _same_class(s.term, now.model)]
@@ -162,6 +162,11 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
 def _tested(searching: Search, scored: Sequence[Scored], seed: int) -> Tested:
     """Test candidates in windows, at their share of the level."""
     return at_level(westfall_young(np.array([s.gains for s in scored]), seed, searching.units.run), 1.0 - FREE_SHARE)
+
+
+def _is_whole(now: Solution) -> bool:
+    """Tell whether the last term is a surface, beside which nothing more is sought."""
+    return bool(now.model.terms[-1].by)
 
 
 def _is_shape(now: Solution) -> bool:
@@ -217,7 +222,7 @@ def _same_class(term: Term, model: Hypothesis) -> bool:
     A curve with many knots over a coordinate contains other changes of the same quantity over it: these are its error.
     """
     fine = [t for t in model.terms if t.form == CURVE and t.knots[2] >= SPANS]
-    if any((t.what, t.coordinate) == (term.what, term.coordinate) for t in fine):
+    if not term.by and any((t.what, t.coordinate) == (term.what, term.coordinate) for t in fine):
         return True
     return _late(term.effect) and any(_late(t.effect) and t.effect != term.effect for t in model.terms)
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects.base import Effect, P
-from idm_env.effects.free import FEATURES, DriverCurve, feature_of
+from idm_env.effects.free import FEATURES, PER, DriverCurve, feature_of, share_of
 from idm_env.effects.places import curve
 from idm_env.parameters import Parameter
 from idm_env.types import Driver, Scene
@@ -32,6 +32,8 @@ SETS = (("time_gap", "desired_speed"), ("max_accel", "comfort_decel"))
 
 OVER = Parameter("over", "", "1", 0.0, 0.0, len(FEATURES) - 1.0, role="shape")
 """Which feature a curve runs over: its place in ``FEATURES``."""
+BY = Parameter("by", "", "1", 0.0, 0.0, float(len(PER)), role="shape")
+"""Which state a curve is proportional to: 1 and its place in ``PER``, 0 for none."""
 
 
 def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
@@ -43,7 +45,10 @@ def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
     for number, feature in enumerate(FEATURES):
         # Chosen, not summed: the loop need not wait for what does not count.
         x = torch.where(p["over"] == number, feature_of(scene, driver, feature, None), x)
-    return curve(x, p, "knot", effect.knots, None, effect.values)
+    share: Any = 1.0
+    for number, state in enumerate(PER, 1):
+        share = torch.where(p["by"] == number, share_of(scene, driver, state), share)
+    return curve(x, p, "knot", effect.knots, None, effect.values) * share
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ class Slot(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Which feature, and 1 for each parameter that changes."""
-        return (OVER, *(Parameter(name, "", "1", 0.0, 0.0, 1.0, null=0.0) for name in self.targets))
+        return (OVER, BY, *(Parameter(name, "", "1", 0.0, 0.0, 1.0, null=0.0) for name in self.targets))
 
     def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
         """Return the driver with the parameters changed."""
@@ -83,7 +88,7 @@ class Push(Effect):
     """An added acceleration c, as in ``Slot``."""
 
     kind: ClassVar[str] = "push"
-    declared: ClassVar[tuple[Parameter, ...]] = (OVER,)
+    declared: ClassVar[tuple[Parameter, ...]] = (OVER, BY)
     label: str = ""
     given: bool = False
     knots: tuple[float, ...] = (0.0, 1.0)

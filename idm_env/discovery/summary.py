@@ -17,7 +17,7 @@ from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import STATES, Term
 from idm_env.discovery.power import Bar, Strength, powerful, strength_of
 from idm_env.discovery.records import Records
-from idm_env.discovery.score import FREE_SHARE, contrast_of, interval_of, level
+from idm_env.discovery.score import FREE_SHARE, contrast_of, interval_of, level, rivals
 from idm_env.discovery.selection import LEAST_GAIN, Round
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution, Task
@@ -289,7 +289,7 @@ def _where(term: Term, values: dict[str, float]) -> dict[str, Any]:
 
 
 def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: int, task: Task) -> list[dict[str, Any]]:
-    result = []
+    result, run = [], units(task.rows.records).run
     at = sum(t.size for t in compared.model.terms[:base])
     for term in compared.model.terms[base:]:
         this, winner = next(
@@ -311,6 +311,7 @@ def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: i
         }
         contrast = contrast_of(compared, task, term.label) if term.located and term.form == CURVE else None
         where = _where(term, values)
+        beside = [] if this.free else rivals(np.array([s.gains for s in this.scored]), winner, run)
         if where["coordinate"] == "time" and (where["interval"][1] or 0) > 9e5:
             where["interval"][1] = None
         effect = None if term.effect is None else ALL[term.effect]
@@ -325,6 +326,7 @@ def _found(compared: Solution, rounds: list[Any], intervals: np.ndarray, base: i
                 "equation": words.CHANGES[term.what][3] if effect is None else effect.equation,
                 "clause": words.clause(term, mine.tolist(), contrast),
                 "equivalent": [this.scored[i].term.effect or this.scored[i].term.label for i in this.equivalent],
+                "rivals": [this.scored[i].term.effect or this.scored[i].term.label for i in beside],
                 "looks_like": [] if effect is None else list(effect.looks_like),
                 "told_by": "" if effect is None else effect.told_by,
                 "parameters": parameters,

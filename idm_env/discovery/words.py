@@ -18,7 +18,7 @@ from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution
 from idm_env.discovery.verdict import HOLDS, Reason, Refusal, Verdict
 from idm_env.effects import ALL
-from idm_env.effects.free import FEATURES
+from idm_env.effects.free import FEATURES, PER
 from idm_env.parameters import Parameter
 
 ERRORS = {
@@ -122,8 +122,10 @@ def _contrast(term: Term, estimates: Sequence[float], c: Contrast) -> str:
     where = f"{amount(high, unit)} than at {amount(low, unit)}"
     if "phase" in term.label:
         where += f" of a cycle of {term.period:.0f} s"
-    of = f"a {ALONG[term.coordinate]} of " if term.fades else ""
-    return f"is {told} at {of}{where}".replace("[-", "[−")
+    prefix = f"a {ALONG[term.coordinate]} of " if term.fades else ""
+    if term.by:
+        where += f", for each {amount(PER[term.by], FEATURES[term.by])} of {ALONG[term.by]}"
+    return f"is {told} at {prefix}{where}".replace("[-", "[−")
 
 
 def _over(term: Term) -> str:
@@ -255,7 +257,10 @@ def details(
         parts.append(f"{name[0].upper()}{name[1:]}: p = {number(f['p_value'], 2)} over the whole list of candidates.")
         if f["equivalent"]:
             parts.append(f"These data cannot tell it from {', '.join(plain(x) for x in f['equivalent'])}.")
-        elif f["looks_like"]:
+        rivals = [plain(x) for x in f["rivals"] if x not in f["equivalent"]]
+        if rivals:
+            parts.append(f"Rivals, whose gain is not lower beyond chance: {', '.join(rivals)}.")
+        if f["looks_like"] and not f["equivalent"] and not rivals:
             parts.append(f"It is most easily confused with {', '.join(spoken(x) for x in f['looks_like'][:3])}.")
         if f["told_by"]:
             parts.append(f"What would tell: {f['told_by']}.")
@@ -346,7 +351,8 @@ def by_use(laws: Sequence[Law], chosen: Law | None) -> list[str]:
     """Say of every error which law is best for it, where that is another one and better beyond chance."""
     told = []
     for key, (name, _) in ERRORS.items():
-        better = [law for law in laws if key in law.against and law.against[key].light is ErrorChange.BETTER]
+        fair = [law for law in laws if key in law.against and not law.at_best]
+        better = [law for law in fair if law.against[key].light is ErrorChange.BETTER]
         best = min(better, key=lambda law: law.against[key].ratio, default=None)
         if best is None or best is chosen:
             continue

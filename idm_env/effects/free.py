@@ -23,6 +23,8 @@ FEATURES: dict[str, str] = {
     "relative_gap": "1",
 }
 """Features that a curve can run over, with their units."""
+PER: dict[str, float] = {"speed": 15.0, "gap": 20.0, "closing_speed": 2.0, "lead_accel": 1.0, "relative_gap": 1.0}
+"""What a curve may be proportional to: states, and how much of each counts as one, up to twice as much."""
 FREE = 3.0
 """Relative gap from which on a driver is free: a larger one is not told from it."""
 
@@ -47,7 +49,14 @@ def feature_of(scene: Scene, driver: Driver, feature: str, period: float | None)
     return along(values[feature], period)
 
 
-def _check(name: str, feature: str, knots: tuple[float, ...]) -> None:
+def share_of(scene: Scene, driver: Driver, state: str) -> Tensor:
+    """Return by how much a curve counts in a state of ``PER``, shape ``(…, vehicles)``: ``x / per``, from −2 to 2."""
+    return (feature_of(scene, driver, state, None) / PER[state]).clamp(-2.0, 2.0)
+
+
+def _check(name: str, feature: str, knots: tuple[float, ...], by: str) -> None:
+    if by and by not in PER:
+        raise ValueError(f"{name}.by = '{by}' is no state of the driver.{nearest(by, PER)}")
     if feature not in FEATURES:
         raise ValueError(f"{name}.feature = '{feature}' is not a feature of the scene.{nearest(feature, FEATURES)}")
     if len(knots) < 2 or any(b <= a for a, b in pairwise(knots)):
@@ -56,20 +65,24 @@ def _check(name: str, feature: str, knots: tuple[float, ...]) -> None:
 
 @dataclass(frozen=True)
 class Curve(Effect):
-    """An added acceleration ``+ Σ c_k hat_k(x)``, piecewise linear in one feature x of the scene, free at its knots."""
+    """An added acceleration ``+ Σ c_k hat_k(x)``, piecewise linear in one feature x of the scene, free at its knots.
+
+    ``by`` another state it is proportional to that (``share_of``): with a curve without, a surface over two states.
+    """
 
     kind: ClassVar[str] = "curve"
     feature: str = "speed"
     knots: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0)
     period: float | None = None
+    by: str = ""
 
     def __post_init__(self) -> None:
-        _check("curve", self.feature, self.knots)
+        _check("curve", self.feature, self.knots, self.by)
 
     @property
     def name(self) -> str:
-        """``curve_over_`` and the feature, so that several curves fit into one simulator."""
-        return f"curve_over_{self.feature}"
+        """``curve_over_`` and the feature, so that several curves fit into one simulator; ``_by_`` and the state."""
+        return f"curve_over_{self.feature}" + (f"_by_{self.by}" if self.by else "")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -81,12 +94,17 @@ class Curve(Effect):
 
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return the curve's acceleration (m/s²)."""
-        return curve(feature_of(scene, driver, self.feature, self.period), p, "knot", self.knots, self.period)
+        x = feature_of(scene, driver, self.feature, self.period)
+        c = curve(x, p, "knot", self.knots, self.period)
+        return c * share_of(scene, driver, self.by) if self.by else c
 
 
 @dataclass(frozen=True)
 class DriverCurve(Effect):
-    """One driver parameter times ``1 + Σ c_k hat_k(x)`` over one feature x: T(x), v0(t) and their kin."""
+    """One driver parameter times ``1 + Σ c_k hat_k(x)`` over one feature x: T(x), v0(t) and their kin.
+
+    ``by`` is that of ``Curve``.
+    """
 
     kind: ClassVar[str] = "driver_curve"
     rank: ClassVar[int] = 3
@@ -94,16 +112,17 @@ class DriverCurve(Effect):
     feature: str = "position"
     knots: tuple[float, ...] = (0.0, 500.0, 1000.0)
     period: float | None = None
+    by: str = ""
 
     def __post_init__(self) -> None:
-        _check("driver_curve", self.feature, self.knots)
+        _check("driver_curve", self.feature, self.knots, self.by)
         if self.target not in Driver._fields:
             raise ValueError(f"driver_curve.target = '{self.target}' is unknown.{nearest(self.target, Driver._fields)}")
 
     @property
     def name(self) -> str:
-        """The target, ``_over_`` and the feature."""
-        return f"{self.target}_over_{self.feature}"
+        """The target, ``_over_`` and the feature, ``_by_`` and the state."""
+        return f"{self.target}_over_{self.feature}" + (f"_by_{self.by}" if self.by else "")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -116,4 +135,5 @@ class DriverCurve(Effect):
         """Return the driver with the target parameter changed."""
         x = feature_of(scene, driver, self.feature, self.period)
         change = curve(x, p, "knot", self.knots, self.period)
+        change = change * share_of(scene, driver, self.by) if self.by else change
         return driver._replace(**{self.target: getattr(driver, self.target) * (1.0 + change)})

@@ -56,6 +56,14 @@ def places(records: Records) -> dict[str, tuple[Term, tuple[float, ...]]]:
         "push over speed": (terms.curve("acceleration", "speed", 0.0, 5.0, 5), (0.3, -0.2, 0.1, 0.2, -0.1)),
         "push over closing speed": (terms.curve("acceleration", "closing_speed", -1.0, 1.0, 3), (0.3, -0.2, 0.2)),
         "T over relative gap": (terms.curve("time_gap", "relative_gap", 0.6, 0.3, 4), (0.3, -0.2, 0.2, 0.1)),
+        "T over gap by closing speed": (
+            terms.curve("time_gap", "gap", 8.0, 8.0, 4, by="closing_speed"),
+            (0.3, -0.2, 0.2, 0.1),
+        ),
+        "push over speed by gap": (
+            terms.curve("acceleration", "speed", 5.0, 5.0, 3, by="relative_gap"),
+            (0.3, -0.2, 0.2),
+        ),
         "push over phase": (terms.curve("acceleration", "time", 0.0, 4.0, 4, 16.0), (0.3, -0.2, 0.1, 0.2)),
     }
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from idm_env.discovery.score import westfall_young
+from idm_env.discovery.score import rivals, westfall_young
 
 
 def test_it_seldom_finds_what_is_not_there() -> None:
@@ -33,3 +33,13 @@ def test_a_tiny_gain_in_all_runs_is_weighed_down() -> None:
     random = np.random.default_rng(2)
     others = 0.02 * random.standard_normal((30, 8))
     assert westfall_young(np.concatenate([others, np.full((1, 8), 1e-6)])).p_value[-1] > 0.5
+
+
+def test_a_rival_gains_beyond_chance_and_not_less_than_the_winner() -> None:
+    random, run = np.random.default_rng(3), np.repeat(np.arange(8), 3)
+    common = 0.1 * random.random(24)
+    winner, near, half = (share + common + 0.01 * random.standard_normal(24) for share in (0.2, 0.2, 0.1))
+    chance, wide = (spread * random.standard_normal(24) for spread in (0.01, 1.0))
+    gains = np.stack([half, chance, winner, near, wide])
+    assert rivals(gains, 2, run) == [3]
+    assert rivals(gains[:, :3], 2, run[:3]) == []  # of a single run nothing is beyond chance

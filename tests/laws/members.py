@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import ALL, IDM, Brakes, CarFollowing, Curve, DriverCurve, Effect, Grade, PerceptionNoise, Wander
-from idm_env.effects.free import FEATURES
+from idm_env.effects.free import FEATURES, PER
 from idm_env.roads import Lane, Ring, Road
 from idm_env.roads.merging import MERGER_GAP, MERGER_SPEED
 from idm_env.simulator import Simulator
@@ -26,6 +26,7 @@ MEMBERS: list[Effect] = [
     Wander(of="min_gap"),
     PerceptionNoise(signal="closing_speed"),
     *(Curve(feature=f, knots=(-1.0, 3.0, 8.0, 15.0)) for f in FEATURES),
+    *(kind(feature="gap", by=state) for kind, state in zip((Curve, DriverCurve) * 3, PER, strict=False)),
     *(DriverCurve(target=t) for t in ("desired_speed", "max_accel", "comfort_decel", "min_gap")),
 ]
 
