@@ -15,7 +15,7 @@ from idm_env.trajectories import baselines, paper
 from idm_env.trajectories.drivers import parameter_rows
 from idm_env.trajectories.recipe import Filtered, clock_of, nearest, overlaps, recipe
 from idm_env.trajectories.scores import RegularMotion, Tally
-from idm_env.trajectories.smoother import SPARSE, Choices, PositionNoise
+from idm_env.trajectories.smoother import SPARSE, PositionNoise, SmootherOptions
 from idm_env.trajectories.tracks import TrackPiece
 
 Recipe = Literal["default", "paper"]
@@ -62,9 +62,9 @@ class FilePlan:
     seconds: float
 
     @property
-    def choices(self) -> Choices:
+    def options(self) -> SmootherOptions:
         """Dense samples are reweighted for outliers and bursts, sparse ones are not."""
-        return Choices() if self.dense else SPARSE
+        return SmootherOptions() if self.dense else SPARSE
 
 
 def done(
@@ -87,7 +87,7 @@ def done(
         seconds, calibration = time.perf_counter() - begin, 0.0
     else:
         assert plan.noise is not None
-        filtered = recipe(tracks, plan.dt, plan.noise, plan.choices, recent) if tracks else []
+        filtered = recipe(tracks, plan.dt, plan.noise, plan.options, recent) if tracks else []
         seconds = time.perf_counter() - begin
         on_stage(1 / stages, "drivers' parameters")
         rows = [] if settings.fixed_parameters else parameter_rows(filtered, recent, settings.model)

@@ -36,7 +36,7 @@ def score(spool: Spool, plan: FilePlan, settings: FilterSettings) -> list[dict[s
     if plan.noise is None:
         ours = [f.motion for f in paper.imitate(halves, plan.dt, fixed_parameters=settings.fixed_parameters)]
     else:
-        ours = [f.motion for f in recipe(list(halves), plan.dt, plan.noise, plan.choices)]
+        ours = [f.motion for f in recipe(list(halves), plan.dt, plan.noise, plan.options)]
     motions = {OURS[settings.recipe]: ours}
     for name in baselines.available() if settings.baselines else ():
         motions[name] = [baselines.run(name, t.time_s, t.position_m, clock_of(t, plan.dt)) for t in halves]

@@ -14,7 +14,7 @@ import torch
 
 from idm_env.trajectories.imagined import Driven, drive
 from idm_env.trajectories.scores import RegularMotion
-from idm_env.trajectories.smoother import Choices, PositionNoise, Smoothed, TrackObservations, smooth
+from idm_env.trajectories.smoother import PositionNoise, Smoothed, SmootherOptions, TrackObservations, smooth
 from idm_env.trajectories.tracks import TrackPiece
 
 SMALLEST_GAP_M = 0.1
@@ -94,7 +94,7 @@ def recipe(
     tracks: Sequence[TrackPiece],
     dt: float,
     noise: PositionNoise,
-    choices: Choices = Choices(),  # noqa: B008
+    options: SmootherOptions = SmootherOptions(),  # noqa: B008
     before: Sequence[Filtered] = (),
 ) -> list[Filtered]:
     """Return the filtered tracks: smooth, keep apart, and drive through the simulator.
@@ -107,13 +107,13 @@ def recipe(
         TrackObservations.of(track.time_s, track.position_m, dt, len(clock))
         for track, clock in zip(tracks, clocks, strict=True)
     ]
-    smoothed = _smoothed(observed, noise, choices)
+    smoothed = _smoothed(observed, noise, options)
     around = Neighbourhood(
         [*tracks, *(f.track for f in before)], [*clocks, *(f.motion.time_s for f in before)]
     )  # fmt: skip
     meetings = list(around.meetings())
     fixed = [f.motion.position_m for f in before]
-    driven = _driven(smoothed, dt, choices)
+    driven = _driven(smoothed, dt, options)
     for _ in range(MOST_ROUNDS):
         positions = [*(d.position for d in driven), *fixed]
         ties = _ties(meetings, around, positions, len(tracks))
@@ -123,8 +123,8 @@ def recipe(
         for i in changed:
             for steps, value in ties[i]:
                 observed[i] = observed[i].bounded(steps, 0, value)
-            smoothed[i] = smooth(observed[i], noise, choices)
-        again = _driven([smoothed[i] for i in changed], dt, choices)
+            smoothed[i] = smooth(observed[i], noise, options)
+        again = _driven([smoothed[i] for i in changed], dt, options)
         for i, d in zip(changed, again, strict=True):
             driven[i] = d
     gaps = [np.full(len(clock), np.nan) for clock in around.clocks]
@@ -140,17 +140,17 @@ def recipe(
     ]  # fmt: skip
 
 
-def _smoothed(observed: Sequence[TrackObservations], noise: PositionNoise, choices: Choices) -> list[Smoothed]:
+def _smoothed(observed: Sequence[TrackObservations], noise: PositionNoise, options: SmootherOptions) -> list[Smoothed]:
     """Fit every track, on as many threads as torch has; the compiled loops release the interpreter lock."""
     threads = min(torch.get_num_threads(), len(observed))
     if threads < 2:
-        return [smooth(o, noise, choices) for o in observed]
+        return [smooth(o, noise, options) for o in observed]
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(lambda o: smooth(o, noise, choices), observed))
+        return list(pool.map(lambda o: smooth(o, noise, options), observed))
 
 
-def _driven(smoothed: Sequence[Smoothed], dt: float, choices: Choices) -> list[Driven]:
-    return drive([(s.position, s.speed, s.accel) for s in smoothed], dt, choices.highest, choices.lowest)
+def _driven(smoothed: Sequence[Smoothed], dt: float, options: SmootherOptions) -> list[Driven]:
+    return drive([(s.position, s.speed, s.accel) for s in smoothed], dt, options.highest, options.lowest)
 
 
 def _gap(m: Meeting, around: Neighbourhood, positions: Sequence[np.ndarray]) -> np.ndarray:

@@ -49,8 +49,8 @@ class PositionNoise:
 
 
 @dataclass(frozen=True)
-class Choices:
-    """Static choices of the smoother.
+class SmootherOptions:
+    """Static options of the smoother.
 
     ``rounds`` of reweighting; ``degrees`` of freedom of the positions' Student-t noise (None for normal noise);
     ``jerk_degrees`` and ``window`` (s): weight, in samples, of the prior variance of the jerk against that over a
@@ -66,7 +66,7 @@ class Choices:
     lowest: float = -8.0
 
 
-SPARSE = Choices(rounds=1, degrees=None, jerk_degrees=None)
+SPARSE = SmootherOptions(rounds=1, degrees=None, jerk_degrees=None)
 """For sparse samples, among which outliers cannot be told."""
 
 
@@ -143,37 +143,37 @@ def log_likelihood(observed: TrackObservations, noise: PositionNoise, inflated: 
     )  # fmt: skip
 
 
-def smooth(observed: TrackObservations, noise: PositionNoise, choices: Choices = Choices()) -> Smoothed:
+def smooth(observed: TrackObservations, noise: PositionNoise, options: SmootherOptions = SmootherOptions()) -> Smoothed:
     """Return the most likely motion of a track, reweighted for outliers and bursts, within its bounds.
 
     Bounds (no reverse, accelerations between ``lowest`` and ``highest``) enter as an active set: where the motion
     breaks one, it is tied to it, until none is broken by more than what rounding and a final clip take away.
     """
-    mean, cov, push = _fitted(observed, noise, choices, None)
+    mean, cov, push = _fitted(observed, noise, options, None)
     for _ in range(6):
-        broken = _broken(mean, choices)
+        broken = _broken(mean, options)
         if not any(len(steps) for steps, _, _ in broken):
             break
         for steps, which, value in broken:
             observed = observed.bounded(steps, which, np.full(len(steps), value))
-        mean, cov, push = _fitted(observed, noise, choices, push)
+        mean, cov, push = _fitted(observed, noise, options, push)
     sigma = np.sqrt(np.maximum(np.einsum("kii->ki", cov)[:, :3], 0.0))
     return Smoothed(
         mean[:, 0] + observed.origin, mean[:, 1], mean[:, 2], sigma, log_likelihood(observed, noise)
     )  # fmt: skip
 
 
-def _broken(mean: np.ndarray, choices: Choices) -> list[tuple[np.ndarray, int, float]]:
+def _broken(mean: np.ndarray, options: SmootherOptions) -> list[tuple[np.ndarray, int, float]]:
     speed, accel = mean[:, 1], mean[:, 2]
     return [
         (np.flatnonzero(speed < -0.01), 1, 0.0),
-        (np.flatnonzero(accel > choices.highest + 0.01), 2, choices.highest),
-        (np.flatnonzero(accel < choices.lowest - 0.01), 2, choices.lowest),
+        (np.flatnonzero(accel > options.highest + 0.01), 2, options.highest),
+        (np.flatnonzero(accel < options.lowest - 0.01), 2, options.lowest),
     ]
 
 
 def _fitted(
-    observed: TrackObservations, noise: PositionNoise, choices: Choices, push: np.ndarray | None
+    observed: TrackObservations, noise: PositionNoise, options: SmootherOptions, push: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean [K, 4], covariance [K, 4, 4] and the variances of the jerk, fitted unless they are given."""
     start, spread = observed.start()
@@ -183,11 +183,11 @@ def _fitted(
     variance = np.where(observed.measured, white, TIGHT)
     mean, cov = np.empty((observed.steps, N)), np.empty((observed.steps, N, N))
     square = np.empty(observed.steps)
-    rounds = choices.rounds if push is None else 2
-    adapting = push is None and choices.jerk_degrees is not None
+    rounds = options.rounds if push is None else 2
+    adapting = push is None and options.jerk_degrees is not None
     if push is None:
         push = np.full(observed.steps, scale)
-    half = max(1, round(0.5 * choices.window / observed.dt))
+    half = max(1, round(0.5 * options.window / observed.dt))
     for turn in range(rounds):
         loops.smooth(
             observed.at, observed.look, observed.value, variance, start, spread, observed.dt,
@@ -195,11 +195,11 @@ def _fitted(
         )  # fmt: skip
         if turn == rounds - 1:
             break
-        if choices.degrees is not None:
+        if options.degrees is not None:
             loops.reweigh(
-                observed.at, observed.look, observed.value, mean, cov, white, choices.degrees, observed.measured,
+                observed.at, observed.look, observed.value, mean, cov, white, options.degrees, observed.measured,
                 variance,
             )  # fmt: skip
-        if adapting and choices.jerk_degrees is not None:
-            loops.adapt(square, push, half, choices.jerk_degrees, scale)
+        if adapting and options.jerk_degrees is not None:
+            loops.adapt(square, push, half, options.jerk_degrees, scale)
     return mean, cov, push

@@ -14,13 +14,20 @@ from idm_env.trajectories.imagined import CAPABLE, drive
 from idm_env.trajectories.noise import fit_noise
 from idm_env.trajectories.recipe import Filtered, clock_of, overlaps, recipe
 from idm_env.trajectories.scores import RegularMotion, Tally
-from idm_env.trajectories.smoother import SPARSE, Choices, PositionNoise, TrackObservations, log_likelihood, smooth
+from idm_env.trajectories.smoother import (
+    SPARSE,
+    PositionNoise,
+    SmootherOptions,
+    TrackObservations,
+    log_likelihood,
+    smooth,
+)
 from idm_env.trajectories.spool import read_table
 from idm_env.trajectories.tracks import Pieces, TrackPiece
 from idm_env.types import Driver
 from tests.trajectories.tracks import swinging, track_of
 
-PLAIN = Choices(rounds=1, jerk_degrees=None)
+PLAIN = SmootherOptions(rounds=1, jerk_degrees=None)
 
 
 def correlated(rng: np.random.Generator, count: int, sigma: float = 0.28, time: float = 0.28) -> np.ndarray:
