@@ -106,7 +106,7 @@ class Model:
     def params(
         self, driver: str | None = None, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> dict[str, dict[str, Tensor]]:
-        """Return the parameters as scalar tensors, those of one driver where he is named.
+        """Return the parameters as tensors of shape ``()``, those of one driver where he is named.
 
         ValueError for a driver who is not in the model.
         """

@@ -397,7 +397,11 @@ def test_a_public_function_that_raises_says_what() -> None:
     assert not silent
 
 
-SHAPE = r"\[[^\]]*\]|``\([^)]*\)``|[Ss]hape|elementwise|\beach vehicle|\b(?:per|one for|one per) (?:vehicle|row|driver)"
+SHAPE = (
+    r"(?<!\w)\[(?![-−0]|[^\]]*\.\d)[^\]\"']*\]|``\([^)]*\)``|[Ss]hape|elementwise|\beach vehicle"
+    r"|\b(?:per|one for|one per) (?:vehicle|row|driver)"
+)
+"""Brackets after a name are an element of it, and those from 0, a negative number or to a fraction an interval."""
 WITHOUT_SHAPES = 28
 """Public functions with tensors or arrays of which nothing says a shape; the number may be lowered, and not raised."""
 

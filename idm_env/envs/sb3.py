@@ -23,6 +23,7 @@ class SB3VecEnv(VecEnv):
     SB3 resets within the step and expects the last observation of an episode in ``info["terminal_observation"]`` and,
     where it was cut off rather than ended, ``info["TimeLimit.truncated"]``. So the vector must be in mode
     ``"SameStep"``, the default, or ``"Disabled"``, in which case this adapter resets.
+    Arrays have the shape ``(environments, …)``; rewards and dones are ``(environments,)``.
 
     Raises:
         ValueError: For a vector in mode ``"NextStep"`` or with torch output.

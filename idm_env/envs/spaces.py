@@ -29,7 +29,7 @@ def observation_box(task: Task, dtype: torch.dtype, agents: int) -> Box:
 
 
 def action_space(task: Task, agents: int) -> Space[np.ndarray]:
-    """Return the space of the actions of ``agents`` agents: float32, exactly [−1, 1], or whole numbers of levels."""
+    """Return the space of actions ``(agents · commands,)``: float32, exactly [−1, 1], or whole numbers of levels."""
     if task.levels is not None:
         return MultiDiscrete(np.repeat(task.levels, agents))
     return Box(-1.0, 1.0, (agents * len(task.commands),), np.float32)

@@ -126,8 +126,8 @@ def prepared(
     """Return the compiled rollouts of these drivers, or why there are none.
 
     ``state`` is a start (its form counts, not its numbers); ``records`` are position (m), speed (m/s), acceleration
-    (m/s²) and, where vehicles come and go, presence of all vehicles, (steps + 1, rows, vehicles), the start first;
-    ``inputs`` those of the simulator, (steps, rows, vehicles) each. ``driver`` is the one vehicle that is no record.
+    (m/s²) and, where vehicles come and go, presence of all vehicles, [steps + 1, rows, vehicles], the start first;
+    ``inputs`` those of the simulator, [steps, rows, vehicles] each. ``driver`` is the one vehicle that is no record.
     """
     if type(simulator.road) is not Lane:
         return f"the road is {type(simulator.road).__name__}; drivers behind records know Lane"

@@ -101,7 +101,7 @@ class Order(NamedTuple):
 
 
 def laps(position: Tensor, leader: Tensor, ring: float) -> Tensor:
-    """Return what has to be added to ``position[leader] − position`` on a ring, in whole laps (m).
+    """Return what has to be added to ``position[leader] − position`` on a ring, in whole laps (m), elementwise.
 
     The leader is less than a lap ahead; who follows himself is a lap behind himself.
     """
@@ -112,7 +112,7 @@ def laps(position: Tensor, leader: Tensor, ring: float) -> Tensor:
 
 
 def missing(way: Tensor, other: Tensor, position: Tensor, ring: float) -> Tensor:
-    """Return the laps (m) by which ``position[other] − position`` falls short of the way that is known (m)."""
+    """Return the laps (m), elementwise, by which ``position[other] − position`` falls short of a known ``way`` (m)."""
     plain = position.detach().double()
     return (ring * ((way - (plain.gather(-1, other) - plain)) / ring).round()).to(position.dtype)
 

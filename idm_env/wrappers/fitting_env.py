@@ -17,9 +17,9 @@ from idm_env.wrappers.fitting import ParameterFitting
 class FittingEnv(gymnasium.Env):
     """``gym.make("DiffIDM-Fit-v0", trajectories="pairs.parquet", task="ring", …)``: one step, one guess.
 
-    Action: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean square
-    residual. Observation: the last guess, zeros at first. Info: its ``parameters`` by full name, after a reset also
-    their ``bounds``, what [−1, 1] spans, and after a step their ``root_mean_squared_error``. Episodes have one step.
+    Action ``(free,)``: every free parameter, scaled from its bounds to [−1, 1] (clipped). Reward: minus the root mean
+    square residual. Observation: the last guess, zeros at first. Info: its ``parameters`` by full name, after a reset
+    also their ``bounds``, what [−1, 1] spans, and after a step ``root_mean_squared_error``. Episodes have one step.
     ``free`` and ``objective`` are those of ``ParameterFitting``, with one set of parameters for all drivers; all other
     keywords make the environment whose drivers are fitted.
 

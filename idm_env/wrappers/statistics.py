@@ -66,7 +66,10 @@ class NormalizeObservation(gymnasium.Wrapper):
 
 
 class RecordEpisodeStatistics(gymnasium.Wrapper):
-    """Add ``info["episode"]`` with the return ``r`` and the length ``l`` at the end of an episode."""
+    """Add ``info["episode"]`` with the return ``r`` and the length ``l`` at the end of an episode.
+
+    Observations keep the shape of the environment's ``observation_space``.
+    """
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
@@ -88,7 +91,7 @@ class RecordEpisodeStatistics(gymnasium.Wrapper):
 
 
 class VectorNormalizeObservation(VectorWrapper):
-    """Normalise the observations of a vector by running moments, ``info["final_obs"]`` included."""
+    """Normalise the observations of a vector ``(environments, …)`` by running moments, ``final_obs`` included."""
 
     def __init__(self, env: VectorEnv, epsilon: float = 1e-8) -> None:
         super().__init__(env)
@@ -115,7 +118,7 @@ class VectorNormalizeObservation(VectorWrapper):
 
 
 class VectorRecordEpisodeStatistics(VectorWrapper):
-    """Add ``info["episode"]`` with returns ``r`` and lengths ``l`` (tensors), valid where ``info["_episode"]``."""
+    """Add ``info["episode"]``: returns ``r``, lengths ``l`` ``(environments,)``, valid where ``info["_episode"]``."""
 
     def __init__(self, env: VectorEnv) -> None:
         super().__init__(env)
