@@ -36,7 +36,8 @@ The scene tells a part of drivers' noise, too: of six sets without an effect, no
 class Ladder:
     """Errors 5 s ahead (m) by rung, the squared error's parts, and the share that is structure with its 95 % interval.
 
-    Parts add up to 1, that is to the squared error of drivers with their own parameters.
+    Parts add up to 1, that is to the squared error of drivers with their own parameters. Drift is what a driver's other
+    errors foresee. What is ``not foreseen`` is new in these 5 s, or nothing that a smooth function of the scene tells.
     """
 
     rungs: dict[str, float]
@@ -74,11 +75,18 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
     rungs |= {name: _rmse(what) for name, what in left.items()} | {"sensors alone": floor_m}
     structure = _share(rows, left["drift followed"], left["smooth function of the scene"], error)
     total = _rmse(models[own].ahead) ** 2
-    named = max(1.0 - _rmse(error) ** 2 / total, 0.0)
-    sensors = min(floor_m**2 / total, 1.0)
-    unnamed = min(max(structure[0], 0.0) * _rmse(error) ** 2 / total, max(1.0 - sensors - named, 0.0))
-    parts = {"sensors": sensors, "drift": max(1.0 - sensors - named - unnamed, 0.0), "named": named}
-    return Ladder(rungs, parts | {"structure without a name": unnamed}, structure)
+    taken = {
+        "sensors": floor_m**2,
+        "added": total - _rmse(error) ** 2,
+        "structure without a name": structure[0] * _rmse(error) ** 2,
+        "drift": _rmse(error) ** 2 - _rmse(rest) ** 2,
+    }
+    parts, room = {}, 1.0
+    for name, square in taken.items():
+        parts[name] = min(max(square / total, 0.0), room)
+        room -= parts[name]
+    order = ("sensors", "drift", "added", "structure without a name")
+    return Ladder(rungs, {name: parts[name] for name in order} | {"not foreseen": room}, structure)
 
 
 def corrected(rows: Rows, error: np.ndarray, plain: np.ndarray, smooth: np.ndarray | None, seed: int) -> np.ndarray:

@@ -124,10 +124,11 @@ def _ladder(r: dict[str, Any]) -> Iterator[Block]:
     if ladder is None:
         return
     parts = ladder["parts"]
+    colours = ("#bbbbbb", "#8fb8de", "#7bc47f", "#e39b6f", "#e8e8e8")
     bar = "".join(
         f'<span style="display:inline-block;overflow:hidden;white-space:nowrap;height:1.6em;width:{100 * share:.2f}%;'
         f'background:{colour}" title="{name} {share:.0%}">&nbsp;{name if share > 0.15 else ""}</span>'
-        for (name, share), colour in zip(parts.items(), ("#bbbbbb", "#8fb8de", "#7bc47f", "#e39b6f"), strict=True)
+        for (name, share), colour in zip(parts.items(), colours, strict=True)
     )
     told = " · ".join(f"{name} {percent(share)}" for name, share in parts.items())
     yield pages.html(f'<div role="img" aria-label="{told}" style="line-height:1.6em">{bar}</div>')
