@@ -10,18 +10,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from idm_env.data import DataError
 from idm_env.discovery import free, judge
 from idm_env.discovery.calibrate import first_prior, population
 from idm_env.discovery.free import GRID_S, further
 from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.noise import Noise
-from idm_env.discovery.records import Records, Rows, whole, windows
+from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.score import without
 from idm_env.discovery.solve import Prior, Solution, Task, solve
 
 FOLDS = 4
 POOLED_S = free.ENDS_S[1]
 """Weight (s) of the population at which every driver is its middle."""
+FURTHER_S = 10.0
+"""The longer horizon of predictions, whose windows must lie in a block that drivers were not fitted to."""
 CLEARLY = 1.1
 """Ratio of errors beyond which whitened predictions do not serve: on short records they do not tell a set-point."""
 EMPTY = np.zeros(0)
@@ -121,11 +124,27 @@ def crossed(
     task = Task(short, noise.alike(len(short)), first_prior(own))
     ahead = _predicted(task, model, values, fold, thetas)
     if whitened is not False and not pooled:
-        other = _predicted(task, model, values, fold, _whitened(task, model, values, fold, theta))
+        others = _whitened(task, model, values, fold, theta)
+        other = _predicted(task, model, values, fold, others)
         left = [_loss(np.bincount(short.group, x**2)[np.unique(short.group)]) ** 0.25 for x in (ahead, other)]
         whitened = bool(whitened or left[1] < CLEARLY * left[0])
-        ahead = other if whitened else ahead
-    return judge.Judged(rows, gap, speed, ahead, short.record, bool(whitened))
+        ahead, thetas = (other, others) if whitened else (ahead, thetas)
+    longer = _in_blocks(records)
+    further = EMPTY if longer is None else _predicted(Task(longer, None, task.prior), model, values, fold, thetas)
+    return judge.Judged(rows, gap, speed, ahead, short.record, bool(whitened), further)
+
+
+def _in_blocks(records: Records) -> Rows | None:
+    """Return the windows of 10 s that end in the block that they begin in, or None where there are none."""
+    try:
+        rows = windows(records, FURTHER_S)
+    except DataError:
+        return None
+    since, dt = rows.start - records.first[rows.record], records.dt
+    spans = (records.bounds[1:] - records.first)[rows.record] * dt
+    sizes = np.array([block_seconds(span) for span in spans])
+    inside = ((since + rows.steps) * dt // sizes).astype(int) == rows.block
+    return rows.some(inside) if inside.any() else None
 
 
 def at_best(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import Any
 
 from idm_env.discovery.march import CURVE
@@ -13,10 +14,13 @@ from idm_env.effects.free import FEATURES, PER
 
 FILE = "found_effect.py"
 """Name of the file."""
-_HEAD = '''"""What `idm-env explain` found, and has no name for. {sentence}
+_HEAD = '''"""What `idm-env explain` found, and has no name for.
 
-In Python: `Simulator(Lane(), (IDM(), {first}(), Brakes()))`, and `effects=[{first}()]` of an environment. In a
-`model.yaml`, with the path from where the command runs: `effects: [idm, "found_effect.py:{first}", brakes]`.
+{sentence}
+
+In Python: `Simulator(Lane(), (IDM(), {first}(), Brakes()))`, and of an environment
+`effects=[{first}()]`. In a `model.yaml`, with the path from where the command runs:
+`effects: [idm, "found_effect.py:{first}", brakes]`.
 """
 
 from dataclasses import dataclass
@@ -32,7 +36,7 @@ _CLASS = '''
 class {name}(Effect):
     """{equation}: c is piecewise linear in x, the {noun} ({unit}){ends}.
 
-    95 % intervals: {intervals}.
+{intervals}
     """
 
     kind: ClassVar[str] = "{kind}"
@@ -47,10 +51,14 @@ class {name}(Effect):
     def {hook}:
         """Return {returns}."""
         x = feature_of(scene, driver, "{feature}", {period})
-        heights = [{heights}]
+        heights = [
+{heights}
+        ]
         c = interpolate(x, self.knots, heights, {period}){share}
         return {result}
 '''
+
+_DEEP: dict[str, Any] = {"initial_indent": 12 * " ", "subsequent_indent": 12 * " "}
 
 
 def source(terms: Sequence[tuple[Term, Mapping[str, Mapping[str, Any]]]], sentence: str) -> str:
@@ -65,7 +73,7 @@ def source(terms: Sequence[tuple[Term, Mapping[str, Mapping[str, Any]]]], senten
         return ""
     classes = [_class(term, parameters) for term, parameters in curves]
     features = "feature_of, share_of" if any(t.by for t, _ in curves) else "feature_of"
-    return _HEAD.format(sentence=sentence, first=_name(curves[0][0]), features=features) + "".join(classes)
+    return _HEAD.format(sentence=fill(sentence, 110), first=_name(curves[0][0]), features=features) + "".join(classes)
 
 
 def _name(term: Term) -> str:
@@ -87,19 +95,21 @@ def _class(term: Term, parameters: Mapping[str, Mapping[str, Any]]) -> str:
     intervals = ", ".join(
         f"{p.symbol} {parameters[p.name]['low']:.3g} to {parameters[p.name]['high']:.3g}" for p in term.parameters
     )
-    inner = [f'p["{p.name}"]' for p in term.parameters]
+    intervals = fill(f"95 % intervals: {intervals}.", 110, initial_indent="    ", subsequent_indent="    ")
+    inner = ", ".join(("0.0 * x", *(f'p["{p.name}"]' for p in term.parameters), "0.0 * x"))
     ends, share = ", and 0 beyond its ends", ""
     if term.by:
         ends += f", times the {ALONG[term.by]} over {PER[term.by]:g} {FEATURES[term.by]}, −2 to 2"
         share = f' * share_of(scene, driver, "{term.by}")'
     added = term.what == "acceleration"
+    knots = tuple(float(f"{first + distance * i:.8g}") for i in range(count))
     changed = ", ".join(f"{n}=driver.{n} * (1.0 + c)" for n in TARGETS.get(term.what, ()))
     return _CLASS.format(
         name=_name(term), equation=CHANGES[term.what][3].replace("k", "c"), noun=ALONG[term.coordinate],
         unit=FEATURES[term.coordinate], ends=ends, share=share, intervals=intervals,
         kind=f"found_{_kind(term)}", title=f"{CHANGES[term.what][2]} by {ALONG[term.coordinate]}",
-        what=term.what, knots=tuple(float(first + distance * i) for i in range(count)), declared="\n".join(declared),
+        what=term.what, knots=knots, declared="\n".join(declared),
         hook="accelerate(self, scene, driver, p)" if added else "adapt(self, driver, scene, p)",
         returns="c (m/s²)" if added else "the driver in force", feature=term.coordinate, period=term.period or None,
-        heights=", ".join(("0.0 * x", *inner, "0.0 * x")), result="c" if added else f"driver._replace({changed})",
+        heights=fill(inner, 110, **_DEEP), result="c" if added else f"driver._replace({changed})",
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,6 +32,8 @@ class Judged:
     ahead_record: np.ndarray
     whitened: bool = False
     """Whether predictions 5 s ahead have drivers calibrated on whitened predictions, and not on the simulation."""
+    further: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """Errors of the gap 10 s ahead [windows of 10 s] with the drivers of those 5 s ahead; empty on short blocks."""
 
     @cached_property
     def gap_error(self) -> np.ndarray:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from idm_env.discovery.judge import Judged
@@ -43,6 +44,8 @@ class Ladder:
     rungs: dict[str, float]
     parts: dict[str, float]
     structure: tuple[float, float, float]
+    others: dict[str, dict[str, float]]
+    """By rung, where it has them: the gap's error in closed-loop simulation, 10 s ahead, and the CRPS 5 s ahead (m)."""
 
     @property
     def is_structured(self) -> bool:
@@ -86,7 +89,29 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
         parts[name] = min(max(square / total, 0.0), room)
         room -= parts[name]
     order = ("sensors", "drift", "added", "structure without a name")
-    return Ladder(rungs, {name: parts[name] for name in order} | {"not foreseen": room}, structure)
+    ahead = {name: judged.ahead for name, judged in models.items()} | left
+    others = {
+        "free_m": {name: judged.summary()["gap_rmse_m"] for name, judged in models.items()},
+        "ten_s_m": {name: _rmse(judged.further) for name, judged in models.items() if len(judged.further)},
+        "crps_m": {name: _crps(rows, what) for name, what in ahead.items()},
+    }
+    return Ladder(rungs, {name: parts[name] for name in order} | {"not foreseen": room}, structure, others)
+
+
+def _crps(rows: Rows, error: np.ndarray) -> float:
+    """Return the mean CRPS (m) of normal forecasts [W] as wide as the driver's errors in his other blocks.
+
+    ``σ (z (2 Φ(z) − 1) + 2 φ(z) − 1/√π)`` with ``z = error / σ`` (Gneiting and Raftery 2007). All drivers' width counts
+    as four windows of each one's own.
+    """
+    half, total = rows.block % 2, np.zeros((2, int(rows.group.max()) + 1))
+    count = np.zeros_like(total)
+    np.add.at(total, (half, rows.group), error**2)
+    np.add.at(count, (half, rows.group), 1.0)
+    others = 1 - half, rows.group
+    wide = np.sqrt((total[others] + 4.0 * np.mean(error**2)) / (count[others] + 4.0)) + 1e-9
+    z = error / wide
+    return float(np.mean(wide * (z * (2.0 * normal.cdf(z) - 1.0) + 2.0 * normal.pdf(z) - np.pi**-0.5)))
 
 
 def corrected(rows: Rows, error: np.ndarray, plain: np.ndarray, smooth: np.ndarray | None, seed: int) -> np.ndarray:

@@ -24,7 +24,7 @@ class Term:
     and over which coordinate; ``form`` is NONE, CURVE or INTERVAL; ``knots`` (first, distance, count) of a curve.
     ``starts`` are values of all parameters to start a search from; ``made`` is the effect with its static choices. A
     curve that ``fades`` is nothing from a knot's distance beyond its ends on: nobody was seen there. ``by`` a
-    state it is proportional to that.
+    state it is proportional to that. Knots that are ``pinned`` stay 0: drivers' own parameters do the same.
     """
 
     label: str
@@ -41,6 +41,7 @@ class Term:
     made: Effect | None = None
     fades: bool = False
     by: str = ""
+    pinned: tuple[int, ...] = ()
 
     @property
     def size(self) -> int:
@@ -277,6 +278,10 @@ def curve(
 ) -> Term:  # fmt: skip
     """Return an unnamed piecewise-linear change of ``what`` over a coordinate, proportional to the state ``by``."""
     label = label or f"{what} curve over {coordinate}" + (f" by {by}" if by else "")
+    nearest: tuple[int, ...] = ()
+    if (what, coordinate, by) == ("time_gap", "closing_speed", ""):
+        # A straight line in Δv is another braking b, and without pins only a kink would be known of the curve.
+        nearest = tuple(sorted(range(count), key=lambda i: abs(first + distance * i))[:2])
     unit = "m/s²" if what == "acceleration" else "1"
     size = (-5.0, 5.0) if what == "acceleration" else (-0.9, 3.0)
     parameters = tuple(Parameter(f"knot_{i}", f"c{i}", unit, 0.0, *size, null=0.0) for i in range(count))
@@ -285,6 +290,7 @@ def curve(
         coordinate=coordinate, form=twin.CURVE, knots=(first, distance, count), period=period,
         smoothness=0.3 if what == "acceleration" else 0.5, fades=coordinate in STATES,
         by=by,
+        pinned=nearest,
     )  # fmt: skip
 
 

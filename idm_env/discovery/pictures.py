@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from idm_env.discovery import march as twin
 from idm_env.discovery import words
+from idm_env.effects.free import FEATURES
 from idm_env.reports.page import Block, picture
 
 if TYPE_CHECKING:
@@ -216,23 +217,11 @@ def _residual(d: Discovery) -> list[np.ndarray]:
 
 
 def features(d: Discovery) -> Figure:
-    """Binned means over speed, gap, closing speed, leader's acceleration, position and time."""
-    figure, axes = plt.subplots(2, 3, layout="constrained", figsize=(9.0, 4.8), sharey=True)
-    column = {name: i for i, name in enumerate(twin.COLUMNS)}
+    """Binned means over position, time, and every state that a shape may run over."""
+    figure, axes = plt.subplots(2, 4, layout="constrained", figsize=(10.0, 4.8), sharey=True)
+    axes[1, 3].set_axis_off()
     for mend, colour, label in zip(_residual(d), (BEFORE, AFTER), d.judgement.titles, strict=False):
-        responses = d.responses
-        rows = responses.rows
-        signals = rows.records.signals
-        second = round(1.0 / rows.records.dt)
-        at = rows.start[:, None] + second * np.arange(mend.shape[1]) + second // 2
-        c = responses.coordinates
-        closing = signals[at, column["speed"]] - signals[at, column["lead_speed"]]
-        shown = {
-            "speed (m/s)": c["speed"], "gap (m)": c["gap"], "closing speed (m/s)": closing,
-            "leader's acceleration (m/s²)": signals[at, column["lead_accel"]], "position (m)": c["position"],
-            "time (s)": c["time"],
-        }  # fmt: skip
-        for axis, (name, values) in zip(axes.ravel(), shown.items(), strict=True):
+        for axis, (name, values) in zip(axes.ravel(), d.responses.coordinates.items(), strict=False):
             edges = np.unique(np.quantile(values, np.linspace(0.01, 0.99, 17)))
             index = np.digitize(values.ravel(), edges) - 1
             centre, mean, error = [], [], []
@@ -244,7 +233,8 @@ def features(d: Discovery) -> Figure:
                     error.append(2 * float(np.std(mine)) / np.sqrt(len(mine)))
             axis.errorbar(centre, mean, error, color=colour, lw=1.1, marker=".", ms=4, label=label, capsize=0)
             axis.axhline(0, color=TRUTH, lw=0.5)
-            axis.set_xlabel(name)
+            unit = FEATURES[name]
+            axis.set_xlabel(words.ALONG[name] + ("" if unit == "1" else f" ({unit})"))
     figure.legend(handles=axes[0, 0].get_legend_handles_labels()[0], loc="outside upper left", ncols=2)
     axes[0, 0].set_ylabel("residual (m/s²)")
     axes[1, 0].set_ylabel("residual (m/s²)")

@@ -22,6 +22,8 @@ from idm_env.parameters import Parameter
 
 STEP = 1e-4
 """Relative difference by which derivatives with respect to θ are taken."""
+PINNED = 1e8
+"""Inverse variance of a knot that stays where it is."""
 LONGEST = 0.5
 """Largest step of log θ in one iteration."""
 
@@ -207,7 +209,10 @@ def prior_of(model: Hypothesis) -> np.ndarray:
     """Return the inverse variance of the prior of every entry of φ: 0 but for knots of curves."""
     if not model.entries.size:
         return np.zeros(0)
-    return np.concatenate([np.full(t.size, t.smoothness**-2.0 if t.smoothness else 0.0) for t in model.terms])
+    return np.concatenate([
+        np.where(np.isin(np.arange(t.size), t.pinned), PINNED, t.smoothness**-2.0 if t.smoothness else 0.0)
+        for t in model.terms
+    ])  # fmt: skip
 
 
 def equations(task: Task, theta: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray]:

@@ -192,7 +192,7 @@ def report(
             for key, c in errors.items()
         },
         "ladder": None if ladder is None else {
-            "rungs_m": ladder.rungs, "parts": ladder.parts, "structure": dict(
+            "rungs_m": ladder.rungs, **ladder.others, "parts": ladder.parts, "structure": dict(
                 zip(("share", "low", "high"), ladder.structure, strict=True)
             ),
         },

@@ -22,7 +22,7 @@ def climbed(records: Records, error: np.ndarray) -> ladder.Ladder:
     rows = whole(records)
     nothing = np.zeros(rows.valid.shape)
     models = {
-        name: Judged(rows, nothing, nothing, x, windows(records).record)
+        name: Judged(rows, nothing, nothing, x, windows(records).record, further=2.0 * x)
         for name, x in (("all", 2.0 * error), ("own", error))
     }
     return ladder.climb(records, models, "own", "own", 0.05, 0)
@@ -53,6 +53,10 @@ def test_what_lasts_in_a_driver_is_drift_and_no_structure(records: Records, carr
     # Of errors that carry on by 0.6 a third is foreseen by the last two; of new ones nothing.
     assert (0.2 < found.parts["drift"] < 0.45) if carry else found.parts["drift"] < 0.02
     assert found.parts["not foreseen"] > 0.5
+    assert found.others["ten_s_m"] == {name: pytest.approx(2.0 * found.rungs[name]) for name in ("all", "own")}
+    assert set(found.others["free_m"]) == {"all", "own"}
+    # Of normal errors whose width is known the CRPS is σ/√π; the width is that of some other windows of the driver.
+    assert found.others["crps_m"]["own"] == pytest.approx(found.rungs["own"] / np.pi**0.5, rel=0.05)
     assert next(iter(found.rungs)) == "all" and list(found.rungs)[-1] == "sensors alone"
 
 

@@ -47,6 +47,13 @@ def test_an_effect_without_a_name_is_a_shape(closing: Discovery) -> None:
     assert entry["effect"] is None and entry["label"] == "time_gap curve over closing_speed"
     assert report["sentence"].startswith("The time gap is ") and "closing speed of" in report["sentence"]
     assert report["helps"]["horizon_rmse_m"]["verdict"] == "better"
+    # A straight line of closing speeds is another braking: nothing below 2 m/s, and then what counts twice.
+    (first, distance, count) = closing.judgement.terms[0].knots
+    height = {
+        first + distance * i: p["estimate"] for i, p in zip(range(count), entry["parameters"].values(), strict=True)
+    }
+    assert max(abs(c) for x, c in height.items() if -2.0 < x < 2.0) < 0.06
+    assert 0.15 < np.interp(3.0, list(height), list(height.values())) < 0.35
     assert report["error"]["after"]["horizon_rmse_m"] < 0.75 * report["error"]["before"]["horizon_rmse_m"]
 
 
