@@ -74,19 +74,24 @@ class Face:
     def params(self, params: Params) -> None:
         self.batch.set_params(params)
 
-    def unroll(self, policy: Callable[[Tensor], Tensor], steps: int, push: Tensor | None = None) -> Unrolled:
+    def unroll(
+        self, policy: Callable[..., Any], steps: int, push: Tensor | None = None, hidden: Tensor | None = None
+    ) -> Unrolled:
         """Do a window of steps with a policy between them, in one call; needs ``output="torch"``.
 
-        ``policy`` maps observations ``(n, features)`` to actions ``(n, actions)``; ``push`` is added to its actions.
-        Episodes that end begin anew within the window, and gradients are cut there. A torch module of small layers
-        (linear, tanh, ReLU, ELU, SiLU, layer norm, sums and products with constants) is compiled with the steps, and
-        the window is one node of autograd, with rewards, observations and actions as outputs; what such a policy does
-        is torch's to rounding. Every other callable runs between compiled steps. Kept are the worlds of all steps.
+        ``policy`` maps observations ``(n, features)`` to actions ``(n, actions)``; ``push`` is added to its
+        actions. With ``hidden`` ``(n, …)`` it maps (observations, hidden) to (actions, hidden) as
+        ``torch.nn.GRUCell`` does; the window's own ``hidden`` is what the next one is given, and 0 where an episode
+        begins. Episodes that end begin anew within the window, and gradients are cut there. A torch module of small
+        layers (linear, tanh, ReLU, ELU, SiLU, layer norm, GRU cell, sums and products with constants), which agents may
+        share, is compiled with the steps, and the window is one node of autograd, with rewards, observations and
+        actions as outputs; what such a policy does is torch's to rounding. Every other callable runs between compiled
+        steps. Kept are the worlds of all steps.
 
         Raises:
             RuntimeError: Before the first reset.
-            ValueError: For steps below 1, numpy output, and a policy whose actions are not finite or of another shape;
-                with a compiled policy nothing has changed then.
+            ValueError: For steps below 1, numpy output, ``hidden`` of other rows, and a policy whose actions or hidden
+                numbers are not finite or of another shape; with a compiled policy nothing has changed then.
         """
         if not self.batch.begun:
             raise RuntimeError("unroll was called before reset. Call reset() first.")
@@ -97,7 +102,7 @@ class Face:
             raise ValueError(
                 f"autoreset_mode = '{mode.value}': unroll begins anew within the step. Make it with 'SameStep'."
             )
-        return unroll(self.batch, policy, whole("steps", steps, 1), push)
+        return unroll(self.batch, policy, whole("steps", steps, 1), push, hidden)
 
     def detach(self) -> None:
         """Cut the graph behind the present states, for truncated back-propagation."""

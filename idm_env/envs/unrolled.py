@@ -6,7 +6,7 @@ Shapes: rows are environments, and time comes first.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +24,8 @@ class Unrolled(NamedTuple):
     ``observation`` ``(steps + 1, n, features)`` is what the policy saw, and sees next: where an episode ended, that of
     the next one, through which no gradient flows. ``action`` ``(steps, n, actions)`` is what it did. ``reward``,
     ``terminated`` and ``truncated`` ``(steps, n)`` are those of ``step``. ``final`` ``(steps, n, features)`` is what is
-    observed after each step, before any reset.
+    observed after each step, before any reset. ``hidden`` ``(n, …)`` is what a policy with a memory remembers then, 0
+    where an episode has just begun; None of other policies.
     """
 
     observation: Tensor
@@ -33,13 +34,21 @@ class Unrolled(NamedTuple):
     terminated: Tensor
     truncated: Tensor
     final: Tensor
+    hidden: Tensor | None = None
 
 
-def unroll(batch: Batch, policy: Callable[[Tensor], Tensor], steps: int, push: Tensor | None) -> Unrolled:
+def unroll(
+    batch: Batch, policy: Callable[..., Any], steps: int, push: Tensor | None, hidden: Tensor | None
+) -> Unrolled:
     """Return a window of steps; see ``Face.unroll``. ValueError for a policy whose actions have another shape."""
     task, values = batch.task, batch.values
     shape = (batch.count, len(task.agents) * len(task.commands))
     extra = torch.zeros(shape, dtype=batch.settings.dtype) if push is None else push.expand(shape).contiguous()
+    if hidden is not None and (len(hidden) != batch.count or hidden.dtype != extra.dtype):
+        raise ValueError(
+            f"hidden has shape {tuple(hidden.shape)} and {hidden.dtype}. Give one row for each of {batch.count} "
+            f"environments, in {extra.dtype}."
+        )
     # On several lanes, and where actions are held, a window is its steps, each of which is compiled.
     fits = task.held == 1 and not (isinstance(task.road, Lanes) or task.simulator.untried)
     if fits and values is not None and dispatch.surroundings() is None:
@@ -47,7 +56,7 @@ def unroll(batch: Batch, policy: Callable[[Tensor], Tensor], steps: int, push: T
 
         try:
             batch.settle()
-            made = window.compiled(batch, values, policy, steps, extra)
+            made = window.compiled(batch, values, policy, steps, extra, hidden)
             if made is not None:
                 return Unrolled(*made)
         except Untraceable:
@@ -56,7 +65,11 @@ def unroll(batch: Batch, policy: Callable[[Tensor], Tensor], steps: int, push: T
     seen = batch.seen()
     first = [seen]
     for _ in range(steps):
-        action = policy(seen) + extra
+        if hidden is None:
+            action = policy(seen) + extra
+        else:
+            action, hidden = policy(seen, hidden)
+            action = action + extra
         if action.shape != shape or not bool(action.isfinite().all()):
             raise ValueError(
                 f"policy gives actions of shape {tuple(action.shape)}; finite ones of shape {shape} are needed."
@@ -66,7 +79,8 @@ def unroll(batch: Batch, policy: Callable[[Tensor], Tensor], steps: int, push: T
         over = np.flatnonzero((outcome.whole.terminated | outcome.whole.truncated).numpy())
         if len(over):
             seen = torch.as_tensor(batch.reset(over)).reshape(batch.count, -1)
+            hidden = None if hidden is None else hidden.index_fill(0, torch.from_numpy(over), 0.0)
         first.append(seen)
         kept.append((action, *outcome.whole, final))
     action, reward, terminated, truncated, final = (torch.stack(x) for x in zip(*kept, strict=True))
-    return Unrolled(torch.stack(first), action, reward, terminated, truncated, final)
+    return Unrolled(torch.stack(first), action, reward, terminated, truncated, final, hidden)

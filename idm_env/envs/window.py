@@ -32,45 +32,45 @@ _MANY = 1009
 class Driver:
     """A policy as compiled loops: what it does, and the vector-Jacobian product of that.
 
+    ``memory`` is the shape of what it remembers of an environment, None where it remembers nothing.
+
     Raises:
         Untraceable: For a policy of other operations than those of small networks.
         ValueError: For one that does not take these observations, or gives no actions.
     """
 
-    def __init__(self, policy: nn.Module, rows: int, width: int, actions: int, dtype: torch.dtype) -> None:
+    def __init__(
+        self, policy: nn.Module, rows: int, width: int, actions: int, dtype: torch.dtype,
+        memory: tuple[int, ...] | None = None,
+    ) -> None:  # fmt: skip
         own = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
         self.names = dict(zip(own, (f"w{i}" for i in range(len(own))), strict=True))
         self.learned = [self.names[n] for n, _ in policy.named_parameters()]
         sample = {self.names[n]: x.detach().clone() for n, x in own.items()}
         if any(x.dtype != dtype or not x.is_contiguous() for x in sample.values()):
             raise Untraceable("a policy in another precision than the environment")
-
-        try:
-            with torch.no_grad():
-                done = policy(torch.zeros(rows, width, dtype=dtype))
-        except RuntimeError as error:
-            why = str(error).splitlines()[0]
-            raise ValueError(f"policy does not take observations of shape (n, {width}): {why}.") from None
-        if not isinstance(done, Tensor) or done.shape != (rows, actions):
-            shape = tuple(done.shape[1:]) if isinstance(done, Tensor) else type(done).__name__
-            raise ValueError(f"policy gives {shape} for each observation, and {actions} actions are needed.")
+        shapes = {"seen": (width,), **({} if memory is None else {"hidden": memory})}
+        _tried(policy, {n: torch.zeros(rows, *shape, dtype=dtype) for n, shape in shapes.items()}, actions)
 
         def act(**given: Tensor) -> dict[str, Tensor]:
             weights = {n: given[short] for n, short in self.names.items()}
-            done = torch.func.functional_call(policy, weights, (given["seen"],))
-            return {"action": done + given["push"]}
+            done = torch.func.functional_call(policy, weights, tuple(given[n] for n in shapes))
+            action, *later = (done,) if memory is None else done
+            return {"action": action + given["push"], **dict(zip(["later"], later, strict=False))}
 
-        leaves = {"seen": torch.zeros(_MANY, width, dtype=dtype), "push": torch.zeros(_MANY, actions, dtype=dtype)}
+        inputs = {**shapes, "push": (actions,)}
+        leaves = {n: torch.zeros(_MANY, *shape, dtype=dtype) for n, shape in inputs.items()}
         try:
             self.forward: PolicyRows = PolicyRows(act, {**leaves, **sample}, _MANY, list(sample))
         except RuntimeError as error:  # it takes as many rows as there are environments, no more
             raise Untraceable(str(error)) from error
-        back = adjoint(act, ["action"], ["seen", *self.learned])
+        outputs = ["action"] if memory is None else ["action", "later"]
+        back = adjoint(act, outputs, [*shapes, *self.learned])
 
         def pulled(**given: Tensor) -> dict[str, Tensor]:
             return {f"to_{n}": x for n, x in back(**given).items()}
 
-        leaves["on_action"] = torch.zeros(_MANY, actions, dtype=dtype)
+        leaves |= {f"on_{n}": torch.zeros_like(x) for n, x in act(**leaves, **sample).items()}
         self.backward: PolicyRows = PolicyRows(pulled, {**leaves, **sample}, _MANY, list(sample))
 
     def weights(self, policy: nn.Module) -> dict[str, Tensor]:
@@ -79,18 +79,55 @@ class Driver:
         return {short: own[n] for n, short in self.names.items()}
 
 
+def _tried(policy: nn.Module, inputs: Mapping[str, Tensor], actions: int) -> None:
+    """Raise ValueError for a policy that does not take such inputs, or gives something else than actions."""
+    taken = " and ".join(f"{_NAMED[n]} of shape {_shape(x)}" for n, x in inputs.items())
+    try:
+        with torch.no_grad():
+            done = policy(*inputs.values())
+    except (RuntimeError, TypeError) as error:
+        why = str(error).splitlines()[0]
+        raise ValueError(f"policy does not take {taken}: {why}.") from None
+    rows = len(inputs["seen"])
+    if "hidden" in inputs:
+        hidden = inputs["hidden"]
+        if not (isinstance(done, tuple) and len(done) == 2 and _shape(done[1]) == _shape(hidden)):
+            raise ValueError(
+                f"policy gives {_shapes(done)}, and (actions, hidden of shape {_shape(hidden)}) are needed."
+            )
+        done = done[0]
+    if not isinstance(done, Tensor) or done.shape != (rows, actions):
+        raise ValueError(f"policy gives {_shapes(done)} for each observation, and {actions} actions are needed.")
+
+
+_NAMED = {"seen": "observations", "hidden": "hidden"}
+
+
+def _shape(x: Any) -> str:
+    """Return the shape of rows as errors tell it."""
+    return f"(n, {', '.join(str(n) for n in x.shape[1:])})" if isinstance(x, Tensor) else type(x).__name__
+
+
+def _shapes(done: Any) -> str:
+    if isinstance(done, tuple):
+        return f"({', '.join(_shape(x) for x in done)})"
+    return str(tuple(done.shape[1:])) if isinstance(done, Tensor) else type(done).__name__
+
+
 _DRIVERS: weakref.WeakKeyDictionary[nn.Module, dict[Any, Driver | None]] = weakref.WeakKeyDictionary()
 
 
-def driver_of(policy: Any, seen: Tensor, actions: int) -> Driver | None:
+def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None) -> Driver | None:
     """Return a policy as compiled loops, recorded once; None where it runs by torch between the steps."""
     if not isinstance(policy, nn.Module):
         return None
     kept, (rows, width), dtype = _DRIVERS.setdefault(policy, {}), seen.shape, seen.dtype
-    key = (width, actions, dtype, policy.training, tuple((n, x.shape) for n, x in policy.state_dict().items()))
+    memory = None if hidden is None else tuple(hidden.shape[1:])
+    weights = tuple((n, x.shape) for n, x in policy.state_dict().items())
+    key = (width, actions, dtype, memory, policy.training, weights)
     if key not in kept:
         try:
-            kept[key] = Driver(policy, rows, width, actions, dtype)
+            kept[key] = Driver(policy, rows, width, actions, dtype, memory)
         except Untraceable:
             kept[key] = None
     return kept[key]
@@ -123,12 +160,14 @@ def _columns(loops: RowFunction, given: Mapping[str, Any], part: slice) -> Array
 
 
 class Tape:
-    """What a window keeps: worlds before and after every step, and what was seen, done and commanded between.
+    """What a window keeps: worlds before and after every step, and what was seen, remembered, done and commanded.
 
     Everything else is computed once more backwards.
     """
 
-    def __init__(self, plan: Plan, driver: Driver, steps: int, blocks: Tensor, seen: Tensor, push: Tensor) -> None:
+    def __init__(
+        self, plan: Plan, driver: Driver, steps: int, blocks: Tensor, seen: Tensor, hidden: Tensor, push: Tensor
+    ) -> None:
         self.plan, self.driver, self.steps = plan, driver, steps
         rows, kind = plan.rows, plan.real
         self.worlds = torch.empty((steps, *blocks.shape), dtype=blocks.dtype)
@@ -136,6 +175,8 @@ class Tape:
         self.between, self.told = plan.between.take(steps)[0], plan.told.take(steps)[0]
         self.seen = np.empty((steps + 1, seen.numel()), kind)
         self.seen[0] = seen.reshape(-1).numpy()
+        self.hidden = np.empty((steps + 1, hidden.numel()), kind)
+        self.hidden[0] = hidden.reshape(-1).numpy()
         self.final = self.told["observation"].reshape(steps, -1)
         self.push = push.numpy()
         self.action = np.empty((steps, push.numel()), kind)
@@ -176,6 +217,7 @@ class Tape:
             to = {n: _each(x, part) for n, x in self.told.items()}
             to |= {n: given[n] for n in ("command", "given", "state_step", "later_state_step") if n in given}
             own = {"seen": _each(self.seen, part), "push": address(self.push), "action": given["action"]}
+            own |= {"hidden": _each(self.hidden, part), "later": _each(self.hidden[1:], part)}
             own |= {n: address(x) for n, x in weights.items()}
             acts = _columns(self.driver.forward, own, part)
             tables = (
@@ -199,6 +241,7 @@ class Tape:
                 fresh = batch.reset(over)
                 batch.settle()
                 self.seen[done] = fresh.reshape(-1).numpy()  # type: ignore[union-attr]
+                self.hidden[done].reshape(plan.rows, -1)[over] = 0.0
                 self.held.append(values.blocks)
                 if done < self.steps:
                     self.now[done] = values.blocks.data_ptr()
@@ -207,7 +250,7 @@ class Tape:
 
     def back(
         self, weights: Mapping[str, Array], on_seen: Array, on_last: Array, on_action: Array, on_reward: Array,
-        on_worlds: Array, on_past: Array,
+        on_worlds: Array, on_past: Array, on_hidden: Array,
     ) -> tuple[Array, Array, Array, Array, dict[str, Array]]:  # fmt: skip
         """Return what falls on first worlds, the past then, parameters, actions (every step), and sums of weights."""
         plan, scratch, driver = self.plan, self.plan.scratch, self.driver
@@ -218,7 +261,7 @@ class Tape:
         on_parameters = np.zeros((len(plan.kernel.program.parameters), plan.count), plan.real)
         acted = np.zeros_like(self.action)
         told, looked = np.zeros((2, self.seen.shape[1]), plan.real)
-        total = on_seen[self.steps].copy()
+        total, recalled, on_later = on_seen[self.steps].copy(), on_hidden.copy(), np.empty_like(on_hidden)
         sums = {n: np.zeros(size, plan.real) for n, size in driver.backward.sums.items()}
         moving = [i for i, n in enumerate(plan.layout.blocks) if f"end_{n}" in scratch.there]
         carried = np.array([i for i, n in enumerate(plan.layout.blocks) if n.startswith("memory_") and i not in moving])
@@ -236,6 +279,7 @@ class Tape:
             asks, tells = segment.bound.laid.back
             see = {"seen": _each(self.seen, part), "push": address(self.push), "on_action": own["on_action"]}
             see |= {n: address(x) for n, x in (*weights.items(), *sums.items())} | {"to_seen": address(looked)}
+            see |= {"hidden": _each(self.hidden, part), "on_later": address(on_later), "to_hidden": address(recalled)}
             acts = _columns(driver.backward, see, part)
             before, after = plan.recorded.backward
             window_back(
@@ -246,15 +290,16 @@ class Tape:
                 *scratch.loops, segment.at, plan.groups, segment.first % 2, segment.last - segment.first,
                 self.ends[part], self.cuts[part], two, pasts, carried.astype(np.int64), on_seen[part], on_last[part],
                 on_action[part], acted[part], told, looked, total,
+                recalled, on_later, "to_hidden" in driver.backward.outs,
             )  # fmt: skip
-        return two[0], pasts[0], on_parameters, acted, {**sums, "seen": total}
+        return two[0], pasts[0], on_parameters, acted, {**sums, "seen": total, "hidden": recalled}
 
 
 class _Window(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, tape: Tape, batch: Batch, values: Values, names: tuple[str, ...], blocks: Tensor,
-        token: Tensor | None, seen: Tensor, push: Tensor, *given: Tensor,
+        token: Tensor | None, seen: Tensor, hidden: Tensor, push: Tensor, *given: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         weights = {n: x.detach().numpy() for n, x in zip(names, given, strict=False)}
         tape.run(batch, values, weights)
@@ -263,20 +308,21 @@ class _Window(torch.autograd.Function):
         rows, steps = tape.plan.rows, tape.steps
         wanted = [x for _, x in tape.segments[0].bound.wanted]
         ctx.tape, ctx.names, ctx.shapes = tape, names, [x.shape for x in wanted]
-        ctx.save_for_backward(blocks, seen, push, *given)
+        ctx.save_for_backward(blocks, seen, hidden, push, *given)
         ctx.set_materialize_grads(False)
         shaped = (steps, rows, -1)
         return (
             values.blocks.clone(), None if token is None else token_like(token),
             torch.from_numpy(tape.seen).view(steps + 1, rows, -1), torch.from_numpy(tape.action).view(shaped),
             torch.from_numpy(tape.tell("whole_reward")).view(steps, rows), torch.from_numpy(tape.final).view(shaped),
+            torch.from_numpy(tape.hidden[-1]).view(hidden.shape),
         )  # fmt: skip
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *on: Tensor | None) -> Any:  # type: ignore[override]
         tape, plan = ctx.tape, ctx.tape.plan
-        blocks, seen, push, *given = ctx.saved_tensors
+        blocks, seen, hidden, push, *given = ctx.saved_tensors
         weights = {n: x.detach().numpy() for n, x in zip(ctx.names, given, strict=False)}
         signals = plan.slots * plan.kernel.signals
 
@@ -287,10 +333,12 @@ class _Window(torch.autograd.Function):
         on_now, on_past, on_parameters, acted, sums = tape.back(
             weights, dense(on[2], steps + 1, wide), dense(on[5], steps, wide), dense(on[3], steps, acts),
             dense(on[4], steps, plan.rows), dense(on[0], len(blocks), plan.count), dense(on[1], signals, plan.count),
+            dense(on[6], hidden.numel()),
         )  # fmt: skip
         found: list[Tensor | None] = [torch.from_numpy(on_now).view(blocks.shape)]
         found.append(torch.from_numpy(on_past) if signals else None)
         found.append(torch.from_numpy(sums["seen"]).view(seen.shape))
+        found.append(torch.from_numpy(sums["hidden"]).view(hidden.shape))
         found.append(torch.from_numpy(acted.sum(0)).view(push.shape))
         summed = tape.driver.backward.summed
         for name, x in zip(ctx.names, given, strict=False):
@@ -304,24 +352,27 @@ class _Window(torch.autograd.Function):
         return (None,) * 4 + tuple(found)
 
 
-def compiled(batch: Batch, values: Values, policy: Any, steps: int, push: Tensor) -> tuple[Tensor, ...] | None:
+def compiled(
+    batch: Batch, values: Values, policy: Any, steps: int, push: Tensor, hidden: Tensor | None
+) -> tuple[Any, ...] | None:
     """Return the fields of a window whose policy runs inside the loops, or None where it cannot."""
     seen = batch.seen()
-    driver = driver_of(policy, seen, push.shape[-1])
+    driver = driver_of(policy, seen, push.shape[-1], hidden)
     if driver is None:
         return None
     plan = values.plan((False, True), batch.task.simulator.draws)
     if plan.size > plan.extent[3]:
         return None
     first = values.blocks
-    tape = Tape(plan, driver, steps, first.detach(), seen.detach(), push.detach())
+    begun = seen.new_zeros(len(seen), 0) if hidden is None else hidden
+    tape = Tape(plan, driver, steps, first.detach(), seen.detach(), begun.detach(), push.detach())
     bound = plan.of(values.layout, batch.episode_params())
     token = values.token_of(plan)
     weights = driver.weights(policy)
     given = (*weights.values(), *(x for _, x in bound.wanted))
     kept = batch.mark()
     try:
-        out = _Window.apply(tape, batch, values, tuple(weights), first, token, seen, push, *given)
+        out = _Window.apply(tape, batch, values, tuple(weights), first, token, seen, begun, push, *given)
     except BaseException:
         batch.back_to(kept)
         raise
@@ -329,4 +380,4 @@ def compiled(batch: Batch, values: Values, policy: Any, steps: int, push: Tensor
     rows = plan.rows
     batch.saw(out[2][-1].view(rows, len(batch.task.agents), -1))
     ends, cuts = (torch.from_numpy(x.copy()) for x in (tape.ends, tape.cuts))
-    return (out[2], out[3], out[4], ends, cuts, out[5])
+    return (out[2], out[3], out[4], ends, cuts, out[5], None if hidden is None else out[6])

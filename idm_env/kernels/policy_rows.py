@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from idm_env.kernels.dense import PITCH, ROWS
-from idm_env.kernels.row_text import UNARY, loops
-from idm_env.kernels.rows import Place, RowFunction, index, storage
+from idm_env.kernels.row_text import BINARY, COMPARE, UNARY, loops
+from idm_env.kernels.rows import Place, RowFunction, index, storage, tensors
 from idm_env.scalar.record import Untraceable
 
 
@@ -55,7 +55,8 @@ def _layer_norm_back(
     normal = (x - mean) * scale
     own = g if weight is None else g * weight
     on_x = scale * (own - own.mean(-1, keepdim=True) - normal * (own * normal).mean(-1, keepdim=True))
-    return on_x, (g * normal).sum([0]) if wanted[1] else None, g.sum([0]) if wanted[2] else None
+    rows = list(range(g.dim() - 1))
+    return on_x, (g * normal).sum(rows) if wanted[1] else None, g.sum(rows) if wanted[2] else None
 
 
 _ATEN = torch.ops.aten
@@ -74,9 +75,10 @@ _SIMPLER: dict[Any, Callable[..., Any]] = {
 class PolicyRows(RowFunction):
     """``function(**inputs)``, of which those named in ``shared`` are the same for all rows.
 
-    Numbers of a block of rows lie side by side, so every loop over rows is one over vectors. An output that is a sum
-    over rows lies in one of ``sums``, arrays that are added to: ``summed`` says for each such output in which, and
-    shape, strides and offset there.
+    Rows may be several agents each: a tensor ``(rows · agents, …)`` is one ``(rows, agents, …)``. Numbers of a
+    block of rows lie side by side, so every loop over rows is one over vectors. An output that is a sum over rows
+    lies in one of ``sums``, arrays that are added to: ``summed`` says for each such output in which, and shape,
+    strides and offset there.
     """
 
     options = ', fastmath={"contract", "reassoc"}'
@@ -198,23 +200,59 @@ class PolicyRows(RowFunction):
     def _print(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> None:
         if name in ("t", "transpose") and self._turned(out):
             return
+        sources = tensors(args)
+        if any(self._known(x) for x in sources) and any(self._split(x) is not x for x in (*sources, *tensors((out,)))):
+            args, out = self._apart(name, args, out)
         if name in ("mm", "addmm"):
             self._product(name, args, kwargs, out)
         elif name == "sum" and self._known(args[0]) and self._over_rows(args, kwargs):
-            source = args[0]
-            to = self._sum(out)
-            if out.dim() > 1:
-                to = to._replace(strides=to.strides[1:])
-
-            def line(at: list[str]) -> list[str]:
-                every = f"    s = s + {self._at(source, at)}"
-                return ["s = F(0.0)", "for r in range(m):", every, f"{index(to, at)} += s"]
-
-            self._parts.append(loops(source.shape[1:], line))
+            self._total(args[0], set(args[1]), out)
         elif name in ("view", "_unsafe_view", "reshape") and storage(out) in self._whole:
             self._place(out)
         else:
             super()._print(name, args, kwargs, out)
+
+    def _split(self, x: Any) -> Any:
+        """Return a tensor of all agents behind one another with agents as its second dimension, others as they are."""
+        agents, more = divmod(x.shape[0] if isinstance(x, Tensor) and x.dim() else 0, self._rows)
+        if more or agents < 2 or storage(x) in self._whole:
+            return x
+        try:
+            return x.view(self._rows, agents, *x.shape[1:])
+        except RuntimeError as error:
+            raise Untraceable("agents that do not lie one behind another") from error
+
+    def _apart(self, name: str, args: tuple[Any, ...], out: Any) -> tuple[tuple[Any, ...], Any]:
+        """Return the arguments and results of an operation, with agents as the second dimension."""
+        plain = name.removesuffix("_")
+        arguments = [[self._split(y) for y in x] if isinstance(x, (list, tuple)) else self._split(x) for x in args]
+        split: Any = [self._split(y) for y in out] if isinstance(out, (list, tuple)) else self._split(out)
+        if plain in _ALONG and len(args) > 1:
+            dims = [args[1]] if isinstance(args[1], int) else args[1]
+            where = [d for each in dims for d in ((0, 1) if each == 0 else (each + (each > 0),))]
+            arguments[1] = where[0] if isinstance(args[1], int) else where
+        if plain in _SPREAD:
+            arguments[1:3] = tuple(split.shape), args[2] + (args[2] > 0)
+        views = all(self._known(x) for x in tensors((out,))) and not name.endswith("_")
+        if not (views or plain in {*_ALONG, *_SPREAD, *_EACH, *self.unary}):
+            raise Untraceable(f"{name} of agents one behind another")
+        return tuple(arguments), split
+
+    def _total(self, source: Tensor, gone: set[int], out: Tensor) -> None:
+        """Print a sum over rows, and over other dimensions."""
+        self._sum(out)
+        left = [d for d in range(1, source.dim()) if d not in gone]
+        shape = [source.shape[d] for d in left]
+        to, inner = self._place(out.view(shape)), sorted(gone - {0})
+
+        def line(at: list[str]) -> list[str]:
+            own = dict(zip(left, at, strict=True))
+            element = self._at(source, [own.get(d, f"k{d}") for d in range(1, source.dim())])
+            heads = [*(f"for k{d} in range({source.shape[d]}):" for d in inner), "for r in range(m):"]
+            lines = ["    " * i + head for i, head in enumerate(heads)]
+            return ["s = F(0.0)", *lines, "    " * len(heads) + f"s = s + {element}", f"{index(to, at)} += s"]
+
+        self._parts.append(loops(shape, line))
 
     def _reduce(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
         """Print a sum or a mean over the last dimension, which is added to for all rows at once."""
@@ -239,11 +277,12 @@ class PolicyRows(RowFunction):
 
     def _turned(self, x: Tensor) -> bool:
         """Return whether a tensor has its rows last."""
-        return self._known(x) and storage(x) not in self._whole and x.dim() == 2 and x.shape[-1] == self._rows
+        if not self._known(x) or storage(x) in self._whole or x.dim() != 2:
+            return False
+        return x.shape[-1] > 0 and x.shape[-1] % self._rows == 0
 
     def _over_rows(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> bool:
-        given = args[1] if len(args) > 1 else kwargs.get("dim")
-        return storage(args[0]) not in self._whole and list(given or ()) == [0]
+        return storage(args[0]) not in self._whole and len(args) > 1 and 0 in (args[1] or ())
 
     def _sum(self, x: Tensor) -> Place:
         """Give a sum over rows its array."""
@@ -260,8 +299,9 @@ class PolicyRows(RowFunction):
         a, b = args[-2:]
         if self._turned(a):
             to, (tall, wide) = self._sum(x), x.shape
-            sides = f"{self._columns(a.t())}, {tall}, {self._columns(b)}, {wide}"
-            self._parts.append([f"outer({to.array}, {to.offset}, {to.strides[0]}, {to.strides[1]}, f, {sides}, m)"])
+            for left, right in zip(self._columns(a.t()), self._columns(b), strict=True):
+                sides = f"{left}, {tall}, {right}, {wide}"
+                self._parts.append([f"outer({to.array}, {to.offset}, {to.strides[0]}, {to.strides[1]}, f, {sides}, m)"])
             return
         to, (deep, wide) = self._fresh(x), b.shape
         if not self._known(b):
@@ -272,17 +312,46 @@ class PolicyRows(RowFunction):
             raise Untraceable(f"{name} of other things than rows and weights")
         first = args[0] if name == "addmm" else 0.0
         self._parts.append(self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(first, at, 'f')}"))
-        sides = f"{self._columns(x)}, {wide}, {self._columns(a)}, {deep}, {by.array}, {by.offset}"
-        self._parts.append([f"dense(f, {sides}, {by.strides[1]}, {by.strides[0]}, m)"])
+        for own, other in zip(self._columns(x), self._columns(a), strict=True):
+            sides = f"{own}, {wide}, {other}, {deep}, {by.array}, {by.offset}"
+            self._parts.append([f"dense(f, {sides}, {by.strides[1]}, {by.strides[0]}, m)"])
 
-    def _columns(self, x: Tensor) -> str:
-        """Return the first place of a matrix of rows, and the distance of its columns."""
-        if not self._known(x) or storage(x) in self._whole or self._turned(x):
+    def _columns(self, x: Tensor) -> list[str]:
+        """Return the first place of a matrix of rows, and the distance of its columns; of every agent's."""
+        x = self._split(x)
+        if not self._known(x):
+            x = self._constant(x)
+        if storage(x) in self._whole or self._turned(x):
             raise Untraceable("a product of other things than rows")
         self._used.add(storage(x))
         place = self._place(x)
-        return f"{int(place.start.removesuffix(' + r')) + place.offset}, {place.strides[0]}"
+        first, (*between, apart) = int(place.start.removesuffix(" + r")) + place.offset, place.strides
+        agents = range(x.shape[1]) if between else (0,)
+        return [f"{first + i * between[0] if between else first}, {apart}" for i in agents]
+
+    def _constant(self, x: Tensor) -> Tensor:
+        """Return a constant that is the same for all rows as numbers of theirs."""
+        values, copied = self._table(x, self._plain(x)), x.contiguous().clone()
+        to = self._fresh(copied)
+        self._parts.append(self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {index(values, at)}"))
+        return copied
 
 
 _SHARED = re.compile(r"\b(?:in_\w+|t\d+)\[[^\[\]]*\]")
 """An element of what is the same for all rows."""
+
+_ALONG, _SPREAD = ("sum", "mean", "cat"), ("slice_backward", "select_backward")
+_EACH = {
+    *BINARY,
+    *COMPARE,
+    "where",
+    "clamp",
+    "clamp_min",
+    "clamp_max",
+    "clone",
+    "_to_copy",
+    "masked_fill",
+    "mm",
+    "addmm",
+}
+"""Operations that are told a dimension by its number, and others that all agents may do at once."""

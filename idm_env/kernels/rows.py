@@ -311,7 +311,7 @@ class RowFunction:
     # -- operations ------------------------------------------------------------------------------------------------
 
     def _print(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> None:
-        if name in _BLANK or name in _FULL or not any(self._known(x) for x in _tensors(args)):
+        if name in _BLANK or name in _FULL or not any(self._known(x) for x in tensors(args)):
             return
         if name == "sort":
             self._parts.append(self._sorted(args, kwargs, out))
@@ -579,7 +579,7 @@ class RowFunction:
         """Return how many of the last dimension's numbers are read, from the first on."""
         ends = []
         for name, args, _, _ in self._calls:
-            if any(storage(x) == storage(slots) and x.shape == slots.shape for x in _tensors(args)):
+            if any(storage(x) == storage(slots) and x.shape == slots.shape for x in tensors(args)):
                 first = name == "slice" and args[1] % slots.dim() == slots.dim() - 1 and args[2] == 0
                 ends.append(args[3] if first else slots.shape[-1])
         return max(ends, default=1)
@@ -614,7 +614,8 @@ def storage(x: Tensor) -> int:
     return x.untyped_storage().data_ptr()
 
 
-def _tensors(args: Sequence[Any]) -> list[Tensor]:
+def tensors(args: Sequence[Any]) -> list[Tensor]:
+    """Return the tensors, of any shape, among arguments and within lists of them."""
     return [x for a in args for x in (a if isinstance(a, (list, tuple)) else (a,)) if isinstance(x, Tensor)]
 
 
@@ -622,10 +623,10 @@ def _refuse_forks(calls: Sequence[Any], inputs: Sequence[Tensor]) -> None:
     """Raise Untraceable where Python has asked for a number that depends on inputs: it may have chosen by it."""
     known = {storage(x) for x in inputs}
     for name, args, _, out in calls:
-        if any(storage(x) in known for x in _tensors(args)):
+        if any(storage(x) in known for x in tensors(args)):
             if name == "_local_scalar_dense":
                 raise Untraceable("a fork on values")
-            known |= {storage(x) for x in _tensors((out,))}
+            known |= {storage(x) for x in tensors((out,))}
 
 
 def _needed(calls: Sequence[Any], found: Sequence[Tensor]) -> list[Any]:
@@ -634,7 +635,7 @@ def _needed(calls: Sequence[Any], found: Sequence[Tensor]) -> list[Any]:
     for call in reversed(calls):
         made = call[3] if isinstance(call[3], (list, tuple)) else (call[3],)
         if any(storage(x) in wanted for x in made if isinstance(x, Tensor)):
-            wanted |= {storage(x) for x in _tensors(call[1])}
+            wanted |= {storage(x) for x in tensors(call[1])}
             kept.append(call)
     return kept[::-1]
 

@@ -48,22 +48,26 @@ def window_back(
     policy, acts, before, asks, after, tells, places, strides, w, h, ah, past, newest, on_ends, on_begins, on_pasts,
     on_parameters, on_inputs, measures, phases, looks, recalls, back, sends, again, k, extent, at, groups, odd, steps,
     ends, cuts, on_worlds, past_worlds, carried, on_seen, on_last, on_acted, acted, told, looked, total,
+    recalled, on_later, remembers,
 ):  # fmt: skip
     """Do the adjoint of some steps, the last one first; ``odd`` says whether the first one's number is.
 
     ``on_worlds`` (2, blocks, vehicles) and ``past_worlds`` take turns as what falls on a world before and after a step,
     with addresses ``on_ends``, ``on_begins`` and ``on_pasts``. ``on_seen``, ``on_last`` and ``on_acted`` fall on what
     was observed and done; ``acted`` falls on actions in all, ``told`` on what was observed after a step. ``looked`` is
-    what comes from the policy, and ``total`` all that falls on what it saw. Nothing flows into another episode.
+    what comes from the policy, and ``total`` all that falls on what it saw. ``recalled`` falls on what it remembered
+    before a step (``remembers``: if anything does), ``on_later`` on that after it. Nothing flows into another episode.
     """
     rows, size, slots = extent[1], extent[2], extent[0]
-    wide, many = told.shape[0] // rows, acted.shape[1]
+    wide, many, deep = told.shape[0] // rows, acted.shape[1], on_later.shape[0] // rows
     for t in range(steps - 1, -1, -1):
         now, later = (t + odd) % 2, (t + odd + 1) % 2
         for i in range(rows):
             over = ends[t, i] or cuts[t, i]
             for j in range(i * wide, (i + 1) * wide):
                 told[j] = on_last[t, j] if over else on_last[t, j] + total[j]
+            for j in range(i * deep, (i + 1) * deep):
+                on_later[j] = 0.0 if over else recalled[j]
             if over:
                 on_worlds[later, :, i * size : (i + 1) * size] = 0
                 past_worlds[later, :, i * size : (i + 1) * size] = 0
@@ -76,6 +80,8 @@ def window_back(
         )  # fmt: skip
         for i in range(many):
             acted[t, i] += on_acted[t, i]
+        if not remembers:
+            recalled[:] = 0.0
         call_rows(policy, 0, rows, acts[t])  # type: ignore[call-arg]
         for i in range(rows * wide):
             total[i] = on_seen[t, i] + looked[i]

@@ -23,10 +23,31 @@ LAYERS = {
         nn.Tanh(),
     ],
 }  # fmt: skip
+
+
+class Recurrent(nn.Module):
+    """A policy that each agent has, with a memory of its own."""
+
+    def __init__(self, width, agents):
+        super().__init__()
+        self.scale, self.norm = nn.Parameter(torch.full((width // agents,), 0.5)), nn.LayerNorm(4)
+        self.cell, self.out = nn.GRUCell(width // agents, 4), nn.Linear(4, 1)
+
+    def forward(self, seen, hidden):
+        own = seen.unflatten(-1, (hidden.shape[1], -1)) * self.scale
+        hidden = self.cell(own.flatten(0, 1), hidden.flatten(0, 1)).view_as(hidden)
+        return torch.tanh(self.out(self.norm(hidden))).squeeze(-1), hidden
+
+
 CASES = [
     ("ring", {"warmup": 20, "max_episode_steps": 12, "failsafe": 3.0}, "all", "float32"),
     ("ring", {"warmup": 5, "effects": ["delay", "memory"], "max_episode_steps": 30}, "tanh", "float64"),
     ("follow", {"max_episode_steps": 25}, "tanh", "float64"),
+]
+REMEMBERING = [
+    ("ring", {"warmup": 20, "max_episode_steps": 12, "failsafe": 3.0}, "recurrent", "float32"),
+    ("platoon", {"max_episode_steps": 25, "controlled": 2}, "recurrent", "float64"),
+    ("ring", {"warmup": 5, "max_episode_steps": 15, "controlled": [3, 7, 9]}, "recurrent", "float64"),
 ]
 
 
@@ -37,30 +58,41 @@ def made(task, keywords, dtype, **more):
 def network(layers, env):
     torch.manual_seed(0)
     width = env.single_observation_space.shape[0]
+    if layers == "recurrent":
+        return Recurrent(width, len(env.task.agents)).to(env.settings.dtype)
     return nn.Sequential(*LAYERS[layers](width)).to(env.settings.dtype)
 
 
 def learned(env, policy, act, push):
-    """Return two windows that follow one another, and what falls on weights, pushes and a parameter of drivers."""
+    """Return two windows that follow one another, and what falls on weights, pushes and a parameter of drivers.
+
+    What a policy remembers at the beginning is a source, too, and what it remembers at the end counts.
+    """
     env.reset(seed=3)
+    hidden = None
+    if isinstance(policy, Recurrent):
+        hidden = torch.full((5, len(env.task.agents), 4), 0.1, dtype=env.settings.dtype, requires_grad=True)
     base = env.task.simulator.base.name
     scale = torch.ones((), dtype=env.settings.dtype, requires_grad=True)
     env.params = {**env.params, base: {**env.params[base], "time_gap": env.params[base]["time_gap"] * scale}}
-    windows = env.unwrapped.unroll(act, 40, push), env.unwrapped.unroll(act, 3)
+    first = env.unwrapped.unroll(act, 40, push, hidden)
+    windows = first, env.unwrapped.unroll(act, 3, hidden=first.hidden)
     loss = sum(w.reward.clamp(-20.0, 20.0).mean() + 0.1 * w.observation.sum() + w.final.mean() for w in windows)
     loss = loss + (windows[0].action ** 2).sum() + env.state.speed.sum()
     sources = [*policy.parameters(), push, scale]
+    if hidden is not None:
+        loss, sources = loss + (windows[1].hidden ** 2).sum(), [*sources, hidden]
     return windows, torch.autograd.grad(loss, sources)
 
 
-@pytest.mark.parametrize(("task", "keywords", "layers", "dtype"), CASES)
+@pytest.mark.parametrize(("task", "keywords", "layers", "dtype"), [*CASES, *REMEMBERING])
 def test_a_compiled_policy_is_one_between_steps(task, keywords, layers, dtype):
     results, close = [], 2e-6 if dtype == "float32" else 1e-9
     for compiled in (True, False):
         env = made(task, keywords, dtype)
         policy = network(layers, env)
-        push = torch.full((5, 1), 0.01, dtype=env.settings.dtype, requires_grad=True)
-        windows, found = learned(env, policy, policy if compiled else lambda seen, policy=policy: policy(seen), push)
+        push = torch.full((5, len(env.task.agents)), 0.01, dtype=env.settings.dtype, requires_grad=True)
+        windows, found = learned(env, policy, policy if compiled else lambda *seen, policy=policy: policy(*seen), push)
         name = type(windows[0].reward.grad_fn).__name__
         assert ("Window" in name) == compiled, f"the other way ran: {name}"
         assert bool((windows[0].truncated | windows[0].terminated).any())
@@ -68,8 +100,9 @@ def test_a_compiled_policy_is_one_between_steps(task, keywords, layers, dtype):
     (ours, mine, episodes), (theirs, wanted, others) = results
     assert episodes == others
     for one, other in zip(ours, theirs, strict=True):
+        assert (one.hidden is None) == (layers != "recurrent")
         for x, y in zip(one, other, strict=True):
-            torch.testing.assert_close(x, y, rtol=10 * close, atol=10 * close)
+            assert x is y is None or torch.allclose(x, y, rtol=10 * close, atol=10 * close)
     for x, y in zip(mine, wanted, strict=True):
         torch.testing.assert_close(x, y, rtol=0.0, atol=close * float(y.abs().max() + 1e-3))
 
@@ -106,6 +139,33 @@ def test_a_compiled_window_with_a_fixed_policy_is_the_loop_to_the_last_bit(task,
         seen, *rest, _ = loop.step(policy(seen))
         assert all(torch.equal(x, y[t]) for x, y in zip(rest, told[2:5], strict=True))
     assert torch.equal(seen, told.observation[40])
+
+
+class Counting(nn.Module):
+    """A policy that remembers how many steps its episode has gone on."""
+
+    def forward(self, seen, hidden):
+        hidden = hidden + 0.0625
+        return hidden - 0.25, hidden
+
+
+def test_what_a_policy_remembers_begins_anew_with_an_episode():
+    """As in a loop of one's own, to the last bit; the next window is given what this one remembers."""
+    window, loop = (made(*CASES[0][:2], "float32") for _ in range(2))
+    policy, hidden = Counting(), torch.zeros(5, 1)
+    first, _ = window.reset(seed=3)
+    seen, _ = loop.reset(seed=3)
+    told = window.unroll(policy, 17, hidden=hidden)
+    later = window.unroll(policy, 20, hidden=told.hidden)
+    ended = torch.cat([told.truncated | told.terminated, later.truncated | later.terminated])
+    assert bool(ended[:17].any()) and bool((told.hidden > 0.0).any()) and torch.equal(told.observation[0], first)
+    for t, action in enumerate(torch.cat([told.action, later.action])):
+        mine, hidden = policy(seen, hidden)
+        assert torch.equal(mine, action)
+        seen, _, terminated, truncated, _ = loop.step(mine)
+        assert torch.equal(terminated | truncated, ended[t])
+        hidden = hidden * ~(terminated | truncated).unsqueeze(-1)
+    assert torch.equal(seen, later.observation[-1]) and torch.equal(hidden, later.hidden)
 
 
 class ForFive(nn.Linear):
@@ -171,22 +231,31 @@ class Blind(nn.Module):
         return seen[:, :1] * torch.nan
 
 
+class Forgetful(nn.Linear):
+    def forward(self, seen, hidden):
+        return super().forward(seen)
+
+
 @pytest.mark.parametrize(
-    ("policy", "steps", "says"),
+    ("policy", "more", "says"),
     [
-        (nn.Linear(3, 1), 0, "steps = 0 must be at least 1"),
-        (nn.Linear(4, 1), 5, "policy does not take observations of shape"),
-        (nn.Linear(3, 2), 5, "policy gives"),
-        (Blind(), 20, "policy returned NaN"),
+        (nn.Linear(3, 1), {"steps": 0}, "steps = 0 must be at least 1"),
+        (nn.Linear(4, 1), {}, "policy does not take observations of shape"),
+        (nn.Linear(3, 2), {}, "policy gives"),
+        (Blind(), {"steps": 20}, "policy returned NaN"),
+        (nn.Linear(3, 1), {"hidden": torch.zeros(5, 2)}, "policy does not take observations .* and hidden of shape"),
+        (Forgetful(3, 1), {"hidden": torch.zeros(5, 2)}, r"policy gives .* \(actions, hidden of shape \(n, 2\)\)"),
+        (Recurrent(3, 1), {"hidden": torch.zeros(4, 1, 4)}, "Give one row for each of 5"),
+        (Recurrent(3, 1), {"hidden": torch.zeros(5, 1, 4).double()}, "in torch.float32"),
     ],
 )
-def test_bad_input_is_told_in_one_line_and_changes_nothing(policy, steps, says):
+def test_bad_input_is_told_in_one_line_and_changes_nothing(policy, more, says):
     env = made("ring", CASES[0][1], "float32")
     env.reset(seed=3)
     env.step(torch.zeros(5, 1))
     other = copy.deepcopy(env)
     with pytest.raises(ValueError, match=says) as error:
-        env.unroll(policy, steps)
+        env.unroll(policy, **{"steps": 5, **more})
     assert "\n" not in str(error.value)
     for _ in range(15):
         assert torch.equal(env.step(torch.zeros(5, 1))[0], other.step(torch.zeros(5, 1))[0])

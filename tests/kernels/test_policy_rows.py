@@ -21,26 +21,54 @@ def called(loops, rows, arrays):
     kind(loops.call)(0, rows, table.ctypes.data)
 
 
+class Pair(nn.Module):
+    """A policy of two agents, who remember four numbers each; without ``hidden`` they begin at 0."""
+
+    def __init__(self):
+        super().__init__()
+        self.cell, self.out = nn.GRUCell(3, 4), nn.Linear(4, 1)
+
+    def forward(self, seen, hidden=None):
+        given = None if hidden is None else hidden.view(-1, 4)
+        later = self.cell(seen.reshape(-1, 3), given)
+        action = torch.cat([self.out(later), later], 1)[:, :1].reshape(len(seen), 2)
+        return action if hidden is None else (action, later.view(-1, 2, 4))
+
+
+LAYERS = [nn.Linear(6, 7), nn.Tanh(), nn.Linear(7, 37), nn.ReLU(), nn.Linear(37, 2)]
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_values_and_gradients_are_those_of_torch(dtype):
+@pytest.mark.parametrize(
+    ("policy", "memory"),
+    [(lambda: nn.Sequential(*LAYERS), None), (Pair, (2, 4)), (Pair, None)],
+    ids=["layers", "two agents who remember", "two agents"],
+)
+def test_values_and_gradients_are_those_of_torch(policy, memory, dtype):
     torch.manual_seed(1)
-    policy = nn.Sequential(nn.Linear(3, 7), nn.Tanh(), nn.Linear(7, 37), nn.ReLU(), nn.Linear(37, 2)).to(dtype)
-    driver = Driver(policy, 2, 3, 2, dtype)
+    policy = policy().to(dtype)
+    driver = Driver(policy, 2, 6, 2, dtype, memory)
     weights = {n: x.detach().numpy() for n, x in driver.weights(policy).items()}
-    close = 2e-5 if dtype == torch.float32 else 1e-12
+    close, shapes = 2e-5 if dtype == torch.float32 else 1e-12, {"seen": (6,), **({"hidden": memory} if memory else {})}
     for rows in (1, 33, 64, 100):
-        seen, on_action = torch.randn(rows, 3, dtype=dtype).requires_grad_(), torch.randn(rows, 2, dtype=dtype)
-        made = {n: torch.zeros(rows, wide, dtype=dtype) for n, wide in (("action", 2), ("to_seen", 3))}
-        arrays = {**weights, "seen": seen.detach().numpy(), "push": np.zeros((rows, 2), str(dtype)[6:])}
-        arrays |= {"on_action": on_action.numpy(), **{n: x.numpy() for n, x in made.items()}}
+        given = {n: torch.randn(rows, *shape, dtype=dtype).requires_grad_() for n, shape in shapes.items()}
+        wanted = policy(*given.values())
+        told = {"action": wanted[0], "later": wanted[1]} if memory else {"action": wanted}
+        on = {n: torch.randn_like(x) for n, x in told.items()}
+        made = {n: torch.zeros_like(x) for n, x in (*told.items(), *((f"to_{n}", x) for n, x in given.items()))}
+        arrays = {**weights, "push": np.zeros((rows, 2), str(dtype)[6:])}
+        arrays |= {n: x.detach().numpy() for n, x in (*given.items(), *made.items())}
+        arrays |= {f"on_{n}": x.numpy() for n, x in on.items()}
         sums = {n: np.zeros(size, str(dtype)[6:]) for n, size in driver.backward.sums.items()}
         called(driver.forward, rows, arrays)
         called(driver.backward, rows, {**arrays, **sums})
-        wanted = policy(seen)
-        torch.testing.assert_close(made["action"], wanted, rtol=close, atol=close)
-        own = torch.autograd.grad(wanted, [seen, *policy.parameters()], on_action)
-        torch.testing.assert_close(made["to_seen"], own[0], rtol=close, atol=close)
-        for (name, _), x in zip(policy.named_parameters(), own[1:], strict=True):
+        own = torch.autograd.grad(list(told.values()), [*given.values(), *policy.parameters()], list(on.values()))
+        for name, x in (*told.items(), *zip((f"to_{n}" for n in given), own, strict=False)):
+            torch.testing.assert_close(made[name], x, rtol=close, atol=close)
+        for (name, _), x in zip(policy.named_parameters(), own[len(given) :], strict=True):
+            if f"to_{driver.names[name]}" not in driver.backward.summed:
+                assert not bool(x.any())
+                continue
             array, *shape = driver.backward.summed[f"to_{driver.names[name]}"]
             torch.testing.assert_close(torch.from_numpy(sums[array]).as_strided(*shape), x, rtol=close, atol=close)
 
