@@ -75,8 +75,8 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 """Where this package lies: a checkout, or the libraries of an installation."""
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(is_asked: bool) -> None:
+    if is_asked:
         print(idm_env.__version__)
         raise typer.Exit
 
@@ -205,14 +205,14 @@ def fit(
     _done(out, result["data"]["account"])
 
 
-def _only(context: typer.Context, mode: str, known: set[str]) -> None:
+def _only(context: typer.Context, mode: str, accepted: set[str]) -> None:
     """Raise ValueError for an option on the command line that says nothing here."""
     for name in context.params:
-        given = context.get_parameter_source(name)
-        if name not in known and given is not None and given.name == "COMMANDLINE":
+        source = context.get_parameter_source(name)
+        if name not in accepted and source is not None and source.name == "COMMANDLINE":
             flag = f"--{name.replace('_', '-')}"
-            told = f"says nothing with {mode}" if mode else "is for --lane-changes"
-            raise ValueError(f"{flag} {told}. Leave it out.")
+            rule = f"says nothing with {mode}" if mode else "is for --lane-changes"
+            raise ValueError(f"{flag} {rule}. Leave it out.")
 
 
 def _fit_lane_changes(
@@ -269,7 +269,7 @@ def explain(
         from idm_env.reports import undecided
 
         files, seconds = files_of(data), pieces.seconds_of(split_runs)
-        candidates, given = _names("--effects", effects), _names("--known", known) or ()
+        candidates, inputs = _names("--effects", effects), _names("--known", known) or ()
         read = None
         if len(files) == 1:  # what one recording cannot tell is said before anything slow is imported
             report("reading", 0, 0, files[0].name)
@@ -281,17 +281,19 @@ def explain(
         from idm_env.discovery.sets import Question, explain_sets
         from idm_env.discovery.sets import explain as explain_one
 
-        asked = Question(
-            by, candidates, given, seed, file.ring_length, file.place, file.layout,
+        question = Question(
+            by, candidates, inputs, seed, file.ring_length, file.place, file.layout,
             None if file.where is None else tuple(file.where), base or "idm", file.columns, seconds,
         )  # fmt: skip
         _work_begins()
         rows: list[dict[str, Any]] = []
         if read is not None:
-            result, models = explain_one(files[0], out, asked, resume=job.resume, on_progress=report, trajectories=read)
+            result, models = explain_one(
+                files[0], out, question, resume=job.resume, on_progress=report, trajectories=read
+            )
         else:
             with job.workers() as workers:
-                rows = explain_sets(files, out, asked, resume=job.resume, executor=workers, on_progress=report)
+                rows = explain_sets(files, out, question, resume=job.resume, executor=workers, on_progress=report)
     if not rows:
         _explained(result, models, out)
         return
@@ -327,8 +329,8 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
         console.print(result["interval"], style="dim", highlight=False)
     console.print(weight(result["prior"]), style="dim", highlight=False)
     if before is not None:
-        told = ceilings(result["ceilings"], before["gap_rmse_m"], result["error"]["floor"]["gap_rmse_m"])
-        console.print(f"What could be explained at all: {told}", style="dim", highlight=False)
+        limits = ceilings(result["ceilings"], before["gap_rmse_m"], result["error"]["floor"]["gap_rmse_m"])
+        console.print(f"What could be explained at all: {limits}", style="dim", highlight=False)
     if result["bases"]:
         console.print(laws(result["bases"]), soft_wrap=True, highlight=False)
     files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
@@ -347,22 +349,22 @@ def _error_row(
 
     row: dict[str, Any] = {"error": f"{name} ({unit})"} | dict(zip(models, (before, after), strict=False))
     if len(models) > 1:
-        known = compared is not None and compared["high"] is not None
+        has_interval = compared is not None and compared["high"] is not None
         row["change"] = percent(after / before) if before else ""
         row["95 % interval"] = (
-            f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and known else ""
+            f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and has_interval else ""
         )
         row["verdict"] = compared["verdict"] if compared else ""
     return row
 
 
 def _names(option: str, text: str | None) -> tuple[str, ...] | None:
-    found = None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
-    if found == ():
+    names = None if text is None else tuple(name.strip() for name in text.split(",") if name.strip())
+    if names == ():
         raise ValueError(
             f"{option} = {validation.shown(text)} names nothing. Give names by comma, or leave {option} out."
         )
-    return found
+    return names
 
 
 @app.command()
@@ -391,9 +393,9 @@ def demo(
         if path is None:
             report("generating", 0, 0, "platoon.csv")
             path = folder / "platoon.csv"
-            made, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
-            told = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
-            storage.write_csv(path, made.table.select(told))
+            trajectories, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
+            measured = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
+            storage.write_csv(path, trajectories.table.select(measured))
             console.print(f"Ten runs of a leader and three followers: {path}", soft_wrap=True)
         result, models = explain_one(path, out, Question(columns=columns if data else None), on_progress=report)
     _explained(result, models, out)
@@ -463,8 +465,8 @@ def drift(
     if scores := result["kept_back"]["scores"]:
         titles = {"model": "model", "ahead_s": "ahead (s)", "gap_rmse_m": "RMSE (m)", "gap_crps_m": "CRPS (m)",
                   "in_90_percent": "in the 90 % band (%)"}  # fmt: skip
-        drawn = [{title: row[name] for name, title in titles.items()} for row in scores]
-        _show(f"Forecasts of the gap of {result['kept_back']['drivers']} drivers kept back", drawn)
+        forecasts = [{title: row[name] for name, title in titles.items()} for row in scores]
+        _show(f"Forecasts of the gap of {result['kept_back']['drivers']} drivers kept back", forecasts)
     console.print(result["sentence"], soft_wrap=True, highlight=False)
     console.print(result["data"]["account"], soft_wrap=True, highlight=False)
     _told("Model", out / "model.yaml")
@@ -518,9 +520,9 @@ def doctor() -> None:
     """Say what works on this machine and what does not, with the cure. Ends with code 1 if something is broken."""
     from idm_env.cli.doctor import findings
 
-    found = findings()
-    _show("This machine", [{"what": f.what, "state": f.state, "found": f.told, "cure": f.cure} for f in found])
-    if any(finding.state == "broken" for finding in found):
+    results = findings()
+    _show("This machine", [{"what": f.what, "state": f.state, "found": f.told, "cure": f.cure} for f in results])
+    if any(finding.state == "broken" for finding in results):
         raise typer.Exit(1)
 
 
@@ -555,8 +557,8 @@ def plot(
     from idm_env.reports.page import account
 
     if out.is_dir() or out.suffix.lower() not in PICTURES:
-        told = "is a folder" if out.is_dir() else "names no kind of picture"
-        raise ValueError(f"--out = {out} {told}. Give a file that ends in {', '.join(PICTURES)}.")
+        fault = "is a folder" if out.is_dir() else "names no kind of picture"
+        raise ValueError(f"--out = {out} {fault}. Give a file that ends in {', '.join(PICTURES)}.")
     written = [out, *([out.with_suffix(".html")] if html else [])]
     for path in written:
         storage.not_an_input(path, [source])
@@ -567,7 +569,7 @@ def plot(
         from idm_env.reports import diagrams, fonts
 
         if source.suffix in (".yaml", ".yml"):
-            drawn = _rollout_panels(source, seconds, seed, report)
+            drawings = _rollout_panels(source, seconds, seed, report)
         else:
             from idm_env.data import load
 
@@ -576,22 +578,22 @@ def plot(
             trajectories = load(source, ring_length=ring_length, layout=layout, columns=columns)
             if where is not None:
                 trajectories = trajectories.where(where)
-            drawn, repairs = diagrams.panels(trajectories), trajectories.repairs
+            drawings, repairs = diagrams.panels(trajectories), trajectories.repairs
         report("drawing", 0, 0, out.name)
-        kept = drawn[:panels]
-        more = f", the largest {len(kept)} of {len(drawn)} panels" if len(drawn) > len(kept) else ""
-        title = f"{source.name}{more}" if len(kept) > 1 else f"{source.name}: {kept[0].title}{more}"
+        largest = drawings[:panels]
+        more = f", the largest {len(largest)} of {len(drawings)} panels" if len(drawings) > len(largest) else ""
+        title = f"{source.name}{more}" if len(largest) > 1 else f"{source.name}: {largest[0].title}{more}"
         out.parent.mkdir(parents=True, exist_ok=True)
-        figure = diagrams.figure_of(kept, title)
+        figure = diagrams.figure_of(largest, title)
         numbers = fonts.legible(figure)
         storage.write(out, figure.savefig)
         if html:
-            diagrams.write_html(out.with_suffix(".html"), kept, title)
+            diagrams.write_html(out.with_suffix(".html"), largest, title)
     if more:
         console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
     if numbers:
-        told = ", ".join(f"{number}: {word}" for number, word in numbers.items())
-        console.print(f"No font here has these names: {told}.", soft_wrap=True, highlight=False)
+        unreadable = ", ".join(f"{number}: {word}" for number, word in numbers.items())
+        console.print(f"No font here has these names: {unreadable}.", soft_wrap=True, highlight=False)
     if source.suffix not in (".yaml", ".yml"):
         console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, highlight=False)
     for path in written:
@@ -612,23 +614,23 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
     env: Any = DiffIDMEnv(**{**load_environment(config), "max_episode_steps": -1})
     env.reset(seed=seed)
     dt = env.task.step_time  # of a step of the environment, for which an action is held
-    kept, lanes, there = [], [], []
+    samples, lanes, presence = [], [], []
     steps = max(1, round(seconds / dt))
     for step in range(steps):
         _, _, terminated, truncated, _ = env.step(None)
         state = env.batch.world.state
-        kept.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
+        samples.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
         if state.links is not None:
             lanes.append(state.links.lane[0])
-            there.append(torch.ones_like(state.speed[0]) if state.present is None else state.present[0])
+            presence.append(torch.ones_like(state.speed[0]) if state.present is None else state.present[0])
         report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
         if terminated or truncated:
             break
-    states = Trajectory(*(torch.stack(column) for column in zip(*kept, strict=True)))
+    states = Trajectory(*(torch.stack(column) for column in zip(*samples, strict=True)))
     lap = env.task.road.lap(state)
     ring = None if lap is None else float(lap.reshape(-1)[0])
     if lanes:
-        lane, present = torch.stack(lanes), torch.stack(there)
+        lane, present = torch.stack(lanes), torch.stack(presence)
         return lane_panels(states, lane, present, dt=dt, ring_length=ring, marked=env.task.agents)
     return [rollout_panel(states, dt=dt, ring_length=ring, marked=env.task.agents)]
 
@@ -799,8 +801,8 @@ def run() -> None:
     except BaseException as error:  # nothing of ours, unless a shell completes a command line
         if "_IDM_ENV_COMPLETE" in os.environ or {"--show-completion", "--install-completion"} & set(sys.argv):
             raise
-        told = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
-        _failed(ValueError(f"the command was ended from within ({told}), as by a file of effects. Mend that file."))
+        words = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
+        _failed(ValueError(f"the command was ended from within ({words}), as by a file of effects. Mend that file."))
     if code == 130:
         _interrupted()
     sys.exit(code if isinstance(code, int) else 0)

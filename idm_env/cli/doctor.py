@@ -34,16 +34,18 @@ def findings(folder: Path = Path()) -> list[Finding]:
 
 def _versions() -> list[Finding]:
     system = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
-    found = [Finding("system", "ok", system)]
+    results = [Finding("system", "ok", system)]
     for name in ("idm-env", "torch", "numpy", "gymnasium", "pettingzoo"):
         try:
-            found.append(Finding(name, "ok", version(name)))
+            results.append(Finding(name, "ok", version(name)))
         except PackageNotFoundError:
             if name == "idm-env":
-                found.append(Finding(name, "missing", "runs from a checkout that is not installed", "pip install -e ."))
+                results.append(
+                    Finding(name, "missing", "runs from a checkout that is not installed", "pip install -e .")
+                )
             else:
-                found.append(Finding(name, "broken", "not installed", f"pip install {name}"))
-    return found
+                results.append(Finding(name, "broken", "not installed", f"pip install {name}"))
+    return results
 
 
 def _extra(name: str) -> Finding:
@@ -55,14 +57,14 @@ def _extra(name: str) -> Finding:
     mine = [line for line in lines if re.search(rf"extra == ['\"]{name}['\"]", line)]
     have, absent = [], []
     for line in mine:
-        asked = re.split(r"[^\w.-]", line, maxsplit=1)[0]
+        package = re.split(r"[^\w.-]", line, maxsplit=1)[0]
         try:
-            have.append(f"{asked} {version(asked)}")
+            have.append(f"{package} {version(package)}")
         except PackageNotFoundError:
-            absent.append(asked)
+            absent.append(package)
     if absent or not mine:
-        told = f"absent: {', '.join(absent)}" if absent else "not known to the installed package"
-        return Finding(f"extra {name}", "missing", told, f"pip install 'idm-env[{name}]'")
+        message = f"absent: {', '.join(absent)}" if absent else "not known to the installed package"
+        return Finding(f"extra {name}", "missing", message, f"pip install 'idm-env[{name}]'")
     return Finding(f"extra {name}", "ok", ", ".join(have))
 
 
@@ -106,12 +108,12 @@ def _threads() -> Finding:
 
     have = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     used = torch.get_num_threads()
-    told = f"{used} of {have} processors"
+    processors = f"{used} of {have} processors"
     if used < have:
-        return Finding("threads", "missing", told, f"Set OMP_NUM_THREADS={have}, or use --executor processes.")
+        return Finding("threads", "missing", processors, f"Set OMP_NUM_THREADS={have}, or use --executor processes.")
     if used > have:
-        return Finding("threads", "missing", told, f"Set OMP_NUM_THREADS={have}: more threads only cost time.")
-    return Finding("threads", "ok", told)
+        return Finding("threads", "missing", processors, f"Set OMP_NUM_THREADS={have}: more threads only cost time.")
+    return Finding("threads", "ok", processors)
 
 
 def _gpu() -> Finding:
@@ -125,17 +127,17 @@ def _gpu() -> Finding:
     return Finding("GPU", "missing", f"torch is built for CUDA {built}, and no device answers", "Look at nvidia-smi.")
 
 
-def _cache(told: str, variable: str) -> Finding:
+def _cache(what: str, variable: str) -> Finding:
     from idm_env.scalar import library
 
-    asked, used = os.environ.get(variable), library.folder(variable)
+    wished, used = os.environ.get(variable), library.folder(variable)
     cure = f"Set {variable} to a folder to which you may write, and nobody else."
     if used is None:
-        return Finding(told, "missing", "no folder serves: all is compiled at every start", cure)
-    if asked and Path(os.path.realpath(asked)) != used:
-        why = library.exposed(Path(os.path.realpath(asked))) if Path(asked).is_dir() else None
-        return Finding(told, "broken", f"{variable}={asked} {why or 'cannot be written'}; {used} is used", cure)
-    return Finding(told, "ok", str(used))
+        return Finding(what, "missing", "no folder serves: all is compiled at every start", cure)
+    if wished and Path(os.path.realpath(wished)) != used:
+        why = library.exposed(Path(os.path.realpath(wished))) if Path(wished).is_dir() else None
+        return Finding(what, "broken", f"{variable}={wished} {why or 'cannot be written'}; {used} is used", cure)
+    return Finding(what, "ok", str(used))
 
 
 def _writable(what: str, folder: Path, cure: str) -> Finding:

@@ -70,8 +70,8 @@ Base = Annotated[
 ]
 
 
-def _trust(given: bool) -> None:
-    if given:
+def _trust(is_given: bool) -> None:
+    if is_given:
         trust.always()
 
 
@@ -137,10 +137,10 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
             options.append(parameter.replace(name=field.name, annotation=types[field.name], default=field.default))
 
     @functools.wraps(command)
-    def spreading(**given: Any) -> None:
+    def spreading(**values: Any) -> None:
         for name, kind in groups.items():
-            given[name] = kind(**{field.name: given.pop(field.name) for field in dataclasses.fields(kind)})  # type: ignore[operator]
-        command(**given)
+            values[name] = kind(**{field.name: values.pop(field.name) for field in dataclasses.fields(kind)})  # type: ignore[operator]
+        command(**values)
 
     spreading.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     spreading.__annotations__ = {option.name: option.annotation for option in options}
