@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from idm_env.effects import references
 from idm_env.effects.base import Effect, P
 from idm_env.types import Command, Driver, Motion, Record, Scene
 
@@ -18,11 +19,11 @@ class Control(Effect):
 
     Input ``control``: a ``Command(accel, active)``. Power, lag and brakes still act on it. A ``careful`` command counts
     only as far as the driver himself would go: ``min(command, driver)``. One that is ``added`` counts beside him:
-    ``command + driver``, so that no command is human driving (Johannink et al. 2019, ICRA, "Residual reinforcement
-    learning for robot control").
+    ``command + driver``, so that no command is human driving (Johannink et al. 2019).
     """
 
     kind: ClassVar[str] = "control"
+    sources: ClassVar[tuple[str, ...]] = (references.JOHANNINK_2019,)
     takes: ClassVar[type | None] = Command
     adds: ClassVar[bool] = False
     rank: ClassVar[int] = 35

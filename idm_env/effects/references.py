@@ -10,6 +10,11 @@ JIANG_2001 = (
     "Jiang, R., Wu, Q., Zhu, Z. (2001). Full velocity difference model for a car-following theory. Physical Review "
     "E 64, 017101. doi:10.1103/PhysRevE.64.017101"
 )
+JOHANNINK_2019 = (
+    "Johannink, T., Bahl, S., Nair, A., Luo, J., Kumar, A., Loskyll, M., Aparicio Ojea, J., Solowjow, E., Levine, S. "
+    "(2019). Residual reinforcement learning for robot control. IEEE International Conference on Robotics and "
+    "Automation, 6023–6029. doi:10.1109/ICRA.2019.8794127"
+)
 KESTING_2007 = (
     "Kesting, A., Treiber, M., Helbing, D. (2007). General lane-changing model MOBIL for car-following models. "
     "Transportation Research Record 1999, 86–94. doi:10.3141/1999-10"
