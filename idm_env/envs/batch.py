@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from idm_env.envs.beginnings import Beginnings
+from idm_env.envs.counters import Counters
 from idm_env.envs.given import checked
 from idm_env.envs.moves import Moves
 from idm_env.envs.settings import INFO, Settings
@@ -26,6 +27,7 @@ from idm_env.kernels import dispatch
 from idm_env.roads import Lanes
 from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import Draw, EnvState
+from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.types import Params, State, mapped
 from idm_env.validation import whole
 
@@ -112,6 +114,9 @@ class Batch:
         self._loaded = False
         self._seen: Any = None
         self._reasons: dict[int, str] = {}
+        self.counters: Counters | None = None
+        if isinstance(made.task, OpenLanesTask) and (made.task.loops or "stops" in made.info):
+            self.counters = Counters(made.task, count)
         self._draw: Draw | None = None
         self._driven: Params | None = None
         self._pool: EnvState | None = None
@@ -170,7 +175,6 @@ class Batch:
         """
         every = rows is None or len(rows) == self.count
         index = np.arange(self.count) if rows is None else rows
-        device = self.settings.device
         draw = self._draws(index, self.episodes[index] + 1)
         if state is not None:
             state = self._given(state, draw)
@@ -178,6 +182,13 @@ class Batch:
         fresh, self._driven = self._beginnings.take(index, self.episodes), None
         if state is not None:
             fresh = fresh._replace(state=state)
+        seen = self._took(index, fresh, draw, every)
+        if self.counters is not None:
+            self.counters.begin(index, self.glance().state)
+        return seen
+
+    def _took(self, index: np.ndarray, fresh: EnvState, draw: Draw, every: bool) -> Tensor | np.ndarray:
+        """Put new worlds into some rows, or all; return the observations of all of them."""
         if every or not self.begun or self._draw is None:
             self.world, self._draw = fresh, draw
         elif self._values is not None and self._loaded and self._seen is not None:
@@ -192,7 +203,7 @@ class Batch:
             self._seen[index] = seen.detach().numpy()
             return self._seen.copy()  # type: ignore[no-any-return]
         else:
-            where = torch.as_tensor(index, device=device)
+            where = torch.as_tensor(index, device=self.settings.device)
             self.world = mapped(lambda old, new: old.index_put((where,), new), self.world, fresh)
             self._draw = Draw(self._draw.key.index_put((where,), draw.key))
         self._block = None
@@ -321,7 +332,12 @@ class Batch:
             if bool(over.all()):
                 break
             outcome = _held(outcome, self._once(action, live), over)
-        return outcome
+        if self.counters is None or "stops" not in self.settings.info:
+            return outcome
+        self.counters.decided(self.glance().state)
+        stops: Any = np.repeat(self.counters.stops[:, None], len(self.task.agents), 1)
+        stops = torch.as_tensor(stops, device=self.settings.device) if self.settings.output == "torch" else stops
+        return outcome._replace(details={**outcome.details, "stops": stops})
 
     def crash_reason(self, row: int, agent: int | None = None) -> str:
         """Return how a row has crashed in this step, or one of its agents."""
@@ -330,6 +346,8 @@ class Batch:
     def _once(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> Outcome:
         """Advance every row by Δt."""
         outcome = self._stepped(action, live)
+        if self.counters is not None and self.counters.loops:
+            self.counters.after(self.glance().state)
         if self.task.held > 1 and self.count > 1 and "crash" in outcome.details:
             crashed = outcome.terminated.any(-1)
             for row in np.flatnonzero(crashed.cpu().numpy() if isinstance(crashed, Tensor) else crashed).tolist():

@@ -66,6 +66,15 @@ class Face:
         return mapped(lambda x: x.clone(), world.state)
 
     @property
+    def detectors(self) -> list[list[dict[str, Any]]]:
+        """What the task's ``detectors`` have told in the present episodes, one list of intervals per environment.
+
+        An interval has ``detector`` (name), ``begin``, ``end`` (s), ``count``, ``speed`` (mean, m/s) and ``occupancy``.
+        """
+        counters = self.batch.counters
+        return [] if counters is None else [list(table) for table in counters.tables]
+
+    @property
     def params(self) -> Params:
         """The parameters in force; assign tensors that require grad to differentiate with respect to them."""
         return self.batch.params

@@ -26,6 +26,8 @@
     How many vehicles are below 0.5 m/s now, and what all emit now (g/s, by Kamal's fuel).
 ``travel``
     Time (s) over the length of the road at the mean speed of now.
+``stops``
+    How often a vehicle stood (below 0.5 m/s) that had not stood at the decision before, of all in this episode.
 
 ``info="none"``, or some of these names, leaves the rest out. With torch output accelerations are tensors, with their
 graph.

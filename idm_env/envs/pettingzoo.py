@@ -188,6 +188,11 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     def _by_agent(self, values: Any) -> dict[str, Any]:
         return {agent: values[i] for i, agent in enumerate(self._slots) if agent in self.agents}
 
+    @property
+    def detectors(self) -> list[dict[str, Any]]:
+        """What the task's ``detectors`` have told in this episode, as of ``DiffIDMEnv``."""
+        return [] if self.batch.counters is None else list(self.batch.counters.tables[0])
+
     def state(self) -> np.ndarray:
         """Return the whole traffic, within ``state_space``. RuntimeError before ``reset``."""
         world = self.batch.world

@@ -22,6 +22,7 @@ RENDER_MODES = ("rgb_array", "human")
 INFO = (
     "accel", "command", "failsafe", "crash", "vehicle_id", "lane_changes", "lane_refusals", "present",
     "queued", "inside", "outflow", "ramp", "standing", "co2", "travel",
+    "stops",
 )  # fmt: skip
 KEYWORDS = (
     "task",

@@ -21,7 +21,7 @@ from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
-from idm_env.tasks.said_roads import DriverClass, classes_of, lengths, rules_of, with_classes
+from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, lengths, loops_of, rules_of, with_classes
 from idm_env.tasks.trip_table import SECOND, TripTable, read, spread
 from idm_env.tasks.trip_table import table as made
 from idm_env.types import Params, State, Trips
@@ -31,8 +31,6 @@ _PLACE_STREAM = 37
 _FLOW = Range(0.0, 1e5, "vehicles an hour")
 _SIGHT = 500.0
 """How far ahead an agent sees that a lane ends (m)."""
-_STANDS = 0.5
-"""Below this speed (m/s) a vehicle stands."""
 
 
 def _present(view: AgentView) -> Tensor:
@@ -110,6 +108,8 @@ class OpenLanesTask(LanesTask):
         limits: Speed limits: ``[{"speed": 25.0, "begin": 0.0, "end": 500.0, "lane": 1}]`` (m/s, m); without a lane on
             all of them.
         closures: Closed lanes: ``[{"lane": 1, "begin": 300.0, "end": 500.0, "since": 60.0, "until": 240.0}]`` (m, s).
+        detectors: Loops across a lane: ``[{"lane": 1, "place": 350.0, "every": 30.0, "name": "upstream"}]`` (m, s; 30 s
+            and a name of its place where it has none). An environment's ``detectors`` are rows of what each tells.
     """
 
     own_effects: ClassVar[tuple[Effect, ...]] = (
@@ -134,11 +134,13 @@ class OpenLanesTask(LanesTask):
     trips: Any = None
     limits: Sequence[Mapping[str, Any]] = ()
     closures: Sequence[Mapping[str, Any]] = ()
+    detectors: Sequence[Mapping[str, Any]] = ()
 
     def __post_init__(self) -> None:
         if self.table is not None:
             object.__setattr__(self, "vehicles", len(self.table.depart))
         super().__post_init__()
+        _ = self.loops
         if self.added and self.failsafe:
             raise ValueError(
                 f"failsafe = {self.failsafe:g} judges whole commands, and added = True gives parts. Leave one out."
@@ -212,6 +214,11 @@ class OpenLanesTask(LanesTask):
     def rules(self) -> tuple[Effect, ...]:
         """What the road tells its drivers."""
         return rules_of(self.limits, self.closed, self.road.count)
+
+    @cached_property
+    def loops(self) -> tuple[Loop, ...]:
+        """The detectors."""
+        return loops_of(self.detectors, self.road.count, float(self.road.length or 0.0), self.simulator.dt)
 
     @property
     def closed(self) -> Sequence[Mapping[str, Any]]:
@@ -338,11 +345,11 @@ class OpenLanesTask(LanesTask):
         every = {
             "queued": found.queued, "inside": found.inside, "outflow": found.left,
             "ramp": (torch.where(from_ramp, state.trips.entered, 0) - still.long()).sum(-1),
-            "standing": (there & (state.speed < _STANDS)).sum(-1),
+            "standing": (there & (state.speed < STANDS)).sum(-1),
             "co2": CO2 * torch.where(there, fuel(state.speed, state.accel), 0.0).sum(-1),
         }  # fmt: skip
         speeds = torch.where(there, state.speed, 0.0).sum(-1) / found.inside.clamp_min(1)
-        every["travel"] = (self.road.length or 0.0) / speeds.clamp_min(_STANDS)
+        every["travel"] = (self.road.length or 0.0) / speeds.clamp_min(STANDS)
         own = {**super().info(world), "present": self.pick(there)}
         return own | {n: x.unsqueeze(-1).expand(-1, len(self.agents)).contiguous() for n, x in every.items()}
 

@@ -15,6 +15,8 @@ from idm_env.tasks import trip_table as table
 from idm_env.tasks.checks import at_least
 from idm_env.validation import one_of, shown
 
+STANDS = 0.5
+"""Below this speed (m/s) a vehicle stands."""
 ALWAYS = 1e9
 """Since when and until when (s) where nothing is said."""
 
@@ -54,6 +56,31 @@ def _stretch(where: str, said: Any, keys: Sequence[str], lanes: int) -> tuple[fl
     begin = at_least(f"{where}.begin", said.get("begin", 0.0), 0.0, "m", 1e6)
     end = at_least(f"{where}.end", said.get("end", 1e6), 0.0, "m", 1e6)
     return float(EVERY_LANE if lane is None else lane), begin, end
+
+
+class Loop(NamedTuple):
+    """A detector: a loop across a lane at a place (m), which tells of every so many seconds."""
+
+    name: str
+    lane: int
+    place: float
+    every: float
+
+
+def loops_of(detectors: Any, lanes: int, length: float, dt: float) -> tuple[Loop, ...]:
+    """Return detectors; ValueError, in one line, for what cannot be."""
+    loops = []
+    for i, said in enumerate(detectors):
+        where = f"detectors[{i}]"
+        lane = int(_stretch(where, said, ("lane", "place", "every", "name"), lanes)[0])
+        if lane == EVERY_LANE or "place" not in said:
+            raise ValueError(f"{where} = {shown(said)} must give lane and place (m).")
+        place = at_least(f"{where}.place", said["place"], 0.1, "m", length)
+        every = at_least(f"{where}.every", said.get("every", 30.0), dt, "s", 1e6)
+        if abs(every / dt - round(every / dt)) > 1e-6:
+            raise ValueError(f"{where}.every = {every:g} s must be whole steps of {dt:g} s.")
+        loops.append(Loop(str(said.get("name", f"lane {lane} at {place:g} m")), lane, place, every))
+    return tuple(loops)
 
 
 def rules_of(limits: Any, closures: Any, lanes: int) -> tuple[Effect, ...]:
