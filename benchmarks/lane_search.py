@@ -1,20 +1,22 @@
-"""Advice of few numbers for the tasks of several lanes, found by evolution: ``python -m benchmarks.lane_search NAME``.
+"""What can be won where traffic merges: ``python -m benchmarks.lane_search NAME [--share 0.3]``.
 
-A tenth of those who enter drive by IDM with a desired speed that depends on lane and place, and with a time gap that
-depends on the lane; a command counts only as far as the driver would go himself. These numbers are found by CMA-ES
-(Hansen 2016, arXiv 1604.00772; library ``cma``), which sees returns of whole episodes only, and so who merges, too.
-It begins beside human drivers. *random search* has the same CPU time for the rule of ``benchmarks.lane_tasks``: blocks
-of ``DRAWS``, each reduced to its best; of these the best on 32 other episodes.
+A share of those who enter drive by an IDM of other numbers: its difference to the usual IDM is added to what the driver
+does (``added=True``), so that ends of lanes and those who merge are minded as by all.
 
-What each seed finds is judged on ``JUDGED_ON`` fresh episodes of 600 s, the same for all rows and never searched on.
-Each row is kept in ``--out`` when it is done, and not done again.
+* *random search*: the rule. One driver for all lanes, drawn evenly in the logarithms of his five numbers.
+* *evolution*: five numbers for each lane, by CMA-ES (Hansen 2016, arXiv 1604.00772; library ``cma``), from humans on.
+  It sees returns of whole episodes only, and so who merges.
+* *gradients*: the same numbers by APG: through traffic and driver, 24 windows of 120 s, from humans on.
+
+The first two have the same ``GENERATIONS · DRIVERS · EPISODES`` episodes. What each seed finds is judged on
+``JUDGED_ON`` fresh ones of 600 s, the same for all rows. Each row is kept in ``--out`` when it is done.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,130 +24,172 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
+from torch import Tensor, nn
 
+from agents.environments import make_env
 from agents.evaluate import judge_lanes
-from agents.rollout import Act, episodes_start, held_moments
-from benchmarks import kept_rows
-from benchmarks.lane_tasks import DEMANDS, DRAWS, Found, Seen, by_place, searched
+from agents.rollout import Act, episodes_start
+from benchmarks import add_executor, named_rows
+from benchmarks.lane_tasks import DEMANDS, Found
+from idm_env.effects.idm import interaction
+from idm_env.jobs.progress import OnProgress
 from idm_env.tasks.open_lanes import OpenLanesTask
+from idm_env.types import Driver
 
-KNOTS = (100.0, 300.0, 500.0, 700.0)
-"""Places (m) between which the advised speed is linear."""
-FASTEST, SLOWEST = 36.0, 8.0
-"""Advised speeds (m/s): at the first, with the shortest time gap, everybody is a human driver."""
-SHORTEST, LONGEST = 0.6, 3.0
-"""Advised time gaps (s)."""
-EPISODES, JUDGED_ON = 12, 128
-
-
-def advised(task: OpenLanesTask, numbers: Tensor, episodes: int) -> Act:
-    """Return agents who follow advice: ``numbers`` ``(n, lanes, knots + 1)``, from 0 (as a human) to 1."""
-    each = numbers.clamp(0.0, 1.0).repeat_interleave(episodes, 0)
-    speeds = FASTEST + (SLOWEST - FASTEST) * each[..., :-1]
-    time_gaps = SHORTEST + (LONGEST - SHORTEST) * each[..., -1]
-    knots = torch.tensor(KNOTS)
-
-    def act(seen: Tensor) -> Tensor:
-        own = Seen(task, seen)
-        on = own.lane.clamp(0, task.road.count - 1)
-        table = speeds.gather(1, on.unsqueeze(-1).expand(-1, -1, len(KNOTS)))
-        at = torch.searchsorted(knots, own.position.contiguous()).clamp(1, len(KNOTS) - 1)
-        share = ((own.position - knots[at - 1]) / (knots[at] - knots[at - 1])).clamp(0.0, 1.0)
-        before, after = (table.gather(-1, i.unsqueeze(-1)).squeeze(-1) for i in (at - 1, at))
-        advice, time_gap = before + share * (after - before), time_gaps.gather(1, on)
-        return own.idm(advice, time_gap, *(torch.tensor(x) for x in (2.0, 1.5, 2.0)))
-
-    return act
+SEEN = {"features": ["speed", "lead_speed", "gap", "lane"], "scaling": "raw"}
+HUMAN = (30.0, 1.2, 2.0, 1.5, 2.0)
+"""v0 (m/s), T (s), s0 (m), a and b (m/s²) of drivers in these tasks."""
+LEAST, MOST = (20.0, 0.5, 1.0, 0.8, 0.8), (40.0, 2.0, 4.0, 2.5, 3.0)
+GENERATIONS, DRIVERS, EPISODES = 9, 10, 10
+ROUNDS = (75, 4), (15, 20), (3, 100)
+"""Drivers that a random search compares, and on how many episodes: as many in all as an evolution has."""
+UPDATES, WINDOW, ROWS, RATE = 24, 120, 8, 0.03
+JUDGED_ON, STUDENT = 64, 1.998
 
 
-def returns(given: dict[str, Any], numbers: Tensor, episodes: int, draw: int) -> list[float]:
-    """Return the mean return (vehicle-hours) of each row of numbers in the same episodes."""
-    start = episodes_start(given, episodes, len(numbers), draws=(draw,))
-    task = start.task
-    assert isinstance(task, OpenLanesTask)
-    act = advised(task, numbers, episodes)
-    lost = torch.zeros(len(numbers) * episodes)
-    for t, (_, _, world) in enumerate(held_moments(start, act, task.steps)):
-        if (t + 1) % task.held == 0:  # once a decision is enough to compare by
-            lost += task.step_time * task.delay(world)
-    return (-lost.view(len(numbers), episodes).mean(-1) / 3600.0).tolist()
+class Drivers(nn.Module):
+    """Acts of IDM drivers beside human ones: the difference of two accelerations. ``log`` ``(drivers, lanes, 5)``."""
+
+    def __init__(self, log: Tensor, limit: float, episodes: int) -> None:
+        super().__init__()
+        self.log, self.limit, self.episodes = nn.Parameter(log), limit, episodes
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Return actions; rows are the episodes of the first driver, then those of the second, and so on."""
+        speed, lead_speed, gap, lane = seen.unflatten(-1, (-1, 4)).unbind(-1)
+        each = self.log.exp().repeat_interleave(self.episodes, 0) if len(self.log) > 1 else self.log.exp()
+        own = [self._on(lane, number) for number in each.unbind(-1)]
+        human = torch.tensor(HUMAN).unbind(-1)
+        more = self._accel(speed, lead_speed, gap, *own) - self._accel(speed, lead_speed, gap, *human)
+        return (more / self.limit).clamp(-1.0, 1.0)
+
+    def _on(self, lane: Tensor, number: Tensor) -> Tensor:
+        value = number[:, :1]
+        for k in range(1, number.shape[1]):
+            value = torch.where(lane > k - 0.5, number[:, k : k + 1], value)
+        return value
+
+    def _accel(self, speed: Tensor, lead_speed: Tensor, gap: Tensor, *numbers: Tensor) -> Tensor:
+        v0, time_gap, s0, a, b = numbers
+        kept = interaction(Driver(a, b, time_gap, s0, v0), speed, gap.clamp_min(0.5), lead_speed)
+        return a * (1.0 - (speed / v0) ** 4 - kept)
 
 
-def evolved(given: dict[str, Any], seed: int, seconds: float) -> tuple[Tensor, int]:
-    """Return the mean of the last generation that CMA-ES makes within some CPU seconds, and how many it made."""
-    import cma
+@dataclass(frozen=True)
+class Part:
+    """A row: a task, how its drivers are found, and a seed."""
 
-    lanes = lanes_of(given)
-    size = lanes * (len(KNOTS) + 1)
-    # The first generations are drawn beside human drivers, at 0.
-    search = cma.CMAEvolutionStrategy([0.1] * size, 0.2, {"seed": seed + 1, "bounds": [0.0, 1.0], "verbose": -9})
-    begin = time.process_time()
-    while time.process_time() - begin < seconds:
-        asked = search.ask()
-        numbers = torch.from_numpy(np.array(asked, np.float32)).view(-1, lanes, len(KNOTS) + 1)
-        draw = 1000 + 500 * seed + search.countiter  # episodes that nobody is judged on
-        search.tell(asked, [-x for x in returns(given, numbers, EPISODES, draw)])
-    found = torch.tensor(search.result.xfavorite, dtype=torch.float32)
-    return found.view(lanes, -1), int(search.countiter)
+    name: str
+    share: float
+    how: str
+    seed: int
 
+    def __str__(self) -> str:
+        return f"{self.name}, {self.share:g}, {self.how}, {self.seed}"
 
-def blind(given: dict[str, Any], seed: int, seconds: float) -> tuple[Tensor, int]:
-    """Return the best rule of a random search within some CPU seconds, and how many were drawn."""
-    generator, lanes = torch.Generator().manual_seed(seed), lanes_of(given)
-    begin, winners = time.process_time(), list[Tensor]()
-    while time.process_time() - begin < seconds:
-        drawn = torch.rand(DRAWS, lanes, 2, generator=generator)
-        places = torch.stack((4.0 + 24.0 * drawn[..., 0], 200.0 + 500.0 * drawn[..., 1]), -1)
-        winners.append(searched(given, places, by_place))
-    rules = torch.cat(winners)
-    start = episodes_start(given, 32, len(rules), draws=(4,))
-    assert isinstance(start.task, OpenLanesTask)
-    found = [row["reward"] for row in judge_lanes(start, by_place(start.task, rules, 32), len(rules))]
-    return rules[torch.tensor(found).argmax()], DRAWS * len(winners)
+    @property
+    def given(self) -> dict[str, Any]:
+        """The keywords of its environment."""
+        added = {"controlled": self.share, "careful": False, "added": True, "observation": SEEN}
+        return {**DEMANDS[self.name], **added}
 
 
-def lanes_of(given: dict[str, Any]) -> int:
-    """Return how many lanes the road of a task has."""
+def task_of(given: dict[str, Any]) -> OpenLanesTask:
+    """Return the task."""
     task = episodes_start(given, 1).task
     assert isinstance(task, OpenLanesTask)
-    return task.road.count
+    return task
 
 
-def judged(given: dict[str, Any], found: Tensor | None, how: str) -> Found:
-    """Return the figures of the fresh episodes."""
-    start = episodes_start(given, JUDGED_ON, draws=(1,))
-    assert isinstance(start.task, OpenLanesTask)
-    make = advised if how == "advice" else by_place
-    act = None if found is None else make(start.task, found.unsqueeze(0), JUDGED_ON)
-    return judge_lanes(start, act, 1)[0]
+def numbers_of(shares: Tensor) -> Tensor:
+    """Return logarithms of numbers, ``(…, 5)``, from 0 (least) to 1 (most)."""
+    low, high = torch.tensor(LEAST).log(), torch.tensor(MOST).log()
+    return low + (high - low) * shares
 
 
-def row_of(name: str, given: dict[str, Any], how: str, seed: int, seconds: float) -> dict[str, Any]:
-    """Return one row: who was found, how, and how he is judged."""
-    begin, found, tried = time.process_time(), None, 0
-    if how != "humans":
-        found, tried = (evolved if how == "advice" else blind)(given, seed, seconds)
+def driven(given: dict[str, Any], log: Tensor, episodes: int, draw: int) -> list[Found]:
+    """Return the figures of each of some drivers in the same episodes."""
+    start = episodes_start(given, episodes, len(log), draws=(draw,))
+    act: Act = Drivers(log, start.task.command_limits[1], episodes)
+    return judge_lanes(start, act, len(log))
+
+
+def returns(given: dict[str, Any], log: Tensor, episodes: int, draw: int) -> Tensor:
+    """Return the mean return (vehicle-hours) of each of some drivers; a crash is worse than any delay."""
+    found = driven(given, log, episodes, draw)
+    return torch.tensor([row["reward"] / 3600.0 - 1e3 * row["collisions"] for row in found])
+
+
+def blind(given: dict[str, Any], seed: int) -> Tensor:
+    """Return the best driver of a random search, ``(1, 1, 5)``."""
+    generator = torch.Generator().manual_seed(seed)
+    log = numbers_of(torch.rand(ROUNDS[0][0], 1, 5, generator=generator))
+    for i, (count, episodes) in enumerate(ROUNDS):
+        left = ROUNDS[i + 1][0] if i + 1 < len(ROUNDS) else 1
+        log = log[returns(given, log[:count], episodes, 1000 + 500 * seed + i).topk(left).indices]
+    return log
+
+
+def evolved(given: dict[str, Any], seed: int) -> Tensor:
+    """Return the mean of the last generation of CMA-ES, ``(1, lanes, 5)``."""
+    import cma
+
+    lanes, (low, high) = task_of(given).road.count, numbers_of(torch.tensor([[0.0] * 5, [1.0] * 5]))
+    begin = ((torch.tensor(HUMAN).log() - low) / (high - low)).clamp(0.05, 0.95).repeat(lanes).tolist()
+    options = {"seed": seed + 1, "bounds": [0.0, 1.0], "verbose": -9, "popsize": DRIVERS}
+    search = cma.CMAEvolutionStrategy(begin, 0.2, options)
+    for generation in range(GENERATIONS):
+        asked = search.ask()
+        log = numbers_of(torch.from_numpy(np.array(asked, np.float32)).view(DRIVERS, lanes, 5))
+        search.tell(asked, (-returns(given, log, EPISODES, 1001 + 500 * seed + generation)).tolist())
+    return numbers_of(torch.tensor(search.result.xfavorite, dtype=torch.float32).view(1, lanes, 5))
+
+
+def pathwise(given: dict[str, Any], seed: int) -> Tensor:
+    """Return what gradients through traffic make of humans, ``(1, lanes, 5)``; their choices of lanes are frozen."""
+    task = task_of(given)
+    drivers = Drivers(torch.tensor(HUMAN).log().repeat(1, task.road.count, 1), task.command_limits[1], 1)
+    env = make_env(given, ROWS, output="torch")
+    env.reset(seed=1000 * seed + 5)
+    optimiser = torch.optim.Adam(drivers.parameters(), lr=RATE)
+    for update in range(UPDATES):
+        optimiser.param_groups[0]["lr"] = RATE * (1.0 - update / UPDATES)
+        env.detach()
+        optimiser.zero_grad()
+        (-env.unroll(drivers, WINDOW).reward.mean()).backward()
+        nn.utils.clip_grad_norm_(drivers.parameters(), 1.0)
+        optimiser.step()
+    return drivers.log.detach()
+
+
+FOUND_BY = {"random search": blind, "evolution": evolved, "gradients": pathwise}
+
+
+def row_of(part: Part, on_progress: OnProgress) -> dict[str, Any]:
+    """Return one row: who was found, in how many CPU seconds, and how he is judged."""
+    torch.set_num_threads(1)
+    if part.how == "humans":
+        found = judge_lanes(episodes_start(part.given, JUDGED_ON, draws=(1,)), None, 1)[0]
+        return {"seconds": 0.0, "numbers": None, "found": found}
+    begin = time.process_time()
+    log = FOUND_BY[part.how](part.given, part.seed)
     spent = time.process_time() - begin
-    numbers = None if found is None else found.tolist()
-    return {
-        "row": f"{name}, {how}, {seed}", "task": name, "how": how, "seed": seed, "seconds": spent, "tried": tried,
-        "numbers": numbers, "found": judged(given, found, how),
-    }  # fmt: skip
+    found = driven(part.given, log, JUDGED_ON, 1)[0]
+    return {"seconds": spent, "numbers": log.exp().tolist(), "found": found}
 
 
-def shown(name: str, rows: list[dict[str, Any]]) -> Table:
+def shown(title: str, rows: dict[Part, dict[str, Any]]) -> Table:
     """Return the rows of a task as a table."""
-    table = Table(title=name)
+    table = Table(title=title)
     for head in ("row", "seed", "return, vehicle-h", "more than humans", "out, 1/h", "ramp, 1/h", "crashes", "CPU s"):
         table.add_column(head)
-    humans = torch.tensor(next(row for row in rows if row["how"] == "humans")["found"]["rewards"])
-    for row in rows:
+    humans = torch.tensor(next(row for part, row in rows.items() if part.how == "humans")["found"]["rewards"])
+    for part, row in rows.items():
         found = row["found"]
         more = (torch.tensor(found["rewards"]) - humans) / 3600.0
-        half = 1.979 * float(more.std()) / len(more) ** 0.5  # Student's t of 127 degrees of freedom
+        half = STUDENT * float(more.std()) / len(more) ** 0.5
         table.add_row(
-            row["how"], str(row["seed"]), f"{found['reward'] / 3600.0:.2f}", f"{float(more.mean()):+.2f} ± {half:.2f}",
+            part.how, str(part.seed), f"{found['reward'] / 3600.0:.2f}", f"{float(more.mean()):+.2f} ± {half:.2f}",
             f"{found['outflow']:.0f}", f"{found['ramp']:.0f}", str(found["collisions"]), f"{row['seconds']:.0f}",
         )  # fmt: skip
     return table
@@ -155,22 +199,16 @@ def main() -> None:
     """Search where that is not done yet, and print all rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=tuple(DEMANDS), help="row of tasks")
+    parser.add_argument("--share", type=float, default=0.3, help="of those who enter")
+    parser.add_argument("--how", nargs="*", choices=tuple(FOUND_BY), default=list(FOUND_BY))
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=120.0, help="CPU seconds of a search")
     parser.add_argument("--out", type=Path, default=Path("runs/lane_search.jsonl"))
+    add_executor(parser)
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    done = kept_rows(options.out, "row")
-    wanted = [("humans", 0), *((how, seed) for seed in range(options.seeds) for how in ("advice", "random search"))]
-    for how, seed in wanted:
-        if f"{options.name}, {how}, {seed}" not in done:
-            row = row_of(options.name, DEMANDS[options.name], how, seed, options.seconds)
-            done[row["row"]] = row
-            with options.out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
-    rows = [done[f"{options.name}, {how}, {seed}"] for how, seed in sorted(wanted, key=lambda x: (x[0] != "humans", x))]
-    Console(width=140).print(shown(options.name, rows))
+    wanted = [("humans", 0), *((how, seed) for seed in range(options.seeds) for how in options.how)]
+    parts = {str(part): part for part in (Part(options.name, options.share, how, seed) for how, seed in wanted)}
+    done = named_rows(row_of, parts, options.out, options)
+    Console(width=140).print(shown(options.name, {part: done[name] for name, part in parts.items()}))
 
 
 if __name__ == "__main__":

@@ -90,6 +90,12 @@ for name, (paid, burnt, _) in found.items():
 left.set(xlabel="fresh episode, sorted", ylabel="vehicle-hours more than humans"), left.legend()
 right.set(xlabel="fresh episode, sorted", ylabel="kg of CO2 in 600 s")
 """,
+    "train_merge": """
+_, axes = plt.subplots(figsize=(7, 2.8), layout="constrained")
+for name, paid in found.items():
+    axes.plot(np.sort(-paid), label=name)
+axes.set(xlabel="fresh episode of 600 s, sorted", ylabel="delay of all (vehicle-hours)"), axes.legend()
+""",
     "train_pettingzoo": """
 observations, _ = env.reset(seed=1)
 earned = []

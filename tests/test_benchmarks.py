@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import math
 from pathlib import Path
 
 import pytest
 import torch
 
-from benchmarks import lane_tasks, lanes, named_rows
+from benchmarks import kept_rows, lane_search, lane_tasks, lanes, named_rows
 from idm_env.jobs.progress import OnProgress
 from idm_env.tasks import make_task
 
@@ -92,6 +93,36 @@ def test_a_signal_holds_the_first_of_the_ramp_until_the_next_may_go():
         assert action[0, 0] == action[0, 2] == 1.0
         held.append(bool(action[0, 1] < 0.0))
     assert held == [True] * 4 + [False] * 2
+
+
+def test_a_driver_of_human_numbers_adds_nothing_and_one_on_each_lane_is_asked():
+    """Of two drivers in two episodes each: the first is human, the second brakes on lane 1 only."""
+    log = torch.tensor(lane_search.HUMAN).log().repeat(2, 3, 1)
+    log[1, 1, 0] = math.log(20.0)
+    seen = torch.tensor([[28.0, 28.0, 60.0, 0.0], [28.0, 28.0, 60.0, 1.0], [28.0, 28.0, 60.0, 2.0]])
+    action = lane_search.Drivers(log, 2.0, 2)(seen.reshape(1, 12).expand(4, -1))
+    braking = 1.5 * ((28.0 / 30.0) ** 4 - (28.0 / 20.0) ** 4) / 2.0
+    expected = torch.tensor([[0.0, 0.0, 0.0], [0.0, max(braking, -1.0), 0.0]]).repeat_interleave(2, 0)
+    torch.testing.assert_close(action.detach(), expected)
+
+
+def test_each_way_to_find_drivers_leaves_a_row_that_is_not_made_again(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("agents.evaluate.STEPS_OF_LANES", 100)
+    monkeypatch.setitem(lane_search.DEMANDS, "small", {"task": "merge", "vehicles": 30})
+    for name, value in {"GENERATIONS": 2, "DRIVERS": 3, "EPISODES": 1, "UPDATES": 2, "ROWS": 2, "WINDOW": 5}.items():
+        monkeypatch.setattr(lane_search, name, value)
+    monkeypatch.setattr(lane_search, "ROUNDS", ((3, 1), (2, 1)))
+    monkeypatch.setattr(lane_search, "JUDGED_ON", 2)
+    monkeypatch.setattr("sys.argv", ["lane_search", "small", "--seeds", "1", "--out", str(tmp_path / "rows.jsonl")])
+    for _ in range(2):
+        lane_search.main()
+        printed = capsys.readouterr().out
+        assert all(how in printed for how in ("humans", *lane_search.FOUND_BY))
+    rows = kept_rows(tmp_path / "rows.jsonl", "name")
+    assert len(rows) == len((tmp_path / "rows.jsonl").read_text().splitlines()) == 4
+    for how, count in (("random search", 1), ("evolution", 3), ("gradients", 3)):
+        found = torch.tensor(rows[f"small, 0.3, {how}, 0"]["found"]["numbers"])
+        assert found.shape == (1, count, 5) and bool((found != torch.tensor(lane_search.HUMAN)).any())
 
 
 def test_a_search_keeps_what_is_best_on_other_episodes(monkeypatch):

@@ -15,11 +15,12 @@ NEEDS = {
     "train_rllib": {"tree": "RLlib pins another gymnasium and has an environment of its own: make rllib"},
     "export_minari": {"minari": "minari is not installed (pip install 'minari[create,hdf5]')"},
     "train_approach": {"cma": "cma is not installed (pip install cma)"},
+    "train_merge": {"cma": "cma is not installed (pip install cma)"},
     "tune_an_agent": {"ray": "ray is not installed (pip install 'idm-env[ray]')"},
 }
 """Modules without which an example is left out, and what to do."""
-SHORTER = {"train_approach": ("1", "2")}
-"""Arguments of an example that takes minutes: turns, and episodes that judge."""
+SHORTER = {"train_approach": ("1", "2"), "train_merge": ("1", "10")}
+"""Arguments of an example that takes minutes: turns, and episodes of each."""
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)

@@ -70,16 +70,16 @@ class Loop(NamedTuple):
 def loops_of(detectors: Any, lanes: int, length: float, dt: float) -> tuple[Loop, ...]:
     """Return detectors; ValueError, in one line, for what cannot be."""
     loops = []
-    for i, said in enumerate(detectors):
+    for i, detector in enumerate(detectors):
         where = f"detectors[{i}]"
-        lane = int(_stretch(where, said, ("lane", "place", "every", "name"), lanes)[0])
-        if lane == EVERY_LANE or "place" not in said:
-            raise ValueError(f"{where} = {shown(said)} must give lane and place (m).")
-        place = at_least(f"{where}.place", said["place"], 0.1, "m", length)
-        every = at_least(f"{where}.every", said.get("every", 30.0), dt, "s", 1e6)
+        lane = int(_stretch(where, detector, ("lane", "place", "every", "name"), lanes)[0])
+        if lane == EVERY_LANE or "place" not in detector:
+            raise ValueError(f"{where} = {shown(detector)} must give lane and place (m).")
+        place = at_least(f"{where}.place", detector["place"], 0.1, "m", length)
+        every = at_least(f"{where}.every", detector.get("every", 30.0), dt, "s", 1e6)
         if abs(every / dt - round(every / dt)) > 1e-6:
             raise ValueError(f"{where}.every = {every:g} s must be whole steps of {dt:g} s.")
-        loops.append(Loop(str(said.get("name", f"lane {lane} at {place:g} m")), lane, place, every))
+        loops.append(Loop(str(detector.get("name", f"lane {lane} at {place:g} m")), lane, place, every))
     return tuple(loops)
 
 
