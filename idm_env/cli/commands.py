@@ -316,6 +316,7 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
         return
     from idm_env.discovery.words import ERRORS, ceilings, laws, weight
     from idm_env.reports.page import account
+    from idm_env.reports.undecided import FOUND
 
     console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
     console.print(result["sentence"], soft_wrap=True, highlight=False)
@@ -338,6 +339,8 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
     console.print(
         "; ".join(f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files)), highlight=False
     )
+    if (out / FOUND).is_file():
+        console.print(f"{FOUND} is the shape as an effect, to be used and changed", highlight=False)
     _done(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
 
 

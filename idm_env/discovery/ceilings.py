@@ -31,20 +31,20 @@ CORRECTED_S = 10.0
 LAGS_S = (5.0, 20.0)
 
 
-def told(at: ClosedLoopFit, kept: Records, null: Solution, left: np.ndarray) -> dict[str, float | None]:
+def told(at: ClosedLoopFit, kept: Records, null: Solution, smooth_gain: float) -> dict[str, float | None]:
     """Return the ceilings by name, None where these data have none.
 
     Args:
         at: IDM in free simulation of the runs that choose.
         kept: Runs kept back.
         null: IDM.
-        left: Gains [units] in log RMSE of the best smooth function of the state over IDM, in windows of 5 s.
+        smooth_gain: Of the best smooth function of the state over IDM, in log RMSE in windows of 5 s.
     """
     found = {
         "repeats_share": repeats(at),
         "time_gap_between_halves": between_halves(at),
         "refitted_gap_rmse_m": refitted(kept, null),
-        "smooth_function_gain": 1.0 - float(np.exp(-max(float(left.mean()), 0.0))),
+        "smooth_function_gain": 1.0 - float(np.exp(-smooth_gain)),
     }
     return {name: value if np.isfinite(value) else None for name, value in found.items()}
 

@@ -333,7 +333,7 @@ def _finish(
         "alike_s": decided.stand.task.prior.alike_s, "tried_s": list(decided.stand.rmse_m),
         "gap_rmse_m": list(decided.stand.rmse_m.values()),
     }  # fmt: skip
-    report["ceilings"] = ceilings.told(decided.stand, scored, decided.null, rounds[0].left)
+    report["ceilings"] = ceilings.told(decided.stand, scored, decided.null, rounds[0].smooth_gain)
     report["error"]["floor"] = floor
     report["bases"] = bases.rows(laws)
     for key in ("sentence", "details", "found", "partial"):

@@ -12,8 +12,6 @@ from idm_env.discovery.slots import TARGETS
 from idm_env.discovery.words import ALONG, CHANGES
 from idm_env.effects.free import FEATURES, PER
 
-FILE = "found_effect.py"
-"""Name of the file."""
 _HEAD = '''"""What `idm-env explain` found, and has no name for.
 
 {sentence}

@@ -145,7 +145,7 @@ def _ridges(basis: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndar
     """Return coefficients [features, ridges]."""
     value, vector = np.linalg.eigh((basis * weight[:, None]).T @ basis)
     push = vector.T @ (basis.T @ (weight * error))
-    scale = value[:, None] + np.array(RIDGES) * weight.sum()
+    scale = value[:, None] + np.array(RIDGES) * weight.sum() + 1e-12  # of no windows nothing is predicted
     result: np.ndarray = vector @ (push[:, None] / scale)
     return result
 

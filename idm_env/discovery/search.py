@@ -123,11 +123,10 @@ class Search:
         found = []
         responses = places.respond(self.task, solution)
         for i, term in enumerate(wanted):
-            self.on_progress(f"round {number}", i, len(wanted) + 12, term.label)
+            self.on_progress(f"round {number}", i, len(wanted) + 1, term.label)
             found.append(self._nested(solution, term, before, f"{number}/{term.label}"))
-        for i, scored in enumerate(self._places(solution, responses, before, number, first)):
-            self.on_progress(f"round {number}", len(wanted) + i, len(wanted) + 12, scored.term.label)
-            found.append(scored)
+        self.on_progress(f"round {number}", len(wanted), len(wanted) + 1, "places, times and shapes")
+        found += self._places(solution, responses, before, number, first)
         return found, before
 
     def again(self, solution: Solution, best: Scored, scored: list[Scored]) -> tuple[Solution, list[Scored]]:

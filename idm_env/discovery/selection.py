@@ -63,6 +63,12 @@ class Round:
     """Whether gains are those of free simulation, and not of predictions in windows."""
 
     @property
+    def smooth_gain(self) -> float:
+        """Gain in log RMSE of the best smooth function of the state that was tried, every shape among them."""
+        shapes = (float(s.gains.mean()) for s in self.scored if s.term.fades)
+        return max(0.0, float(self.left.mean()), *shapes)
+
+    @property
     def significant(self) -> bool:
         """Whether any candidate gained enough, beyond chance."""
         least = together.LEAST_GAIN if self.free else LEAST_GAIN

@@ -173,7 +173,7 @@ def report(
     if verdict is Verdict.CANNOT_TELL and not power and (refusal is None or refusal.reason is Reason.NO_GAIN):
         refusal = Refusal(Reason.NO_POWER, len(fit_runs))
     errors = judged.errors
-    left = 1.0 - np.exp(-max(float(first.left.mean()), 0.0))
+    left = 1.0 - np.exp(-first.smooth_gain)
     content = {
         "schema": SCHEMA,
         "verdict": verdict.value,

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from idm_env.discovery.discover import Discovery
-from idm_env.discovery.found import FILE
 from idm_env.jobs.storage import results, write_json
 from idm_env.model_file import save_model
 from idm_env.reports.page import write_page
-from idm_env.reports.undecided import EXPLAINED
+from idm_env.reports.undecided import EXPLAINED, FOUND
 
 
 def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
@@ -21,7 +20,7 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
     from idm_env.discovery import page
 
     with results(out, EXPLAINED) as folder:
-        unnamed = (FILE,) if discovery.found_effect else ()
+        unnamed = (FOUND,) if discovery.found_effect else ()
         paths = {name: folder / name for name in ("report.json", "report.html", *discovery.models, *unnamed)}
         for name in EXPLAINED:  # the other model of an earlier run would be taken for one of this
             if name not in paths:
@@ -29,7 +28,7 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
         write_json(paths["report.json"], discovery.report)
         for name, model in discovery.models.items():
             save_model(paths[name], model)
-        if FILE in paths:
-            paths[FILE].write_text(discovery.found_effect, encoding="utf-8")
+        if FOUND in paths:
+            paths[FOUND].write_text(discovery.found_effect, encoding="utf-8")
         write_page(paths["report.html"], page.title(discovery), page.blocks(discovery))
     return paths

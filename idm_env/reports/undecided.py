@@ -13,7 +13,9 @@ from idm_env.reports.diagrams import space_time
 if TYPE_CHECKING:
     from idm_env.data import Trajectories
 
-EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml", "found_effect.py")
+FOUND = "found_effect.py"
+"""An effect in a state that has no name."""
+EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml", FOUND)
 """What ``explain`` writes."""
 
 

@@ -69,6 +69,14 @@ def test_what_the_scene_tells_is_structure(records: Records) -> None:
     assert found.parts["structure without a name"] == pytest.approx(found.structure[0], abs=1e-6)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_of_a_single_driver_nothing_is_foreseen() -> None:
+    made, _ = synthetic.generate(4, runs=1, followers=1, seconds=120.0)
+    alone = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
+    found = climbed(alone, noise(alone, 0.6))
+    assert not found.is_structured and found.rungs["drift followed"] == found.rungs["own"]
+
+
 def test_nothing_is_not_said_of_an_effect_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Closing speeds count double above 2 m/s: no candidate has that shape, and something is missing."""
     usual = hidden._desired_gap

@@ -20,6 +20,7 @@ from idm_env.effects import IDM, Brakes, Effect
 from idm_env.effects.free import PER
 from idm_env.effects.registry import read
 from idm_env.model_file import load_model
+from idm_env.reports.undecided import FOUND
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
@@ -47,6 +48,7 @@ def test_an_effect_without_a_name_is_a_shape(closing: Discovery) -> None:
     assert entry["effect"] is None and entry["label"] == "time_gap curve over closing_speed"
     assert report["sentence"].startswith("The time gap is ") and "closing speed of" in report["sentence"]
     assert report["helps"]["horizon_rmse_m"]["verdict"] == "better"
+    assert report["ceilings"]["smooth_function_gain"] >= entry["held_out_gain"] > 0.2
     # A straight line of closing speeds is another braking: nothing below 2 m/s, and then what counts twice.
     (first, distance, count) = closing.judgement.terms[0].knots
     height = {
@@ -66,7 +68,7 @@ def test_no_wrong_name_is_given_to_an_effect_in_two_states(monkeypatch: pytest.M
 
 def test_the_file_of_a_shape_is_the_model_that_was_judged(closing: Discovery, tmp_path: Path) -> None:
     """Its effect, among the candidates of discovery's loop, leaves the errors that the report has."""
-    path = write_report(closing, tmp_path)[found.FILE]
+    path = write_report(closing, tmp_path)[FOUND]
     effect = read(f"{path}:TimeGapOverClosingSpeed")()
     term = terms.simple(effect)
     base = closing.null.model
@@ -84,7 +86,7 @@ def test_the_file_of_a_shape_is_the_model_that_was_judged(closing: Discovery, tm
 
 
 def test_a_model_may_name_the_file(closing: Discovery, tmp_path: Path) -> None:
-    path = write_report(closing, tmp_path)[found.FILE]
+    path = write_report(closing, tmp_path)[FOUND]
     own = tmp_path / "own.yaml"
     listed = f'[idm, "{path}:TimeGapOverClosingSpeed", brakes]'
     own.write_text(f"configures: model\nschema: 1\neffects: {listed}\n")
@@ -104,7 +106,7 @@ def test_every_shape_is_the_same_in_its_file_and_in_the_model(
     heights = np.array([0.3, -0.2, 0.4])
     told = {p.name: {"estimate": float(x), "low": 0.0, "high": 1.0}
             for p, x in zip(term.parameters, heights, strict=True)}  # fmt: skip
-    path = tmp_path / found.FILE
+    path = tmp_path / FOUND
     path.write_text(found.source([(term, told)], "A sentence."), encoding="utf-8")
     kind = f"{what}_over_{coordinate}" + (f"_by_{by}" if by else "")
     name = "".join(word.capitalize() for word in kind.split("_"))
