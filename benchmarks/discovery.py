@@ -89,7 +89,8 @@ def jobs(sets: int, clean: int, first: int, few: int = 0) -> list[Job]:
             for j, (strength, ou) in enumerate((("middle", 0.0), ("half", 0.0), ("middle", 0.1), ("half", 0.1))):
                 made.append(Job("one", effect, strength, ou, seed + 10 * i + j))
         for part in range(2):
-            made += [Job("outside", e, "", 0.0, seed + 400 + 10 * part + k) for k, e in enumerate(OUTSIDE)]
+            ou = (0.0, 0.1)[part]
+            made += [Job("outside", e, "", ou, seed + 400 + 10 * part + k) for k, e in enumerate(OUTSIDE)]
         made += [Job("two", "+".join(e), "", 0.0, seed + 500 + k) for k, e in enumerate(TWO)]
     for j, ou in enumerate((0.0, 0.1, 0.2)):
         made += [Job("none", "none", "", ou, first + 500_000 + 1000 * j + k) for k in range(clean)]

@@ -71,7 +71,8 @@ def timed(part: tuple[str, Path, dict[str, Any]], _: OnProgress = silent) -> dic
 
 def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
     report = found.report
-    drivers = report["error"]["held_out_drivers"]
+    drivers, law = report["error"]["held_out_drivers"], found.judgement.law
+    helps = found.judgement.errors if law is None else law.against
     return {
         "case": name,
         "drivers": report["data"]["drivers"],
@@ -90,7 +91,8 @@ def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
         "known": report["known"],
         "why": report["reason"],
         "partial": report["partial"],
-        "helps": {key: (h["verdict"], h["ratio"], h["low"], h["high"]) for key, h in report["helps"].items()},
+        "law": None if law is None else law.title,
+        "helps": {key: (c.light.value, c.ratio, c.low, c.high) for key, c in helps.items()},
         "ceilings": report["ceilings"],
         "before": report["error"]["before"],
         "after": report["error"]["after"],
@@ -113,6 +115,7 @@ def said(r: dict[str, Any]) -> str:
         number = f" {first['estimate']:.2f} ({first['low']:.2f} … {first['high']:.2f})" if first else ""
         names.append(" or ".join([f["name"] + number, *f["equivalent"]]))
     words = r["verdict"].replace("_", " ") + (f" ({r['why']})" if r["why"] else "")
+    words += f"; {r['law']}" if r.get("law") else ""
     words += f": {', '.join(names)}" if names else f"; nearest {r['partial']['effect']}" if r["partial"] else ""
     for k in r["known"]:
         if k["effect"] == "grade":
