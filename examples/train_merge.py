@@ -1,4 +1,4 @@
-"""Evolve drivers for a ramp in 4 CPU minutes: 3 of 10 vehicles save more delay than by the rule of a random search."""
+"""Evolve drivers for a ramp in 4 CPU minutes: with 3 of 10 vehicles delay falls; beside it a random search's rule."""
 
 import sys
 

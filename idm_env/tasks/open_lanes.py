@@ -179,6 +179,12 @@ class OpenLanesTask(LanesTask):
                 raise ValueError(f"{where} enters on lane {lane}: this road has lanes 0 to {self.road.count - 1}.")
             if destination and destination not in self.exits:
                 raise ValueError(f"{where} has destination {shown(destination)}.{nearest(destination, self.exits)}")
+            begin = float(self.road.at_lane(torch.tensor(lane), torch.zeros(()), "begins"))
+            if destination and self.exits[destination] <= begin:
+                raise ValueError(
+                    f"{where} has destination {shown(destination)} at {self.exits[destination]:g} m, behind the entry "
+                    f"of lane {lane} at {begin:g} m. Enter before it, or leave the destination out."
+                )
 
     @cached_property
     def table(self) -> TripTable | None:

@@ -13,6 +13,7 @@ from idm_env.model_file import load_environment
 from idm_env.multilane import demand
 from idm_env.tasks import Draw, Task, make_task
 from idm_env.tasks import trip_table as table
+from idm_env.tasks.open_lanes import OpenHighwayTask
 from idm_env.types import Command
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -132,6 +133,16 @@ def test_a_motorway_in_yaml_is_that_in_python() -> None:
     exec((ROOT / "examples" / "motorway.py").read_text(encoding="utf-8").split("\nenv = ")[0], said)
     given = load_environment(ROOT / "configs" / "motorway.yaml")
     assert given == {"task": "open_highway", "controlled": 1, **said["road"]}
+
+
+def test_a_destination_behind_the_entry_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a road of one's own: on those of the package every exit is behind every entry."""
+    monkeypatch.setattr(OpenHighwayTask, "exits", {"exit": 300.0})
+    rows = [{"depart": 1.0, "lane": 0, "destination": "exit"}]
+    with pytest.raises(
+        ValueError, match=r"row 0, .* has destination 'exit' at 300 m, behind the entry of lane 0 at 400 m"
+    ):
+        make_task("open_highway", on_ramp=[700.0, 800.0], trips=rows)
 
 
 @pytest.mark.parametrize("says", BAD)
