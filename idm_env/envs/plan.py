@@ -383,7 +383,7 @@ class Plan:
             after.call, tells.filled(moment.now, moment.later, given),
             before.call, asks.filled(moment.now, moment.later, given), self._places(moment, moment.given),
             bound.strides, *room.work, moment.past, moment.newest, room.ends, room.begins, address(on_past),
-            address(past), address(on_parameters), room.inputs_at, *room.loops, moment.at, 0,
+            address(past), address(on_parameters), room.inputs_at, *room.loops, moment.at, False, False, 0,
             self.groups,
         )  # fmt: skip
         return on_now, on_action, on_parameters, past

@@ -170,7 +170,7 @@ class Tape:
     ) -> None:
         self.plan, self.driver, self.steps = plan, driver, steps
         rows, kind = plan.rows, plan.real
-        self.worlds = torch.empty((steps, *blocks.shape), dtype=blocks.dtype)
+        self.worlds = torch.from_numpy(np.empty((steps, *blocks.shape), kind))  # numpy asks for large pages
         self.held: list[Any] = [blocks, push]
         self.between, self.told = plan.between.take(steps)[0], plan.told.take(steps)[0]
         self.seen = np.empty((steps + 1, seen.numel()), kind)

@@ -181,6 +181,6 @@ def retreat_chains(
     seeds_to_places(low, high, seeds, seed_places, own, n, extent[2], k)
     retreat(
         places, strides, w, h, ah, past, newest, on_end, on_begin, 0, 0, on_parameters, on_inputs, measures, phases,
-        looks, recalls, back, sends, again, k, extent, t, first, last,
+        looks, recalls, back, sends, again, k, extent, t, False, False, first, last,
     )  # fmt: skip
     sums_to_slots(low, high, sums, sum_slots, slots, n, extent[2], k)

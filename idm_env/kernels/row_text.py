@@ -80,6 +80,10 @@ _ELEMENT = re.compile(r"\b(?:[fdib]|out_\w+)\[U\((\d+|r)[^\[\]]*\]")
 """An element of the workspace or of an output: its text, and where its storage begins."""
 
 
+_NUMBER = re.compile(r"v\d+ = ")
+"""A number of a row, with a name of its own."""
+
+
 class _Group:
     """Loops over one shape that run as one: none reads what another one writes at another element."""
 
@@ -102,6 +106,14 @@ class _Group:
         self.lines.append(line)
         return True
 
+    def lets_by(self, line: str) -> bool:
+        """Return whether a number of a row may be computed before these loops, though it comes after them."""
+        name, value = line.split(" = ", 1)
+        word = re.compile(rf"\b{re.escape(name)}\b")
+        return not (
+            any(store in self._written for _, store in _elements(value)) or any(word.search(x) for x in self.lines)
+        )
+
 
 def _elements(text: str) -> list[tuple[str, str]]:
     """Return elements with the storage that each lies in."""
@@ -123,6 +135,9 @@ def fused(parts: Sequence[list[str]]) -> list[str]:
     for lines in parts:
         *head, last = lines
         line = last.strip()
+        if group is not None and _NUMBER.match(line) and not head and group.lets_by(line):
+            made.append(line)
+            continue
         alone = head and all(x.strip().startswith("for ") for x in head) and _elements(line.split(" = ")[0])
         if not alone:
             close()

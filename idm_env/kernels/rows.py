@@ -485,8 +485,16 @@ class RowFunction:
             raise Untraceable(f"{name} mixes rows")
         begin, end, step = (rest[0], rest[0] + 1, 1) if name == "select_backward" else rest
         begin, end = (min(x + shape[k] if x < 0 else x, shape[k]) for x in (begin, end))
-        lines = self._loops(shape, lambda at: f"{index(to, at)} = {self._number(0, to.kind)}")
-        part = [len(range(begin, end, step)) if j == k else n for j, n in enumerate(shape)]
+        zero, many = self._number(0, to.kind), len(range(begin, end, step))
+        if many == 1:
+
+            def chosen(at: list[str]) -> str:
+                own = [("0" if j == k else i) for j, i in enumerate(at) if j != k or name == "slice_backward"]
+                return f"{index(to, at)} = {self._at(source, own, to.kind)} if {at[k]} == {begin} else {zero}"
+
+            return self._loops(shape, chosen)
+        lines = self._loops(shape, lambda at: f"{index(to, at)} = {zero}")
+        part = [many if j == k else n for j, n in enumerate(shape)]
 
         def line(at: list[str]) -> str:
             there = [f"({begin} + {i} * {step})" if j == k else i for j, i in enumerate(at)]

@@ -1,7 +1,9 @@
 """Many steps of worlds with a policy between them, and their adjoint, in one call each.
 
 A step is ``world_loop``'s, the policy ``policy_rows``'. What every step is given was laid out beforehand: tables of
-addresses, one a step. A window goes on until the worlds of some row end: they begin anew outside.
+addresses, one a step. A window goes on until the worlds of some row end: they begin anew outside. Worlds of a tile do
+several steps before those of the next one do: what they read and write stays in the cache, and their parameters are
+laid out once.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -9,7 +11,10 @@ from __future__ import annotations
 
 from idm_env.kernels.phases import call_rows
 from idm_env.kernels.tiles import exact
-from idm_env.kernels.world_loop import retreat_worlds, step_worlds
+from idm_env.kernels.world_loop import cut, retreat_worlds, step_worlds
+
+AHEAD = 8
+"""Steps that a tile does before the next one; where an episode ends in another tile they are done again."""
 
 
 @exact
@@ -22,24 +27,31 @@ def window(
     ``seen`` (steps + 1, …) is what the policy observes and ``last_seen`` (steps, …) what is observed after a step;
     ``ends`` and ``cuts`` (steps, rows) tell whose episode is over.
     """
-    rows, slots = extent[1], extent[0]
-    for t in range(first, last):
-        call_rows(policy, 0, rows, acts[t])  # type: ignore[call-arg]
-        step_worlds(
-            before, asks[t], after, tells[t], clocks[t], later_clocks[t], places[t], strides, w, h, past,
-            newest + (t - first if slots else 0), measures, phases, looks, recalls, read, k, extent, at + t - first,
-            t > first and groups == 1, 0, groups,
-        )  # fmt: skip
-        over = False
-        for i in range(rows):
-            over = over or ends[t, i] or cuts[t, i]
-        for i in range(seen.shape[1]):
-            seen[t + 1, i] = last_seen[t, i]
+    slots, wide, done = extent[0], seen.shape[1] // extent[1], first
+    while done < last:
+        stop, over = min(done + AHEAD, last), False
+        for tile in range(groups):
+            low, high, _, _ = cut(extent, tile, tile + 1)
+            t = done
+            while t < stop:
+                call_rows(policy, low, high, acts[t])  # type: ignore[call-arg]
+                step_worlds(
+                    before, asks[t], after, tells[t], clocks[t], later_clocks[t], places[t], strides, w, h, past,
+                    newest + (t - first if slots else 0), measures, phases, looks, recalls, read, k, extent,
+                    at + t - first, t > done, tile, tile + 1,
+                )  # fmt: skip
+                for i in range(low * wide, high * wide):
+                    seen[t + 1, i] = last_seen[t, i]
+                t += 1
+                for i in range(low, high):
+                    if t < last:
+                        clocks[t, i] = later_clocks[t - 1, i]
+                    if ends[t - 1, i] or cuts[t - 1, i]:
+                        # Later steps of tiles before this one are done again: they read what they read before.
+                        stop, over = t, True
+        done = stop
         if over:
-            return t + 1
-        if t + 1 < last:
-            for i in range(rows):
-                clocks[t + 1, i] = later_clocks[t, i]
+            return done
     return last
 
 
@@ -59,29 +71,34 @@ def window_back(
     before a step (``remembers``: if anything does), ``on_later`` on that after it. Nothing flows into another episode.
     """
     rows, size, slots = extent[1], extent[2], extent[0]
-    wide, many, deep = told.shape[0] // rows, acted.shape[1], on_later.shape[0] // rows
-    for t in range(steps - 1, -1, -1):
-        now, later = (t + odd) % 2, (t + odd + 1) % 2
-        for i in range(rows):
-            over = ends[t, i] or cuts[t, i]
-            for j in range(i * wide, (i + 1) * wide):
-                told[j] = on_last[t, j] if over else on_last[t, j] + total[j]
-            for j in range(i * deep, (i + 1) * deep):
-                on_later[j] = 0.0 if over else recalled[j]
-            if over:
-                on_worlds[later, :, i * size : (i + 1) * size] = 0
-                past_worlds[later, :, i * size : (i + 1) * size] = 0
-        for i in carried:
-            on_worlds[now, i] = on_worlds[later, i]
-        retreat_worlds(
-            after, tells[t], before, asks[t], places[t], strides, w, h, ah, past,
-            newest + (t if slots else 0), on_ends, on_begins, on_pasts[later], on_pasts[now], on_parameters,
-            on_inputs, measures, phases, looks, recalls, back, sends, again, k, extent, at + t, 0, groups,
-        )  # fmt: skip
-        for i in range(many):
-            acted[t, i] += on_acted[t, i]
-        if not remembers:
-            recalled[:] = 0.0
-        call_rows(policy, 0, rows, acts[t])  # type: ignore[call-arg]
-        for i in range(rows * wide):
-            total[i] = on_seen[t, i] + looked[i]
+    wide, many, deep = told.shape[0] // rows, acted.shape[1] // rows, on_later.shape[0] // rows
+    for tile in range(groups):
+        low, high, _, _ = cut(extent, tile, tile + 1)
+        for t in range(steps - 1, -1, -1):
+            now, later, since = (t + odd) % 2, (t + odd + 1) % 2, newest + (t if slots else 0)
+            kept, more = t < steps - 1, t > 0
+            for i in range(low, high):
+                over = ends[t, i] or cuts[t, i]
+                for j in range(i * wide, (i + 1) * wide):
+                    told[j] = on_last[t, j] if over else on_last[t, j] + total[j]
+                for j in range(i * deep, (i + 1) * deep):
+                    on_later[j] = 0.0 if over else recalled[j]
+                    if not remembers:
+                        recalled[j] = 0.0
+                if over:
+                    on_worlds[later, :, i * size : (i + 1) * size] = 0
+                    past_worlds[later, :, i * size : (i + 1) * size] = 0
+            for i in carried:
+                for j in range(low * size, high * size):
+                    on_worlds[now, i, j] = on_worlds[later, i, j]
+            retreat_worlds(
+                after, tells[t], before, asks[t], places[t], strides, w, h, ah, past,
+                since, on_ends, on_begins, on_pasts[later], on_pasts[now], on_parameters,
+                on_inputs, measures, phases, looks, recalls, back, sends, again, k, extent, at + t, kept, more,
+                tile, tile + 1,
+            )  # fmt: skip
+            for i in range(low * many, high * many):
+                acted[t, i] += on_acted[t, i]
+            call_rows(policy, low, high, acts[t])  # type: ignore[call-arg]
+            for i in range(low * wide, high * wide):
+                total[i] = on_seen[t, i] + looked[i]

@@ -126,13 +126,15 @@ def step_worlds(
 @apart
 def retreat(
     places, strides, w, h, ah, past, newest, on_end, on_begin, on_past_end, on_past, on_parameters, on_inputs,
-    measures, phases, looks, recalls, back, sends, again, k, extent, t, begin, end,
+    measures, phases, looks, recalls, back, sends, again, k, extent, t, kept, more, begin, end,
 ):  # fmt: skip
     """Carry adjoints at the end of a step to its begin, tile by tile; what falls on parameters is added.
 
     Arguments as of ``advance`` and of ``lane_adjoint.backward``: ``on_end`` and ``on_begin`` are addresses of dense
     adjoints of the moving states, ``on_past_end`` and ``on_past`` (slots · signals, vehicles), newest step first,
     ``on_parameters`` (parameters, vehicles), ``on_inputs`` (inputs, vehicles). ``ah`` is room for an adjoint past.
+    ``kept`` says that the last call was that of the following step of the same single tile, and ``more`` that the next
+    one will be that of the step before: what falls on parameters is added when all have been.
     """
     slots, rows, size, wide, around = extent
     states, signals, is_ring = measures[STATES], measures[SIGNALS], measures[IS_RING] != 0
@@ -144,13 +146,14 @@ def retreat(
         at = row * size + first + skip
         for i in again:
             load(w, measures[STATE_ROWS] + i * ROW, places[i], strides, dense, 0, row, first, n, size, False)
-        load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
-        filled = max(filled, n)
+        if not kept:
+            load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
+            filled = max(filled, n)
+            fill(w, measures[GRADIENT_ROWS], 0, (measures[PARAMETERS] + measures[HOISTS]) * ROW)
         if has_inputs:
             load_inputs(w, operands, strides, t, row, first, n, size, measures)
         for i in range(measures[MOVING]):
             load(w, measures[ON_ROWS] + i * ROW, on_end[i], strides, dense, 0, row, first, n, size, False)
-        fill(w, measures[GRADIENT_ROWS], 0, (measures[PARAMETERS] + measures[HOISTS]) * ROW)
         if signals:
             fill(ah, 0, 0, len(ah))
             load_past(ah, on_past_end, False, 1, slots, signals, strides, row, first, n, size, count)
@@ -162,26 +165,27 @@ def retreat(
         step_back(w, source, pitch, ah, n, size, measures, phases, back, looks, recalls, sends, k, now, slots)
         for i in range(measures[NUMBERS]):
             copy(on_inputs, i * count + at, w, measures[ON_INPUT_ROWS] + i * ROW + skip, own)
-        if back[HOIST]:
+        if back[HOIST] and not more:
             call(back[HOIST], w, padded(n), k)  # type: ignore[call-arg]
         for i in range(measures[MOVING]):
             copy(on_begin[i], at, w, measures[ON_ROWS] + i * ROW + skip, own)
         store_past(ah, on_past, slots - 1, slots, signals, at, skip, own, count)
-        for i in range(measures[PARAMETERS]):
+        for i in range(0 if more else measures[PARAMETERS]):
             add(on_parameters, i * count + at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)
 
 
 @exact
 def retreat_worlds(
     after, told, before, asked, places, strides, w, h, ah, past, newest, on_end, on_begin, on_past_end, on_past,
-    on_parameters, on_inputs, measures, phases, looks, recalls, back, sends, again, k, extent, t, begin, end,
+    on_parameters, on_inputs, measures, phases, looks, recalls, back, sends, again, k, extent, t, kept, more, begin,
+    end,
 ):  # fmt: skip
     """Do the adjoint of ``step_worlds``: ``after`` and ``before`` are now the adjoints of these loops."""
     low, high, first, last = cut(extent, begin, end)
     call_rows(after, low, high, told)  # type: ignore[call-arg]
     retreat(
         places, strides, w, h, ah, past, newest, on_end, on_begin, on_past_end, on_past, on_parameters, on_inputs,
-        measures, phases, looks, recalls, back, sends, again, k, extent, t, first, last,
+        measures, phases, looks, recalls, back, sends, again, k, extent, t, kept, more, first, last,
     )  # fmt: skip
     call_rows(before, low, high, asked)  # type: ignore[call-arg]
 
