@@ -23,6 +23,8 @@ GOLDEN = _signed(0x9E3779B97F4A7C15)
 _FIRST = _signed(0xBF58476D1CE4E5B9)
 _SECOND = _signed(0x94D049BB133111EB)
 _LOW = 0xFFFFFFFF
+_AT_ONCE = 1 << 17
+"""Hashes that are made at once: more would ask the system for fresh memory at every operation."""
 
 
 def mix(z: Tensor) -> Tensor:
@@ -69,10 +71,16 @@ class Draw(NamedTuple):
         the same numbers, whatever the block in which they are drawn. With u₁, u₂ the halves of a hash, ``√(−2 ln u₁)
         cos 2πu₂`` and ``√(−2 ln u₁) sin 2πu₂``; at most 6.8 standard deviations.
         """
-        pairs = (width + 1) // 2
-        block = torch.arange(steps * pairs, dtype=torch.int64, device=self.key.device).view(steps, 1, pairs) + 1
-        z = _mixed((block + (step * pairs).view(1, -1, 1)).mul_(GOLDEN).add_(self.key.view(1, -1, 1)))
-        high = (z >> 32).bitwise_and_(_LOW)
-        radius = high.to(dtype).add_(0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
-        angle = z.bitwise_and_(_LOW).to(dtype).mul_(2.0 * math.pi * 2.0**-32)
-        return torch.cat((radius * angle.cos(), radius * angle.sin_()), dim=-1)[..., :width]
+        pairs, rows = (width + 1) // 2, len(self.key)
+        drawn = torch.empty(steps, rows, 2 * pairs, dtype=dtype, device=self.key.device)
+        each = max(1, _AT_ONCE // (rows * pairs)) if self.key.device.type == "cpu" else max(1, steps)
+        for first in range(0, steps, each):
+            part = drawn[first : first + each]
+            block = torch.arange(first * pairs + 1, (first + len(part)) * pairs + 1, device=self.key.device)
+            counter = block.view(-1, 1, pairs) + (step * pairs).view(1, -1, 1)
+            z = _mixed(counter.mul_(GOLDEN).add_(self.key.view(1, -1, 1)))
+            high = (z >> 32).bitwise_and_(_LOW)
+            radius = high.to(dtype).add_(0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
+            angle = z.bitwise_and_(_LOW).to(dtype).mul_(2.0 * math.pi * 2.0**-32)
+            torch.cat((radius * angle.cos(), radius.mul_(angle.sin_())), dim=-1, out=part)
+        return drawn[..., :width]

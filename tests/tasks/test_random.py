@@ -2,7 +2,7 @@
 
 import torch
 
-from idm_env.tasks import Draw
+from idm_env.tasks import Draw, random
 
 
 def draw(count, episode=0):
@@ -14,6 +14,14 @@ def test_blocks_give_what_single_steps_give():
     block = draw(3).normals(step, 6, 5, torch.float64)
     for t in range(6):
         assert torch.equal(block[t], draw(3).normals(step + t, 1, 5, torch.float64)[0])
+
+
+def test_normals_are_the_same_however_many_are_made_at_once(monkeypatch):
+    draw, step = Draw.of(torch.arange(5), torch.zeros(5, dtype=torch.int64)), torch.arange(5) - 2
+    whole = draw.normals(step, 9, 7, torch.float32)
+    monkeypatch.setattr(random, "_AT_ONCE", 50)
+    assert torch.equal(draw.normals(step, 9, 7, torch.float32), whole)
+    assert draw.normals(step, 0, 7, torch.float32).shape == (0, 5, 7)
 
 
 def test_rows_are_what_a_single_environment_draws():
