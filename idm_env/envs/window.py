@@ -117,7 +117,7 @@ def _shapes(done: Any) -> str:
 _DRIVERS: weakref.WeakKeyDictionary[nn.Module, dict[Any, Driver | None]] = weakref.WeakKeyDictionary()
 
 
-def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None) -> Driver | None:
+def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None = None) -> Driver | None:
     """Return a policy as compiled loops, recorded once; None where it runs by torch between the steps."""
     if not isinstance(policy, nn.Module):
         return None

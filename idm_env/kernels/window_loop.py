@@ -76,7 +76,7 @@ def window_back(
         low, high, _, _ = cut(extent, tile, tile + 1)
         for t in range(steps - 1, -1, -1):
             now, later, since = (t + odd) % 2, (t + odd + 1) % 2, newest + (t if slots else 0)
-            kept, more = t < steps - 1, t > 0
+            laid, more = t < steps - 1, t > 0
             for i in range(low, high):
                 over = ends[t, i] or cuts[t, i]
                 for j in range(i * wide, (i + 1) * wide):
@@ -94,7 +94,7 @@ def window_back(
             retreat_worlds(
                 after, tells[t], before, asks[t], places[t], strides, w, h, ah, past,
                 since, on_ends, on_begins, on_pasts[later], on_pasts[now], on_parameters,
-                on_inputs, measures, phases, looks, recalls, back, sends, again, k, extent, at + t, kept, more,
+                on_inputs, measures, phases, looks, recalls, back, sends, again, k, extent, at + t, laid, more,
                 tile, tile + 1,
             )  # fmt: skip
             for i in range(low * many, high * many):

@@ -72,10 +72,10 @@ class Draw(NamedTuple):
         cos 2πu₂`` and ``√(−2 ln u₁) sin 2πu₂``; at most 6.8 standard deviations.
         """
         pairs, rows = (width + 1) // 2, len(self.key)
-        drawn = torch.empty(steps, rows, 2 * pairs, dtype=dtype, device=self.key.device)
+        normals = torch.empty(steps, rows, 2 * pairs, dtype=dtype, device=self.key.device)
         each = max(1, _AT_ONCE // (rows * pairs)) if self.key.device.type == "cpu" else max(1, steps)
         for first in range(0, steps, each):
-            part = drawn[first : first + each]
+            part = normals[first : first + each]
             block = torch.arange(first * pairs + 1, (first + len(part)) * pairs + 1, device=self.key.device)
             counter = block.view(-1, 1, pairs) + (step * pairs).view(1, -1, 1)
             z = _mixed(counter.mul_(GOLDEN).add_(self.key.view(1, -1, 1)))
@@ -83,4 +83,4 @@ class Draw(NamedTuple):
             radius = high.to(dtype).add_(0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
             angle = z.bitwise_and_(_LOW).to(dtype).mul_(2.0 * math.pi * 2.0**-32)
             torch.cat((radius * angle.cos(), radius.mul_(angle.sin_())), dim=-1, out=part)
-        return drawn[..., :width]
+        return normals[..., :width]

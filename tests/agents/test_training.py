@@ -521,8 +521,7 @@ def test_a_window_of_shac_is_its_steps_one_by_one(ring, controlled):
             window = shac.roll(env, policy, target, a)
             assert bool(window.ended[:-1].any()), "no episode ends within the window"
             seen = env.task.observe(env.batch.world).flatten(1)
-            compiled = driver_of(policy, seen, controlled) is not None
-            assert compiled == (controlled == 1), "the policy of one agent runs within the window"
+            assert driver_of(policy, seen, controlled) is not None, "the policy runs between the steps"
             gain, scenes = window.gain, window.scenes
         else:
             gain, scenes = stepwise(env, policy, target, a)
