@@ -20,7 +20,8 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
     from idm_env.discovery import page
 
     with results(out, EXPLAINED) as folder:
-        unnamed = (FOUND,) if discovery.found_effect else ()
+        found_effect = discovery.found_effect
+        unnamed = (FOUND,) if found_effect else ()
         paths = {name: folder / name for name in ("report.json", "report.html", *discovery.models, *unnamed)}
         for name in EXPLAINED:  # the other model of an earlier run would be taken for one of this
             if name not in paths:
@@ -28,7 +29,7 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
         write_json(paths["report.json"], discovery.report)
         for name, model in discovery.models.items():
             save_model(paths[name], model)
-        if FOUND in paths:
-            paths[FOUND].write_text(discovery.found_effect, encoding="utf-8")
+        if found_effect:
+            paths[FOUND].write_text(found_effect, encoding="utf-8")
         write_page(paths["report.html"], page.title(discovery), page.blocks(discovery))
     return paths

@@ -72,9 +72,14 @@ def _crashed(values: dict[str, np.ndarray]) -> np.ndarray:
     return np.asarray((values["gap"] <= 0.0) & (values["present"] > 0))
 
 
+def _time(task: Task, state: State, row: int) -> float:
+    """Return the time of one row of a state (s)."""
+    return float(state.step.expand(len(state.speed))[row]) * task.simulator.dt
+
+
 def _marks(task: Task, state: State, row: int, params: Params) -> list[Mark]:
     """Return what stands on the road of one row of a state."""
-    now = float(state.step.expand(len(state.speed))[row]) * task.simulator.dt
+    now = _time(task, state, row)
     marks: list[Mark] = []
     for effect in task.simulator.effects if params else ():
         own = params[effect.name].items()
@@ -190,7 +195,7 @@ class Viewer:
 
     def _watch(self, task: Task, state: State, row: int, lane: np.ndarray) -> None:
         """Keep who has changed lanes in the last second, and from where."""
-        now = float(state.step.expand(len(state.speed))[row]) * task.simulator.dt
+        now = _time(task, state, row)
         self._changes = {i: (old, at) for i, (old, at) in self._changes.items() if 0.0 <= now - at <= _CHANGE_SHOWN}
         if self._lanes is not None and len(self._lanes) == len(lane):
             for i in np.flatnonzero(np.abs(lane - self._lanes) == 1):
@@ -311,7 +316,7 @@ class Viewer:
     ) -> None:  # fmt: skip
         there = values["present"] > 0
         mean = float(values["speed"][there].mean()) if there.any() else 0.0
-        seconds = float(state.step.expand(len(state.speed))[row]) * task.simulator.dt
+        seconds = _time(task, state, row)
         crash = "   crash" if _crashed(values).any() else ""
         text = f"{task.name}   t = {seconds:.1f} s   mean speed {mean:.1f} m/s{crash}"
         canvas.blit(self._font.render(text, True, _INK), (12, 10))
