@@ -78,6 +78,16 @@ def test_bad_input_is_one_line_and_exit_code_1(frame: pl.DataFrame, tmp_path: Pa
     assert not (tmp_path / "out" / "report.json").exists()
 
 
+@pytest.mark.parametrize("words", [["--help"], ["fit", "--help"], ["effects"]])
+def test_who_reads_no_further_is_told_nothing(words: list[str]) -> None:
+    """As ``idm-env --help | head -1`` with a reader that has gone: no advice to mend a file."""
+    command = [sys.executable, "-m", "idm_env", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None and running.stderr is not None
+        running.stdout.close()
+        assert running.stderr.read() == ""
+
+
 def test_options_that_go_together_are_in_every_command_of_their_kind() -> None:
     """Work that can be taken up again can be done by others, and a file that is cut by rows is read in any layout."""
     commands = {c.name or c.callback.__name__: set(inspect.signature(c.callback).parameters)

@@ -804,6 +804,8 @@ def run() -> None:
     except BaseException as error:  # nothing of ours, unless a shell completes a command line
         if "_IDM_ENV_COMPLETE" in os.environ or {"--show-completion", "--install-completion"} & set(sys.argv):
             raise
+        if isinstance(error.__context__, BrokenPipeError):
+            raise  # rich and click end so where nobody reads on, as of "… | head"
         words = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": ")
         _failed(ValueError(f"the command was ended from within ({words}), as by a file of effects. Mend that file."))
     if code == 130:
