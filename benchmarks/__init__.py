@@ -1,18 +1,20 @@
 """Benchmarks: every figure in README and docs comes from one of these commands.
 
-What those share that consist of parts is here: where parts run, and the rows that are done and kept. Importing this
-imports no numpy, since some set threads before it starts.
+What they share is here: how a function becomes a command, where parts run, the rows that are done and kept, and tables.
+Importing this imports no numpy, since some set threads before it starts.
 """
 
 from __future__ import annotations
 
-import argparse
+import inspect
 import json
+import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TextIO, TypeVar
 
 if TYPE_CHECKING:
     from idm_env.jobs.executor import Executor, Work
@@ -20,13 +22,43 @@ if TYPE_CHECKING:
 P = TypeVar("P")
 
 
-def add_executor(parser: argparse.ArgumentParser, usual: str = "serial") -> None:
-    """Add ``--executor``, ``--jobs`` and ``--ray-address``."""
-    from idm_env.jobs.executor import KINDS
+@dataclass(frozen=True)
+class Place:
+    """Where parts run; no result depends on it.
 
-    parser.add_argument("--executor", choices=KINDS, default=usual, help="where parts run; no result depends on it")
-    parser.add_argument("--jobs", type=int, help="parts that run at a time; default: one per processor")
-    parser.add_argument("--ray-address", help="of a Ray cluster, host:port or auto; default: Ray on this machine")
+    Args:
+        executor: Here, in processes, or as tasks of a Ray cluster.
+        jobs: Parts that run at a time; by default one per processor.
+        ray_address: Of a Ray cluster, host:port or auto; by default Ray on this machine.
+    """
+
+    executor: Literal["serial", "processes", "ray"] = "serial"
+    jobs: int | None = None
+    ray_address: str | None = None
+
+    def opened(self) -> AbstractContextManager[Executor]:
+        """Give the executor."""
+        from idm_env.jobs.executor import opened
+
+        return opened(self.executor, self.jobs, self.ray_address)
+
+
+HERE, IN_PROCESSES = Place(), Place("processes")
+DATA = Path(os.environ.get("IDM_ENV_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+"""Folder of the measured files."""
+
+
+def command(work: Callable[..., None] | Mapping[str, Callable[..., None]]) -> None:
+    """Run a function, or one of several by name, as the command line says: parameters are options of the same name."""
+    import tyro
+
+    module: Any = inspect.getmodule(work if callable(work) else next(iter(work.values())))
+    said: dict[str, Any] = {
+        "prog": f"python -m {module.__spec__.name}",
+        "description": module.__doc__,
+        "config": (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    }
+    tyro.cli(work, **said) if callable(work) else tyro.extras.subcommand_cli_from_dict(dict(work), **said)
 
 
 def kept_rows(out: Path, column: str) -> dict[Any, dict[str, Any]]:
@@ -35,38 +67,46 @@ def kept_rows(out: Path, column: str) -> dict[Any, dict[str, Any]]:
     return {row[column]: row for row in rows}
 
 
-def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
-    """Give the executor that the arguments name."""
-    from idm_env.jobs.executor import opened
-
-    return opened(arguments.executor, arguments.jobs, arguments.ray_address)
+def _keep(row: dict[str, Any], file: TextIO) -> dict[str, Any]:
+    """Write a row, and return it as ``kept_rows`` will read it."""
+    line = json.dumps(row)
+    file.write(line + "\n")
+    file.flush()
+    return json.loads(line)  # type: ignore[no-any-return]
 
 
 def rows_of(
-    work: Work[P, Any], parts: Sequence[P], out: Path, arguments: argparse.Namespace
-) -> Iterator[dict[str, Any]]:
-    """Give the row of every part when it is done, as ``kept_rows`` will read it; by then it is a line of the file."""
-    with executor_of(arguments) as executor, out.open("a") as file:
-        for _, row in executor.map(work, parts):
-            line = json.dumps(row)
-            file.write(line + "\n")
-            file.flush()
-            yield json.loads(line)
+    work: Work[P, Any], parts: Mapping[str, P], out: Path, place: Place, column: str, told: Callable[[Any], str]
+) -> list[dict[str, Any]]:
+    """Return the row of every part; those that a file has under their ``column`` are not done again.
+
+    Each is a line of the file when it is done, and ``told`` on stderr.
+    """
+    done = kept_rows(out, column)
+    missing = [part for name, part in parts.items() if name not in done]
+    with place.opened() as executor, out.open("a") as file:
+        for number, (_, row) in enumerate(executor.map(work, missing), 1):
+            done[row[column]] = row = _keep(row, file)
+            print(f"{number}/{len(missing)} {row[column]}: {told(row)}", file=sys.stderr, flush=True)
+    return [done[name] for name in parts]
 
 
-def named_rows(work: Work[P, Any], parts: Mapping[str, P], out: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+def named_rows(work: Work[P, Any], parts: Mapping[str, P], out: Path, place: Place) -> dict[str, Any]:
     """Return what every part gives, by name; each is kept in a file when it is done, and not done again.
 
     What a part says of itself (``repr``) is kept beside it: where that differs, or is missing, it is done anew.
     """
     done = kept_rows(out, "name")
-    todo = [name for name, part in parts.items() if done.get(name, {}).get("part") != repr(part)]
+    missing = [name for name, part in parts.items() if done.get(name, {}).get("part") != repr(part)]
     out.parent.mkdir(parents=True, exist_ok=True)
-    with executor_of(arguments) as executor, out.open("a") as file:
-        for i, found in executor.map(work, [parts[name] for name in todo]):
-            line = json.dumps({"name": todo[i], "part": repr(parts[todo[i]]), "found": found})
-            done[todo[i]] = json.loads(line)
-            file.write(line + "\n")
-            file.flush()
-            print(f"{todo[i]}: done, kept in {out}", file=sys.stderr, flush=True)
+    with place.opened() as executor, out.open("a") as file:
+        for i, result in executor.map(work, [parts[name] for name in missing]):
+            name = missing[i]
+            done[name] = _keep({"name": name, "part": repr(parts[name]), "found": result}, file)
+            print(f"{name}: done, kept in {out}", file=sys.stderr, flush=True)
     return {name: done[name]["found"] for name in parts}
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))

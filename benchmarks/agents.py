@@ -1,11 +1,11 @@
 """Agents side by side: equal searches, ten seeds of the best, held-out rings and drivers.
 
-    python benchmarks/agents.py reference [--tests failsafe-shock follow] [--out runs/benchmark]
-    python benchmarks/agents.py run [--only ring-ppo] [--trial 0] [--seeds 3] [--times 10] [--executor ray]
-    python benchmarks/agents.py table [--out runs/benchmark]
-    python benchmarks/agents.py picture [--out runs/benchmark]
-    python benchmarks/agents.py takeover [--out runs/benchmark]
-    python benchmarks/agents.py shocks [--only ring-brakes-distil]
+    python -m benchmarks.agents reference [--tests failsafe-shock follow] [--out runs/benchmark]
+    python -m benchmarks.agents run [--only ring-ppo] [--trial 0] [--seeds 3] [--times 10] [--executor ray]
+    python -m benchmarks.agents table [--out runs/benchmark]
+    python -m benchmarks.agents picture [--out runs/benchmark]
+    python -m benchmarks.agents takeover [--out runs/benchmark]
+    python -m benchmarks.agents shocks [--only ring-brakes-distil]
 
 ``reference`` has what learns nothing, ``run`` the searches and the seeds of each best trial (or of the one that is
 given, without a search). Every training is one process with one thread and one file of results; what is done is
@@ -32,17 +32,14 @@ import statistics
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
     os.environ.setdefault(variable, "1")
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-import matplotlib.pyplot as plt  # noqa: E402 (threads are set before numpy starts, and the path before our own)
+import matplotlib.pyplot as plt  # noqa: E402 (threads are set before numpy starts)
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
@@ -75,12 +72,12 @@ from agents.reference import (  # noqa: E402
     tried,
 )  # fmt: skip
 from agents.rollout import FRESH, LENGTHS, Act  # noqa: E402
-from benchmarks import add_executor, executor_of  # noqa: E402
-from idm_env.jobs.executor import Executor, Serial  # noqa: E402
+from benchmarks import HERE, Place, command, table  # noqa: E402
 from idm_env.jobs.progress import OnProgress  # noqa: E402
 from idm_env.jobs.storage import write_text  # noqa: E402
 from idm_env.model_file import read_yaml  # noqa: E402
 
+ROOT = Path(__file__).resolve().parents[1]
 LIMIT = 150.0
 """CPU seconds after which a training ends that has updates left."""
 SHOCKS: dict[str, dict[str, Any]] = {
@@ -92,6 +89,7 @@ SHOCKS: dict[str, dict[str, Any]] = {
 TESTS = (*(ring + shock for ring in ("failsafe", "brakes") for shock in SHOCKS), "follow")
 """Of the reference rows (``tests``)."""
 SEARCH_SEEDS, SEEDS = (100, 101), tuple(range(10))
+OUT = Path("runs/benchmark")
 
 Options = dict[str, Any]
 Row = dict[str, Any]
@@ -294,29 +292,31 @@ def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
 
 
 def run(
-    configs: list[str],
-    out: Path,
-    seeds: int,
-    given: int | None = None,
-    executor: Executor | None = None,
-    times: int = 1,
-) -> None:
-    """Do every search and the first ``seeds`` seeds of its best trial, or those of a given one without any search.
+    only: Sequence[str] = tuple(SEARCH), out: Path = OUT, seeds: int = len(SEEDS), trial: int | None = None,
+    times: int = 1, place: Place = HERE,
+) -> None:  # fmt: skip
+    """Do every search, and train the first seeds of its best trial.
 
-    ``times`` makes the trainings of these seeds longer, not those of the search.
+    Args:
+        only: Configurations, such as ring-ppo.
+        out: Folder of all results.
+        seeds: Train no more seeds than that.
+        trial: Train the seeds of this trial, without a search.
+        times: Train the seeds for so many times the updates; searches are not longer.
+        place: Where trainings run.
     """
-    executor = executor or Serial()
-    searched = [job for config in configs for job in trials(config)] if given is None else []
-    deque(executor.map(train, [Training(job, out) for job in searched]), 0)
-    wanted = []
-    for config in configs:
-        trial = chosen(config, out)[0] if given is None else given
-        if trial < 0:
-            print(f"{config}: another process is still searching.")
-            continue
-        best = SEARCH[config][trial]
-        wanted += [Job(config, trial, best, s, times) for s in SEEDS[:seeds]]
-    deque(executor.map(train, [Training(job, out) for job in wanted]), 0)
+    out = out.resolve()
+    searched = [job for config in only for job in trials(config)] if trial is None else []
+    with place.opened() as executor:
+        deque(executor.map(train, [Training(job, out) for job in searched]), 0)
+        wanted = []
+        for config in only:
+            best = chosen(config, out)[0] if trial is None else trial
+            if best < 0:
+                print(f"{config}: another process is still searching.")
+                continue
+            wanted += [Job(config, best, SEARCH[config][best], s, times) for s in SEEDS[:seeds]]
+        deque(executor.map(train, [Training(job, out) for job in wanted]), 0)
 
 
 def results(out: Path, config: str) -> list[Row]:
@@ -333,13 +333,6 @@ def groups(out: Path, config: str, seeds: Sequence[int]) -> dict[str, list[Row]]
             times = r.get("times", 1)
             found.setdefault(f"{r['trial']}" + (f", {times} times" if times > 1 else ""), []).append(r)
     return found
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a Markdown table."""
-    print("\n| " + " | ".join(head) + " |\n|" + " --- |" * len(head))
-    for row in rows:
-        print("| " + " | ".join(row) + " |")
 
 
 def spread(values: Sequence[float], form: str) -> str:
@@ -365,7 +358,7 @@ def search_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> Non
             ends = ["/".join(ring(r["last"])[:2]) for r in part if r["history"]]
             options = ", ".join(f"{k} {v}" for k, v in part[0]["options"].items())
             rows.append([config, str(trial), options, f"{solved(part)} of {len(part)}", ", ".join(ends)])
-    table(("agent", "trial", "what it changes", "solved", "last ratio/std of each seed"), rows)
+    print("\n" + table(("agent", "trial", "what it changes", "solved", "last ratio/std of each seed"), rows))
 
 
 def solved(rows: Sequence[Row]) -> int:
@@ -389,10 +382,10 @@ def summary_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> No
             spread([d["cpu_seconds"] for d in done], ".1f"), spread([d["steps"] / 1000 for d in done], ".0f"),
             spread([d["steps"] * vehicles / 1e6 for d in done], ".1f"),
         ])  # fmt: skip
-    table(
+    print("\n" + table(
         ("agent", "trial", "solved", "ever passed", "CPU s to first pass", "CPU s trained", "CPU s to solved",
          "1000 steps to solved", "million vehicle-steps to solved"), rows
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 def median_ratio(theirs: Sequence[float], ours: Sequence[float], draws: int = 10_000) -> tuple[float, float, float]:
@@ -451,13 +444,21 @@ def seed_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
             before = "/".join(ring(r["untrained"])[:2])
             rows.append([config, name, str(r["seed"]), before, *when, *ends, *far])
     figures = "ratio/std/time gap/collisions"
-    table(
+    print("\n" + table(
         ("agent", "trial", "seed", "before any update", "CPU s", "1000 steps", f"last: {figures}", f"best: {figures}",
          "lengths 200–300 m", "drivers ±20 %, worst", "drivers mixed"), rows,
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
-def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+def checkpoints(out: Path, config: str, seeds: int) -> list[Path]:
+    """Return the last checkpoints of a configuration's first seeds."""
+    return [p for seed in SEEDS[:seeds] for p in sorted((out / config).glob(f"trial*/seed{seed}/training/last.pt"))]
+
+
+RINGS, FOLLOWERS = (tuple(c for c in SEARCH if c.startswith(task)) for task in ("ring", "follow"))
+
+
+def takeover(only: Sequence[str] = RINGS, out: Path = OUT, seeds: int = len(SEEDS)) -> None:
     """Print where the last checkpoints touch somebody, taking over in other traffic, without and with a failsafe.
 
     A case is: rings with a collision of all rings, and the medians over seeds of worst speed ratio and deviation.
@@ -466,9 +467,8 @@ def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> N
     # A controller with memory drives one batch once, so it is made anew for every case.
     by_hand = controllers(environment, LENGTHS, draws)
     policies: dict[str, list[Any]] = {name: [by_hand[name]] for name in ("no command", "PI with saturation")}
-    for config in configs:
-        paths = [(out / config).glob(f"trial*/seed{seed}/training/last.pt") for seed in seeds]
-        policies[config] = [lambda path=path: common.load(path)[0] for found in paths for path in found]
+    for config in only:
+        policies[config] = [lambda path=path: common.load(path)[0] for path in checkpoints(out, config, seeds)]
     for name, makers in policies.items():
         for failsafe in (0.0, 3.0):
             own = {**environment, "failsafe": failsafe}
@@ -479,23 +479,23 @@ def takeover_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> N
                 ratio, std = (statistics.median(r[k] for r in found) for k in ("speed_ratio", "speed_std"))
                 figures.append(f"{touched} of {rings} / {ratio:.3f} / {std:.2f}")
             rows.append([name, str(len(makers)), f"{failsafe:g} m/s²" if failsafe else "none", *figures])
-    table(
+    print("\n" + table(
         ("agent", "seeds", "failsafe", "after 75 s (Flow's)", "after 175 s", "after 300 s (the test)",
          "after 300 s, drivers mixed"), rows,
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
-def shocks_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> None:
+def shocks(only: Sequence[str] = RINGS, out: Path = OUT, seeds: int = len(SEEDS)) -> None:
     """Print what the last checkpoints do on the thirty fresh rings of their test, by its shocks."""
     rows = []
-    for config in configs:
-        for path in (p for seed in seeds for p in sorted((out / config).glob(f"trial*/seed{seed}/training/last.pt"))):
+    for config in only:
+        for path in checkpoints(out, config, seeds):
             policy, content = common.load(path)
             test = as_judged(content["environment"], content["training"]["arguments"]["judged_in"])
             found = [evaluate(policy, {**test, **shock}, draws=FRESH) for shock in SHOCKS.values()]
             figures = ["/".join(ring(x)) + (", passes" if x["passed"] else "") for x in found]
             rows.append([config, *path.parts[-4:-2], *figures])
-    table(("agent", "trial", "seed", *(name or "no shock" for name in SHOCKS)), rows)
+    print("\n" + table(("agent", "trial", "seed", *(name or "no shock" for name in SHOCKS)), rows))
 
 
 def environment_of(config: str) -> Row:
@@ -517,13 +517,13 @@ def follow_table(out: Path, configs: Sequence[str], leader: Path | None) -> None
         )
         rows.append([name, "IDM", "", *follow(human)])
         for config in configs:
-            for path in sorted((out / config).glob("trial*/seed*/training/last.pt")):
+            for path in checkpoints(out, config, len(SEEDS)):
                 seed = path.parents[1].name.removeprefix("seed")
                 rows.append([name, config, seed, *follow(evaluate_follow(common.load(path)[0], environment))])
-    table(
+    print("\n" + table(
         ("leader", "vehicle", "seed", "reward per step", "L/100 km", "L/100 km with those behind", "energy (J/kg/m)",
          "smallest time gap (s)", "collisions"), [r + [""] * (9 - len(r)) for r in rows],
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 def follow(r: Row) -> list[str]:
@@ -534,19 +534,15 @@ def follow(r: Row) -> list[str]:
     ]  # fmt: skip
 
 
-def tables(
-    out: Path, search: dict[str, list[Row]], search_seeds: Sequence[int], seeds: Sequence[int], data: Path
-) -> None:
+def tables(out: Path = OUT) -> None:
     """Print everything that there are results for."""
-    compared = [c for c, trials in search.items() if len(trials) > 1]
-    rings, followers = ([c for c in search if c.startswith(task)] for task in ("ring", "follow"))
-    search_table(out, compared, search_seeds)
-    for task, configs in (("ring", rings), ("follow", followers)):
-        summary_table(out, configs, seeds)
+    search_table(out, [c for c, trials in SEARCH.items() if len(trials) > 1], SEARCH_SEEDS)
+    for task, configs in (("ring", RINGS), ("follow", FOLLOWERS)):
+        summary_table(out, configs, SEEDS)
         for other in ("shac", "ppo", "sac"):
-            ratio_line(out, f"{task}-apg", f"{task}-{other}", seeds)
-    seed_table(out, rings, seeds)
-    follow_table(out, followers, data)
+            ratio_line(out, f"{task}-apg", f"{task}-{other}", SEEDS)
+    seed_table(out, RINGS, SEEDS)
+    follow_table(out, FOLLOWERS, default_data())
 
 
 UNTRAINED = range(8)
@@ -555,7 +551,7 @@ MOST = 0.05
 """Share of the random policies above which a task is no test."""
 
 
-def tests() -> dict[str, Row]:
+def environments() -> dict[str, Row]:
     """Return the environments by name: rings behind a failsafe or with real brakes, with a shock or without; follow."""
     guarded = environment_of("ring-apg")
     free = {**guarded, "failsafe": 0.0, "max_command": [-4.5, 2.6]}
@@ -622,11 +618,17 @@ def behind_leader(environment: Row, folder: Path) -> dict[str, Callable[[], Row]
     return made
 
 
-def reference(out: Path, names: Sequence[str]) -> None:
-    """Do what is missing, and print the table."""
+def reference(tests: Sequence[Literal[TESTS]] = TESTS, out: Path = OUT) -> None:
+    """Drive what learns nothing where that is not done yet, and print the table.
+
+    Args:
+        tests: By the names of their environments.
+        out: Folder of all results.
+    """
+    out = out.resolve()
     columns: dict[str, dict[str, Row | None]] = {}
-    for name in names:
-        environment, folder = tests()[name], out / "reference" / name
+    for name in tests:
+        environment, folder = environments()[name], out / "reference" / name
         columns[name] = {}
         # With and without a shock policies are trained alike.
         trained = out / "reference" / name.split("-")[0]
@@ -635,11 +637,15 @@ def reference(out: Path, names: Sequence[str]) -> None:
             print(f"{name}: {row}", flush=True)
             columns[name][row] = once(folder / f"row{i}", lambda make=make, row=row: {"row": row, **make()})
     every = dict.fromkeys(row for column in columns.values() for row in column)
-    rows = [[row, *(told(columns[n][row]) if row in columns[n] else "" for n in names)] for row in every]
-    table(
-        ("passed of tried; the best: ratio/std/time gap/collisions, of follow reward/time gap/collisions", *names), rows
+    rows = [[row, *(told(columns[n][row]) if row in columns[n] else "" for n in tests)] for row in every]
+    print(
+        "\n"
+        + table(
+            ("passed of tried; the best: ratio/std/time gap/collisions, of follow reward/time gap/collisions", *tests),
+            rows,
+        )
     )
-    for name in names:
+    for name in tests:
         found = [columns[name][row] for row in RANDOM]
         done = [r for r in found if r is not None]
         if len(done) == len(found):
@@ -692,12 +698,12 @@ def curve(axes: Axes, rows: Sequence[Row], name: str, colour: str) -> None:
     axes.plot(spent, left.evaluate(spent), "|", color=colour, markersize=10)
 
 
-def picture(out: Path, seeds: Sequence[int], path: Path) -> None:
-    """Write the picture, a panel per task."""
+def picture(out: Path = OUT, path: Path = ROOT / "docs" / "agents_survival.png") -> None:
+    """Draw the picture, a panel per task."""
     figure, panels = plt.subplots(1, len(TASKS), figsize=(10, 3.6), sharey=True, layout="constrained")
     for axes, (task, title) in zip(panels, TASKS.items(), strict=True):
         for agent, colour in AGENTS.items():
-            rows = shown(out, f"{task}-{agent}", seeds)
+            rows = shown(out, f"{task}-{agent}", SEEDS)
             if rows:
                 curve(axes, rows, agent.upper(), colour)
         axes.set(title=title, xscale="log", xlabel="CPU seconds of training", ylim=(-0.03, 1.4))
@@ -711,32 +717,9 @@ def picture(out: Path, seeds: Sequence[int], path: Path) -> None:
 
 def main() -> None:
     """Run, or show."""
-    import argparse
-
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["reference", "run", "table", "picture", "takeover", "shocks"])
-    parser.add_argument("--only", nargs="*", default=list(SEARCH))
-    parser.add_argument("--tests", nargs="*", default=list(TESTS), choices=TESTS, help="of the reference rows")
-    parser.add_argument("--trial", type=int, help="train the seeds of this trial, without a search")
-    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="train no more seeds than that")
-    parser.add_argument("--times", type=int, default=1, help="train the seeds for so many times the updates")
-    parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
-    add_executor(parser)
-    options = parser.parse_args()
-    rings, seeds = [c for c in options.only if c.startswith("ring")], SEEDS[: options.seeds]
-    if options.what == "table":
-        tables(options.out, SEARCH, SEARCH_SEEDS, SEEDS, default_data())
-    elif options.what == "picture":
-        picture(options.out, SEEDS, ROOT / "docs" / "agents_survival.png")
-    elif options.what == "takeover":
-        takeover_table(options.out, rings, seeds)
-    elif options.what == "shocks":
-        shocks_table(options.out, rings, seeds)
-    elif options.what == "reference":
-        reference(options.out.resolve(), options.tests)
-    else:
-        with executor_of(options) as executor:
-            run(options.only, options.out.resolve(), options.seeds, options.trial, executor, options.times)
+    command({
+        "reference": reference, "run": run, "table": tables, "picture": picture, "takeover": takeover, "shocks": shocks,
+    })  # fmt: skip
 
 
 if __name__ == "__main__":

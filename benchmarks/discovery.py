@@ -3,16 +3,14 @@
 Every set is generated from a fresh seed by idm_env.data.synthetic, whose code shares nothing with the simulator; the
 tool sees positions, speeds and lengths only. One line of JSON per set is kept, so that a run goes on where it stopped:
 
-    python benchmarks/discovery.py --sets 2 --clean 100 --jobs 2 --out /tmp/discovery_benchmark.jsonl
-    python benchmarks/discovery.py --pictures docs    # those of docs/closing-the-loop.md, from data made here
+    python -m benchmarks.discovery --sets 2 --clean 100 --jobs 2 --out /tmp/discovery_benchmark.jsonl
+    python -m benchmarks.discovery --pictures docs    # those of docs/closing-the-loop.md, from data made here
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import os
-import sys
 import time
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -21,11 +19,9 @@ from typing import Any
 for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
     os.environ.setdefault(variable, "1")
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 
-from benchmarks import add_executor, kept_rows, rows_of  # noqa: E402
+from benchmarks import IN_PROCESSES, Place, command, rows_of  # noqa: E402
 
 RESPONSE = {"delay", "lag"}
 TRUE = {
@@ -260,7 +256,7 @@ def share(rows: list[Any]) -> str:
     return f"{100 * np.mean(rows):.0f} % of {len(rows)}" if rows else "–"
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def shown(rows: list[dict[str, Any]]) -> str:
     """Return the table of results and the confusion matrix as text."""
     one = [r for r in rows if r["kind"] == "one"]
     groups = defaultdict(list)
@@ -324,7 +320,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def pictures(folder: Path) -> None:
+def draw(folder: Path) -> None:
     """Draw what one discovery tried, who looks like whom, and gaps before and after."""
     from idm_env.data import synthetic
     from idm_env.discovery import discover, pictures
@@ -339,30 +335,28 @@ def pictures(folder: Path) -> None:
         figure.savefig(folder / f"discovery_{name}.png", dpi=90, bbox_inches="tight")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", type=int, default=1, help="sets of every kind with an effect")
-    parser.add_argument("--clean", type=int, default=6, help="sets without an effect, of every kind of noise")
-    parser.add_argument("--few", type=int, default=0, help="sets without an effect, of 4 to 9 runs")
-    add_executor(parser, "processes")
-    parser.add_argument("--first-seed", type=int, default=70_000)
-    parser.add_argument("--only", default="", help="part of the keys of the sets to run, such as 'one|delay'")
-    parser.add_argument("--out", type=Path, default=Path("discovery_benchmark.jsonl"))
-    parser.add_argument("--pictures", type=Path, help="draw the pictures of the documents into this folder, no more")
-    arguments = parser.parse_args()
-    if arguments.pictures is not None:
-        pictures(arguments.pictures)
+def main(
+    sets: int = 1, clean: int = 6, few: int = 0, first_seed: int = 70_000, only: str = "",
+    out: Path = Path("discovery_benchmark.jsonl"), pictures: Path | None = None, place: Place = IN_PROCESSES,
+) -> None:  # fmt: skip
+    """Run the sets that are not there yet, and print the table.
+
+    Args:
+        sets: Sets of every kind with an effect.
+        clean: Sets without an effect, of every kind of noise.
+        few: Sets without an effect, of 4 to 9 runs.
+        first_seed: Of the first set.
+        only: Part of the keys of the sets to run, such as 'one|delay'.
+        out: File of rows.
+        pictures: Draw the pictures of the documents into this folder, no more.
+        place: Where sets are worked on.
+    """
+    if pictures is not None:
+        draw(pictures)
         return
-    done = kept_rows(arguments.out, "key")
-    wanted = [
-        j for j in jobs(arguments.sets, arguments.clean, arguments.first_seed, arguments.few) if arguments.only in j.key
-    ]
-    missing = [j for j in wanted if j.key not in done]
-    for number, row in enumerate(rows_of(measure, missing, arguments.out, arguments), 1):
-        done[row["key"]] = row
-        print(f"{number}/{len(missing)} {row['key']}: {row['verdict']} {row['found']}", file=sys.stderr)
-    print(table([done[j.key] for j in wanted if j.key in done]))
+    parts = {job.key: job for job in jobs(sets, clean, first_seed, few) if only in job.key}
+    print(shown(rows_of(measure, parts, out, place, "key", lambda row: f"{row['verdict']} {row['found']}")))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

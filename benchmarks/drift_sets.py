@@ -13,10 +13,8 @@ be, so that a run goes on where it stopped.
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +28,7 @@ import polars as pl  # noqa: E402
 import torch  # noqa: E402
 from scipy.stats import t as student  # noqa: E402
 
-from benchmarks import add_executor, kept_rows, rows_of  # noqa: E402
+from benchmarks import HERE, Place, command, rows_of, table  # noqa: E402
 from idm_env.data import Trajectories, episodes  # noqa: E402
 from idm_env.drift.estimate import estimate, usual  # noqa: E402
 from idm_env.drift.kinds import behind_a_record, tell  # noqa: E402
@@ -138,13 +136,11 @@ def key(part: Part) -> str:
     return f"{seed}{size}|alone" if alone else f"{seed}{size}"
 
 
-def table(sets: list[dict[str, Any]]) -> str:
+def shown(sets: list[dict[str, Any]]) -> str:
     """Return what came out, by sort and of all."""
-    lines = [
-        "hidden | sets | right name alone | among those named | sigma: median error (foreseen); estimate / true, "
-        "median; covered | tau: the same",
-        "--- | --- | --- | --- | --- | ---",
-    ]
+    head = ("hidden", "sets", "right name alone", "among those named",
+            "sigma: median error (foreseen); estimate / true, median; covered", "tau: the same")  # fmt: skip
+    lines = []
     drifting = [s for s in sets if s["hidden"] != "none"]
     for name in dict.fromkeys([*(s["hidden"] for s in drifting), "all"]):
         rows = [s for s in drifting if name in (s["hidden"], "all")]
@@ -152,11 +148,11 @@ def table(sets: list[dict[str, Any]]) -> str:
         alone, among = sum(s["one_of"] == [s["hidden"]] for s in told), sum(s["hidden"] in s["one_of"] for s in told)
         texts = [str(alone), str(among)] if told else ["–", "–"]
         texts += [recovered(rows, i, number) for i, number in enumerate(("sigma", "memory_time"))]
-        lines.append(f"{name} | {len(rows)} | {' | '.join(texts)}")
+        lines.append([name, str(len(rows)), *texts])
     steady = [not s["one_of"] for s in sets if s["hidden"] == "none"]
     if steady:
-        lines.append(f"none | {len(steady)} | {sum(steady)} | – | – | –")
-    return "\n".join([*lines, f"CPU seconds per set, median: {np.median([s['cpu_s'] for s in sets]):.0f}"])
+        lines.append(["none", str(len(steady)), str(sum(steady)), "–", "–", "–"])
+    return "\n".join([table(head, lines), f"CPU seconds per set, median: {np.median([s['cpu_s'] for s in sets]):.0f}"])
 
 
 def recovered(rows: list[dict[str, Any]], i: int, number: str) -> str:
@@ -172,30 +168,30 @@ def recovered(rows: list[dict[str, Any]], i: int, number: str) -> str:
     return f"{100 * error:.0f} % ({100 * foreseen:.0f} %); {np.median(ratio):.2f}; {sum(inside)} of {len(rows)}"
 
 
-def main() -> None:
-    """Run the sets that are not there yet, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", type=int, default=60)
-    parser.add_argument("--first-seed", type=int, default=1000)
-    parser.add_argument("--out", type=Path, default=Path("drift_sets.jsonl"))
-    parser.add_argument("--drivers", type=int, default=DRIVERS)
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="of every driver")
-    only = parser.add_mutually_exclusive_group()
-    only.add_argument("--alone", action="store_true", help="estimate only what is hidden, on sets with drift")
-    only.add_argument("--steady", action="store_true", help="only sets without drift, a fifth of --sets")
-    add_executor(parser)
-    arguments = parser.parse_args()
-    done = kept_rows(arguments.out, "key")
-    seeds: Sequence[int] = range(arguments.first_seed, arguments.first_seed + arguments.sets)
-    if arguments.alone or arguments.steady:
-        seeds = [s for s in seeds if bool(HIDDEN[s % len(HIDDEN)][1]) == arguments.alone]
-    wanted = [(s, arguments.alone, arguments.drivers, arguments.seconds) for s in seeds]
-    missing = [part for part in wanted if key(part) not in done]
-    for row in rows_of(scored, missing, arguments.out, arguments):
-        done[row["key"]] = row
-        print(f"{row['key']}: {row['hidden']}, told {row['one_of']}", file=sys.stderr, flush=True)
-    print(table([done[key(part)] for part in wanted]))
+def main(
+    sets: int = 60, first_seed: int = 1000, out: Path = Path("drift_sets.jsonl"), drivers: int = DRIVERS,
+    seconds: float = SECONDS, alone: bool = False, steady: bool = False, place: Place = HERE,
+) -> None:  # fmt: skip
+    """Run the sets that are not there yet, and print the table.
+
+    Args:
+        sets: How many, those of other seeds left out by ``alone`` and ``steady`` included.
+        first_seed: Of the first set.
+        out: File of rows.
+        drivers: Of a set.
+        seconds: Of every driver.
+        alone: Estimate only what is hidden, on sets with drift.
+        steady: Only sets without drift, a fifth of them.
+        place: Where sets are worked on.
+    """
+    if alone and steady:
+        raise SystemExit("error: --alone and --steady leave no set. Give one of them.")
+    seeds: Sequence[int] = range(first_seed, first_seed + sets)
+    if alone or steady:
+        seeds = [s for s in seeds if bool(HIDDEN[s % len(HIDDEN)][1]) == alone]
+    parts = {key(part): part for part in ((s, alone, drivers, seconds) for s in seeds)}
+    print(shown(rows_of(scored, parts, out, place, "key", lambda row: f"{row['hidden']}, told {row['one_of']}")))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

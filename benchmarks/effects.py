@@ -6,10 +6,10 @@ vehicle. Every effect is timed in turns with IDM and brakes alone, so the ratios
 
 from __future__ import annotations
 
-import sys
-
 import torch
+import tyro
 
+from benchmarks import command
 from benchmarks.bench.measure import Case, measure
 from idm_env.effects import ALL, CANDIDATES, IDM, Brakes, Effect
 from idm_env.roads import Lane
@@ -38,10 +38,9 @@ def case(vehicles: int, effects: tuple[Effect, ...], backward: bool) -> Case:
     return Case(run, STEPS * vehicles * 1e-6)
 
 
-def main() -> None:
+def main(vehicles: tyro.conf.Positional[int] = 200_000) -> None:
     """Print a line per effect."""
     torch.set_num_threads(1)
-    vehicles = int(sys.argv[1]) if len(sys.argv) > 1 else 200_000
     print(f"{'effect':24s} {'forward':>8s} {'ratio':>6s} {'both':>8s} {'ratio':>6s}   ns per vehicle-step")
     for name in ("", *(n for n in CANDIDATES if n not in ("lateral", "grade"))):
         effects = (ALL[name](),) if name else ()
@@ -55,4 +54,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

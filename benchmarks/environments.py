@@ -1,13 +1,12 @@
 """Environment steps per second beside HighwayEnv, and what warm-up costs.
 
 CPU time of one thread, everything in one run, so that ratios hold wherever it runs: ratios are the figures to compare,
-rates depend on the machine. Run: python benchmarks/environments.py [--quick]. With --returns it writes what episodes of
+rates depend on the machine. Run: python -m benchmarks.environments [--quick]. With --returns it writes what episodes of
 every task return under no command, IDM, the best rule that a search finds and an agent: 5 seeds.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 import warnings
@@ -19,6 +18,10 @@ import numpy as np
 import torch
 
 import idm_env  # noqa: F401
+from benchmarks import command
+from benchmarks.bench.gradients import rows as steps_with_gradients
+from benchmarks.bench.measure import rate, turning
+from benchmarks.bench.peers import highway
 from idm_env.effects import CANDIDATES
 from idm_env.tasks import TASKS
 
@@ -26,40 +29,13 @@ ROOT = Path(__file__).resolve().parents[1]
 warnings.filterwarnings("ignore")
 
 
-def rate(step: Callable[[], object], seconds: float) -> float:
-    """Return calls per second of CPU time."""
-    step()
-    count, begin = 0, time.process_time()
-    while time.process_time() - begin < seconds:
-        step()
-        count += 1
-    return count / (time.process_time() - begin)
-
-
-def driven(env: gym.Env, action: object) -> Callable[[], object]:
-    """Return a step that resets where an episode ends; the reset is part of the cost."""
-    env.reset(seed=0)
-
-    def step() -> None:
-        *_, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:
-            env.reset()
-
-    return step
-
-
 def single(seconds: float) -> None:
-    try:
-        import highway_env
-
-        gym.register_envs(highway_env)
-    except ImportError:
+    theirs, ours = highway(), gym.make("DiffIDM-v0")
+    if theirs is None:
         print("highway-env is not installed (pip install highway-env): no ratio.")
         return
-    theirs = gym.make("highway-fast-v0")
-    ours = gym.make("DiffIDM-v0")
-    them = rate(driven(theirs, 1), seconds)
-    us = rate(driven(ours, np.zeros(1, np.float32)), seconds)
+    them, us = (rate(turning(env, lambda action=action: action), seconds)
+                for env, action in ((theirs, 1), (ours, np.zeros(1, np.float32))))  # fmt: skip
     config = theirs.unwrapped.config
     per_step = config["simulation_frequency"] // config["policy_frequency"] * (config["vehicles_count"] + 1)
     print("\nsingle environment            env steps/s   vehicle updates/s")
@@ -103,14 +79,7 @@ def faces(seconds: float) -> None:
         found = []
         for count in counts:
             if count == 1:
-                env = gym.make("DiffIDM-v0", **keywords)
-                env.reset(seed=0)
-
-                def step(env=env) -> None:
-                    *_, terminated, truncated, _ = env.step(random[next(at) % 64, 0])
-                    if terminated or truncated:
-                        env.reset()
-
+                step = turning(gym.make("DiffIDM-v0", **keywords), lambda: random[next(at) % 64, 0])
             else:
                 env = gym.make_vec("DiffIDM-v0", num_envs=count, **keywords)
                 env.reset(seed=0)
@@ -132,13 +101,10 @@ def rings(effect: str) -> bool:
     return True
 
 
-def gradients(turns: int) -> None:
+def gradient_steps(turns: int) -> None:
     """Print the least and the median CPU time of a step with its gradients."""
-    sys.path.insert(0, str(ROOT))
-    from benchmarks.bench.gradients import rows
-
     print("\ntorch output, 32 x 32 policy in torch, forward + backward: ms of CPU time a step, least (median)")
-    for row in rows(turns):
+    for row in steps_with_gradients(turns):
         what, way, least, median = row.values()
         print(f"  {what:32s} {way:32s} {least:8.4f} ({median:.4f})", flush=True)
 
@@ -170,7 +136,7 @@ RANGES = ((2.5, 40.0), (0.1, 3.0), (0.3, 6.0), (0.3, 3.0), (0.5, 4.0), (0.005, 1
 """Where rules are looked for: v0 (m/s), T (s), s0 (m), a, b (m/s²), and the share of IDM's acceleration."""
 
 
-def returns(tasks: list[str], out: Path) -> None:
+def write_returns(tasks: list[str], out: Path) -> None:
     """Write the returns of an episode of every task, a row each: zero action, IDM, best rule, best agent."""
     sys.path.insert(0, str(ROOT / "examples"))
     import train_apg
@@ -235,26 +201,28 @@ def rule(values: torch.Tensor, limit: float) -> Callable[[torch.Tensor], torch.T
     return act
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="short measurements")
-    parser.add_argument("--envs", type=int, default=4096)
-    parser.add_argument("--gradients", action="store_true", help="only steps with their gradients")
-    parser.add_argument("--returns", nargs="*", metavar="TASK", help="returns of tasks (all), into docs/returns.csv")
-    options = parser.parse_args()
+def main(quick: bool = False, envs: int = 4096, gradients: bool = False, returns: Sequence[str] | None = None) -> None:
+    """Print rates of steps, with their gradients and without, and what a warm-up costs.
+
+    Args:
+        quick: Short measurements.
+        envs: Environments of a vector.
+        gradients: Only steps with their gradients.
+        returns: Only the returns of these tasks, of all if none is named, into docs/returns.csv.
+    """
     torch.set_num_threads(1)
-    if options.returns is not None:
-        returns(options.returns or list(TASKS), ROOT / "docs" / "returns.csv")
+    if returns is not None:
+        write_returns(list(returns or TASKS), ROOT / "docs" / "returns.csv")
         return
-    gradients(3 if options.quick else 7)
-    if options.gradients:
+    gradient_steps(3 if quick else 7)
+    if gradients:
         return
-    seconds = 0.3 if options.quick else 4.0
+    seconds = 0.3 if quick else 4.0
     faces(seconds)
     single(seconds)
-    vector(seconds, options.envs)
-    warmup(options.envs)
+    vector(seconds, envs)
+    warmup(envs)
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -6,7 +6,6 @@ Times are CPU seconds of this process and wall seconds beside them.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import os
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks import DATA, command, table
 from idm_env.data import Episodes, episodes, load, synthetic
 from idm_env.effects import IDM, Brakes, Replay, make
 from idm_env.fitting.batch import Batch
@@ -110,32 +110,31 @@ def recovery() -> list[dict[str, Any]]:
 def show(title: str, rows: list[dict[str, Any]]) -> None:
     """Print rows as a Markdown table."""
     names = list(dict.fromkeys(name for row in rows for name in row))
-    print(f"\n## {title}\n\n| " + " | ".join(names) + " |\n|" + " --- |" * len(names))
-    for row in rows:
-        cells = (row.get(name, "") for name in names)
-        print("| " + " | ".join(f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells) + " |")
+    cells = ((row.get(name, "") for name in names) for row in rows)
+    texts = ([f"{c:.4g}" if isinstance(c, float) else str(c) for c in row] for row in cells)
+    print(f"\n## {title}\n\n{table(names, texts)}")
 
 
-def main() -> None:
-    """Print the tables and write them as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    default = os.environ.get("IDM_ENV_DATA", str(Path(__file__).resolve().parents[2] / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=Path(default))
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+def main(data: Path = DATA, out: Path | None = None) -> None:
+    """Print the tables.
+
+    Args:
+        data: Folder of the measured files.
+        out: Also write them as JSON.
+    """
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, {time.strftime('%Y-%m-%d')}")
     result: dict[str, Any] = {"recovery": recovery()}
     show("50 generated drivers, 120 s, 5 cm of noise", result["recovery"])
-    if (options.data / "ngsim_i80_pairs.parquet").exists():
-        result["all_pairs"] = all_pairs(options.data)
+    if (data / "ngsim_i80_pairs.parquet").exists():
+        result["all_pairs"] = all_pairs(data)
         show("All 228 I-80 pairs, per driver", [result["all_pairs"]])
-        result["benchmark"] = benchmark(options.data)
+        result["benchmark"] = benchmark(data)
         show("I-80 benchmark: 100 training pairs, judged on 20 test pairs", result["benchmark"])
     else:
-        print(f"\n{options.data} has no ngsim_i80_pairs.parquet: the measured tables are left out.")
-    if options.out:
-        options.out.write_text(json.dumps(result, indent=1))
+        print(f"\n{data} has no ngsim_i80_pairs.parquet: the measured tables are left out.")
+    if out:
+        out.write_text(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -14,14 +14,15 @@ The first two have the same ``GENERATIONS · DRIVERS · EPISODES`` episodes. Wha
 
 from __future__ import annotations
 
-import argparse
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
+import tyro
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
@@ -29,7 +30,7 @@ from torch import Tensor, nn
 from agents.environments import make_env
 from agents.evaluate import judge_lanes
 from agents.rollout import Act, episodes_start
-from benchmarks import add_executor, named_rows
+from benchmarks import HERE, Place, command, named_rows
 from benchmarks.lane_tasks import DEMANDS, Found
 from idm_env.effects.idm import interaction
 from idm_env.jobs.progress import OnProgress
@@ -195,21 +196,26 @@ def shown(title: str, rows: dict[Part, dict[str, Any]]) -> Table:
     return table
 
 
-def main() -> None:
-    """Search where that is not done yet, and print all rows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", choices=tuple(DEMANDS), help="row of tasks")
-    parser.add_argument("--share", type=float, default=0.3, help="of those who enter")
-    parser.add_argument("--how", nargs="*", choices=tuple(FOUND_BY), default=list(FOUND_BY))
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path("runs/lane_search.jsonl"))
-    add_executor(parser)
-    options = parser.parse_args()
-    wanted = [("humans", 0), *((how, seed) for seed in range(options.seeds) for how in options.how)]
-    parts = {str(part): part for part in (Part(options.name, options.share, how, seed) for how, seed in wanted)}
-    done = named_rows(row_of, parts, options.out, options)
-    Console(width=140).print(shown(options.name, {part: done[name] for name, part in parts.items()}))
+def main(
+    name: tyro.conf.Positional[Literal[tuple(DEMANDS)]], share: float = 0.3,
+    how: Sequence[Literal[tuple(FOUND_BY)]] = tuple(FOUND_BY), seeds: int = 5,
+    out: Path = Path("runs/lane_search.jsonl"), place: Place = HERE,
+) -> None:  # fmt: skip
+    """Search where that is not done yet, and print all rows.
+
+    Args:
+        name: Row of tasks.
+        share: Of those who enter.
+        how: Ways to find drivers.
+        seeds: Of each way.
+        out: File of rows.
+        place: Where searches run.
+    """
+    wanted = [("humans", 0), *((way, seed) for seed in range(seeds) for way in how)]
+    parts = {str(part): part for part in (Part(name, share, way, seed) for way, seed in wanted)}
+    done = named_rows(row_of, parts, out, place)
+    Console(width=140).print(shown(name, {part: done[label] for label, part in parts.items()}))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -21,13 +21,13 @@ over episodes. ``--policy FILE`` adds a checkpoint of an agent to the rows of it
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+import tyro
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
@@ -35,6 +35,7 @@ from torch import Tensor
 from agents.common import load
 from agents.evaluate import judge_lanes
 from agents.rollout import Act, episodes_start
+from benchmarks import command
 from idm_env.effects.idm import interaction
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.types import Driver
@@ -182,7 +183,7 @@ def searched(given: Mapping[str, Any], values: Tensor, make: Callable[[OpenLanes
     return values
 
 
-def rows_of(given: Mapping[str, Any], policies: list[Path]) -> dict[str, Found]:
+def rows_of(given: Mapping[str, Any], policies: Sequence[Path]) -> dict[str, Found]:
     """Return the rows of a task, with the CPU seconds that each took."""
     generator, rows = torch.Generator().manual_seed(0), dict[str, Found]()
     begin = time.process_time()
@@ -235,19 +236,17 @@ def shown(name: str, rows: dict[str, Found]) -> Table:
     return table
 
 
-def main() -> None:
-    """Print the rows of the tasks that are asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(DEMANDS)}; all")
-    parser.add_argument("--policy", type=Path, action="append", default=[], help="checkpoints of agents")
-    options = parser.parse_args()
+def main(names: tyro.conf.Positional[tuple[Literal[tuple(DEMANDS)], ...]] = (), policy: Sequence[Path] = ()) -> None:
+    """Print the rows of the tasks that are asked for.
+
+    Args:
+        names: Of rows of tasks; by default all.
+        policy: Checkpoints of agents.
+    """
     torch.set_num_threads(1)
-    unknown = [name for name in options.names if name not in DEMANDS]
-    if unknown:
-        raise SystemExit(f"error: '{unknown[0]}' is no row of tasks. Take one of {', '.join(DEMANDS)}.")
-    for name in options.names or DEMANDS:
-        Console(width=140).print(shown(name, rows_of(DEMANDS[name], options.policy)))
+    for name in names or DEMANDS:
+        Console(width=140).print(shown(name, rows_of(DEMANDS[name], policy)))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

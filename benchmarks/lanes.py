@@ -16,27 +16,26 @@ counted, never corrected.
 
 from __future__ import annotations
 
-import argparse
 import collections
-import contextlib
 import math
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from importlib import import_module
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
 import torch
+import tyro
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
 import idm_env  # noqa: F401  (registers the environments)
-from benchmarks import add_executor, named_rows
+from benchmarks import HERE, Place, command, named_rows, table
+from benchmarks.bench.measure import Case, measure, rate, turning
+from benchmarks.bench.peers import highway, started
 from idm_env.effects import IDM, Brakes, LaneCommand, MandatoryChange, Mobil
 from idm_env.jobs import progress, storage
 from idm_env.jobs.progress import OnProgress
@@ -78,28 +77,6 @@ def changes(state: State) -> int:
     return int(state.links.changed.sum())
 
 
-@contextlib.contextmanager
-def started(net: str, routes: str, step: float, *options: str) -> Iterator[Any]:
-    """Give ``libsumo`` on a net with its traffic, where nobody is teleported, and end it; None where it is missing."""
-    if not find_spec("libsumo"):
-        yield None
-        return
-    import libsumo
-
-    with tempfile.TemporaryDirectory() as folder:
-        at_net, at_routes = Path(folder, "net.xml"), Path(folder, "routes.xml")
-        at_net.write_text(net)
-        at_routes.write_text(routes)
-        libsumo.start([
-            "sumo", "-n", str(at_net), "-r", str(at_routes), "--step-length", str(step), "--time-to-teleport", "-1",
-            "--no-step-log", "--no-warnings", *options,
-        ])  # fmt: skip
-        try:
-            yield libsumo
-        finally:
-            libsumo.close()
-
-
 def sumo(
     each: int, per_km: float, seconds: float, model: str = "LC2013", seed: int = 1
 ) -> tuple[float, float, float] | None:
@@ -111,7 +88,7 @@ def sumo(
     routes = _routes(each, ring, min(20.0, 0.5 * (1000.0 / per_km - 7.0)), model)
     options = ["--step-method.ballistic", "--collision.action", "none", "--seed", str(seed)]
     options += ["--lateral-resolution", "0.8"] if model == "SL2015" else []
-    with started(_net(ring), routes, DT, *options) as libsumo:
+    with started(_net(ring), routes, *options) as libsumo:
         return None if libsumo is None else _driven(libsumo, seconds)
 
 
@@ -142,6 +119,15 @@ def _net(ring: float) -> str:
     return "".join(parts) + "</net>"
 
 
+def vehicle_type(number: int, top: float, length: float = 5.0, model: str = "LC2013") -> str:
+    """Return SUMO's type ``t{number}`` of a vehicle with a desired speed (m/s)."""
+    return (
+        f'<vType id="t{number}" carFollowModel="IDM" laneChangeModel="{model}" length="{length:g}" '
+        f'accel="{DRIVER["max_accel"]}" decel="{DRIVER["comfort_decel"]}" tau="{DRIVER["time_gap"]}" '
+        f'minGap="{DRIVER["min_gap"]}" maxSpeed="{top:.3f}" speedFactor="1" speedDev="0"/>'
+    )
+
+
 def _routes(each: int, ring: float, pace: float, model: str) -> str:
     generator = torch.Generator().manual_seed(1)
     desired = (25.0 + 10.0 * torch.rand(each, generator=generator)).tolist()
@@ -149,11 +135,7 @@ def _routes(each: int, ring: float, pace: float, model: str) -> str:
     for i, top in enumerate(desired):
         place = (i // LANES) * ring * LANES / each
         edge, at = ("a", place) if place < 0.5 * ring else ("b", place - 0.5 * ring)
-        types.append(
-            f'<vType id="t{i}" carFollowModel="IDM" laneChangeModel="{model}" length="5" accel="{DRIVER["max_accel"]}" '
-            f'decel="{DRIVER["comfort_decel"]}" tau="{DRIVER["time_gap"]}" minGap="{DRIVER["min_gap"]}" '
-            f'maxSpeed="{top:.3f}" speedFactor="1" speedDev="0"/>'
-        )
+        types.append(vehicle_type(i, top, model=model))
         cars.append(
             f'<vehicle id="v{i}" type="t{i}" route="{edge}" depart="0" departLane="{i % LANES}" '
             f'departPos="{at:.2f}" departSpeed="{pace:.2f}" insertionChecks="none"/>'
@@ -185,16 +167,6 @@ def _driven(libsumo: Any, seconds: float) -> tuple[float, float, float]:
 SIZES = (20_000, 200_000, 2_000_000)
 
 
-def best(times: int, work: Callable[[], object]) -> float:
-    """Return the least CPU time of some calls (s)."""
-    found = []
-    for _ in range(times):
-        begin = time.process_time()
-        work()
-        found.append(time.process_time() - begin)
-    return min(found)
-
-
 def rollouts(vehicles: int, dtype: torch.dtype) -> tuple[float, float, float]:
     """Return million updates per CPU second forward and forward with backward, and changes per vehicle and hour."""
     simulator, state, params = traffic(max(1, vehicles // EACH), 15.0, dtype)
@@ -205,7 +177,7 @@ def rollouts(vehicles: int, dtype: torch.dtype) -> tuple[float, float, float]:
         nonlocal end
         end, _ = simulator.rollout(state, {}, params, steps, keep=None)
 
-    taken = best(2, forward)
+    taken = measure({"": Case(forward)}, 2)[""]["cpu_min_ms"] / 1e3
     leaf = params["idm"]["desired_speed"].requires_grad_()
 
     def both() -> None:
@@ -214,21 +186,7 @@ def rollouts(vehicles: int, dtype: torch.dtype) -> tuple[float, float, float]:
 
     updates = state.speed.numel() * 1e-6
     rate = (changes(end) - changes(state)) / state.speed.numel() / (steps * simulator.dt) * 3600.0
-    return updates * steps / taken, updates * 20 / best(3, both), rate
-
-
-def env_steps(env: Any, count: int, actions: Callable[[], Any], seconds: float) -> float:
-    """Return env steps per CPU second, episodes that end begun anew."""
-    env.reset(seed=1)
-    for _ in range(12):
-        env.step(actions())
-    done, begin = 0, time.process_time()
-    while time.process_time() - begin < seconds:
-        *_, terminated, truncated, _ = env.step(actions())
-        done += count
-        if count == 1 and (terminated or truncated):
-            env.reset()
-    return done / (time.process_time() - begin)
+    return updates * steps / taken, updates * 20e3 / measure({"": Case(both)}, 3)[""]["cpu_min_ms"], rate
 
 
 def our_highway(vector: int, seconds: float) -> float:
@@ -236,26 +194,23 @@ def our_highway(vector: int, seconds: float) -> float:
     draw = np.random.default_rng(1)
     if vector == 1:
         single = gymnasium.make("DiffIDM-v0", task="highway", vehicles=51, lanes_count=4)
-        return env_steps(single, 1, lambda: draw.uniform(-1, 1, 1).astype(np.float32), seconds)
+        return rate(turning(single, lambda: draw.uniform(-1, 1, 1).astype(np.float32)), seconds)
     many = gymnasium.make_vec("DiffIDM-v0", num_envs=vector, task="highway", vehicles=50, lanes_count=4)
     block = draw.uniform(-1, 1, (vector, 1)).astype(np.float32)
-    return env_steps(many, vector, lambda: block, seconds)
+    many.reset(seed=1)
+    return rate(lambda: many.step(block), seconds) * vector
 
 
 def their_highway(seconds: float) -> float | None:
     """Return env steps per CPU second of HighwayEnv's ``highway-fast-v0`` with 51 vehicles; None without it."""
-    if not find_spec("highway_env"):
-        return None
-    gymnasium.register_envs(import_module("highway_env"))
-    env = gymnasium.make("highway-fast-v0", config={"vehicles_count": 50, "lanes_count": 4})
-    draw = np.random.default_rng(1)
-    return env_steps(env, 1, lambda: int(draw.integers(5)), seconds)
+    env, draw = highway(vehicles_count=50, lanes_count=4), np.random.default_rng(1)
+    return None if env is None else rate(turning(env, lambda: int(draw.integers(5))), seconds)
 
 
-def speed(parts: str = "rollouts,highway") -> None:
-    """Print what was measured, with the targets."""
+def speed(part: tyro.conf.Positional[Literal["all", "rollouts", "highway"]] = "all") -> None:
+    """Print million vehicle updates per CPU second beside SUMO, and env steps of ``highway`` beside HighwayEnv."""
     console = Console()
-    if "rollouts" in parts:
+    if part != "highway":
         peer = sumo(EACH, 15.0, 30.0)
         beside = None if peer is None else peer[2]
         told = Table("", "vehicles", "forward", "× SUMO", "forward + backward", "changes /vehicle/h",
@@ -268,7 +223,7 @@ def speed(parts: str = "rollouts,highway") -> None:
                 told.add_row(name, f"{size:,}", f"{forward:.1f}", ratio, f"{both:.1f}", f"{rate:.0f}")
         told.add_row("SUMO", f"{EACH:,}", "not installed" if peer is None else f"{peer[2]:.2f}", "1", "", "")
         console.print(told)
-    if "highway" in parts:
+    if part != "rollouts":
         single, peer_steps, vector = our_highway(1, 3.0), their_highway(8.0), our_highway(1024, 4.0)
         ratio = "" if peer_steps is None else f", {single / peer_steps:.0f} ×"
         told = Table("", "env steps per CPU s", title="Task highway, 4 lanes")
@@ -371,19 +326,22 @@ def picture(found: Rows, path: Path) -> None:
     storage.write(path, lambda beside: figure.savefig(beside, dpi=110))
 
 
-def flow(arguments: argparse.Namespace, path: Path = Path("out/lanes-flow.png")) -> None:
-    """Print flow (vehicles per hour and lane) and changes per vehicle and hour, and draw them."""
+def flow(path: Path = Path("out/lanes-flow.png"), place: Place = HERE) -> None:
+    """Print flow (vehicles per hour and lane) and changes per vehicle and hour, and draw them.
+
+    Args:
+        path: The picture.
+        place: Where simulators run.
+    """
     parts = {f"{name} at {density:g} /km/lane": Part(name, density) for name in WHO for density in DENSITIES}
-    driven = named_rows(drive, parts, KEPT, arguments)
+    driven = named_rows(drive, parts, KEPT, place)
     found: Rows = {name: {d: driven[f"{name} at {d:g} /km/lane"] for d in DENSITIES} for name in WHO}
-    print("| per km and lane | " + " | ".join(f"{name}: flow, changes" for name in WHO) + " |")
-    print("| --- |" + " --- |" * len(WHO))
+    rows = []
     for density in DENSITIES:
-        cells = []
-        for name in WHO:
-            row = found[name][density]
-            cells.append("not installed" if row is None else f"{row[0] * density * 3.6:.0f}, {row[1]:.0f}")
-        print(f"| {density:g} | " + " | ".join(cells) + " |")
+        cells = (found[name][density] for name in WHO)
+        texts = ("not installed" if x is None else f"{x[0] * density * 3.6:.0f}, {x[1]:.0f}" for x in cells)
+        rows.append([f"{density:g}", *texts])
+    print(table(("per km and lane", *(f"{name}: flow, changes" for name in WHO)), rows))
     picture(found, path)
     print(f"Picture: {path}; rows are kept in {KEPT}, remove it to drive them again.")
 
@@ -562,19 +520,25 @@ def stood(task: OpenLanesTask, rows: int = 8, seconds: int = 600) -> Stood:
 
 def standing() -> None:
     """Print how long vehicles stand in the open tasks."""
-    print("| | drivers | longest stand in each of 8 × 600 s (s) | from lane 0, vehicles/h | out, vehicles/h "
-          "| hard brakings, s | touched, s |")  # fmt: skip
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    head = ("", "drivers", "longest stand in each of 8 × 600 s (s)", "from lane 0, vehicles/h", "out, vehicles/h",
+            "hard brakings, s", "touched, s")  # fmt: skip
+    rows = []
     for name, (kind, given) in DEMANDS.items():
         for drivers, changed in zip(("without", "as they come"), BEFORE, strict=True):
             found = stood(kind(parameters=changed, **given))
             each = ", ".join(f"{x:.0f}" for x in found.longest)
-            print(f"| {name} | {drivers} | {each} | {found.merged:.0f} | {found.out:.0f} "
-                  f"| {found.hard:.0f} | {found.touched:.0f} |")  # fmt: skip
+            rows.append([name, drivers, each, *(f"{x:.0f}" for x in found[1:])])
+    print(table(head, rows))
 
 
-def laws(steps: float) -> None:
-    """Print how often random traffic broke a law, and what else it did."""
+def laws(steps: tyro.conf.Positional[float] = 1e9) -> None:
+    """Print how often random traffic broke a law, and what else it did.
+
+    Args:
+        steps: Vehicle-steps, 1000 or more.
+    """
+    if not 1000.0 <= steps < math.inf:
+        raise SystemExit(f"error: {steps:g} vehicle-steps are no number of 1000 or more. Usual is 1e9.")
     with progress.shown(Console(stderr=True)) as on_progress:
         found = check(steps, on_progress)
     print(counted(found))
@@ -583,29 +547,7 @@ def laws(steps: float) -> None:
 def main() -> None:
     """Run what is asked for."""
     torch.set_num_threads(1)
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="what", required=True)
-    parts = commands.add_parser("speed").add_argument("parts", nargs="?", choices=("rollouts", "highway"))
-    parts.default = "rollouts,highway"
-    add_executor(commands.add_parser("flow"))
-    commands.add_parser("standing")
-    commands.add_parser("laws").add_argument("steps", nargs="?", type=_steps, default=1e9)
-    given = parser.parse_args()
-    if given.what == "speed":
-        speed(given.parts)
-    elif given.what == "flow":
-        flow(given)
-    elif given.what == "standing":
-        standing()
-    else:
-        laws(given.steps)
-
-
-def _steps(text: str) -> float:
-    with contextlib.suppress(ValueError):
-        if 1000.0 <= float(text) < math.inf:
-            return float(text)
-    raise argparse.ArgumentTypeError(f"'{text}' is no number of 1000 or more. Usual is 1e9.")
+    command({"speed": speed, "flow": flow, "standing": standing, "laws": laws})
 
 
 if __name__ == "__main__":

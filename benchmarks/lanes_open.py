@@ -13,7 +13,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.lanes import DRIVER, DT, started
+from benchmarks import command
+from benchmarks.bench.peers import started, straight
+from benchmarks.lanes import DRIVER, DT, vehicle_type
 from idm_env.effects import IDM, Brakes, Mobil
 from idm_env.multilane import demand
 from idm_env.roads import Lanes
@@ -73,31 +75,18 @@ def found(counted: int, there: int, way: float) -> Found:
 def sumo(flow: float) -> Found | None:
     """Return what SUMO does with the same departures; None where it is missing."""
     table, desired = drivers(flow)
-    lanes = "".join(
-        f'<lane id="a_{k}" index="{k}" speed="60" length="{LENGTH}" width="3.2" shape="0,{3 * k} {LENGTH},{3 * k}"/>'
-        for k in range(LANES)
-    )
-    ends = "".join(
-        f'<junction id="{name}" type="dead_end" x="{x}" y="0" incLanes="{inside}" intLanes="" shape="{x},0 {x},9"/>'
-        for name, x, inside in (("w", 0.0, ""), ("e", LENGTH, " ".join(f"a_{k}" for k in range(LANES))))
-    )
-    net = (
-        f'<net version="1.16"><location netOffset="0,0" convBoundary="0,0,{LENGTH},9" origBoundary="0,0,1,1" '
-        f'projParameter="!"/><edge id="a" from="w" to="e" priority="1">{lanes}</edge>{ends}</net>'
-    )
-    parts = ['<route id="r" edges="a"/>']
+    parts = ['<route id="r" edges="ab"/>']
     for i, (depart, lane, speed, kind) in enumerate(
         zip(table.depart, table.lane, table.speed, table.kind, strict=True)
     ):
         parts.append(
-            f'<vType id="t{i}" carFollowModel="IDM" laneChangeModel="LC2013" length="{TRUCK if kind else 5.0}" '
-            f'accel="{DRIVER["max_accel"]}" decel="{DRIVER["comfort_decel"]}" tau="{DRIVER["time_gap"]}" '
-            f'minGap="{DRIVER["min_gap"]}" maxSpeed="{desired[i]:.3f}" speedFactor="1" speedDev="0"/>'
-            f'<vehicle id="v{i}" type="t{i}" route="r" depart="{depart:.2f}" departLane="{lane}" '
+            vehicle_type(i, desired[i], TRUCK if kind else 5.0)
+            + f'<vehicle id="v{i}" type="t{i}" route="r" depart="{depart:.2f}" departLane="{lane}" '
             f'departSpeed="{speed}"/>'
         )
+    net = straight(LENGTH, 60.0, lanes=LANES)
     counted, there, way, before = 0, 0, 0.0, dict[str, int]()
-    with started(net, f"<routes>{''.join(parts)}</routes>", DT, "--step-method.ballistic") as libsumo:
+    with started(net, f"<routes>{''.join(parts)}</routes>", "--step-method.ballistic") as libsumo:
         if libsumo is None:
             return None
         for second in range(int(SECONDS)):
@@ -128,4 +117,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

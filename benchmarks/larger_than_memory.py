@@ -9,16 +9,15 @@ step per sample: what is measured is the way of the data, not the quality of the
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import resource
 import time
 from pathlib import Path
 
+from benchmarks import HERE, Place, command
 from idm_env.data import synthetic
 from idm_env.fitting.job import fit_file
 from idm_env.fitting.options import Options, Source
-from idm_env.jobs.executor import KINDS, opened
 
 FOLLOWERS, RUNS = 10, 200
 SECONDS = 15.0
@@ -43,33 +42,27 @@ def megabytes(who: int) -> float:
     return resource.getrusage(who).ru_maxrss / 1024
 
 
-def main() -> None:
+def main(
+    drivers: int = 20_000, folder: Path = Path("out/drives"), out: Path = Path("out/drives-fit"), place: Place = HERE
+) -> None:
     """Make, fit, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--drivers", type=int, default=20_000)
-    parser.add_argument("--folder", type=Path, default=Path("out/drives"))
-    parser.add_argument("--out", type=Path, default=Path("out/drives-fit"))
-    parser.add_argument("--executor", choices=KINDS, default="serial")
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--ray-address")
-    arguments = parser.parse_args()
-    drivers = make(arguments.folder, arguments.drivers)
-    size = sum(path.stat().st_size for path in arguments.folder.glob("*.parquet"))
+    drivers = make(folder, drivers)
+    size = sum(path.stat().st_size for path in folder.glob("*.parquet"))
     print(f"{drivers} drivers in {size / 1e6:.0f} MB of parquet", flush=True)
     before, begin = resource.getrusage(resource.RUSAGE_SELF), time.perf_counter()
-    with opened(arguments.executor, arguments.jobs, arguments.ray_address) as executor:
+    with place.opened() as executor:
         options = Options(starts=1, substeps=1)
-        report = fit_file(Source(arguments.folder), options, arguments.out, executor=executor)
+        report = fit_file(Source(folder), options, out, executor=executor)
     wall = time.perf_counter() - begin
     mine, children = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     cpu = mine.ru_utime + mine.ru_stime - before.ru_utime - before.ru_stime + children.ru_utime + children.ru_stime
-    digest = hashlib.sha256(b"".join((arguments.out / name).read_bytes() for name in FILES)).hexdigest()[:12]
+    digest = hashlib.sha256(b"".join((out / name).read_bytes() for name in FILES)).hexdigest()[:12]
     print(
-        f"{arguments.executor}: {report['fit']['groups']} fitted, {cpu:.0f} CPU s (Ray's workers not counted), "
+        f"{place.executor}: {report['fit']['groups']} fitted, {cpu:.0f} CPU s (Ray's workers not counted), "
         f"{wall:.0f} s of wall time, at most {megabytes(resource.RUSAGE_SELF):.0f} MB here and "
         f"{megabytes(resource.RUSAGE_CHILDREN):.0f} MB in a worker; digest {digest}"
     )
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -8,10 +8,8 @@ altitude_m are taken out of ZalaZone unless the case says that the grade is know
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import os
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import polars as pl  # noqa: E402
 
-from benchmarks import add_executor, kept_rows, rows_of  # noqa: E402
+from benchmarks import DATA, HERE, Place, command, rows_of, table  # noqa: E402
 from idm_env.data import load  # noqa: E402
 from idm_env.discovery import Discovery, discover  # noqa: E402
 from idm_env.jobs.progress import OnProgress, silent  # noqa: E402
@@ -124,13 +122,13 @@ def said(r: dict[str, Any]) -> str:
     return words
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def shown(rows: list[dict[str, Any]]) -> str:
     """Return all cases: what is said, what IDM leaves, after / before with intervals, and ceilings."""
-    lines = [
-        "case | drivers | verdict | IDM: gap m pooled, median driver; 5 s ahead m; speed m/s | after / before: gap | "
-        "gap 5 s ahead | speed | repeats | refitted | CPU s",
-        "--- | --- | --- | --- | --- | --- | --- | --- | --- | ---",
-    ]
+    head = (
+        "case", "drivers", "verdict", "IDM: gap m pooled, median driver; 5 s ahead m; speed m/s",
+        "after / before: gap", "gap 5 s ahead", "speed", "repeats", "refitted", "CPU s",
+    )  # fmt: skip
+    lines = []
     for r in rows:
         b, c = r["before"], r["ceilings"] or {}
         errors = "–"
@@ -144,25 +142,25 @@ def table(rows: list[dict[str, Any]]) -> str:
                 ratios[i] = f"{ratio:.2f} ({low:.2f} … {high:.2f}), {verdict}"
         repeats, refitted = c.get("repeats_share"), c.get("refitted_gap_rmse_m")
         ends = ["–" if repeats is None else f"{100 * repeats:.0f} %", "–" if refitted is None else f"{refitted:.2f} m"]
-        lines.append(" | ".join([r["case"], str(r["drivers"]), said(r), errors, *ratios, *ends, f"{r['cpu_s']:.0f}"]))
-    return "\n".join(lines)
+        lines.append([r["case"], str(r["drivers"]), said(r), errors, *ratios, *ends, f"{r['cpu_s']:.0f}"])
+    return table(head, lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("IDM_ENV_DATA", "../shared/data")))
-    parser.add_argument("--out", type=Path, default=Path("measured.jsonl"))
-    parser.add_argument("--only", default="", help="part of the names of the cases to run")
-    add_executor(parser)
-    arguments = parser.parse_args()
-    done = kept_rows(arguments.out, "case")
-    wanted = {n: c for n, c in cases(arguments.data).items() if arguments.only in n}
-    missing = [(name, arguments.data, case) for name, case in wanted.items() if name not in done]
-    for found in rows_of(timed, missing, arguments.out, arguments):
-        done[found["case"]] = found
-        print(f"{found['case']}: {found['verdict']}", file=sys.stderr)
-    print(table([done[n] for n in wanted if n in done]))
+def main(
+    data: Path = DATA, out: Path = Path("measured.jsonl"),
+    only: str = "", place: Place = HERE,
+) -> None:  # fmt: skip
+    """Do the cases that are not done yet, and print the table.
+
+    Args:
+        data: Folder of the measured files.
+        out: File of rows; those that are there are not done again.
+        only: Part of the names of the cases to run.
+        place: Where cases run.
+    """
+    parts = {name: (name, data, case) for name, case in cases(data).items() if only in name}
+    print(shown(rows_of(timed, parts, out, place, "case", lambda row: row["verdict"])))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

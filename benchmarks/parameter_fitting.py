@@ -3,18 +3,20 @@
 The problem is that of ``ParameterFitting`` over the ring environment: five IDM parameters, one value for all drivers,
 simulated behind the measured leaders with the environment's own step. Each method stops at the first error within 1
 % of the best known one. Cost is counted in simulated vehicle-steps (a reverse pass counts as two forward ones, a
-tangent as one each) and in CPU time of one thread. Run: python benchmarks/parameter_fitting.py FILE [--seeds 3]
+tangent as one each) and in CPU time of one thread. Run: python -m benchmarks.parameter_fitting FILE [--seeds 3]
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
+import tyro
 
+from benchmarks import command
 from idm_env.data import load
 from idm_env.tasks import make_task
 from idm_env.wrappers import FittingEnv, ParameterFitting
@@ -103,13 +105,15 @@ METHODS = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("file", help="trajectories with columns in_manifest and split")
-    parser.add_argument("--seeds", type=int, default=3)
-    options = parser.parse_args()
+def main(file: tyro.conf.Positional[Path], seeds: int = 3) -> None:
+    """Print a line per method.
+
+    Args:
+        file: Trajectories with columns in_manifest and split.
+        seeds: Of methods that draw.
+    """
     torch.set_num_threads(1)
-    measured = load(options.file).where("in_manifest=true").where("split=train")
+    measured = load(file).where("in_manifest=true").where("split=train")
     task = make_task("ring")
     env = FittingEnv(measured)
     best = ParameterFitting(task, measured)
@@ -122,8 +126,8 @@ def main() -> None:
     print(f"{'method':24s} {'reached':>8s} {'M vehicle-steps':>16s} {'CPU s':>8s} {'error m':>8s}   (medians)")
     for name, method in METHODS.items():
         rows = []
-        seeds = 1 if method in (levenberg, adam) else options.seeds
-        for seed in range(seeds):
+        count = 1 if method in (levenberg, adam) else seeds
+        for seed in range(count):
             problem = ParameterFitting(task, measured)
             meter = Meter(problem.vehicle_steps, target)
             reached = False
@@ -135,8 +139,8 @@ def main() -> None:
                 pass
             rows.append((reached, meter.count / 1e6, time.process_time() - meter.begin, meter.best))
         middle = np.median([row[1:] for row in rows], axis=0)
-        print(f"{name:24s} {sum(r[0] for r in rows)} of {seeds:2d} {middle[0]:16.1f} {middle[1]:8.2f} {middle[2]:8.3f}")
+        print(f"{name:24s} {sum(r[0] for r in rows)} of {count:2d} {middle[0]:16.1f} {middle[1]:8.2f} {middle[2]:8.3f}")
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

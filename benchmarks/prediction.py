@@ -8,14 +8,15 @@ predicted, so every figure is held out. ``--shares`` prints those fitted to all 
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 
-from benchmarks import add_executor, executor_of
+import tyro
+
+from benchmarks import HERE, Place, command
 from idm_env.data.scenario import Scenario
 from idm_env.data.womd import scenarios
 from idm_env.jobs.progress import OnProgress, silent
@@ -92,18 +93,19 @@ def compared(agents: Iterable[tuple[Known, Shares]], methods: Sequence[str]) -> 
     }
 
 
-def main() -> None:
-    """Score the scenes of the files."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("files", nargs="+", type=Path)
-    parser.add_argument("--shares", action="store_true", help="print the shares fitted to all scenes, and nothing else")
-    add_executor(parser)
-    options = parser.parse_args()
+def main(files: tyro.conf.Positional[list[Path]], shares: bool = False, place: Place = HERE) -> None:
+    """Score the scenes of the files.
+
+    Args:
+        files: Scenarios of the Waymo Open Motion Dataset.
+        shares: Print the shares fitted to all scenes, and nothing else.
+        place: Where scenes are worked on.
+    """
     begin = time.perf_counter()
-    parts = [scenario for path in options.files for scenario in scenarios(path)]
-    with executor_of(options) as executor:
+    parts = [scenario for path in files for scenario in scenarios(path)]
+    with place.opened() as executor:
         scenes = [scene for _, scene in sorted(executor.map(known_agents, parts), key=itemgetter(0))]
-    if options.shares:
+    if shares:
         for (kind, pace), values in fit_shares(one.seen for scene in scenes for one in scene).items():
             count = sum((one.seen.kind, one.seen.pace) == (kind, pace) for scene in scenes for one in scene)
             print(f'    ("{kind}", "{pace}"): ({", ".join(f"{x:.3f}" for x in values)}),  # {count} agents')
@@ -124,4 +126,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -9,9 +9,7 @@ its NGSIM test events and scored by its rule; the reference figures are those th
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ import polars as pl
 import torch
 from torch import Tensor
 
+from benchmarks import DATA, command
 from idm_env.effects import IDM, Replay
 from idm_env.effects.base import Effect, P
 from idm_env.roads import Lane
@@ -179,15 +178,12 @@ def transfollower(folder: Path, values: Sequence[float] = NGSIM_IDM, most: int |
     return lost(items, follow(items, values, (IDM(exponent=None), Clip()), 0))
 
 
-def main() -> None:
+def main(data: Path = DATA) -> None:
     """Print both benchmarks."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("IDM_ENV_DATA", "../shared/data")))
-    folder = parser.parse_args().data
-    for name, apart in opencf(folder).items():
+    for name, apart in opencf(data).items():
         print(f"OpenCF {name}: at most {apart:.1e} m from what was submitted, 500 pairs")
     for title, most in (("whole events", None), (f"first {EVENT_STEPS} steps", EVENT_STEPS)):
-        found = transfollower(folder, most=most)
+        found = transfollower(data, most=most)
         print(
             f"TransFollower NGSIM, its IDM, {title}: {found.total:.2f} (spacing {found.spacing:.2f} m², "
             f"speed {found.speed:.3f} m²/s²), {found.collisions} collisions"
@@ -195,4 +191,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

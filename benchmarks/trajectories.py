@@ -10,19 +10,18 @@ recipe is run as published; its speed is compared with a direct implementation o
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 
 import numpy as np
 import polars as pl
 import torch
 
-from benchmarks import add_executor, executor_of
+from benchmarks import HERE, Place, command
 from idm_env.data import synthetic
 from idm_env.data.scenario import Agent, MapLane, Scenario, TrafficControl
 from idm_env.jobs.progress import OnProgress, silent
@@ -202,7 +201,6 @@ def _dense(motion: RegularMotion, clock: np.ndarray) -> RegularMotion:
 
 def timing(count: int, seconds: float) -> None:
     """Time the default recipe, the published one, and the published one written on the published layer, in one run."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     from tests.trajectories.direct import direct
     from tests.trajectories.test_recipe import correlated
     from tests.trajectories.tracks import swinging, track_of
@@ -276,7 +274,7 @@ def crossing() -> Scenario:
     )
 
 
-def pictures(folder: Path) -> None:
+def draw(folder: Path) -> None:
     """Draw a filtered track before and after, and the futures of a vehicle at a stop sign beside what it did."""
     tracks = noisy_tracks()
     filtered = recipe(tracks, 0.1, fit_noise([(t.time_s, t.position_m) for t in tracks], 0.1))
@@ -285,31 +283,36 @@ def pictures(folder: Path) -> None:
     figure.savefig(folder / "prediction.png", dpi=90)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, help="folder of the measured files")
-    parser.add_argument("--part", choices=("filter", "reconstruct", "time"))
-    parser.add_argument("--tracks", type=int, default=200)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    add_executor(parser)
-    parser.add_argument("--pictures", type=Path, help="draw the pictures of the documents into this folder, no more")
-    options = parser.parse_args()
-    if options.pictures is not None:
-        pictures(options.pictures)
+def main(
+    data: Path | None = None, part: Literal["filter", "reconstruct", "time"] | None = None, tracks: int = 200,
+    seconds: float = 60.0, pictures: Path | None = None, place: Place = HERE,
+) -> None:  # fmt: skip
+    """Print the scores of every method, and times.
+
+    Args:
+        data: Folder of the measured files; by default only times are taken.
+        part: All three, by default.
+        tracks: Of which times are taken.
+        seconds: Of each of these.
+        pictures: Draw the pictures of the documents into this folder, no more.
+        place: Where parts run.
+    """
+    if pictures is not None:
+        draw(pictures)
         return
-    if options.part in (None, "time"):
-        timing(options.tracks, options.seconds)
-    if options.data is None:
+    if part in (None, "time"):
+        timing(tracks, seconds)
+    if data is None:
         return
-    with executor_of(options) as executor:
-        if options.part in (None, "filter"):
-            for _, text in executor.map(filtering, [(options.data, number) for number in (1, 2)]):
+    with place.opened() as executor:
+        if part in (None, "filter"):
+            for _, text in executor.map(filtering, [(data, half) for half in (1, 2)]):
                 print(text, flush=True)
-        if options.part in (None, "reconstruct"):
-            parts = [(options.data, place, seconds) for place in FILES for seconds in SPARSE_S]
+        if part in (None, "reconstruct"):
+            parts = [(data, name, apart) for name in FILES for apart in SPARSE_S]
             for _, text in executor.map(reconstruction, parts):
                 print(text, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

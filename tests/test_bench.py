@@ -71,7 +71,7 @@ def test_memory_is_measured_in_a_process_of_its_own():
 
 def test_absent_peers_are_none(monkeypatch):
     monkeypatch.setattr(peers, "find_spec", lambda _: None)
-    assert peers.diffidm_layer() is None and peers.sumo() is None and peers.highway() is None
+    assert peers.diffidm_layer() is None and peers.sumo() is None and peers.highway_rate() is None
 
 
 def test_sizes_must_be_whole_lanes():

@@ -73,7 +73,7 @@ def run(
         ("discovery", 6.0, lambda: fits.discovery() if numba else {}),
     ]
     if others:
-        jobs.append(("peers", 3.0, lambda: {"sumo": peers.sumo(), "highway": peers.highway()}))
+        jobs.append(("peers", 3.0, lambda: {"sumo": peers.sumo(), "highway": peers.highway_rate()}))
     jobs.append(("all_cores", 4.0, lambda: _all_cores(threads, max(sizes), rounds)))
     whole = sum(weight for _, weight, _ in jobs)
     progress, before, weight = on_progress or silent, 0.0, 0.0

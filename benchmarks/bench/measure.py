@@ -25,25 +25,39 @@ def measure(cases: Mapping[str, Case], rounds: int) -> dict[str, dict[str, float
     taken: dict[str, list[tuple[float, float]]] = {name: [] for name in cases}
     for _ in range(rounds):
         for name, case in cases.items():
-            wall, cpu = time.perf_counter(), time.process_time()
+            cpu, wall = time.process_time(), time.perf_counter()
             case.run()
-            taken[name].append(
-                (
-                    1e3 * (time.process_time() - cpu) / case.units,
-                    1e3 * (time.perf_counter() - wall) / case.units,
-                )
-            )
-    return {name: _summary(values) for name, values in taken.items()}
-
-
-def _summary(values: list[tuple[float, float]]) -> dict[str, float]:
-    cpu, wall = [c for c, _ in values], [w for _, w in values]
+            taken[name].append((time.process_time() - cpu, time.perf_counter() - wall))
     return {
-        "cpu_min_ms": min(cpu),
-        "cpu_median_ms": statistics.median(cpu),
-        "wall_min_ms": min(wall),
-        "wall_median_ms": statistics.median(wall),
+        name: {
+            f"{clock}_{kind}_ms": 1e3 * statistic(column) / cases[name].units
+            for clock, column in zip(("cpu", "wall"), zip(*rows, strict=True), strict=True)
+            for kind, statistic in (("min", min), ("median", statistics.median))
+        }
+        for name, rows in taken.items()
     }
+
+
+def rate(step: Callable[[], object], seconds: float) -> float:
+    """Return calls per second of CPU time, after one to warm up."""
+    step()
+    count, begin = 0, time.process_time()
+    while time.process_time() - begin < seconds:
+        step()
+        count += 1
+    return count / (time.process_time() - begin)
+
+
+def turning(env: Any, action: Callable[[], object]) -> Callable[[], None]:
+    """Return a step of an environment that resets where an episode ends; the reset is part of the cost."""
+    env.reset(seed=0)
+
+    def step() -> None:
+        *_, terminated, truncated, _ = env.step(action())
+        if terminated or truncated:
+            env.reset()
+
+    return step
 
 
 def machine() -> dict[str, Any]:

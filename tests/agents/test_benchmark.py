@@ -7,8 +7,9 @@ import json
 import pickle
 import shutil
 import subprocess
+from contextlib import nullcontext
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -54,7 +55,7 @@ def test_every_trial_is_trained_once(benchmark, tmp_path):
 def test_a_policy_is_distilled_from_the_same_seeds_teacher_where_there_is_one(benchmark, tmp_path):
     """Else the configuration's teacher is trained first."""
     benchmark.run(["ring-brakes-distil"], tmp_path, 1)
-    benchmark.run(["ring-apg"], tmp_path, 2, given=0)
+    benchmark.run(["ring-apg"], tmp_path, 2, trial=0)
     benchmark.run(["ring-brakes-distil"], tmp_path, 2)
     first, second = (c for c in benchmark.trained if "agents.distil" in c)
     assert "--teacher" not in first
@@ -76,7 +77,8 @@ def test_trainings_are_parts_of_an_executor(benchmark, tmp_path):
             given.append([str(part) for part in pickle.loads(pickle.dumps(parts))])
             yield from ((i, function(part, silent)) for i, part in enumerate(parts))
 
-    benchmark.run(["ring-apg", "ring-shac", "ring-ppo"], tmp_path, 2, executor=Recording())
+    place = SimpleNamespace(opened=lambda: nullcontext(Recording()))
+    benchmark.run(["ring-apg", "ring-shac", "ring-ppo"], tmp_path, 2, place=place)
     searches, seeds = given
     assert len(searches) == len(set(searches)) == 2 * 5 * 2 and not any("shac" in name for name in searches)
     assert len(seeds) == 3 * 2 and len(benchmark.trained) == 26
@@ -122,7 +124,7 @@ def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, 
 
     monkeypatch.setattr(benchmark, "evaluate_ring", judge)
     save(tmp_path / "ring-apg/trial2/seed1/training/last.pt", Policy(3), "apg", environment_of("ring-apg"), {})
-    benchmark.takeover_table(tmp_path, ["ring-apg"], (0, 1))
+    benchmark.takeover(["ring-apg"], tmp_path, 2)
     cases = [(False, 750), (False, 1750), (False, 3000), (True, 3000)]
     names = ("no_command", "PISaturation", "Policy")
     assert judged == [(name, b, *case) for name in names for b in (0.0, 3.0) for case in cases]
@@ -130,7 +132,7 @@ def test_take_overs_are_judged_without_and_with_a_failsafe(benchmark, tmp_path, 
 
 
 def test_the_seeds_of_a_given_trial_need_no_search(benchmark, tmp_path):
-    benchmark.run(["ring-apg"], tmp_path, 2, given=3)
+    benchmark.run(["ring-apg"], tmp_path, 2, trial=3)
     options = [c[c.index("--window") + 1] for c in benchmark.trained]
     assert options == ["300", "300"]
 
@@ -148,13 +150,13 @@ def test_reference_rows_are_made_once_and_say_what_a_test_is_worth(benchmark, tm
 
     monkeypatch.setattr(benchmark, "on_ring", makers)
     for _ in range(2):
-        benchmark.reference(tmp_path, ("failsafe", "failsafe-shock"))
+        benchmark.reference(("failsafe", "failsafe-shock"), tmp_path)
     assert len(made) == 6 and {shock for _, shock in made} == {0.0, 4.0}
     printed = capsys.readouterr().out
     assert "| constants | 2 of 10; 1.000/0.10/1.00/0 | 0 of 10; 1.000/0.10/1.00/0 |" in printed
     assert "failsafe: 4 of 20 random policies pass, so it is no test." in printed
     assert "failsafe-shock: 0 of 20 random policies pass, so it is a test." in printed
-    assert set(benchmark.TESTS) == set(benchmark.tests())
+    assert set(benchmark.TESTS) == set(benchmark.environments())
 
 
 def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark, monkeypatch):
@@ -170,7 +172,7 @@ def test_what_passes_behind_a_leader_is_asked_again_on_fresh_stretches(benchmark
 
     monkeypatch.setattr(benchmark, "evaluate_follow", judge)
     monkeypatch.setattr(benchmark, "random_policies", lambda environment, count, hidden: [Policy(3)] * 2)
-    rows = benchmark.behind_leader(benchmark.tests()["follow"], Path())
+    rows = benchmark.behind_leader(benchmark.environments()["follow"], Path())
     alone = rows["IDM (a human driver more)"]()
     assert (alone["tried"], alone["passed"]) == (1, [])
     assert rows["random networks"]()["passed"] == ["0", "1"] and asked == [(0,)] * 3 + [(1, 2, 3, 4, 5)] * 2
@@ -212,7 +214,7 @@ def test_the_share_not_solved_yet_counts_those_that_never_solve(benchmark):
 
 
 def test_longer_trainings_have_as_many_times_the_updates_and_a_place_of_their_own(benchmark, tmp_path):
-    benchmark.run(["ring-ppo", "ring-apg"], tmp_path, 1, given=4, times=3)
+    benchmark.run(["ring-ppo", "ring-apg"], tmp_path, 1, trial=4, times=3)
     given = [dict(zip(c[3::2], c[4::2], strict=False)) for c in benchmark.trained]
     assert [g["--updates"] for g in given] == ["180", "132"]  # three times those of trial 4
     assert {g["--cpu-seconds"] for g in given} == {str(3 * benchmark.LIMIT)}

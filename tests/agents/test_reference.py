@@ -1,4 +1,4 @@
-"""The ring with a shock is a test: what learns nothing fails it. A sample of ``benchmarks/agents.py reference``."""
+"""The ring with a shock is a test: what learns nothing fails it. A sample of ``benchmarks.agents reference``."""
 
 from __future__ import annotations
 

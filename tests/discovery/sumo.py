@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from benchmarks.bench.peers import straight_lane
+from benchmarks.bench.peers import straight
 from idm_env.data import Trajectories, scripted
 
 STEP, LENGTH = 0.1, 4.5
@@ -69,7 +69,7 @@ def _files(folder: Path, random: np.random.Generator, slope: float, decides_ever
     net, routes = folder / "net.xml", folder / "routes.xml"
     x = np.linspace(0.0, 8000.0, 321)
     height = slope * 730.0 / (2 * np.pi) * (1.0 - np.cos(2 * np.pi * x / 730.0))
-    straight_lane(net, float(x[-1]), 60.0, height.tolist())
+    net.write_text(straight(float(x[-1]), 60.0, height.tolist()))
     types = [f'<vType id="t0" length="{LENGTH}" accel="10" decel="10" maxSpeed="60" minGap="0" tau="0.1"/>']
     cars = ['<vehicle id="v0" type="t0" route="r" depart="0" departPos="200" departSpeed="10"/>']
     for i in range(1, followers + 1):

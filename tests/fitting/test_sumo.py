@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.bench.peers import straight_lane
+from benchmarks.bench.peers import straight
 from idm_env.effects import IDM, Brakes, Gipps
 from idm_env.effects.idm import equilibrium_gap
 from idm_env.fitting import sumo
@@ -23,7 +23,7 @@ def test_sumo_drives_as_the_fitted_drivers(tmp_path: Path) -> None:
     """Its own readers take the file; behind a leader at 15 m/s the gap is that of IDM's equilibrium."""
     libsumo = pytest.importorskip("libsumo", reason="libsumo is not installed")
     sumo.write(tmp_path / "vtypes.add.xml", MODEL)
-    straight_lane(tmp_path / "net.xml", 9000.0, 50.0)
+    (tmp_path / "net.xml").write_text(straight(9000.0, 50.0))
     (tmp_path / "r.rou.xml").write_text(
         '<routes><vType id="slow" maxSpeed="15" sigma="0" speedDev="0"/><route id="r" edges="ab"/>'
         '<vehicle id="leader" type="slow" route="r" depart="0" departPos="200" departSpeed="15"/>'
