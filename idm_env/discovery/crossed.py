@@ -47,11 +47,6 @@ def values_of(task: Task, solution: Solution, runs: Sequence[str], fold: np.ndar
     return result
 
 
-def lean(model: Hypothesis) -> Hypothesis:
-    """Return a model that has nothing but its law with a loop of its own, which does not ask for absent effects."""
-    return model if model.terms else Hypothesis((), replace(model.catalogue, effects=(), located=False))
-
-
 @dataclass(frozen=True, eq=False)
 class _Fold:
     """Drivers of one fold, the others' population, and log θ [2, G, P] by weight, from each half of their time.
@@ -96,7 +91,7 @@ def crossed(
             the null, takes that of whitened ones, against which drivers' noise weighs least, if it leaves not
             ``CLEARLY`` more.
     """
-    rows, own, model = whole(records), model.catalogue.own, lean(model)
+    rows, own = whole(records), model.catalogue.own
     is_calibrated = start is not None
     task, theta = judge.unweighed(
         records, model, values.mean(0), first_prior(own), start=start, calibrated=is_calibrated
@@ -154,7 +149,6 @@ def at_best(
 
     A model whose errors are far above another's even so needs no cross-fitting. ``start`` is as in ``crossed``.
     """
-    model = lean(model)
     theta = judge.unweighed(
         records, model, values, first_prior(model.catalogue.own), start=start, calibrated=start is not None
     )[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from itertools import accumulate, product
 
 import numpy as np
@@ -104,6 +105,11 @@ class Hypothesis:
         index = [t.label for t in self.terms].index(label)
         begin = sum(t.size for t in self.terms[:index])
         return slice(begin, begin + self.terms[index].size)
+
+    @cached_property
+    def bare(self) -> Hypothesis:
+        """The law alone with a loop of its own, which does not ask for absent effects: half the time of a step."""
+        return Hypothesis((), replace(self.catalogue, effects=(), located=False))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -28,9 +28,9 @@ from idm_env.jobs.storage import Store
 FAINT = 0.002
 """Share of the squared error, at best on the very data, below which a candidate is fitted in one step only."""
 NEAR, RACED = 0.3, 3
-"""Starts whose share is that near the best one's are fitted, so many at most."""
+"""Starts whose share is that near the best one's are fitted, so many at most; so are candidates to the end."""
 WORTH = 0.01
-"""Linear gain in log RMSE from which a located candidate is worth a nested fit."""
+"""Linear gain in log RMSE from which a located candidate is worth a nested fit, or ``NEAR`` that of the best name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +120,15 @@ class Search:
         before = held_out(self.task, solution)
         wanted = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
         wanted += [terms.given_profile(e) for e in self._sought("given") if e.name not in have]
-        found = []
+        found: list[Scored] = []
         responses = places.respond(self.task, solution)
-        for i, term in enumerate(wanted):
+        promised = {t.label: self._promise(solution, t)[0].max() for t in wanted}
+        # What promises most comes first: all others need not be fitted to the end where they stay far behind it.
+        for i, term in enumerate(sorted(wanted, key=lambda t: -promised[t.label])):
             self.on_progress(f"round {number}", i, len(wanted) + 1, term.label)
-            found.append(self._nested(solution, term, before, f"{number}/{term.label}"))
+            found.append(self._nested(solution, term, before, f"{number}/{term.label}", worth=_worth(found)))
         self.on_progress(f"round {number}", len(wanted), len(wanted) + 1, "places, times and shapes")
-        found += self._places(solution, responses, before, number, first)
+        found += self._places(solution, responses, before, number, first, max(_worth(found), WORTH))
         return found, before
 
     def again(self, solution: Solution, best: Scored, scored: list[Scored]) -> tuple[Solution, list[Scored]]:
@@ -163,7 +165,9 @@ class Search:
         key: str,
         starts: Sequence[np.ndarray] | None = None,
         iterations: int = 8,
+        worth: float = 0.0,
     ) -> Scored:
+        """Score a term by a fit, which goes no further where even on the very data it gains less than ``worth``."""
         model = solution.model.adding(term)
         kept = self.saved.get(key)
         if kept is not None:
@@ -172,7 +176,7 @@ class Search:
             best = finish(self.task, model, theta, values, linear, kept["cost"])
         else:
             starts = starts or [np.append(solution.values, s) for s in term.starts]
-            share, scaled = self._promise(solution, model, term, np.array(starts))
+            share, scaled = self._promise(solution, term, starts)
             # Chance alone lowers the error by the number of parameters over that of the errors.
             if share.max() < FAINT + term.size / solution.linear.residual.size:
                 best = solve(self.task, model, solution.theta, scaled[share.argmax()], iterations=1)
@@ -180,20 +184,22 @@ class Search:
                 wanted = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
                 first = [solve(self.task, model, solution.theta, s, iterations=5) for s in wanted]
                 best = min(first, key=lambda s: s.cost)
-                best = solve(self.task, model, best.theta, best.values, iterations=iterations)
+                if 0.5 * np.log(solution.cost / best.cost) >= worth:
+                    best = solve(self.task, model, best.theta, best.values, iterations=iterations)
             arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
             self.saved.put(key, {**arrays, "cost": float(best.cost)})
         gains = log_gain(before, held_out(self.task, best))
         return Scored(term, best, gains)
 
     def _promise(
-        self, solution: Solution, model: Hypothesis, term: Term, starts: np.ndarray
+        self, solution: Solution, term: Term, given: Sequence[np.ndarray] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return by which share every start [S, Q] lowers the squared error [S], and the starts scaled to do so.
 
         A start's response, after θ has followed it, is scaled by one number, which scales strengths.
         """
-        task, linear = self.task, solution.linear
+        task, linear, model = self.task, solution.linear, solution.model.adding(term)
+        starts = np.array(given or [np.append(solution.values, s) for s in term.starts])
         residual = task.residual(task.errors(np.repeat(solution.theta[None], len(starts), axis=0), model, starts))
         responses = np.concatenate([linear.jacobian[: linear.own], residual - linear.residual])
         tried = Linear(linear.residual, responses, linear.own)
@@ -215,14 +221,16 @@ class Search:
         return [e for e in effects if e.sought == what]
 
     def _curves(
-        self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int, curves: Sequence[Term]
-    ) -> list[Scored]:
-        """Score curves by their linear response, and those that promise most by a fit."""
+        self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int, curves: Sequence[Term],
+        worth: float = WORTH,
+    ) -> list[Scored]:  # fmt: skip
+        """Score curves by their linear response, and those that promise most, and ``worth``, by a fit."""
         have, result = {t.label for t in solution.model.terms}, []
         looked = [(t, *_line(responses, t)) for t in curves if t.label not in have]
         looked.sort(key=lambda one: -one[2].mean())
         for i, (term, start, gains) in enumerate(looked):
-            faint = gains.mean() < WORTH and (term.effect is None or term.what != "acceleration")
+            least = max(worth, NEAR * looked[0][2].mean())
+            faint = gains.mean() < least and (term.effect is None or term.what != "acceleration" or worth > WORTH)
             if faint or i >= RACED:
                 result.append(Scored(term, None, gains))
                 continue
@@ -235,8 +243,9 @@ class Search:
     # -- where and when ----------------------------------------------------------------------------------------------
 
     def _places(
-        self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int, first: bool
-    ) -> list[Scored]:
+        self, solution: Solution, responses: places.Responses, before: np.ndarray, number: int, first: bool,
+        worth: float,
+    ) -> list[Scored]:  # fmt: skip
         have = {t.label for t in solution.model.terms}
         period = self.task.rows.records.period
         result: list[Scored] = []
@@ -252,7 +261,7 @@ class Search:
             term = _interval_term(what, coordinate, found, open_end, named, period)
             if term.label in have:
                 return
-            if named is None and found.gains.mean() < WORTH:
+            if found.gains.mean() < worth and (named is None or worth > WORTH):
                 result.append(Scored(term, None, found.gains))
                 return
             starts = [np.append(solution.values, s) for s in _around(term, found, open_end)]
@@ -262,7 +271,7 @@ class Search:
             result.append(Scored(term, one.solution, gains, found.stable))
 
         def curve_of(*curves: Term) -> None:
-            result.extend(self._curves(solution, responses, before, number, curves))
+            result.extend(self._curves(solution, responses, before, number, curves, worth))
 
         position = _knots(responses.coordinates["position"], 80.0, 48, period)
         for effect in self._sought("profile"):
@@ -291,13 +300,18 @@ class Search:
         cycle, gains = places.best_period(responses, "acceleration")
         term = terms.curve("acceleration", "time", 0.0, cycle / 8, 8, cycle, label="acceleration over phase")
         if term.label not in have:
-            if gains.mean() < WORTH:
+            if gains.mean() < worth:
                 result.append(Scored(term, None, gains))
             else:
                 start = np.append(solution.values, np.zeros(8))
                 one = self._nested(solution, term, before, f"{number}/{term.label}", [start])
                 result.append(Scored(term, one.solution, np.minimum(one.gains, gains + 0.5 * np.abs(gains))))
         return result
+
+
+def _worth(found: Sequence[Scored]) -> float:
+    """Return the gain in log RMSE below which a candidate stays far behind the best of those found."""
+    return NEAR * max((float(s.gains.mean()) for s in found), default=0.0)
 
 
 def _surfaces(shape: Term) -> list[Term]:

@@ -76,6 +76,8 @@ class Task:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return predicted gap and speed [C, R, samples]; log θ [C, G, P], values [C, Q] or [C, G, Q]."""
         rows, records = self.rows, self.rows.records
+        if not model.terms and pulse is None:
+            model, values = model.bare, values[..., :0]
         copies = len(theta)
         if values.ndim == 2:
             values = np.broadcast_to(values[:, None], (copies, self.groups, values.shape[-1]))

@@ -12,9 +12,10 @@ from idm_env.discovery import search
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
+from idm_env.discovery.score import held_out
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import _same_class
-from idm_env.discovery.solve import Solution, Task, _Nested, linearise
+from idm_env.discovery.solve import Solution, Task, _Nested, linearise, solve
 from idm_env.jobs.storage import Store
 
 
@@ -55,8 +56,7 @@ def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypa
         monkeypatch.setattr(Task, "predict", counted)
         for term in map(terms.simple, names):
             copies.clear()
-            model = Hypothesis().adding(term)
-            share, scaled = searching._promise(null, model, term, np.array(term.starts))
+            share, scaled = searching._promise(null, term)
             assert len(share) == len(scaled) == len(term.starts) and copies == [len(term.starts)]
             found = searching._nested(null, term, np.ones(len(searching.units)), term.label).solution
             assert found is not None
@@ -66,6 +66,40 @@ def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypa
             elif hidden is None:
                 assert share.max() < search.FAINT and lowered < 2 * search.FAINT and sum(copies) < 60
         monkeypatch.undo()
+
+
+def test_a_law_alone_has_a_loop_of_its_own(platoon: Records) -> None:
+    """It rolls out as the whole catalogue's does with an effect at its null."""
+    rows = whole(platoon)
+    task, theta = Task(rows, None, first_prior()), np.tile(first_prior().centre, (1, len(platoon.groups), 1))
+    absent = Hypothesis((terms.simple("drag"),))
+    assert not Hypothesis().bare.catalogue.effects and absent.catalogue.effects
+    alone = task.predict(theta, Hypothesis(), np.zeros((1, 0)))
+    beside = task.predict(theta, absent, np.zeros((1, 1)))
+    np.testing.assert_allclose(alone, beside, rtol=0, atol=1e-9)
+
+
+def test_candidates_far_behind_the_best_are_not_fitted_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("memory", "leader_acceleration", "drag", "power_limit", "speed_time_gap")
+    searching, null = begun(made(31, runs=6, followers=2, seconds=120.0, effect="speed_time_gap"), *names)
+    before = held_out(searching.task, null)
+    to_the_end: list[str] = []
+
+    def noted(task: Task, model: Hypothesis, *rest: np.ndarray, iterations: int = 12) -> Solution:
+        if model.terms and iterations > 5:
+            to_the_end.append(model.terms[-1].label)
+        return solve(task, model, *rest, iterations=iterations)
+
+    monkeypatch.setattr(search, "solve", noted)
+    alone = {n: searching._nested(null, terms.simple(n), before, f"alone/{n}") for n in names}
+    best = max(alone, key=lambda n: alone[n].gains.mean())
+    assert best == "speed_time_gap" and len(to_the_end) > 1
+    to_the_end.clear()
+    scored = {s.term.label: s for s in searching.round(null, 1)[0] if s.term.label in alone}
+    assert to_the_end == [best]
+    np.testing.assert_array_equal(scored[best].gains, alone[best].gains)
+    behind = [s.gains.mean() for n, s in scored.items() if n != best]
+    assert max(behind) < search.NEAR * alone[best].gains.mean()
 
 
 def test_only_groups_that_moved_are_rolled_out_again(platoon: Records) -> None:
