@@ -33,7 +33,7 @@ class Law(NamedTuple):
     errors: Judged
     against: dict[str, Comparison]
     at_best: bool = False
-    """Whether it and the null have errors of the very data that they are fitted to, far larger ones already."""
+    """Whether it and the null have errors of the very data that they are fitted to, which speak against it already."""
 
     @property
     def own(self) -> tuple[str, ...]:
@@ -94,12 +94,15 @@ def compared(
     return laws
 
 
-def is_far(law: Judged, null: Judged) -> bool:
-    """Tell whether a law errs so much more than the null that it needs no cross-fitting.
+def is_far(law: Judged, null: Judged, has_null: bool = False) -> bool:
+    """Tell whether a law is so far from better than the null that it needs no cross-fitting.
 
-    That is by more than ``HOLDS`` in all of ``SCREENED``, each fitted to the very data that are judged.
+    Each is fitted to the very data that are judged. A law errs by more than ``HOLDS`` more in all of ``SCREENED``; one
+    that ``has_null`` in it, with more parameters of the drivers' own, does not predict better 5 s ahead by ``LEAST``.
     """
     errors, others = law.summary(), null.summary()
+    if has_null:
+        return errors["horizon_rmse_m"] > (1.0 - LEAST) * others["horizon_rmse_m"]
     return all(errors[key] > HOLDS * others[key] for key in SCREENED)
 
 

@@ -312,7 +312,7 @@ def _finish(
                 assert errors is not None
                 return errors, before
             at_best, theta = crossed.at_best(prepared, model, null.values)
-            if bases.is_far(at_best, best):
+            if bases.is_far(at_best, best, bool(model.catalogue.personal)):
                 return at_best, best
             values = crossed.values_of(searching.task, null, prepared.runs, fold)
             return crossed.crossed(prepared, model, values, fold, noise(), theta, whitened=whitened), before

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,7 +13,9 @@ import torch
 
 from idm_env.data import synthetic
 from idm_env.discovery import discover, write_report
+from idm_env.discovery.bases import is_far
 from idm_env.discovery.calibrate import first_prior
+from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, whole
@@ -40,6 +45,25 @@ def test_the_loop_of_a_law_is_the_simulator(platoon: Records, name: str) -> None
         reference = problem.simulate(values).gap.numpy()[4::5].T
     count = min(mine.shape[1], reference.shape[1])
     assert float(np.abs(mine[:, :count] - reference[:, :count])[rows.valid[:, :count]].max()) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("gap", "ahead", "has_null", "far"),
+    [
+        (1.06, 1.06, False, True),
+        (2.0, 0.8, False, False),
+        (0.8, 2.0, False, False),
+        (0.8, 0.99, True, True),
+        (0.8, 0.94, True, False),
+    ],
+)
+def test_laws_that_cannot_be_better_need_no_cross_fitting(gap: float, ahead: float, has_null: bool, far: bool) -> None:
+    """One that has the null in it must at least predict the very data better 5 s ahead."""
+    law, null = (
+        cast(Judged, SimpleNamespace(summary=partial(dict, gap_rmse_m=x, horizon_rmse_m=y)))
+        for x, y in ((gap, ahead), (1.0, 1.0))
+    )
+    assert is_far(law, null, has_null) is far
 
 
 def test_another_law_is_completed_and_the_law_of_the_data_is_named_first(tmp_path: Path) -> None:
