@@ -99,24 +99,24 @@ _DETAILS = tuple((name, f"info_{name}") for name in INFO)
 class Batch:
     """``count`` environments that step together; row i draws what a single environment with its seed draws."""
 
-    def __init__(self, made: Settings, count: int) -> None:
-        self.settings = made
-        self.task = made.task
+    def __init__(self, settings: Settings, count: int) -> None:
+        self.settings = settings
+        self.task = settings.task
         self.count = count
-        self.params: Params = self.task.params(made.dtype, made.device)
-        self.limit = made.limit
+        self.params: Params = self.task.params(settings.dtype, settings.device)
+        self.limit = settings.limit
         self.seeds = np.zeros(count, dtype=np.int64)
         self.episodes = np.full(count, -1, dtype=np.int64)
         self._world: EnvState | None = None
-        self._moves = Moves(made)
+        self._moves = Moves(settings)
         self._values = self._compiled()
         self._on_lanes = 0
         self._loaded = False
         self._seen: Any = None
         self._reasons: dict[int, str] = {}
         self.counters: Counters | None = None
-        if isinstance(made.task, OpenLanesTask) and (made.task.loops or "stops" in made.info):
-            self.counters = Counters(made.task, count)
+        if isinstance(settings.task, OpenLanesTask) and (settings.task.loops or "stops" in settings.info):
+            self.counters = Counters(settings.task, count)
         self._draw: Draw | None = None
         self._driven: Params | None = None
         self._pool: EnvState | None = None
@@ -128,12 +128,12 @@ class Batch:
 
     def _compiled(self) -> Values | None:
         """Return what steps in compiled loops, where that can be."""
-        made = self.settings
-        if made.device.type != "cpu" or dispatch.surroundings() is not None:
+        settings = self.settings
+        if settings.device.type != "cpu" or dispatch.surroundings() is not None:
             return None
         from idm_env.envs.values import Values
 
-        return Values(self._moves, graph=made.output == "torch")
+        return Values(self._moves, graph=settings.output == "torch")
 
     @property
     def begun(self) -> bool:
@@ -324,8 +324,8 @@ class Batch:
         if self.task.journeys and action is not None:
             state = self.glance().state
             assert state.present is not None
-            there = self.task.pick(state.present) > 0
-            live = there if live is None else live & there
+            on_road = self.task.pick(state.present) > 0
+            live = on_road if live is None else live & on_road
         outcome = self._once(action, live)
         for _ in range(self.task.held - 1):
             over = outcome.whole.terminated | outcome.whole.truncated
@@ -358,9 +358,9 @@ class Batch:
         self._on_lanes += isinstance(self.task.road, Lanes)
         eager = self.task.simulator.untried or 0 < self._on_lanes <= EAGER_STEPS
         if self._values is not None and not eager:
-            told = self._step_values(action, live)
-            if told is not None:
-                return Outcome.of(told)
+            outputs = self._step_values(action, live)
+            if outputs is not None:
+                return Outcome.of(outputs)
         with torch.no_grad() if self.settings.output == "numpy" else contextlib.nullcontext():
             return Outcome.of(self._step_torch(action, live))
 
@@ -372,10 +372,10 @@ class Batch:
         block = self._normals(lambda: before.state.step)
         normals = None if block is None else {name: x[self.used - 1] for name, x in block.items()}
         driven = self.task.episode_params(before.episode, self.params)
-        self.world, told = self._moves.step(before, action, live, normals, driven)
+        self.world, outputs = self._moves.step(before, action, live, normals, driven)
         # What a task tells may be a part of its state: whoever is told gets numbers of his own.
-        told = {name: x.clone() for name, x in told.items()}
-        return {n: x.cpu().numpy() for n, x in told.items()} if self.settings.output == "numpy" else told
+        outputs = {name: x.clone() for name, x in outputs.items()}
+        return {n: x.cpu().numpy() for n, x in outputs.items()} if self.settings.output == "numpy" else outputs
 
     def _step_values(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> dict[str, Any] | None:
         """Return what is told of a step by compiled loops; None, with nothing changed, where there are none."""
@@ -391,7 +391,7 @@ class Batch:
             normals = self._normals(values.clock)
             noise = None if normals is None else self._drawn
             who = None if live is None else live.numpy().reshape(-1)
-            told = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params())
+            outputs = values.step(action, who, noise, max(self.used - 1, 0), self.episode_params())
         except Untraceable as why:
             self._world, self._loaded = self.world, False
             self.used, self._block = used, block
@@ -402,9 +402,9 @@ class Batch:
                 self._values = None
             return None
         # What is told is written to by whom it pleases.
-        seen = told["observation"]
+        seen = outputs["observation"]
         self._world, self._loaded, self._seen = None, True, seen.clone() if isinstance(seen, Tensor) else seen.copy()
-        return told
+        return outputs
 
     def detach(self) -> None:
         """Cut the graph behind the present state, for truncated back-propagation."""

@@ -56,10 +56,10 @@ class Beginnings:
         others = np.flatnonzero(ahead)
         oldest = others[np.argsort(self._begun[others], kind="stable")][: max(0, self._asked - len(missing))]
         chosen = np.concatenate((missing, oldest))
-        of = np.concatenate((episodes[missing], episodes[oldest] + 1))
-        made = self._make(chosen, of)
+        numbers = np.concatenate((episodes[missing], episodes[oldest] + 1))
+        worlds = self._make(chosen, numbers)
         if self._worlds is None:
-            self._worlds = mapped(lambda x: x.new_empty((self._count, *x.shape[1:])), made)
+            self._worlds = mapped(lambda x: x.new_empty((self._count, *x.shape[1:])), worlds)
         where = torch.as_tensor(chosen)
-        mapped(lambda held, new: held.index_put_((where.to(held.device),), new), self._worlds, made)
-        self._ready[chosen] = of
+        mapped(lambda held, new: held.index_put_((where.to(held.device),), new), self._worlds, worlds)
+        self._ready[chosen] = numbers

@@ -38,23 +38,23 @@ def checked(given: Any, like: State, road: Road) -> State:
         raise ValueError(
             f"options['state'] is of type {type(given).__name__}: give a State, such as env.unwrapped.state."
         )
-    wanted, found = dict(_leaves(like)), dict(_leaves(given))
-    for name in wanted:
-        if name not in found:
+    expected, leaves = dict(_leaves(like)), dict(_leaves(given))
+    for name in expected:
+        if name not in leaves:
             raise ValueError(f"options['state'].{name} is missing, and this task has it. Start from its own state.")
-    kept = {}
-    for name, x in found.items():
-        if name not in wanted and not name.startswith(_LATER):
+    tensors = {}
+    for name, x in leaves.items():
+        if name not in expected and not name.startswith(_LATER):
             raise ValueError(f"options['state'].{name} is no part of this task's state. Leave it out.")
-        kept[name] = _fitting(name, x, wanted.get(name), like, road)
+        tensors[name] = _fitting(name, x, expected.get(name), like, road)
     parts: dict[str, Any] = {}
     for field, value in given._asdict().items():
         if isinstance(value, tuple):
-            parts[field] = type(value)(**{n: kept[f"{field}.{n}"] for n in value._asdict()})  # type: ignore[attr-defined]
+            parts[field] = type(value)(**{n: tensors[f"{field}.{n}"] for n in value._asdict()})  # type: ignore[attr-defined]
         elif isinstance(value, Mapping):
-            parts[field] = {n: kept[f"{field}.{n}"] for n in value}
+            parts[field] = {n: tensors[f"{field}.{n}"] for n in value}
         else:
-            parts[field] = kept.get(field, {} if isinstance(getattr(like, field), Mapping) else None)
+            parts[field] = tensors.get(field, {} if isinstance(getattr(like, field), Mapping) else None)
     state = State(**parts)
     with torch.no_grad():
         _linked(state, road)
@@ -109,7 +109,7 @@ def _linked(state: State, road: Road) -> None:
     if links is None:
         return
     own = torch.arange(state.speed.shape[-1], device=state.speed.device).expand_as(links.lane)
-    there = torch.ones_like(own, dtype=torch.bool) if state.present is None else state.present > 0
+    present = torch.ones_like(own, dtype=torch.bool) if state.present is None else state.present > 0
     apart = (state.gap > 0).all(-1, keepdim=True)
     order = road.links(state.position, state.length, links.lane, state.present)
     assert order is not None
@@ -117,8 +117,8 @@ def _linked(state: State, road: Road) -> None:
         (links.leader, links.follower, order.leader),
         (links.follower, links.leader, order.follower),
     ):
-        right = there.gather(-1, to) & (links.lane.gather(-1, to) == links.lane) & (back.gather(-1, to) == own)
-        wrong = there & (((to != own) & ~right) | (apart & (to != nearest)))
+        right = present.gather(-1, to) & (links.lane.gather(-1, to) == links.lane) & (back.gather(-1, to) == own)
+        wrong = present & (((to != own) & ~right) | (apart & (to != nearest)))
         if bool(wrong.any()):
             row, vehicle = wrong.nonzero()[0].tolist()
             raise ValueError(

@@ -31,11 +31,11 @@ def asked_of_make() -> int | None:
     Gymnasium keeps it for its own TimeLimit and tells the environment nothing, but a task must know the end: starts in
     a record, the cost of a crash and whether the record is long enough all depend on it. So it is read where it stands.
     """
-    made = compat.locals_of(gymnasium.make.__code__)
-    if made is None:
+    frame = compat.locals_of(gymnasium.make.__code__)
+    if frame is None:
         return None
-    given = made.get(LIMIT)
-    return getattr(made.get("env_spec"), LIMIT, None) if given is None else given
+    limit = frame.get(LIMIT)
+    return getattr(frame.get("env_spec"), LIMIT, None) if limit is None else limit
 
 
 class Face:
@@ -147,28 +147,28 @@ class DiffIDMEnv(Face, gymnasium.Env):
     }
 
     def __init__(self, render_mode: str | None = None, **keywords: Any) -> None:
-        asked = asked_of_make()
-        made = settings(render_mode=render_mode, **(keywords if asked is None else {**keywords, LIMIT: asked}))
-        self.settings = made
-        self.render_mode = made.render_mode
-        self.batch = Batch(made, 1)
-        self.task = made.task
+        limit = asked_of_make()
+        own = settings(render_mode=render_mode, **(keywords if limit is None else {**keywords, LIMIT: limit}))
+        self.settings = own
+        self.render_mode = own.render_mode
+        self.batch = Batch(own, 1)
+        self.task = own.task
         agents = len(self.task.agents)
         self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.task.step_time))}
-        self.observation_space = observation_box(self.task, made.dtype, agents)
+        self.observation_space = observation_box(self.task, own.dtype, agents)
         self._shape = (agents * len(self.task.commands),)
         self.action_space = action_space(self.task, agents)
-        self._numpy = made.output == "numpy"
+        self._numpy = own.output == "numpy"
         self._viewer: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for ``seed`` and ``options``."""
-        given = reset_options(options, ("state",))
+        chosen = reset_options(options, ("state",))
         super().reset(seed=seed)
         if seed is not None or not self.batch.begun:
             # Without any seed the one that Gymnasium draws from the operating system is used.
             self.batch.seed([0], [self.np_random_seed if seed is None else seed])
-        observation = self.batch.reset(state=given.get("state"))
+        observation = self.batch.reset(state=chosen.get("state"))
         if self.render_mode == "human":
             self.render()
         return self._out(observation), begun(self.batch)
@@ -177,8 +177,8 @@ class DiffIDMEnv(Face, gymnasium.Env):
         """Advance by Δt; return observation, reward, terminated, truncated and info. RuntimeError before ``reset``."""
         if not self.batch.begun:
             raise RuntimeError("step was called before reset. Call reset() first.")
-        given = None if action is None else action_of(action, self._shape, self.settings)[None]
-        outcome = self.batch.step(given)
+        actions = None if action is None else action_of(action, self._shape, self.settings)[None]
+        outcome = self.batch.step(actions)
         if self.render_mode == "human":
             self.render()
         reward, terminated, truncated = outcome.whole

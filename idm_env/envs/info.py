@@ -58,16 +58,16 @@ class Ids(tuple[str, ...]):
 
 def ids(batch: Batch) -> Ids | None:
     """Return the recorded ids of the agents' vehicles where the infos tell them."""
-    known = batch.task.vehicle_ids
-    if known is None or "vehicle_id" not in batch.settings.info:
+    names = batch.task.vehicle_ids
+    if names is None or "vehicle_id" not in batch.settings.info:
         return None
-    return Ids(known[i] for i in batch.task.agents)
+    return Ids(names[i] for i in batch.task.agents)
 
 
 def begun(batch: Batch) -> dict[str, Any]:
     """Return the info of the reset of a single environment."""
-    known = ids(batch)
-    return {} if known is None else {"vehicle_id": known}
+    names = ids(batch)
+    return {} if names is None else {"vehicle_id": names}
 
 
 def single(batch: Batch, outcome: Outcome) -> dict[str, Any]:
@@ -94,12 +94,12 @@ class Rows:
     def __init__(self, batch: Batch) -> None:
         self.batch = batch
         self._torch = batch.settings.output == "torch"
-        known = ids(batch)
+        names = ids(batch)
         self._ids = None
-        if known is not None:
+        if names is not None:
             self._ids = np.empty(batch.count, dtype=object)
             for row in range(batch.count):  # numpy would fill in the codes
-                self._ids[row] = known
+                self._ids[row] = names
 
     def begun(self, rows: np.ndarray) -> dict[str, Any]:
         """Return the info of resets of some rows (bool)."""

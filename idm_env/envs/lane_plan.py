@@ -130,23 +130,25 @@ class Stage:
     @cached_property
     def back(self) -> RowFunction:
         """The adjoint: from ``pass_NAME``, what falls on the leaves afterwards, to ``new_NAME`` before."""
-        given = {f"pass_{n}": self._examples[n].clone() for n in self.moving}
+        passes = {f"pass_{n}": self._examples[n].clone() for n in self.moving}
         changed = [n for n in self.moving if f"then_{n}" in self.loops.outs]
         by = [*self.moving, *self.more]
         back = adjoint(self._then, [f"then_{n}" for n in changed], by)
 
         def through(**leaves: Tensor) -> dict[str, Tensor]:
             seeds = {f"on_then_{n}": leaves[f"pass_{n}"] for n in changed}
-            found = back(**{n: x for n, x in leaves.items() if n[:5] != "pass_"}, **seeds)
-            made = {}
+            gradients = back(**{n: x for n, x in leaves.items() if n[:5] != "pass_"}, **seeds)
+            results = {}
             for n in self.moving:
                 if n in changed:
-                    made[f"new_{n}"] = found[n] if n in found else 0.0 * leaves[f"pass_{n}"]
+                    results[f"new_{n}"] = gradients[n] if n in gradients else 0.0 * leaves[f"pass_{n}"]
                 else:
-                    made[f"new_{n}"] = leaves[f"pass_{n}"] + found[n] if n in found else leaves[f"pass_{n}"].clone()
-            return made | {f"new_{n}": found[n] for n in self.more if n in found}
+                    results[f"new_{n}"] = (
+                        leaves[f"pass_{n}"] + gradients[n] if n in gradients else leaves[f"pass_{n}"].clone()
+                    )
+            return results | {f"new_{n}": gradients[n] for n in self.more if n in gradients}
 
-        return RowFunction(through, {**self._examples, **given}, self._many, apart=True)
+        return RowFunction(through, {**self._examples, **passes}, self._many, apart=True)
 
 
 class LaneLaid(Laid):
@@ -167,9 +169,9 @@ class LaneLaid(Laid):
             bound.moves.append((("block", int(plan.states_at[i])), (n, 1), False, int(places[i])))
         for name in (*program.statics, *program.parameters):
             if name in ("led", "leads", "ends"):
-                made = np.zeros(room, real)
-                bound.chained.append((name, made))
-                places.append(address(made))
+                array = np.zeros(room, real)
+                bound.chained.append((name, array))
+                places.append(address(array))
                 strides.append((0, wide, 1))
                 continue
             if name in ("length", "present"):
@@ -180,11 +182,11 @@ class LaneLaid(Laid):
                 source, by = operand(tensor.to(like.dtype), (rows,), n)
             self._enter(bound, bound.stays, source, by, False, places, strides)
         for i, (slot, (x, by)) in enumerate(zip((*kernel.numbers, *kernel.flags), self.inputs, strict=True)):
-            asked = self.given.get(2 * states + plan.fixed + i)
-            source = x if asked is None else ("given", asked)
-            into = bound.stays if asked is None else bound.moves
-            if asked is not None and by[2] == 0:
-                bound.given[len(places)] = asked
+            call_name = self.given.get(2 * states + plan.fixed + i)
+            source = x if call_name is None else ("given", call_name)
+            into = bound.stays if call_name is None else bound.moves
+            if call_name is not None and by[2] == 0:
+                bound.given[len(places)] = call_name
                 places.append(0)
                 strides.append(by)
                 continue
@@ -207,10 +209,10 @@ class LaneLaid(Laid):
                 strides.append(by)
                 return
             source = ("array", address(source))
-        made = np.zeros(plan.rows * plan.places, np.uint8 if truth else plan.real)
-        bound.held.append(made)
-        into.append((source, by[1:], truth, address(made)))
-        places.append(address(made))
+        array = np.zeros(plan.rows * plan.places, np.uint8 if truth else plan.real)
+        bound.held.append(array)
+        into.append((source, by[1:], truth, address(array)))
+        places.append(address(array))
         strides.append((0, plan.places, 1))
 
 
@@ -220,8 +222,8 @@ class LaneBound(Bound):
     ``moves`` are copied at every step, ``stays`` where vehicles were laid out anew, ``chained`` with the layout.
     """
 
-    def __init__(self, *given: Any) -> None:
-        super().__init__(*given)
+    def __init__(self, *laid: Any) -> None:
+        super().__init__(*laid)
         self.moves: list[Any] = []
         self.stays: list[Any] = []
         self.chained: list[tuple[str, Array]] = []
@@ -248,8 +250,8 @@ class LaneBound(Bound):
         if self.laid_out != chain.serial:
             which = rows if len(rows) and self.laid_out == chain.before else np.arange(plan.rows)
             self._staying.copy(which, chain, plan, mid, {})
-            for name, made in self.chained:
-                np.copyto(made, getattr(chain, name))
+            for name, array in self.chained:
+                np.copyto(array, getattr(chain, name))
             self.laid_out = chain.serial
 
     def forget(self) -> None:
@@ -272,11 +274,11 @@ class _Copies:
 
     def sources(self, mid: int, given: Mapping[str, int]) -> Array:
         """Return where everything is: blocks begin at ``mid``."""
-        made = self._base.copy()
-        made[self._blocks] = self._block_at + mid
+        cells = self._base.copy()
+        cells[self._blocks] = self._block_at + mid
         for i, name in self._given:
-            made[i] = given[name]
-        return made
+            cells[i] = given[name]
+        return cells
 
     def copy(self, rows: Array, chain: Chain, plan: LanePlan, mid: int, given: Mapping[str, int]) -> None:
         """Copy some rows."""
@@ -300,7 +302,7 @@ class LanePlan(Plan):
         super().__init__(moves, world, layout, kind, draws)
         if self.kernel.signals:
             raise Untraceable("an effect looks back, where vehicles change lanes")
-        made, like = self.recorded, world.state
+        recorded, like = self.recorded, world.state
         self.like = np.empty(0, self.real)
         self.states_at = self._states // self.pitch
         self.every = simulator.decides_after
@@ -310,8 +312,8 @@ class LanePlan(Plan):
         self.tables = np.array([self.road.table(name) for name in ("opens", "closes", "stops")], self.real)
         self.moving = [_block(n) for n in self.kernel.program.moving]
         self.whole = [n for n in WHOLE if n in named(world)]
-        sample = examples_of(world, made.many)
-        self.said = "replay_lane_now" if "replay_lane_now" in made.before.shapes else None
+        sample = examples_of(world, recorded.many)
+        self.said = "replay_lane_now" if "replay_lane_now" in recorded.before.shapes else None
         if self.said and self.ring:
             raise Untraceable("records of lanes on a ring")
         pairs = [n.split(".", 1) for n in self.kernel.program.parameters]
@@ -320,21 +322,21 @@ class LanePlan(Plan):
         if self.coming:
             names = {f"param_{e}_{p}": (e, p) for e, p in pairs}
             dtype = like.speed.dtype
-            given = {n: torch.ones(made.many, self.size, dtype=dtype) for n in names}
+            examples = {n: torch.ones(recorded.many, self.size, dtype=dtype) for n in names}
             self.turn_params = [tuple(x) for x in pairs]  # type: ignore[misc]
-            self.turn = Stage(self._turned(names), {**sample, **given}, made.many, self.moving, list(names))
-        truths = {"fresh": torch.ones(made.many, self.size, dtype=torch.bool)}
+            self.turn = Stage(self._turned(names), {**sample, **examples}, recorded.many, self.moving, list(names))
+        truths = {"fresh": torch.ones(recorded.many, self.size, dtype=torch.bool)}
         self.found: Any = None
         if simulator.lane_change_models:
-            self.found = decision(simulator, Form.of(like._replace(links=None, trips=None), made.inputs))
+            self.found = decision(simulator, Form.of(like._replace(links=None, trips=None), recorded.inputs))
             if isinstance(self.found, str):
                 raise Untraceable(self.found)
-            slots = torch.zeros(made.many, self.size, dtype=torch.int64)
+            slots = torch.zeros(recorded.many, self.size, dtype=torch.int64)
             sees = {"merger": slots} if simulator.sees_mergers else {}
-            self.settle = Stage(self._settled, {**sample, **truths, **sees}, made.many, self.moving)
+            self.settle = Stage(self._settled, {**sample, **truths, **sees}, recorded.many, self.moving)
         if self.said:
             plain = self.settle if self.settle is not None and not simulator.sees_mergers else None
-            self.place = plain or Stage(self._settled, {**sample, **truths}, made.many, self.moving)
+            self.place = plain or Stage(self._settled, {**sample, **truths}, recorded.many, self.moving)
         blocks = simulator.decides_in_blocks
         self.turns = simulator.turns(self.size).numpy() if blocks else np.empty(0, np.int64)
         self.stages = np.unique(self.turns) if blocks else np.zeros(1, np.int64)
@@ -387,7 +389,7 @@ class LanePlan(Plan):
         """
         if self.found is None:
             return None
-        blocks, given, led = [], [], []
+        blocks, inputs, led = [], [], []
         like = self.world.state
         laid: LaneLaid = bound.laid  # type: ignore[assignment]
 
@@ -402,7 +404,7 @@ class LanePlan(Plan):
                 if to is not None:
                     if self.recorded.before.types.get(to, self.real) != self.real:
                         raise Untraceable(f"drivers who change lanes look at {name.removesuffix(' now')}")
-                    given.append((i, to))
+                    inputs.append((i, to))
                     return 0, by_row, by_vehicle
                 return self._keep(bound, x.astype(self.real)), by_row, by_vehicle
             still = laid.layout.still.get(_block(name))
@@ -419,12 +421,12 @@ class LanePlan(Plan):
             return 0, self.size, 1
 
         plan, places = rows_of(self.found.slots, find)
-        at = np.array([b for _, b in blocks], np.int64) * self.pitch
+        offsets = np.array([b for _, b in blocks], np.int64) * self.pitch
         which = np.array([i for i, _ in blocks], np.int64)
         marks = {name: np.zeros(self.count, self.real) for name in ("led", "leads")}
         for i, name in led:
             plan[i, lane_change_loops.ADDRESS] = address(marks[name])
-        return plan, places, which, at, given, marks, self.found.compiled(self.real.name)
+        return plan, places, which, offsets, inputs, marks, self.found.compiled(self.real.name)
 
     def _keep(self, bound: LaneBound, x: Array) -> int:
         bound.held.append(x)
@@ -434,38 +436,38 @@ class LanePlan(Plan):
 
     def run(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> dict[str, Array]:
         """Do one step of blocks [rows · vehicles], as ``Plan.run``; Unordered, nothing changed, where torch must."""
-        bound, lanes, made = moment.bound, moment.lanes, self.recorded
+        bound, lanes, recorded = moment.bound, moment.lanes, self.recorded
         assert isinstance(bound, LaneBound) and isinstance(lanes, Crossing)
         moment.now, moment.later = now.data_ptr(), later.data_ptr()
-        between, there = self.between.take() if tape else self._reused
+        between, between_at = self.between.take() if tape else self._reused
         clock, whole = np.empty_like(moment.clock), self._named(lanes.whole, "")
-        given = self._given(moment, between, there, clock)
-        all_rows(made.before.call, self.rows, bound.laid.ask.filled(moment.now, 0, given | whole))
-        before = given | self._drawn(moment)
+        pointers = self._given(moment, between, between_at, clock)
+        all_rows(recorded.before.call, self.rows, bound.laid.ask.filled(moment.now, 0, pointers | whole))
+        before = pointers | self._drawn(moment)
         self._decide(moment, now, before, tape)
         assert lanes.mid is not None and lanes.whole_mid is not None and lanes.chain is not None
         mid, chain = lanes.mid.data_ptr(), lanes.chain
         lanes.whole_later = lanes.whole_mid.copy() if self.said else lanes.whole_mid
-        told, where = self.told.take()
-        where |= given | whole | self._named(lanes.whole_later, "later_")
+        outputs, where = self.told.take()
+        where |= pointers | whole | self._named(lanes.whole_later, "later_")
         tells = bound.laid.tell.filled(moment.now, moment.later, where)
         copies = bound._moving
         position, was, present = (self._view(x, n) for x, n in (
             (later, "position"), (lanes.mid, "present"), (later, "present")))  # fmt: skip
-        said, settle, settled = np.empty(0, np.int64), 0, np.empty(0, np.int64)
+        record_lanes, settle, settled = np.empty(0, np.int64), 0, np.empty(0, np.int64)
         lanes.placed = np.zeros(self.count if self.said else 0, np.bool_)
         for i in self._carried:
             later[i].copy_(lanes.mid[i])
         if self.said and self.place is not None:
-            said, settle = between[self.said].reshape(-1), self.place.loops.call
-            known = {"fresh": address(lanes.placed), "state_step": given["later_state_step"]}
-            settled = self._stage(bound, self.place.loops, moment.later, lanes.whole_later, known, moment.later, None)
+            record_lanes, settle = between[self.said].reshape(-1), self.place.loops.call
+            own = {"fresh": address(lanes.placed), "state_step": pointers["later_state_step"]}
+            settled = self._stage(bound, self.place.loops, moment.later, lanes.whole_later, own, moment.later, None)
         places = self._operands(bound, before)
 
         def part(begin: int, end: int, work: Any) -> None:
             step_chains(
-                made.after.call, tells, moment.clock, clock, bool(self.said), settled, settle, said, lanes.whole_mid,
-                lanes.whole_later, position, was, present, self.coming, self.road.count, lanes.placed,
+                recorded.after.call, tells, moment.clock, clock, bool(self.said), settled, settle, record_lanes,
+                lanes.whole_mid, lanes.whole_later, position, was, present, self.coming, self.road.count, lanes.placed,
                 copies.sources(mid, before), copies.strides, copies.truths, copies.targets,
                 places[len(self._states) : 2 * len(self._states)], self._states + moment.later, chain.slots, chain.own,
                 places, bound.strides, *work, self.like, 0, *self.loops, 0, False, self.size, begin, end,
@@ -477,9 +479,9 @@ class LanePlan(Plan):
         else:
             new = self.kernel, self.slots, self.real
             pool.split(lambda begin, end: part(begin, end, workspaces(*new)), self.groups, 1, threads)
-        return self._finished(later, told, clock, bound)
+        return self._finished(later, outputs, clock, bound)
 
-    def _decide(self, moment: Moment, now: Tensor, there: Mapping[str, int], tape: bool) -> None:
+    def _decide(self, moment: Moment, now: Tensor, pointers: Mapping[str, int], tape: bool) -> None:
         """Let vehicles come, go and change lanes in the rows whose turn it is; and lay out who is elsewhere now."""
         bound, lanes = moment.bound, moment.lanes
         assert isinstance(bound, LaneBound) and isinstance(lanes, Crossing)
@@ -498,7 +500,7 @@ class LanePlan(Plan):
             chain = lanes.chain = Chain(slots, own, led, led.copy(), led.copy(), stale)
         try:
             if len(lanes.turned) or len(lanes.decided):
-                self._change(moment, now, there, phase, tape)
+                self._change(moment, now, pointers, phase, tape)
             anew = chain.stale.copy()
             anew[lanes.turned] = anew[lanes.decided] = True
             rows = np.flatnonzero(anew)
@@ -518,7 +520,7 @@ class LanePlan(Plan):
             chain.stale[:] = True
             raise
 
-    def _change(self, moment: Moment, now: Tensor, there: Mapping[str, int], phase: Array, tape: bool) -> None:
+    def _change(self, moment: Moment, now: Tensor, pointers: Mapping[str, int], phase: Array, tape: bool) -> None:
         """Let vehicles come, go and change lanes, on copies."""
         bound, lanes = moment.bound, moment.lanes
         assert isinstance(bound, LaneBound) and isinstance(lanes, Crossing)
@@ -530,15 +532,15 @@ class LanePlan(Plan):
         lanes.mid, lanes.whole_mid = mid, lanes.whole.copy()
         step = {"state_step": moment.given["state_step"]}
         if self.turn is not None and len(lanes.turned):
-            known = {n: address(x) for n, x in bound.turn_params.items()} | step
-            stage = self._stage(bound, self.turn.loops, moment.now, lanes.whole, known, mid.data_ptr(), lanes.whole_mid)
+            own = {n: address(x) for n, x in bound.turn_params.items()} | step
+            stage = self._stage(bound, self.turn.loops, moment.now, lanes.whole, own, mid.data_ptr(), lanes.whole_mid)
             each_row(self.turn.loops.call, lanes.turned, stage)
         if self.settle is None or not len(lanes.decided):
             return
-        plan, places, which, at, given, marks, (phase_at, constants) = bound.decides
-        plan[which, lane_change_loops.ADDRESS] = at + mid.data_ptr()
-        for i, name in given:
-            plan[i, lane_change_loops.ADDRESS] = there[name]
+        plan, places, which, offsets, inputs, marks, (phase_at, constants) = bound.decides
+        plan[which, lane_change_loops.ADDRESS] = offsets + mid.data_ptr()
+        for i, name in inputs:
+            plan[i, lane_change_loops.ADDRESS] = pointers[name]
         if not self.ring:
             mark_led(lanes.decided, self.size, *lanes.whole_mid[1:3], marks["led"], marks["leads"])
         lanes.fresh = np.zeros(self.count, np.uint8)
@@ -552,12 +554,12 @@ class LanePlan(Plan):
             self.turns, order, begin,
         ):  # fmt: skip
             raise Unordered("links are not the order of positions")
-        known = {"fresh": address(lanes.fresh), "merger": address(lanes.merger), **step}
-        stage = self._stage(bound, self.settle.loops, mid.data_ptr(), lanes.whole_mid, known, mid.data_ptr(), None)
+        own = {"fresh": address(lanes.fresh), "merger": address(lanes.merger), **step}
+        stage = self._stage(bound, self.settle.loops, mid.data_ptr(), lanes.whole_mid, own, mid.data_ptr(), None)
         each_row(self.settle.loops.call, lanes.decided, stage)
 
     def _stage(
-        self, bound: LaneBound, loops: RowFunction, now: int, whole: Array, known: Mapping[str, int], to: int,
+        self, bound: LaneBound, loops: RowFunction, now: int, whole: Array, own: Mapping[str, int], to: int,
         whole_to: Array | None,
     ) -> Array:  # fmt: skip
         """Return the table of a stage that reads blocks at ``now`` and writes what it changes to those at ``to``."""
@@ -565,11 +567,11 @@ class LanePlan(Plan):
         held = self._tables.get(id(loops))
         if held is None or held[0] != layout.version:
             held = self._tables[id(loops)] = (layout.version, _Table(loops, layout, self.pitch))
-        given = {**self._named(whole, ""), **known}
-        given |= {f"then_{n}": to + i * self.pitch for i, n in enumerate(layout.blocks)}
+        pointers = {**self._named(whole, ""), **own}
+        pointers |= {f"then_{n}": to + i * self.pitch for i, n in enumerate(layout.blocks)}
         if whole_to is not None:
-            given |= self._named(whole_to, "then_")
-        return held[1].filled(now, 0, given)
+            pointers |= self._named(whole_to, "then_")
+        return held[1].filled(now, 0, pointers)
 
     def _named(self, whole: Array, prefix: str) -> dict[str, int]:
         """Return the addresses of whole numbers by name."""
@@ -587,13 +589,13 @@ class LanePlan(Plan):
         step = moment.at * self.pitch
         return {n: address(x) + step for n, x in (moment.normals or {}).items()}
 
-    def _operands(self, bound: LaneBound, given: Mapping[str, int]) -> Array:
+    def _operands(self, bound: LaneBound, pointers: Mapping[str, int]) -> Array:
         """Return the addresses of states and operands by place."""
         if not bound.given:
             return bound.places
         places = bound.places.copy()
         for place, name in bound.given.items():
-            places[place] = given[name]
+            places[place] = pointers[name]
         return places
 
     # -- backwards -----------------------------------------------------------------------------------------------
@@ -615,57 +617,57 @@ class LanePlan(Plan):
         assert lanes.mid is not None and lanes.chain is not None
         assert lanes.whole_mid is not None and lanes.whole_later is not None
         whole = self._named(lanes.whole, "") | self._named(lanes.whole_later, "later_")
-        on_now, on_action, given = self._seeded(moment, on_told, on_later, room)
+        on_now, on_action, pointers = self._seeded(moment, on_told, on_later, room)
         on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
-        given |= whole
+        pointers |= whole
         flow = room.flows
         flow.begin()
-        made, tables = self.recorded, bound.laid.back
-        before, after = made.backward
-        all_rows(after.call, self.rows, tables[1].filled(moment.now, moment.later, given))
+        recorded, tables = self.recorded, bound.laid.back
+        before, after = recorded.backward
+        all_rows(after.call, self.rows, tables[1].filled(moment.now, moment.later, pointers))
         if self.place is not None and self.said and lanes.placed is not None:
-            known = {"fresh": address(lanes.placed), "state_step": given["later_state_step"]}
-            self._through(bound, self.place, np.arange(self.rows), moment.later, lanes.whole_later, known, flow, None)
+            own = {"fresh": address(lanes.placed), "state_step": pointers["later_state_step"]}
+            self._through(bound, self.place, np.arange(self.rows), moment.later, lanes.whole_later, own, flow, None)
         mid, chain, n = lanes.mid.data_ptr(), lanes.chain, self.size
-        drawn = moment.given | self._drawn(moment)
-        bound._moving.copy(np.arange(self.rows), chain, self, mid, drawn)
+        inputs_at = moment.given | self._drawn(moment)
+        bound._moving.copy(np.arange(self.rows), chain, self, mid, inputs_at)
         bound.forget()
         bound.to_places(np.arange(self.rows), chain, self, mid)
         room.clear()
         slots = np.concatenate((flow.then(), room.on_input_slots, addresses(list(on_parameters))))
         retreat_chains(
-            flow.now(), room.ends, room.sums, slots, chain.slots, chain.own, n, self._operands(bound, drawn),
+            flow.now(), room.ends, room.sums, slots, chain.slots, chain.own, n, self._operands(bound, inputs_at),
             bound.strides, *room.work, self.like, 0, room.ends, room.begins, address(room.by_place),
             address(room.inputs_by_place), *room.loops, 0, 0, self.groups,
         )  # fmt: skip
         flow.turn()
         if self.settle is not None and len(lanes.decided):
             assert lanes.fresh is not None and lanes.merger is not None
-            known = {
+            own = {
                 "fresh": address(lanes.fresh),
                 "merger": address(lanes.merger),
-                "state_step": given["state_step"],
+                "state_step": pointers["state_step"],
             }
-            self._through(bound, self.settle, lanes.decided, mid, lanes.whole_mid, known, flow, None)
+            self._through(bound, self.settle, lanes.decided, mid, lanes.whole_mid, own, flow, None)
         if self.turn is not None and len(lanes.turned):
-            known = {n: address(x) for n, x in bound.turn_params.items()} | {"state_step": given["state_step"]}
-            self._through(bound, self.turn, lanes.turned, moment.now, lanes.whole, known, flow, on_parameters)
-        given |= {f"carried_{n}": x for n, x in zip(self.moving, flow.now(), strict=True)}
-        all_rows(before.call, self.rows, tables[0].filled(moment.now, moment.later, given))
+            own = {n: address(x) for n, x in bound.turn_params.items()} | {"state_step": pointers["state_step"]}
+            self._through(bound, self.turn, lanes.turned, moment.now, lanes.whole, own, flow, on_parameters)
+        pointers |= {f"carried_{n}": x for n, x in zip(self.moving, flow.now(), strict=True)}
+        all_rows(before.call, self.rows, tables[0].filled(moment.now, moment.later, pointers))
         return on_now, on_action, on_parameters, np.empty((0, self.count), self.real)
 
     def _through(
-        self, bound: LaneBound, stage: Stage, rows: Array, now: int, whole: Array, known: Mapping[str, int], flow: Flow,
+        self, bound: LaneBound, stage: Stage, rows: Array, now: int, whole: Array, own: Mapping[str, int], flow: Flow,
         on_parameters: Array | None,
     ) -> None:  # fmt: skip
         """Carry what falls on the leaves after a stage to those before it, in some rows."""
         flow.copy()
-        given = dict(known)
-        given |= {f"pass_{n}": x for n, x in zip(self.moving, flow.now(), strict=True)}
-        given |= {f"new_{n}": x for n, x in zip(self.moving, flow.then(), strict=True)}
+        pointers = dict(own)
+        pointers |= {f"pass_{n}": x for n, x in zip(self.moving, flow.now(), strict=True)}
+        pointers |= {f"new_{n}": x for n, x in zip(self.moving, flow.then(), strict=True)}
         more = np.zeros((len(stage.more), self.count), self.real)
-        given |= {f"new_{n}": x for n, x in zip(stage.more, addresses(list(more)), strict=True)}
-        each_row(stage.back.call, rows, self._stage(bound, stage.back, now, whole, given, 0, None))
+        pointers |= {f"new_{n}": x for n, x in zip(stage.more, addresses(list(more)), strict=True)}
+        each_row(stage.back.call, rows, self._stage(bound, stage.back, now, whole, pointers, 0, None))
         flow.turn()
         if on_parameters is not None:
             on_parameters += more

@@ -19,11 +19,11 @@ from idm_env.types import Params
 class Moves:
     """The functions of a step, of what environments are made of."""
 
-    def __init__(self, made: Settings) -> None:
-        self.task, self._info = made.task, made.info
-        self._limit = None if made.limit is None else made.limit * made.task.held
+    def __init__(self, settings: Settings) -> None:
+        self.task, self._info = settings.task, settings.info
+        self._limit = None if settings.limit is None else settings.limit * settings.task.held
         # With torch output always the step itself, so that values are the same bits with and without a graph.
-        self._advance = self.task.simulator.step if made.output == "torch" else self.task.simulator.advance
+        self._advance = self.task.simulator.step if settings.output == "torch" else self.task.simulator.advance
 
     def step(
         self,
@@ -34,12 +34,12 @@ class Moves:
         driven: Params,
     ) -> tuple[EnvState, dict[str, Tensor]]:
         """Return the worlds Δt later and all that faces tell of the step; ``driven`` are ``task.episode_params``."""
-        command, given, inputs = self.commanded(world, action, normals, live)
+        command, limited, inputs = self.commanded(world, action, normals, live)
         after = world._replace(state=self._advance(world.state, inputs, driven))
         if command is None:
             none = after.state.speed.new_zeros(len(after.state.speed), len(self.task.agents))
-            return after, self.told(world, none, given, after, False)
-        return after, self.told(world, command, given, after, True)
+            return after, self.told(world, none, limited, after, False)
+        return after, self.told(world, command, limited, after, True)
 
     def commanded(
         self,
@@ -51,11 +51,11 @@ class Moves:
         """Return commands, commands as the failsafe lets them pass, and the inputs of a step."""
         task = self.task
         command = None if action is None else task.command(action)
-        given = None if command is None else task.limit(world, command)
-        inputs = task.with_lane_commands(task.inputs(world, given, normals, live), action, live)
+        limited = None if command is None else task.limit(world, command)
+        inputs = task.with_lane_commands(task.inputs(world, limited, normals, live), action, live)
         if command is not None and live is not None:
             command = torch.where(live, command, 0.0)
-        return command, given, inputs
+        return command, limited, inputs
 
     def told(
         self, before: EnvState, command: Tensor, given: Tensor | None, after: EnvState, commanded: bool
@@ -83,22 +83,22 @@ class Moves:
         }
 
     def _details(
-        self, after: EnvState, command: Tensor | None, given: Tensor | None, crashed: Tensor
+        self, after: EnvState, command: Tensor | None, limited: Tensor | None, crashed: Tensor
     ) -> dict[str, Tensor]:
         """Return what infos tell of a step (``idm_env.envs.info``) and no more, shape ``(n, agents)`` each."""
-        task, asked, found = self.task, self._info, dict[str, Tensor]()
-        if "accel" in asked:
-            found["accel"] = task.there(after.state, task.pick(after.state.accel))
-        if "command" in asked:
+        task, names, details = self.task, self._info, dict[str, Tensor]()
+        if "accel" in names:
+            details["accel"] = task.there(after.state, task.pick(after.state.accel))
+        if "command" in names:
             shape = (len(after.state.speed), len(task.agents))
-            found["command"] = (
+            details["command"] = (
                 after.state.accel.new_full(shape, torch.nan) if command is None else task.there(after.state, command)
             )
-        if "failsafe" in asked:
-            if command is None or given is None or not task.failsafe:
-                found["failsafe"] = torch.zeros_like(crashed)
+        if "failsafe" in names:
+            if command is None or limited is None or not task.failsafe:
+                details["failsafe"] = torch.zeros_like(crashed)
             else:
-                found["failsafe"] = task.there(after.state, given < command)
-        if "crash" in asked:
-            found["crash"] = crashed
-        return found | {name: x for name, x in task.info(after).items() if name in asked} if asked else found
+                details["failsafe"] = task.there(after.state, limited < command)
+        if "crash" in names:
+            details["crash"] = crashed
+        return details | {name: x for name, x in task.info(after).items() if name in names} if names else details

@@ -19,12 +19,12 @@ _ROOM = 64
 class Past:
     """The past of worlds of one shape: ``rows`` (steps · signals, vehicles), oldest first; ``newest`` is the last step.
 
-    ``slots`` of these steps count. Without a past in the state it is empty, with no slots. ``kept`` says that what was
-    written stays as it is, for those who have the array.
+    ``slots`` of these steps count. Without a past in the state it is empty, with no slots. ``writes_once`` says that what
+    was written stays as it is, for those who have the array.
     """
 
-    def __init__(self, state: State, kept: bool = False) -> None:
-        self.kept = kept
+    def __init__(self, state: State, writes_once: bool = False) -> None:
+        self.writes_once = writes_once
         self._shape = tuple(state.speed.shape)
         past = state.memory.get(PAST)
         self.slots, self._signals = (0, 1) if past is None else tuple(past.shape[-2:])
@@ -35,10 +35,10 @@ class Past:
 
     def copy(self) -> Past:
         """Return another one of the same steps, with memory of its own."""
-        made = Past.__new__(Past)
-        made.__dict__.update(self.__dict__)
-        made.rows = self.rows.copy()
-        return made
+        other = Past.__new__(Past)
+        other.__dict__.update(self.__dict__)
+        other.rows = self.rows.copy()
+        return other
 
     def load(self, state: State) -> None:
         """Take over the past of all worlds."""
@@ -50,14 +50,14 @@ class Past:
         """Take over the past of some worlds (indices)."""
         if self.slots:
             apart = self._last().reshape(self.slots, self._signals, self._shape[0], -1)
-            given = self._of(fresh)
-            apart[:, :, worlds] = given.reshape(len(given), self._signals, len(worlds), -1)
+            steps = self._of(fresh)
+            apart[:, :, worlds] = steps.reshape(len(steps), self._signals, len(worlds), -1)
 
     def make_room(self) -> None:
         """See that one more step fits in."""
         if (self.newest + 2) * self._signals > len(self.rows):
             last = self._last().copy()
-            if self.kept:
+            if self.writes_once:
                 self.rows = np.zeros_like(self.rows)
             self.newest = self.slots - 1
             self._last()[:] = last
@@ -79,5 +79,5 @@ class Past:
 
     def _of(self, state: State) -> Array:
         """Return what a state holds, oldest step first; one step may stand for all."""
-        given = past_rows(state.memory[PAST], tuple(state.speed.shape))
-        return given.reshape(-1, self._signals, given.shape[1])[::-1]
+        rows = past_rows(state.memory[PAST], tuple(state.speed.shape))
+        return rows.reshape(-1, self._signals, rows.shape[1])[::-1]

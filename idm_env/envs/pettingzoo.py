@@ -51,21 +51,21 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
     }
 
     def __init__(self, *, max_cycles: int | None = None, render_mode: str | None = None, **keywords: Any) -> None:
-        made = settings(max_episode_steps=max_cycles, render_mode=render_mode, **keywords)
-        if made.output != "numpy":
+        own = settings(max_episode_steps=max_cycles, render_mode=render_mode, **keywords)
+        if own.output != "numpy":
             raise ValueError("output = 'torch' has no meaning for PettingZoo. Use gym.make_vec for gradients.")
-        self.settings = made
-        self.task = made.task
-        self.max_cycles = made.limit
-        self.render_mode = made.render_mode
-        self.batch = Batch(made, 1)
+        self.settings = own
+        self.task = own.task
+        self.max_cycles = own.limit
+        self.render_mode = own.render_mode
+        self.batch = Batch(own, 1)
         trips = [f"_trip_{k}" for k in range(1, self.task.journeys + 1)] or [""]
         self.possible_agents = [f"vehicle_{i}{trip}" for i in self.task.agents for trip in trips]
         self.agents: list[str] = []
         self._slots: list[str] = []
-        self.observation_spaces = {a: observation_box(self.task, made.dtype, 1) for a in self.possible_agents}
+        self.observation_spaces = {a: observation_box(self.task, own.dtype, 1) for a in self.possible_agents}
         self.action_spaces = {a: action_space(self.task, 1) for a in self.possible_agents}
-        kind, n = numpy_dtype(made.dtype), self.task.vehicles
+        kind, n = numpy_dtype(own.dtype), self.task.vehicles
         low = np.repeat(np.array([0.0, -1.0], kind), n)
         high = np.repeat(np.array([10.0, _FARTHEST / _GAP_SCALE], kind), n)
         self.state_space = Box(low, high, dtype=kind)
@@ -112,22 +112,22 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         for i, agent in enumerate(before):
             if live[i]:
                 commands[0, :, i] = self._action(agent, actions)
-        made = self.settings
+        own = self.settings
         with torch.no_grad():
             everybody = all(live)
             outcome = self.batch.step(
-                torch.as_tensor(commands.reshape(1, -1), dtype=made.dtype, device=made.device),
-                None if everybody else torch.tensor([live], device=made.device),
+                torch.as_tensor(commands.reshape(1, -1), dtype=own.dtype, device=own.device),
+                None if everybody else torch.tensor([live], device=own.device),
             )
-        told = self._by_agent(np.asarray(outcome.observation[0]))
+        observations = self._by_agent(np.asarray(outcome.observation[0]))
         rewards, terminated, truncated = (self._by_agent(x[0].tolist()) for x in outcome[1:4])
         infos = {agent: self._info(i, outcome) for i, agent in enumerate(before) if live[i]}
         self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
         if self.task.journeys and self.agents:
-            self._arrived(outcome, (told, rewards, terminated, truncated, infos))
+            self._arrived(outcome, (observations, rewards, terminated, truncated, infos))
         if self.render_mode == "human":
             self.render()
-        return told, rewards, terminated, truncated, infos
+        return observations, rewards, terminated, truncated, infos
 
     def _appear(self) -> list[str]:
         """Return the agents that are there now, and note whose every slot is ("" for nobody's)."""
@@ -136,15 +136,15 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
             return list(self._slots)
         state = self.batch.glance().state
         assert state.present is not None and state.trips is not None
-        there, trip = (self.task.pick(x)[0].tolist() for x in (state.present, state.trips.entered))
+        presence, trip = (self.task.pick(x)[0].tolist() for x in (state.present, state.trips.entered))
         self._slots = [
-            f"vehicle_{i}_trip_{k}" if here else "" for i, here, k in zip(self.task.agents, there, trip, strict=True)
+            f"vehicle_{i}_trip_{k}" if here else "" for i, here, k in zip(self.task.agents, presence, trip, strict=True)
         ]
         return [agent for agent in self._slots if agent]
 
-    def _arrived(self, outcome: Outcome, told: tuple[dict[str, Any], ...]) -> None:
+    def _arrived(self, outcome: Outcome, columns: tuple[dict[str, Any], ...]) -> None:
         """End the agents whose trips are over, and begin those of whose vehicles have entered."""
-        seen, rewards, terminated, truncated, infos = told
+        seen, rewards, terminated, truncated, infos = columns
         now = self._appear()
         for agent in set(self.agents) - set(now):
             terminated[agent], seen[agent] = True, np.zeros_like(seen[agent])
@@ -161,8 +161,8 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
 
     def _begun(self, i: int) -> dict[str, Any]:
         """Return the recorded id of an agent's vehicle, where there is one."""
-        known = ids(self.batch)
-        return {} if known is None else {"vehicle_id": known[i]}
+        names = ids(self.batch)
+        return {} if names is None else {"vehicle_id": names[i]}
 
     def _info(self, i: int, outcome: Outcome) -> dict[str, Any]:
         """Return what ``idm_env.envs.info`` says of a step, as numbers of one agent."""

@@ -109,26 +109,26 @@ class _Table:
         self._later, self._later_at = self._within(layout, pitch, "later_")
 
     def _within(self, layout: Layout, pitch: int, prefix: str) -> tuple[Array, Array]:
-        found = {i: self.given.pop(prefix + n) for i, n in enumerate(layout.blocks) if prefix + n in self.given}
-        return np.array(list(found.values()), np.int64), np.array(list(found), np.int64) * pitch
+        places = {i: self.given.pop(prefix + n) for i, n in enumerate(layout.blocks) if prefix + n in self.given}
+        return np.array(list(places.values()), np.int64), np.array(list(places), np.int64) * pitch
 
     def filled(self, now: int, later: int, given: Mapping[str, int]) -> Array:
         """Return the addresses for one call."""
-        made = self._stays.copy()
-        made[self._now] = self._now_at + now
-        made[self._later] = self._later_at + later
+        cells = self._stays.copy()
+        cells[self._now] = self._now_at + now
+        cells[self._later] = self._later_at + later
         for name, place in self.given.items():
-            made[place] = given[name]
-        return made
+            cells[place] = given[name]
+        return cells
 
     def each(self, now: Array, later: Array, given: Mapping[str, Any]) -> Array:
         """Return the addresses for some calls, of which the worlds' and what is given are one a call."""
-        made = np.repeat(self._stays[None], len(now), 0)
-        made[:, self._now] = self._now_at + now[:, None]
-        made[:, self._later] = self._later_at + later[:, None]
+        cells = np.repeat(self._stays[None], len(now), 0)
+        cells[:, self._now] = self._now_at + now[:, None]
+        cells[:, self._later] = self._later_at + later[:, None]
         for name, place in self.given.items():
-            made[:, place] = given[name]
-        return made
+            cells[:, place] = given[name]
+        return cells
 
 
 class _Room:
@@ -147,45 +147,45 @@ class _Room:
         """Return fresh arrays by name, with ``steps`` as their first dimension where there are any; and addresses."""
         base = {kind: np.empty(size * max(steps, 1), kind) for kind, size in self._sizes.items()}
         first = {kind: x.__array_interface__["data"][0] for kind, x in base.items()}
-        made, there = {}, {}
+        arrays, pointers = {}, {}
         for name, kind, begin, count, shape in self._at:
             own = max(steps, 1)
             flat = base[kind][begin * own : (begin + count) * own]
-            made[name] = flat.reshape((steps, *shape) if steps else shape)
-            there[name] = first[kind] + begin * own * kind.itemsize
-        return made, there
+            arrays[name] = flat.reshape((steps, *shape) if steps else shape)
+            pointers[name] = first[kind] + begin * own * kind.itemsize
+        return arrays, pointers
 
 
 class Laid:
     """Tables and operands of a plan for the arrays of one layout."""
 
     def __init__(self, plan: Plan, layout: Layout) -> None:
-        made, self.layout, self._plan = plan.recorded, layout, plan
-        self.ask = _Table(made.before, layout, plan.pitch)
-        self.tell = _Table(made.after, layout, plan.pitch)
+        recorded, self.layout, self._plan = plan.recorded, layout, plan
+        self.ask = _Table(recorded.before, layout, plan.pitch)
+        self.tell = _Table(recorded.after, layout, plan.pitch)
         self.inputs: list[tuple[Array, Strides]] = []
         self.given: dict[int, str] = {}
         """Places of the kernel's inputs that are given with every call, by name."""
         first = 2 * len(plan.kernel.program.states) + plan.fixed
         for i, slot in enumerate((*plan.kernel.numbers, *plan.kernel.flags)):
-            found, name = self._input(slot)
-            self.inputs.append(found)
+            source, name = self._input(slot)
+            self.inputs.append(source)
             if name is not None:
                 self.given[first + i] = name
 
     def _input(self, slot: str) -> tuple[tuple[Array, Strides], str | None]:
         """Return where the kernel finds an input, and its name where that is given with every call."""
-        made, rows, size = self._plan.recorded, self._plan.rows, self._plan.size
+        recorded, rows, size = self._plan.recorded, self._plan.rows, self._plan.size
         empty = np.empty(0, self._plan.real)
-        if slot in made.normals:
-            return (empty, (rows * size, size, 1)), made.normals[slot]
+        if slot in recorded.normals:
+            return (empty, (rows * size, size, 1)), recorded.normals[slot]
         name = _plain(slot)
-        other, width = made.before.same.get(name, (name, made.before.shapes.get(name)))
+        other, width = recorded.before.same.get(name, (name, recorded.before.shapes.get(name)))
         if width is not None:
             wide = math.prod(width)
             return (empty, (0, wide, 0 if wide < size else 1)), other
-        x = part_of(made.inputs, slot)
-        if x.dim() == 2 and x.shape[0] == made.many:
+        x = part_of(recorded.inputs, slot)
+        if x.dim() == 2 and x.shape[0] == recorded.many:
             x = x[:1]
         return operand(x[None], (rows,), size, 1), None
 
@@ -204,10 +204,10 @@ class Laid:
         state = state._replace(**views)  # type: ignore[arg-type]
         program = kernel.program
         values = [static_of(task.simulator, state, params, n) for n in (*program.statics, *program.parameters)]
-        made = [operand(x.to(state.speed.dtype), (plan.rows,), plan.size) for x in values] + self.inputs
-        places = np.concatenate((np.zeros(2 * len(program.states), np.int64), addresses([a for a, _ in made])))
-        strides = table([*(s for _, s in made), (0, plan.size, 1)])
-        return Bound(self, params, program.parameters, [a for a, _ in made], places, strides)
+        operands = [operand(x.to(state.speed.dtype), (plan.rows,), plan.size) for x in values] + self.inputs
+        places = np.concatenate((np.zeros(2 * len(program.states), np.int64), addresses([a for a, _ in operands])))
+        strides = table([*(s for _, s in operands), (0, plan.size, 1)])
+        return Bound(self, params, program.parameters, [a for a, _ in operands], places, strides)
 
 
 class Plan:
@@ -223,18 +223,18 @@ class Plan:
         self, moves: Moves, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
     ) -> None:
         self.moves, task = moves, moves.task
-        made = self.recorded = _record(moves, world, kind, draws)
-        self.kernel = kernel = made.kernel
+        recorded = self.recorded = _record(moves, world, kind, draws)
+        self.kernel = kernel = recorded.kernel
         self.task, self.world = task, world
         self.rows, self.size = rows, size = world.state.speed.shape
         self.real = real = np.dtype(np.float32 if world.state.speed.dtype == torch.float32 else np.float64)
         self.count = rows * size
         self.pitch = self.count * real.itemsize
-        self.between = _Room({n: (rows, *s) for n, s in made.before.shapes.items()}, made.before.types)
+        self.between = _Room({n: (rows, *s) for n, s in recorded.before.shapes.items()}, recorded.before.types)
         self._reused = self.between.take()
-        self.told = _Room({n: (rows, *s) for n, s in made.after.shapes.items()}, made.after.types)
-        self._same = [(n, other, (rows, *s)) for n, (other, s) in made.after.same.items()]
-        self.constant = {n: np.repeat(x[None], rows, 0) for n, x in made.after.constants.items()}
+        self.told = _Room({n: (rows, *s) for n, s in recorded.after.shapes.items()}, recorded.after.types)
+        self._same = [(n, other, (rows, *s)) for n, (other, s) in recorded.after.same.items()]
+        self.constant = {n: np.repeat(x[None], rows, 0) for n, x in recorded.after.constants.items()}
         past = world.state.memory.get(PAST)
         self.slots = past.shape[-2] if past is not None and kernel.signals else 0
         along = self._along()
@@ -282,20 +282,20 @@ class Plan:
         bound = moment.bound
         moment.now, moment.later = now.data_ptr(), later.data_ptr()
         assert bound is not None
-        between, there = self.between.take() if tape else self._reused
+        between, between_at = self.between.take() if tape else self._reused
         clock = np.empty_like(moment.clock)
-        given = self._given(moment, between, there, clock)
-        told, where = self.told.take()
-        where |= {n: given[n] for n in _GIVEN if n in given}
-        where["state_step"], where["later_state_step"] = given["state_step"], given["later_state_step"]
+        pointers = self._given(moment, between, between_at, clock)
+        outputs, where = self.told.take()
+        where |= {n: pointers[n] for n in _GIVEN if n in pointers}
+        where["state_step"], where["later_state_step"] = pointers["state_step"], pointers["later_state_step"]
         asks, tells = (
-            bound.laid.ask.filled(moment.now, moment.later, given),
+            bound.laid.ask.filled(moment.now, moment.later, pointers),
             bound.laid.tell.filled(moment.now, moment.later, where),
         )
-        places = self._places(moment, there)
+        places = self._places(moment, between_at)
         call = (moment.past, moment.newest, *self.loops, moment.at)
-        made = self.recorded
-        head = (made.before.call, asks, made.after.call, tells, moment.clock, clock, places, bound.strides)
+        recorded = self.recorded
+        head = (recorded.before.call, asks, recorded.after.call, tells, moment.clock, clock, places, bound.strides)
         threads = 1 if self._small else pool.count(self.count)
         if threads == 1:
             step_worlds(*head, *self.work, *call, self._one and self._loaded is bound, 0, self.groups)
@@ -308,29 +308,29 @@ class Plan:
             pool.split(part, self.groups, 1, threads)
         for i in self._carried:
             later[i].copy_(now[i])
-        return self._finished(later, told, clock, bound)
+        return self._finished(later, outputs, clock, bound)
 
-    def _given(self, moment: Moment, between: Any, there: Mapping[str, int], clock: Array) -> dict[str, int]:
+    def _given(self, moment: Moment, between: Any, between_at: Mapping[str, int], clock: Array) -> dict[str, int]:
         """Return the addresses of all that a step is given, and note them: its adjoint is given the same."""
-        given = {**there, "state_step": address(moment.clock), "later_state_step": address(clock)}
+        pointers = {**between_at, "state_step": address(moment.clock), "later_state_step": address(clock)}
         if moment.action is not None:
-            given["action"] = address(moment.action)
+            pointers["action"] = address(moment.action)
         if moment.live is not None:
-            given["live"] = address(moment.live)
-        given |= {n: given[other] for n, (other, _) in self.recorded.before.same.items()}
-        moment.held, moment.given = (between, clock), given
-        return given
+            pointers["live"] = address(moment.live)
+        pointers |= {n: pointers[other] for n, (other, _) in self.recorded.before.same.items()}
+        moment.held, moment.given = (between, clock), pointers
+        return pointers
 
-    def _finished(self, later: Tensor, told: dict[str, Array], clock: Array, bound: Bound) -> dict[str, Array]:
+    def _finished(self, later: Tensor, outputs: dict[str, Array], clock: Array, bound: Bound) -> dict[str, Array]:
         """Return all that is told; Untraceable where an effect of the user's own returned NaN."""
         if self.task.simulator.own and bool(later[bound.laid.layout.blocks.index("state_speed")].isnan().any()):
             raise Untraceable("an effect returned nan: the step itself tells which")
-        told["clock"] = clock
+        outputs["clock"] = clock
         for name, other, shape in self._same:
-            told[name] = told[other].reshape(shape)
+            outputs[name] = outputs[other].reshape(shape)
         for name, value in self.constant.items():
-            told[name] = value.copy()
-        return told
+            outputs[name] = value.copy()
+        return outputs
 
     def _places(self, moment: Moment, between: Mapping[str, int]) -> Array:
         """Return the addresses of states now and later and of the kernel's operands."""
@@ -373,15 +373,15 @@ class Plan:
         bound, room = moment.bound, self.scratch
         assert bound is not None
         asks, tells = bound.laid.back
-        on_now, on_action, given = self._seeded(moment, on_told, on_later, room)
+        on_now, on_action, pointers = self._seeded(moment, on_told, on_later, room)
         on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
         before, after = self.recorded.backward
         signals = self.slots * self.kernel.signals
         on_past = np.zeros((signals, self.count), self.real) if on_past is None else on_past
         past = np.empty((signals, self.count), self.real)
         retreat_worlds(
-            after.call, tells.filled(moment.now, moment.later, given),
-            before.call, asks.filled(moment.now, moment.later, given), self._places(moment, moment.given),
+            after.call, tells.filled(moment.now, moment.later, pointers),
+            before.call, asks.filled(moment.now, moment.later, pointers), self._places(moment, moment.given),
             bound.strides, *room.work, moment.past, moment.newest, room.ends, room.begins, address(on_past),
             address(past), address(on_parameters), room.inputs_at, *room.loops, moment.at, False, False, 0,
             self.groups,
@@ -397,19 +397,19 @@ class Plan:
         on_now = np.zeros((len(layout.blocks), self.count), self.real)
         on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
         seeded, begun = room.zeros if on_later is None else on_later.data_ptr(), address(on_now)
-        given = {**room.there, **{f"on_{n}": room.zeros if x is None else x.data_ptr() for n, x in on_told.items()}}
+        pointers = {**room.there, **{f"on_{n}": room.zeros if x is None else x.data_ptr() for n, x in on_told.items()}}
         for i, name in enumerate(layout.blocks):
             step = i * self.pitch
-            given[f"seed_{name}"] = room.zeros if on_later is None else seeded + step
-            given[f"begin_{name}"] = begun + step
+            pointers[f"seed_{name}"] = room.zeros if on_later is None else seeded + step
+            pointers[f"begin_{name}"] = begun + step
         if on_later is not None and self._carried:
             later = on_later.numpy().reshape(on_now.shape)
             for i in self._carried:
                 on_now[i] = later[i]
-        given |= moment.given
+        pointers |= moment.given
         if on_action is not None:
-            given["on_action"] = address(on_action)
-        return on_now, on_action, given
+            pointers["on_action"] = address(on_action)
+        return on_now, on_action, pointers
 
 
 class Scratch:
@@ -425,8 +425,8 @@ class Scratch:
         self.inputs_at = address(self.on_inputs)
         self.there |= {f"on_{_plain(n)}": address(x) for n, x in zip(kernel.numbers, self.on_inputs, strict=True)}
         self.ends, self.begins = (np.array([self.there[f"{k}_{n}"] for n in moving]) for k in ("end", "carried"))
-        told = plan.recorded.after
-        most = max([plan.count, *(plan.rows * math.prod(s) for s in told.shapes.values())])
+        after = plan.recorded.after
+        most = max([plan.count, *(plan.rows * math.prod(s) for s in after.shapes.values())])
         self._zeros = np.zeros(most, real)
         self.zeros = address(self._zeros)
         work, past = workspaces(kernel, plan.slots, real)
@@ -459,11 +459,11 @@ class Bound:
 
     def with_values(self, values: Sequence[Tensor]) -> dict[str, dict[str, Tensor]]:
         """Return the parameters with others in place of those that are ``wanted``."""
-        made = {effect: dict(own) for effect, own in self.params.items()}
+        params = {effect: dict(own) for effect, own in self.params.items()}
         for name, x in zip(self._names, values, strict=True):
             effect, parameter = name.split(".", 1)
-            made[effect][parameter] = x
-        return made
+            params[effect][parameter] = x
+        return params
 
     def changed(self) -> bool:
         """Return whether a parameter is another tensor now, or was written to."""
@@ -484,18 +484,18 @@ def _record(moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple
     many = next(p for p in _ROWS if p not in (size, count))
     dtype = world.state.speed.dtype
     sample = examples_of(world, many)
-    given = {} if idle else {"action": torch.zeros(many, count * len(task.commands), dtype=dtype)}
+    actions = {} if idle else {"action": torch.zeros(many, count * len(task.commands), dtype=dtype)}
     if not (idle or every):
-        given["live"] = torch.ones(many, count, dtype=torch.bool)
+        actions["live"] = torch.ones(many, count, dtype=torch.bool)
     normals = {name: torch.zeros(many, size, dtype=dtype) for name in draws}
     seen: dict[str, Any] = {}
     slots: dict[str, str] = {}
 
     def early(**leaves: Tensor) -> dict[str, Tensor]:
         world_now = world_of(leaves, world)
-        asked, passed, inputs = moves.commanded(world_now, leaves.get("action"), normals or None, leaves.get("live"))
+        command, passed, inputs = moves.commanded(world_now, leaves.get("action"), normals or None, leaves.get("live"))
         seen.update(inputs)
-        out = {} if asked is None or passed is None else {"command": asked, "given": passed}
+        out = {} if command is None or passed is None else {"command": command, "given": passed}
         for effect, value in inputs.items():
             for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
                 if x is not None and x is normals.get(effect):
@@ -504,7 +504,7 @@ def _record(moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple
                     out[_plain(slot_name(effect, part))] = x
         return out
 
-    first = RowFunction(early, {**sample, **given}, many)
+    first = RowFunction(early, {**sample, **actions}, many)
     inside = {effect: _without_lane(value) for effect, value in seen.items() if effect in simulator.by_name}
     kernel = tile_kernel(simulator, Form.of(world.state._replace(links=None, trips=None), inside))
     if isinstance(kernel, str):
@@ -512,9 +512,9 @@ def _record(moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple
 
     def late(**leaves: Tensor) -> dict[str, Tensor]:
         then = world_of({n: x for n, x in leaves.items() if not n.startswith("later_")}, world)
-        now, asked = world_of(leaves, world, "later_"), leaves.get("command")
-        said = now.state.speed.new_zeros(len(now.state.speed), count) if asked is None else asked
-        return moves.told(then, said, leaves.get("given"), now, asked is not None)
+        now, command = world_of(leaves, world, "later_"), leaves.get("command")
+        accel = now.state.speed.new_zeros(len(now.state.speed), count) if command is None else command
+        return moves.told(then, accel, leaves.get("given"), now, command is not None)
 
     examples = {**sample, **{f"later_{n}": x.clone() for n, x in sample.items()}}
     if not idle:
@@ -529,37 +529,37 @@ def _record(moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple
         late_back = adjoint(late, flowing, by)
 
         def later_first(**leaves: Tensor) -> dict[str, Tensor]:
-            found = late_back(**{n: x for n, x in leaves.items() if not n.startswith("seed_")})
-            made = {f"end_{n}": _sum(leaves[f"seed_{n}"], found.get(f"later_{n}")) for n in moving}
-            made |= {f"direct_{n}": found[n] for n in moving if n in found}
-            return made | {f"on_{n}": found[n] for n in _GIVEN if n in found}
+            gradients = late_back(**{n: x for n, x in leaves.items() if not n.startswith("seed_")})
+            ends = {f"end_{n}": _sum(leaves[f"seed_{n}"], gradients.get(f"later_{n}")) for n in moving}
+            ends |= {f"direct_{n}": gradients[n] for n in moving if n in gradients}
+            return ends | {f"on_{n}": gradients[n] for n in _GIVEN if n in gradients}
 
-        told = {n: x for n, x in late(**examples).items() if n in flowing}
-        seeds = {f"on_{n}": torch.zeros_like(x).contiguous() for n, x in told.items()}
+        outputs = {n: x for n, x in late(**examples).items() if n in flowing}
+        seeds = {f"on_{n}": torch.zeros_like(x).contiguous() for n, x in outputs.items()}
         seeds |= {f"seed_{n}": sample[n].clone() for n in moving}
         after_back = RowFunction(later_first, {**examples, **seeds}, many, apart=True)
-        there = after_back.outs
-        asked = [n for n in _GIVEN if f"on_{n}" in there]
+        outs = after_back.outs
+        commands = [n for n in _GIVEN if f"on_{n}" in outs]
 
         def wide(**leaves: Tensor) -> dict[str, Tensor]:
             out = early(**leaves)
             return {n: x if n in _GIVEN else x.expand(many, size) for n, x in out.items()}
 
-        early_back = adjoint(wide, [*numbers, *asked], [*moving, *(() if idle else ("action",))])
+        early_back = adjoint(wide, [*numbers, *commands], [*moving, *(() if idle else ("action",))])
 
         def earlier(**leaves: Tensor) -> dict[str, Tensor]:
-            found = early_back(**{n: x for n, x in leaves.items() if n.split("_")[0] not in ("carried", "direct")})
-            made = {
-                f"begin_{n}": _sum(_sum(leaves[f"carried_{n}"], leaves.get(f"direct_{n}")), found.get(n))
+            gradients = early_back(**{n: x for n, x in leaves.items() if n.split("_")[0] not in ("carried", "direct")})
+            begins = {
+                f"begin_{n}": _sum(_sum(leaves[f"carried_{n}"], leaves.get(f"direct_{n}")), gradients.get(n))
                 for n in moving
             }
-            return made | ({"on_action": found["action"]} if "action" in found else {})
+            return begins | ({"on_action": gradients["action"]} if "action" in gradients else {})
 
         seeds = {f"on_{n}": torch.zeros(many, size, dtype=dtype) for n in numbers}
-        seeds |= {f"on_{n}": torch.zeros(many, count, dtype=dtype) for n in asked}
+        seeds |= {f"on_{n}": torch.zeros(many, count, dtype=dtype) for n in commands}
         seeds |= {f"carried_{n}": sample[n].clone() for n in moving}
-        seeds |= {f"direct_{n}": sample[n].clone() for n in moving if f"direct_{n}" in there}
-        return RowFunction(earlier, {**sample, **given, **seeds}, many, apart=True), after_back
+        seeds |= {f"direct_{n}": sample[n].clone() for n in moving if f"direct_{n}" in outs}
+        return RowFunction(earlier, {**sample, **actions, **seeds}, many, apart=True), after_back
 
     return Recorded(first, kernel, last, seen, slots, many, flowing, back)
 
@@ -589,13 +589,13 @@ def _flowing(function: Callable[..., Mapping[str, Tensor]], leaves: Mapping[str,
 def named(world: EnvState) -> dict[str, Tensor]:
     """Return the tensors of a world by names that can stand in a program; the past is not among them."""
     state = world.state
-    found = {f"state_{n}": x for n, x in zip(State._fields, state, strict=True) if isinstance(x, Tensor)}
+    leaves = {f"state_{n}": x for n, x in zip(State._fields, state, strict=True) if isinstance(x, Tensor)}
     shape = state.speed.shape
-    found |= {f"memory_{n}": x.expand(shape) for n, x in state.memory.items() if n != PAST}
+    leaves |= {f"memory_{n}": x.expand(shape) for n, x in state.memory.items() if n != PAST}
     for part in ("links", "trips"):
         held = getattr(state, part)
-        found |= {} if held is None else {f"{part}_{n}": x.expand(shape) for n, x in held._asdict().items()}
-    return found | {f"episode_{n}": x for n, x in world.episode.items()}
+        leaves |= {} if held is None else {f"{part}_{n}": x.expand(shape) for n, x in held._asdict().items()}
+    return leaves | {f"episode_{n}": x for n, x in world.episode.items()}
 
 
 def world_of(leaves: Mapping[str, Tensor], like: EnvState, prefix: str = "") -> EnvState:

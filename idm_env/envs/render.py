@@ -126,16 +126,16 @@ class _View:
 
 def _view(task: Task, values: dict[str, np.ndarray], lanes: int) -> _View:
     """Return the whole of a road that ends, else what is around its vehicles, at least 170 m."""
-    there = values["present"] > 0
+    on_road = values["present"] > 0
     outline = task.road.outline
     if outline is not None and outline.length is not None:
-        wanted = LANE_M * (WIDE - 2 * _EDGE) / outline.length
-        return _View(0.0, outline.length, lanes, float(np.clip(wanted, *_LANE_PIXELS)))
+        pixels = LANE_M * (WIDE - 2 * _EDGE) / outline.length
+        return _View(0.0, outline.length, lanes, float(np.clip(pixels, *_LANE_PIXELS)))
     if outline is not None:
         middle = float(values["position"][task.agents[0]])
         return _View(middle - _NEAR, middle + _NEAR, lanes, _LANE_PIXELS[1])
-    front = float(values["position"][there].max()) if there.any() else 2.0 * _NEAR
-    back = float((values["position"] - values["length"])[there].min()) if there.any() else 0.0
+    front = float(values["position"][on_road].max()) if on_road.any() else 2.0 * _NEAR
+    back = float((values["position"] - values["length"])[on_road].min()) if on_road.any() else 0.0
     return _View(min(back, front - 2.0 * _NEAR), front, lanes, _LANE_PIXELS[1])
 
 
@@ -196,7 +196,9 @@ class Viewer:
     def _watch(self, task: Task, state: State, row: int, lane: np.ndarray) -> None:
         """Keep who has changed lanes in the last second, and from where."""
         now = _time(task, state, row)
-        self._changes = {i: (old, at) for i, (old, at) in self._changes.items() if 0.0 <= now - at <= _CHANGE_SHOWN}
+        self._changes = {
+            i: (old, since) for i, (old, since) in self._changes.items() if 0.0 <= now - since <= _CHANGE_SHOWN
+        }
         if self._lanes is not None and len(self._lanes) == len(lane):
             for i in np.flatnonzero(np.abs(lane - self._lanes) == 1):
                 self._changes[int(i)] = int(self._lanes[i]), now
@@ -282,20 +284,20 @@ class Viewer:
         if view.back <= mark.begin <= view.front:
             self._pygame.draw.line(canvas, _STOP if mark.stops else _PASS, (left, top), (left, bottom), 4)
 
-    def _crash(self, canvas: Any, at: tuple[float, float]) -> None:
+    def _crash(self, canvas: Any, place: tuple[float, float]) -> None:
         """Draw a cross where two vehicles touch."""
-        self._pygame.draw.circle(canvas, _CRASH, at, 11)
-        self._pygame.draw.circle(canvas, _INK, at, 11, 2)
+        self._pygame.draw.circle(canvas, _CRASH, place, 11)
+        self._pygame.draw.circle(canvas, _INK, place, 11, 2)
         for side in (-1, 1):
-            ends = (at[0] - 5, at[1] - 5 * side), (at[0] + 5, at[1] + 5 * side)
+            ends = (place[0] - 5, place[1] - 5 * side), (place[0] + 5, place[1] + 5 * side)
             self._pygame.draw.line(canvas, _INK, *ends, 3)
 
-    def _text(self, canvas: Any, words: str, at: tuple[float, float]) -> None:
+    def _text(self, canvas: Any, words: str, place: tuple[float, float]) -> None:
         """Write small words around a place, within the picture."""
-        drawn = self._small.render(words, True, _INK)
-        half = 0.5 * drawn.get_width()
-        x = min(max(at[0], half + 2), canvas.get_width() - half - 2)
-        canvas.blit(drawn, (x - half, at[1] - 0.5 * drawn.get_height()))
+        image = self._small.render(words, True, _INK)
+        half = 0.5 * image.get_width()
+        x = min(max(place[0], half + 2), canvas.get_width() - half - 2)
+        canvas.blit(image, (x - half, place[1] - 0.5 * image.get_height()))
 
     def _vehicle(
         self, canvas: Any, centre: tuple[float, float], heading: float, size: tuple[float, float], speed: float,
@@ -314,8 +316,8 @@ class Viewer:
         self, canvas: Any, task: Task, state: State, row: int, values: dict[str, np.ndarray], fastest: float,
         wider: float,
     ) -> None:  # fmt: skip
-        there = values["present"] > 0
-        mean = float(values["speed"][there].mean()) if there.any() else 0.0
+        on_road = values["present"] > 0
+        mean = float(values["speed"][on_road].mean()) if on_road.any() else 0.0
         seconds = _time(task, state, row)
         crash = "   crash" if _crashed(values).any() else ""
         text = f"{task.name}   t = {seconds:.1f} s   mean speed {mean:.1f} m/s{crash}"
@@ -325,8 +327,8 @@ class Viewer:
             self._pygame.draw.line(canvas, colour(x / width * fastest, fastest), (left + x, top), (left + x, top + 8))
         self._pygame.draw.rect(canvas, _MARK, (left + width + 110, top - 1, 20, 10))
         canvas.blit(self._small.render(f"0 to {fastest:.0f} m/s", True, _INK), (left + width + 8, top - 3))
-        told = "agent" + ("" if wider < 1.5 else f"      widths are drawn {wider:.0f} times as large")
-        canvas.blit(self._small.render(told, True, _INK), (left + width + 136, top - 3))
+        label = "agent" + ("" if wider < 1.5 else f"      widths are drawn {wider:.0f} times as large")
+        canvas.blit(self._small.render(label, True, _INK), (left + width + 136, top - 3))
 
     def _display(self, canvas: Any) -> None:
         pygame = self._pygame

@@ -35,9 +35,9 @@ class SB3VecEnv(VecEnv):
             raise ValueError(
                 f"autoreset_mode = {mode} does not fit SB3. Make the vector with autoreset_mode='SameStep'."
             )
-        made = getattr(vector_env.unwrapped, "settings", None)
-        if made is not None and made.output != "numpy":
-            raise ValueError(f"output = '{made.output}' does not fit SB3, which takes arrays. Use output='numpy'.")
+        settings = getattr(vector_env.unwrapped, "settings", None)
+        if settings is not None and settings.output != "numpy":
+            raise ValueError(f"output = '{settings.output}' does not fit SB3, which takes arrays. Use output='numpy'.")
         self.vector_env = vector_env
         self._same_step = mode is AutoresetMode.SAME_STEP
         self._actions: np.ndarray | None = None

@@ -98,8 +98,8 @@ def settings(
     }
     if config is not None:
         read = load_environment(config, trusted=trusted)
-        said = {key: read.pop(key, None) for key in own}
-        own = {key: said[key] if value is None else value for key, value in own.items()}
+        in_file = {key: read.pop(key, None) for key in own}
+        own = {key: in_file[key] if value is None else value for key, value in own.items()}
         choices = {**read, **choices}
     chosen = own["task"] or "ring"
     if own["max_episode_steps"] is not None:
@@ -110,19 +110,19 @@ def settings(
             "Give it to the task."
         )
     with trust.trusting(trusted):
-        made = chosen if isinstance(chosen, Task) else task_with(cast(str, chosen), choices, KEYWORDS)
-    found = Settings(
-        task=made,
+        own_task = chosen if isinstance(chosen, Task) else task_with(cast(str, chosen), choices, KEYWORDS)
+    result = Settings(
+        task=own_task,
         output=cast(Any, one_of("output", own["output"] or "numpy", OUTPUTS)),
         device=_device(own["device"] or "cpu"),
         dtype=DTYPES[one_of("dtype", own["dtype"] or "float32", DTYPES)],
         autoreset_mode=_mode(own["autoreset_mode"] or AutoresetMode.SAME_STEP),
         render_mode=None if own["render_mode"] is None else one_of("render_mode", own["render_mode"], RENDER_MODES),
-        limit=made.horizon,
+        limit=own_task.horizon,
         info=_info(own["info"]),
     )
-    affordable(found, 1)
-    return found
+    affordable(result, 1)
+    return result
 
 
 def _mode(value: Any) -> AutoresetMode:
@@ -139,8 +139,8 @@ def _device(value: Any) -> torch.device:
         device = torch.device(value)
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, TypeError):
-        known = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-        raise ValueError(f"device = {shown(value)} is unknown or not there. Available: {', '.join(known)}.") from None
+        names = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+        raise ValueError(f"device = {shown(value)} is unknown or not there. Available: {', '.join(names)}.") from None
     return device
 
 
@@ -149,8 +149,8 @@ def _info(value: Any) -> tuple[str, ...]:
         return INFO
     if value == "none":
         return ()
-    asked = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
-    return tuple(one_of("info", name, INFO) for name in asked)
+    names = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    return tuple(one_of("info", name, INFO) for name in names)
 
 
 def reset_options(options: Any, known: tuple[str, ...]) -> dict[str, Any]:
@@ -171,13 +171,13 @@ def affordable(made: Settings, count: int) -> None:
     features = len(task.bounds.names) * len(task.agents)
     needed = count * (size * (TENSORS * task.vehicles + SPACES * (features + task.pairs)) + ROW_BYTES)
     if made.device.type == "cuda":
-        there = torch.cuda.get_device_properties(made.device).total_memory
+        memory = torch.cuda.get_device_properties(made.device).total_memory
     else:
-        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else sys.maxsize
-    if needed > there:
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else sys.maxsize
+    if needed > memory:
         what = f"num_envs = {count}" if count > 1 else f"vehicles = {task.vehicles} with {len(task.agents)} agents"
-        most = int(count * there / needed / 2)
+        most = int(count * memory / needed / 2)
         raise ValueError(
-            f"{what} would take about {needed / 1e9:,.0f} GB, and {made.device} has {there / 1e9:,.0f} GB. "
+            f"{what} would take about {needed / 1e9:,.0f} GB, and {made.device} has {memory / 1e9:,.0f} GB. "
             f"Take {f'at most {most}' if most else 'fewer vehicles or agents'}."
         )

@@ -56,12 +56,12 @@ def unroll(
 
         try:
             batch.settle()
-            made = window.compiled(batch, values, policy, steps, extra, hidden)
-            if made is not None:
-                return Unrolled(*made)
+            fields = window.compiled(batch, values, policy, steps, extra, hidden)
+            if fields is not None:
+                return Unrolled(*fields)
         except Untraceable:
             pass
-    kept: list[tuple[Tensor, ...]] = []
+    columns: list[tuple[Tensor, ...]] = []
     seen = batch.seen()
     first = [seen]
     for _ in range(steps):
@@ -81,6 +81,6 @@ def unroll(
             seen = torch.as_tensor(batch.reset(over)).reshape(batch.count, -1)
             hidden = None if hidden is None else hidden.index_fill(0, torch.from_numpy(over), 0.0)
         first.append(seen)
-        kept.append((action, *outcome.whole, final))
-    action, reward, terminated, truncated, final = (torch.stack(x) for x in zip(*kept, strict=True))
+        columns.append((action, *outcome.whole, final))
+    action, reward, terminated, truncated, final = (torch.stack(x) for x in zip(*columns, strict=True))
     return Unrolled(torch.stack(first), action, reward, terminated, truncated, final, hidden)

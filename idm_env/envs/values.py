@@ -75,12 +75,12 @@ class Values:
         if still.keys() != old.keys() or not all(np.array_equal(x, old[n]) for n, x in still.items()):
             self.layout = Layout((*blocks, "clock"), still, self.layout.version + 1)
         self.blocks = _block(world, self.layout.blocks)
-        self.past = Past(world.state, kept=self._graph)
+        self.past = Past(world.state, writes_once=self._graph)
         self.past.load(world.state)
-        kept = world.state.memory.get(PAST)
+        past = world.state.memory.get(PAST)
         self._token = None
-        if kept is not None and kept.requires_grad:
-            self._token = _Enter.apply(kept, tuple(world.state.speed.shape))
+        if past is not None and past.requires_grad:
+            self._token = _Enter.apply(past, tuple(world.state.speed.shape))
 
     def replace(self, rows: Array, fresh: EnvState) -> None:
         """Replace some rows (indices) by the worlds of ``fresh``, with their graph; that of the rows before is cut."""
@@ -146,33 +146,33 @@ class Values:
         """
         plan = self.plan((action is None, live is None), tuple(normals or ()))
         bound = plan.of(self.layout, params)
-        given = action.detach().numpy() if isinstance(action, Tensor) else action
-        if given is not None and not given.flags.c_contiguous:
-            given = np.ascontiguousarray(given)  # loops read row after row
+        command = action.detach().numpy() if isinstance(action, Tensor) else action
+        if command is not None and not command.flags.c_contiguous:
+            command = np.ascontiguousarray(command)  # loops read row after row
         if self.past.slots:
             self.past.make_room()
         moment = Moment(
-            0, 0, self._clock, given, live, normals, at, self.past.rows, self.past.newest, bound
+            0, 0, self._clock, command, live, normals, at, self.past.rows, self.past.newest, bound
         )  # fmt: skip
         if self._whole is not None:
             moment.lanes = Crossing(self._whole, self._chain, self._graph)
-        told: dict[str, Any]
+        outputs: dict[str, Any]
         if self._graph and torch.is_grad_enabled() and self._differentiated(action, bound):
-            told = self._noted(plan, moment, action, bound)
+            outputs = self._noted(plan, moment, action, bound)
         else:
             later = self._spare if self._spare is not None else torch.empty_like(self.blocks)
-            told = plan.run(moment, self.blocks, later, tape=False)
+            outputs = plan.run(moment, self.blocks, later, tape=False)
             self._spare = None if self._graph else self.blocks
             self.blocks, self._token = later, None
             if self._graph:
-                clock = told.pop("clock")
-                told = {n: torch.from_numpy(x) for n, x in told.items()} | {"clock": clock}
-        self._clock = told.pop("clock")
+                clock = outputs.pop("clock")
+                outputs = {n: torch.from_numpy(x) for n, x in outputs.items()} | {"clock": clock}
+        self._clock = outputs.pop("clock")
         if moment.lanes is not None:
             self._whole, self._chain = moment.lanes.whole_later, moment.lanes.chain
         if self.past.slots:
             self.past.newest += 1
-        return told
+        return outputs
 
     def arrive(self, blocks: Tensor, clock: Array, token: Tensor | None = None) -> None:
         """Go on from other worlds of the same episodes."""
@@ -214,14 +214,14 @@ class Values:
 
     def _noted(self, plan: Plan, moment: Moment, action: Any, bound: Bound) -> dict[str, Any]:
         """Do a step as a node of autograd."""
-        told: dict[str, Any] = {}
-        wanted = [x for _, x in bound.wanted]
+        outputs: dict[str, Any] = {}
+        parameters = [x for _, x in bound.wanted]
         token = self.token_of(plan)
-        out = _Step.apply(plan, moment, told, self.blocks, action, token, *wanted)
+        out = _Step.apply(plan, moment, outputs, self.blocks, action, token, *parameters)
         self.blocks = out[0]
         self._token = out[1] if self.past.slots else None
-        told.update(zip(plan.recorded.flowing, out[2:], strict=True))
-        return told
+        outputs.update(zip(plan.recorded.flowing, out[2:], strict=True))
+        return outputs
 
 
 class _Step(torch.autograd.Function):
@@ -243,39 +243,39 @@ class _Step(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, on_later: Tensor | None, on_past: Tensor | None, *on_told: Tensor | None) -> Any:  # type: ignore[override]
         plan, moment = ctx.plan, ctx.moment
-        blocks, _, action, token, *wanted = ctx.saved_tensors
+        blocks, _, action, token, *parameters = ctx.saved_tensors
         if torch.is_grad_enabled():
-            return (None,) * 3 + _twice(ctx, blocks, action, token, wanted, (on_later, on_past, *on_told))
+            return (None,) * 3 + _twice(ctx, blocks, action, token, parameters, (on_later, on_past, *on_told))
         names = plan.recorded.flowing
         seeds = {n: None if x is None else x.contiguous() for n, x in zip(names, on_told, strict=True)}
         later = None if on_later is None else on_later.contiguous()
         past = None if on_past is None else on_past.contiguous().numpy()
         on_now, on_action, on_parameters, before = plan.back(moment, seeds, later, past)
         shape = blocks.shape
-        found = [torch.from_numpy(on_now).view(shape), None if on_action is None else torch.from_numpy(on_action)]
-        found.append(None if token is None else torch.from_numpy(before))
+        gradients = [torch.from_numpy(on_now).view(shape), None if on_action is None else torch.from_numpy(on_action)]
+        gradients.append(None if token is None else torch.from_numpy(before))
         for i, x in moment.bound.wanted:
-            found.append(torch.from_numpy(on_parameters[i]).view(shape[1:]).sum_to_size(x.shape).to(x.dtype))
-        return (None,) * 3 + tuple(found)
+            gradients.append(torch.from_numpy(on_parameters[i]).view(shape[1:]).sum_to_size(x.shape).to(x.dtype))
+        return (None,) * 3 + tuple(gradients)
 
 
 def _twice(
-    ctx: Any, blocks: Tensor, action: Tensor | None, token: Tensor | None, wanted: Sequence[Tensor],
+    ctx: Any, blocks: Tensor, action: Tensor | None, token: Tensor | None, parameters: Sequence[Tensor],
     seeds: Sequence[Tensor | None],
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     """Return gradients with a graph of their own, for second derivatives, from the torch path."""
     plan, moment = ctx.plan, ctx.moment
-    later, past, told = _again(plan, moment, blocks, action, token, moment.bound.with_values(wanted))
-    outputs = [later, past, *(told[n] for n in plan.recorded.flowing)]
+    later, past, by_name = _again(plan, moment, blocks, action, token, moment.bound.with_values(parameters))
+    outputs = [later, past, *(by_name[n] for n in plan.recorded.flowing)]
     pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if o is not None and s is not None and o.requires_grad]
-    sources = [x for x in (blocks, action, token, *wanted) if x is not None and x.requires_grad]
-    found = iter(
+    sources = [x for x in (blocks, action, token, *parameters) if x is not None and x.requires_grad]
+    gradients = iter(
         torch.autograd.grad(
             [o for o, _ in pairs], sources, [s for _, s in pairs], create_graph=True, allow_unused=True
         )
     )  # fmt: skip
     return tuple(
-        next(found) if x is not None and x.requires_grad else None for x in (blocks, action, token, *wanted)
+        next(gradients) if x is not None and x.requires_grad else None for x in (blocks, action, token, *parameters)
     )  # fmt: skip
 
 
@@ -291,11 +291,15 @@ def _again(
     whole = None if moment.lanes is None else moment.lanes.whole
     world = _world(plan.world, layout, blocks, moment.clock, past, whole)
     live = None if moment.live is None else torch.from_numpy(moment.live).view(shape[0], -1)
-    drawn = moment.normals
-    normals = None if drawn is None else {n: torch.from_numpy(x).view(-1, *shape)[moment.at] for n, x in drawn.items()}
-    after, told = plan.moves.step(world, action, live, normals, params)
+    normal_blocks = moment.normals
+    normals = (
+        None
+        if normal_blocks is None
+        else {n: torch.from_numpy(x).view(-1, *shape)[moment.at] for n, x in normal_blocks.items()}
+    )
+    after, outputs = plan.moves.step(world, action, live, normals, params)
     last = after.state.memory.get(PAST)
-    return _block(after, layout.blocks), None if last is None else _as_rows(last, shape), told
+    return _block(after, layout.blocks), None if last is None else _as_rows(last, shape), outputs
 
 
 def _world(
@@ -311,8 +315,10 @@ def _world(
         if name not in leaves:
             array = clock if name == "state_step" else layout.still[name]
             leaves[name] = torch.from_numpy(array).view(x.shape)
-    made = world_of(leaves, like)
-    return made if past is None else made._replace(state=made.state._replace(memory={**made.state.memory, PAST: past}))
+    world = world_of(leaves, like)
+    return (
+        world if past is None else world._replace(state=world.state._replace(memory={**world.state.memory, PAST: past}))
+    )
 
 
 def _block(world: EnvState, names: Sequence[str]) -> Tensor:

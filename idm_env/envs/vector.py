@@ -47,27 +47,27 @@ class DiffIDMVectorEnv(Face, VectorEnv):
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **keywords: Any) -> None:
         self._viewers: list[Any] = []  # before anything can fail: Gymnasium 1.1 closes what was never made, too
-        made = settings(render_mode=render_mode, **keywords)
-        self.settings = made
-        self.task = made.task
+        own = settings(render_mode=render_mode, **keywords)
+        self.settings = own
+        self.task = own.task
         self.num_envs = whole("num_envs", num_envs, 1)
-        affordable(made, num_envs)
-        self.render_mode = made.render_mode
-        self.autoreset_mode = made.autoreset_mode
+        affordable(own, num_envs)
+        self.render_mode = own.render_mode
+        self.autoreset_mode = own.autoreset_mode
         self.metadata = {
             **type(self).metadata,
             "render_fps": max(1, round(1.0 / self.task.step_time)),
-            "autoreset_mode": made.autoreset_mode,
+            "autoreset_mode": own.autoreset_mode,
         }
         agents = len(self.task.agents)
-        self.single_observation_space = observation_box(self.task, made.dtype, agents)
+        self.single_observation_space = observation_box(self.task, own.dtype, agents)
         self.single_action_space = action_space(self.task, agents)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.batch = Batch(made, num_envs)
+        self.batch = Batch(own, num_envs)
         self._rows = Rows(self.batch)
         self._shape = (num_envs, agents * len(self.task.commands))
-        self._numpy = made.output == "numpy"
+        self._numpy = own.output == "numpy"
         self._ended = np.zeros(num_envs, dtype=bool)
 
     # -- reset and step ------------------------------------------------------------------------------------------
@@ -80,10 +80,10 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         A number seeds environment i with ``seed + i``; a sequence gives every one its own. ``options["state"]`` is a
         ``State`` to start from, one row per environment that is reset.
         """
-        given = reset_options(options, ("state", "reset_mask"))
-        rows = self._masked(given.get("reset_mask"))
+        chosen = reset_options(options, ("state", "reset_mask"))
+        rows = self._masked(chosen.get("reset_mask"))
         self._seed(seed, rows)
-        observation = self.batch.reset(rows, given.get("state"))
+        observation = self.batch.reset(rows, chosen.get("state"))
         self._ended[rows] = False
         if self.render_mode == "human":
             self.render()
@@ -122,8 +122,8 @@ class DiffIDMVectorEnv(Face, VectorEnv):
                 )
             if not self.batch.begun and None in seeds:
                 self.batch.seed(np.arange(self.num_envs), self._entropy())
-        given = [row for row in rows if seeds[row] is not None]
-        self.batch.seed(given, [seed for row in given if (seed := seeds[row]) is not None])
+        seeded = [row for row in rows if seeds[row] is not None]
+        self.batch.seed(seeded, [seed for row in seeded if (seed := seeds[row]) is not None])
 
     def _entropy(self) -> list[int]:
         """Return the seeds that follow the one that Gymnasium draws from the operating system."""
@@ -143,9 +143,9 @@ class DiffIDMVectorEnv(Face, VectorEnv):
             raise RuntimeError(
                 f"environments {over[:5].tolist()} have ended. Reset them with options={{'reset_mask': mask}}."
             )
-        given = None if actions is None else action_of(actions, self._shape, self.settings)
+        batch_actions = None if actions is None else action_of(actions, self._shape, self.settings)
         with torch.no_grad() if self._numpy else contextlib.nullcontext():
-            outcome = self.batch.step(given)
+            outcome = self.batch.step(batch_actions)
             observation, (reward, terminated, truncated) = outcome.observation, outcome.whole
             # Episodes that ended with the step before begin in this one: it is no step of theirs.
             stepped = ~self._ended
@@ -176,10 +176,10 @@ class DiffIDMVectorEnv(Face, VectorEnv):
             mask = torch.as_tensor(ended, device=flat.device)
             final = torch.where(mask.unsqueeze(-1), flat, 0.0)
             return {"final_obs": final, "_final_obs": mask, "final_info": last, "_final_info": mask.clone()}
-        kept = np.full(self.num_envs, None, dtype=object)
+        observations = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
-            kept[i] = flat[i]
-        return {"final_obs": kept, "_final_obs": ended, "final_info": last, "_final_info": ended.copy()}
+            observations[i] = flat[i]
+        return {"final_obs": observations, "_final_obs": ended, "final_info": last, "_final_info": ended.copy()}
 
     def _out(self, observation: Any) -> Any:
         flat = observation.reshape(self.num_envs, -1)

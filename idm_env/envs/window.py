@@ -121,16 +121,16 @@ def driver_of(policy: Any, seen: Tensor, actions: int, hidden: Tensor | None = N
     """Return a policy as compiled loops, recorded once; None where it runs by torch between the steps."""
     if not isinstance(policy, nn.Module):
         return None
-    kept, (rows, width), dtype = _DRIVERS.setdefault(policy, {}), seen.shape, seen.dtype
+    drivers, (rows, width), dtype = _DRIVERS.setdefault(policy, {}), seen.shape, seen.dtype
     memory = None if hidden is None else tuple(hidden.shape[1:])
     weights = tuple((n, x.shape) for n, x in policy.state_dict().items())
     key = (width, actions, dtype, memory, policy.training, weights)
-    if key not in kept:
+    if key not in drivers:
         try:
-            kept[key] = Driver(policy, rows, width, actions, dtype, memory)
+            drivers[key] = Driver(policy, rows, width, actions, dtype, memory)
         except Untraceable:
-            kept[key] = None
-    return kept[key]
+            drivers[key] = None
+    return drivers[key]
 
 
 class _Segment(NamedTuple):
@@ -150,13 +150,13 @@ def _each(x: Array, part: slice) -> Array:
     return address(x) + np.arange(part.start, part.stop, dtype=np.int64) * (x.nbytes // len(x))
 
 
-def _columns(loops: RowFunction, given: Mapping[str, Any], part: slice) -> Array:
+def _columns(loops: RowFunction, pointers: Mapping[str, Any], part: slice) -> Array:
     """Return tables of the loops of a policy, one for each step."""
-    made = np.empty((part.stop - part.start, len(loops.table({}))), np.int64)
-    made[:] = loops.table({})
+    columns = np.empty((part.stop - part.start, len(loops.table({}))), np.int64)
+    columns[:] = loops.table({})
     for name in (*loops.needs, *loops.outs, *getattr(loops, "sums", ())):
-        made[:, loops.place(name)] = given[name]
-    return made
+        columns[:, loops.place(name)] = pointers[name]
+    return columns
 
 
 class Tape:
@@ -199,10 +199,10 @@ class Tape:
 
     def given(self, part: slice) -> dict[str, Any]:
         """Return the addresses of what steps are given beside their worlds."""
-        found: dict[str, Any] = {n: _each(x, part) for n, x in self.between.items()}
-        found |= {n: found[o] for n, (o, _) in self.plan.recorded.before.same.items()}
-        found |= {"action": _each(self.action, part), "state_step": _each(self.clocks, part)}
-        return found | {"later_state_step": _each(self.later_clocks, part)}
+        pointers: dict[str, Any] = {n: _each(x, part) for n, x in self.between.items()}
+        pointers |= {n: pointers[o] for n, (o, _) in self.plan.recorded.before.same.items()}
+        pointers |= {"action": _each(self.action, part), "state_step": _each(self.clocks, part)}
+        return pointers | {"later_state_step": _each(self.later_clocks, part)}
 
     def run(self, batch: Batch, values: Values, weights: Mapping[str, Array]) -> None:
         """Do all steps; episodes that end begin anew."""
@@ -213,17 +213,17 @@ class Tape:
             room = values.past.room() if values.past.slots else ahead
             part = slice(done, min(self.steps, done + ahead, done + room))
             bound = plan.of(values.layout, batch.episode_params())
-            given, now, later = self.given(part), self.now[part], self.later[part]
+            pointers, now, later = self.given(part), self.now[part], self.later[part]
             to = {n: _each(x, part) for n, x in self.told.items()}
-            to |= {n: given[n] for n in ("command", "given", "state_step", "later_state_step") if n in given}
-            own = {"seen": _each(self.seen, part), "push": address(self.push), "action": given["action"]}
+            to |= {n: pointers[n] for n in ("command", "given", "state_step", "later_state_step") if n in pointers}
+            own = {"seen": _each(self.seen, part), "push": address(self.push), "action": pointers["action"]}
             own |= {"hidden": _each(self.hidden, part), "later": _each(self.hidden[1:], part)}
             own |= {n: address(x) for n, x in weights.items()}
             acts = _columns(self.driver.forward, own, part)
             tables = (
-                self.driver.forward.call, acts, plan.recorded.before.call, bound.laid.ask.each(now, later, given),
+                self.driver.forward.call, acts, plan.recorded.before.call, bound.laid.ask.each(now, later, pointers),
                 plan.recorded.after.call, bound.laid.tell.each(now, later, to), self.clocks[part],
-                self.later_clocks[part], plan.places_of(bound, normals, now, later, given),
+                self.later_clocks[part], plan.places_of(bound, normals, now, later, pointers),
             )  # fmt: skip
             past = values.past
             count = window(
@@ -260,17 +260,17 @@ class Tape:
         pasts[self.steps % 2] = on_past
         on_parameters = np.zeros((len(plan.kernel.program.parameters), plan.count), plan.real)
         acted = np.zeros_like(self.action)
-        told, looked = np.zeros((2, self.seen.shape[1]), plan.real)
+        on_observation, looked = np.zeros((2, self.seen.shape[1]), plan.real)
         total, recalled, on_later = on_seen[self.steps].copy(), on_hidden.copy(), np.empty_like(on_hidden)
         sums = {n: np.zeros(size, plan.real) for n, size in driver.backward.sums.items()}
         moving = [i for i, n in enumerate(plan.layout.blocks) if f"end_{n}" in scratch.there]
         carried = np.array([i for i, n in enumerate(plan.layout.blocks) if n.startswith("memory_") and i not in moving])
         for segment in reversed(self.segments):
             part = slice(segment.first, segment.last)
-            now, later, given = self.now[part], self.later[part], self.given(part)
+            now, later, pointers = self.now[part], self.later[part], self.given(part)
             side = np.arange(part.start, part.stop) % 2
-            own = {**scratch.there, **{f"on_{n}": scratch.zeros for n in plan.recorded.flowing}, **given}
-            own |= {"on_observation": address(told), "on_whole_reward": _each(on_reward, part)}
+            own = {**scratch.there, **{f"on_{n}": scratch.zeros for n in plan.recorded.flowing}, **pointers}
+            own |= {"on_observation": address(on_observation), "on_whole_reward": _each(on_reward, part)}
             own["on_action"] = _each(acted, part)
             for i, name in enumerate(plan.layout.blocks):
                 first = address(two) + i * plan.pitch
@@ -284,12 +284,12 @@ class Tape:
             before, after = plan.recorded.backward
             window_back(
                 driver.backward.call, acts, before.call, asks.each(now, later, own), after.call,
-                tells.each(now, later, own), plan.places_of(segment.bound, segment.normals, now, later, given),
+                tells.each(now, later, own), plan.places_of(segment.bound, segment.normals, now, later, pointers),
                 segment.bound.strides, *scratch.work, segment.past, segment.newest, scratch.ends, scratch.begins,
                 np.array([address(x) for x in pasts]), address(on_parameters), address(scratch.on_inputs),
                 *scratch.loops, segment.at, plan.groups, segment.first % 2, segment.last - segment.first,
                 self.ends[part], self.cuts[part], two, pasts, carried.astype(np.int64), on_seen[part], on_last[part],
-                on_action[part], acted[part], told, looked, total,
+                on_action[part], acted[part], on_observation, looked, total,
                 recalled, on_later, "to_hidden" in driver.backward.outs,
             )  # fmt: skip
         return two[0], pasts[0], on_parameters, acted, {**sums, "seen": total, "hidden": recalled}
@@ -306,8 +306,8 @@ class _Window(torch.autograd.Function):
         if not np.isfinite(tape.action).all():
             raise ValueError("policy returned NaN or infinite actions. Give finite numbers in [-1, 1].")
         rows, steps = tape.plan.rows, tape.steps
-        wanted = [x for _, x in tape.segments[0].bound.wanted]
-        ctx.tape, ctx.names, ctx.shapes = tape, names, [x.shape for x in wanted]
+        parameters = [x for _, x in tape.segments[0].bound.wanted]
+        ctx.tape, ctx.names, ctx.shapes = tape, names, [x.shape for x in parameters]
         ctx.save_for_backward(blocks, seen, hidden, push, *given)
         ctx.set_materialize_grads(False)
         shaped = (steps, rows, -1)
@@ -322,8 +322,8 @@ class _Window(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *on: Tensor | None) -> Any:  # type: ignore[override]
         tape, plan = ctx.tape, ctx.tape.plan
-        blocks, seen, hidden, push, *given = ctx.saved_tensors
-        weights = {n: x.detach().numpy() for n, x in zip(ctx.names, given, strict=False)}
+        blocks, seen, hidden, push, *tensors = ctx.saved_tensors
+        weights = {n: x.detach().numpy() for n, x in zip(ctx.names, tensors, strict=False)}
         signals = plan.slots * plan.kernel.signals
 
         def dense(x: Tensor | None, *shape: int) -> Array:
@@ -335,21 +335,21 @@ class _Window(torch.autograd.Function):
             dense(on[4], steps, plan.rows), dense(on[0], len(blocks), plan.count), dense(on[1], signals, plan.count),
             dense(on[6], hidden.numel()),
         )  # fmt: skip
-        found: list[Tensor | None] = [torch.from_numpy(on_now).view(blocks.shape)]
-        found.append(torch.from_numpy(on_past) if signals else None)
-        found.append(torch.from_numpy(sums["seen"]).view(seen.shape))
-        found.append(torch.from_numpy(sums["hidden"]).view(hidden.shape))
-        found.append(torch.from_numpy(acted.sum(0)).view(push.shape))
+        gradients: list[Tensor | None] = [torch.from_numpy(on_now).view(blocks.shape)]
+        gradients.append(torch.from_numpy(on_past) if signals else None)
+        gradients.append(torch.from_numpy(sums["seen"]).view(seen.shape))
+        gradients.append(torch.from_numpy(sums["hidden"]).view(hidden.shape))
+        gradients.append(torch.from_numpy(acted.sum(0)).view(push.shape))
         summed = tape.driver.backward.summed
-        for name, x in zip(ctx.names, given, strict=False):
+        for name, x in zip(ctx.names, tensors, strict=False):
             if f"to_{name}" not in summed:
-                found.append(None)
+                gradients.append(None)
                 continue
             array, shape, strides, offset = summed[f"to_{name}"]
-            found.append(torch.from_numpy(sums[array]).as_strided(shape, strides, offset).reshape(x.shape))
+            gradients.append(torch.from_numpy(sums[array]).as_strided(shape, strides, offset).reshape(x.shape))
         for (i, x), shape in zip(tape.segments[0].bound.wanted, ctx.shapes, strict=True):
-            found.append(torch.from_numpy(on_parameters[i]).view(blocks.shape[1:]).sum_to_size(shape).to(x.dtype))
-        return (None,) * 4 + tuple(found)
+            gradients.append(torch.from_numpy(on_parameters[i]).view(blocks.shape[1:]).sum_to_size(shape).to(x.dtype))
+        return (None,) * 4 + tuple(gradients)
 
 
 def compiled(
@@ -369,12 +369,12 @@ def compiled(
     bound = plan.of(values.layout, batch.episode_params())
     token = values.token_of(plan)
     weights = driver.weights(policy)
-    given = (*weights.values(), *(x for _, x in bound.wanted))
-    kept = batch.mark()
+    tensors = (*weights.values(), *(x for _, x in bound.wanted))
+    mark = batch.mark()
     try:
-        out = _Window.apply(tape, batch, values, tuple(weights), first, token, seen, begun, push, *given)
+        out = _Window.apply(tape, batch, values, tuple(weights), first, token, seen, begun, push, *tensors)
     except BaseException:
-        batch.back_to(kept)
+        batch.back_to(mark)
         raise
     values.arrive(out[0], values.clock().numpy(), out[1])
     rows = plan.rows

@@ -70,10 +70,10 @@ def task_with(task: str, choices: Mapping[str, Any], others: Iterable[str] = ())
     """
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"unknown task {shown(task)}.{nearest(shown(task), TASKS)}")
-    known = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]
+    names = [f.name for f in dataclasses.fields(TASKS[task]) if f.init]
     for choice in choices:
-        if choice not in known:
-            like = nearest(str(choice), [name for name in (*known, *others) if name != choice])
+        if choice not in names:
+            like = nearest(str(choice), [name for name in (*names, *others) if name != choice])
             raise KeywordError(f"task '{task}' got an unexpected keyword argument {shown(choice)}.{like}")
     return TASKS[task](**choices)
 

@@ -34,9 +34,9 @@ def _line(view: AgentView) -> Tensor:
 
 def _signal(view: AgentView) -> tuple[Tensor, Tensor]:
     """Return 1 where it is red, and the time to the next change (s)."""
-    said = {name: view.world.episode[f"signal_{name}"] for name in _SAID}
-    since, red = Signal.phase(view.task.simulator.time(view.state), said)
-    until = torch.where(red, said["cycle"] - since, said["cycle"] - said["red"] - since)
+    signal = {name: view.world.episode[f"signal_{name}"] for name in _SAID}
+    since, red = Signal.phase(view.task.simulator.time(view.state), signal)
+    until = torch.where(red, signal["cycle"] - since, signal["cycle"] - signal["red"] - since)
     return view.own(red.to(since.dtype)), view.own(until)
 
 
@@ -103,9 +103,9 @@ class ApproachTask(OpenLanesTask):
     @property
     def own_parameters(self) -> Mapping[str, Mapping[str, float]]:  # type: ignore[override]
         """Drivers of a town, and the signal."""
-        known = super().own_parameters
+        usual = super().own_parameters
         signal = {"place": LINE, "cycle": self.cycle, "red": self.cycle - self.green}
-        return {**known, "idm": {**known["idm"], "desired_speed": 15.0}, "signal": signal}
+        return {**usual, "idm": {**usual["idm"], "desired_speed": 15.0}, "signal": signal}
 
     @cached_property
     def road(self) -> Lanes:  # type: ignore[override]
@@ -133,23 +133,23 @@ class ApproachTask(OpenLanesTask):
 
     def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
         """Return trips of which those of a cycle come in its first part, at a rhythm that every later trip keeps."""
-        given = super()._trips(draw, dtype)
+        trips = super()._trips(draw, dtype)
         if self.table is not None:
-            return given
+            return trips
         first = self.filled / self.entry_speed  # so long before an episode the first platoon begins
-        begun = ((given.departs + first) / self.cycle).floor() * self.cycle
-        departs = begun + self.platoon * (given.departs + first - begun) - first
-        return given._replace(departs=departs, again=(given.again / self.cycle).ceil() * self.cycle)
+        begun = ((trips.departs + first) / self.cycle).floor() * self.cycle
+        departs = begun + self.platoon * (trips.departs + first - begun) - first
+        return trips._replace(departs=departs, again=(trips.again / self.cycle).ceil() * self.cycle)
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
         """As in the other open tasks, with what the signal does in these episodes."""
         world = super().begin(draw, params)
         speed = world.state.speed
-        said = {
+        signal = {
             f"signal_{name}": params["signal"][name].detach().to(speed.dtype).expand_as(speed).contiguous()
             for name in _SAID
         }
-        return world._replace(episode={**world.episode, **said})
+        return world._replace(episode={**world.episode, **signal})
 
     @property
     def features_of_self(self) -> tuple[Feature, ...]:

@@ -315,25 +315,25 @@ class Task(abc.ABC):
         own = {effect: dict(values) for effect, values in self.own_parameters.items()}
         if self.noise:
             extra += (Noise(),)
-        made = behaviour(
+        model = behaviour(
             self.own_effects, extra, own, self.effects, self.parameters, self.dt, self.integration, self.drivers
         )
-        ranges(type(self))["dt"].check("dt", made.dt)
+        ranges(type(self))["dt"].check("dt", model.dt)
         if self.noise:
-            made.parameters.setdefault("noise", {}).setdefault("sigma", self.noise * math.sqrt(made.dt))
-        given = {effect.name for effect in self.machinery}
-        for effect in made.effects:
-            if effect.takes is not None and effect.name not in given:
+            model.parameters.setdefault("noise", {}).setdefault("sigma", self.noise * math.sqrt(model.dt))
+        names = {effect.name for effect in self.machinery}
+        for effect in model.effects:
+            if effect.takes is not None and effect.name not in names:
                 raise ValueError(
                     f"effect '{effect.name}' takes an input that task '{self.name}' does not give. Leave it out here."
                 )
-        return made
+        return model
 
     @cached_property
     def simulator(self) -> Simulator:
         """The simulator of this task."""
-        made = self._behaviour
-        return Simulator(self.road, made.effects, made.dt, made.integration)
+        model = self._behaviour
+        return Simulator(self.road, model.effects, model.dt, model.integration)
 
     @cached_property
     def _tensors(self) -> dict[tuple[str, torch.device, torch.dtype], Tensor]:
@@ -342,11 +342,11 @@ class Task(abc.ABC):
     def constant(self, name: str, values: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
         """Return a static tensor, made once per device and dtype; ``values`` may be a function that gives them."""
         key = (name, device, dtype)
-        found = self._tensors.get(key)
-        if found is None:
-            made = values() if callable(values) else values
-            found = self._tensors[key] = torch.as_tensor(made, device=device).to(dtype)
-        return found
+        tensor = self._tensors.get(key)
+        if tensor is None:
+            data = values() if callable(values) else values
+            tensor = self._tensors[key] = torch.as_tensor(data, device=device).to(dtype)
+        return tensor
 
     def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
         """Return checked parameters as tensors (a number: scalar; a list: one per vehicle; a tensor: as it is)."""
@@ -361,14 +361,14 @@ class Task(abc.ABC):
     @cached_property
     def _ranges(self) -> dict[tuple[str, str], tuple[float, float]]:
         """What is drawn for every episode, and the ends of its range."""
-        found = ranges_of(self.randomise)
-        for end in (0, 1) if found else ():
+        spans = ranges_of(self.randomise)
+        for end in (0, 1) if spans else ():
             values = {effect: dict(part) for effect, part in self._behaviour.parameters.items()}
-            for (effect, name), ends in found.items():
+            for (effect, name), ends in spans.items():
                 values.setdefault(effect, {})[name] = ends[end]
             ends_of = replace(self._behaviour, parameters=values)
             self.simulator.check(ends_of.params(self.vehicles, torch.float64, "cpu"))
-        return found
+        return spans
 
     def _is_agent(self) -> list[bool]:
         own = set(self.agents)
@@ -411,31 +411,31 @@ class Task(abc.ABC):
 
     def who(self, draw: Draw) -> dict[str, Tensor]:
         """Return which of the drivers every vehicle is in these episodes, and where in their ranges parameters are."""
-        found = {}
+        episode = {}
         if self._behaviour.drivers:
             count = len(next(iter(self._behaviour.drivers.values())))
             share = draw.stream("drivers").uniforms(0, self.vehicles, torch.float64)
-            found["driver"] = (share * count).long()
+            episode["driver"] = (share * count).long()
         if self._ranges:
-            found["randomised"] = draw.stream("randomise").uniforms(0, len(self._ranges), torch.float64)
-        return found
+            episode["randomised"] = draw.stream("randomise").uniforms(0, len(self._ranges), torch.float64)
+        return episode
 
     def episode_params(self, episode: Mapping[str, Tensor], params: Params) -> Params:
         """Return the parameters of a step in these episodes: each vehicle's driver's, and what episodes have drawn."""
         who, where = episode.get("driver"), episode.get("randomised")
         if who is None and where is None:
             return params
-        made = {effect: dict(values) for effect, values in params.items()}
+        result = {effect: dict(values) for effect, values in params.items()}
         dtype = self.like(params).dtype
         if who is not None:
             for (effect, name), values in self._behaviour.drivers.items():
                 table = self.constant(f"drivers' {effect}.{name}", np.array(values), who.device, dtype)
-                made[effect][name] = table[who]
+                result[effect][name] = table[who]
         if where is not None:
             for i, ((effect, name), (low, high)) in enumerate(self._ranges.items()):
-                drawn = (low + (high - low) * where[:, i : i + 1]).to(dtype)
-                made.setdefault(effect, {})[name] = drawn.expand(-1, self.vehicles)
-        return made
+                number = (low + (high - low) * where[:, i : i + 1]).to(dtype)
+                result.setdefault(effect, {})[name] = number.expand(-1, self.vehicles)
+        return result
 
     def _unsteady(self, world: EnvState, draw: Draw) -> EnvState:
         """Return the worlds with drivers who drift as they are in the long run, rather than all at their mean."""
@@ -488,8 +488,8 @@ class Task(abc.ABC):
         road = self.road.view(state)
         ahead = road.ahead(x)
         if state.present is not None or nobody is not None:
-            there = road.leader_present(state.present, x) > 0
-            ahead = torch.where(there, ahead, x if nobody is None else nobody)
+            is_led = road.leader_present(state.present, x) > 0
+            ahead = torch.where(is_led, ahead, x if nobody is None else nobody)
         return self.pick(ahead)
 
     def safe_command(self, world: EnvState) -> Tensor:

@@ -87,8 +87,8 @@ def behaviour(
             chosen.append(effect)
     names = {e.name for e in chosen}
     chosen += [e for e in required if e.name not in names]
-    known = {e.name for e in chosen}
-    values = {effect: dict(part) for effect, part in values.items() if effect in known}
+    all_names = {e.name for e in chosen}
+    values = {effect: dict(part) for effect, part in values.items() if effect in all_names}
     for key, change in nested(changes or {}).items():
         values.setdefault(key, {}).update(change)
         single = {name: x for name, x in single.items() if name[0] != key or name[1] not in change}

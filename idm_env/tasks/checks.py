@@ -51,13 +51,13 @@ def in_ranges(task: Any) -> None:
 
     None stands for what the task decides, where that is an option's default.
     """
-    known = ranges(type(task))
+    by_name = ranges(type(task))
     for field in dataclasses.fields(task):
         value = getattr(task, field.name)
         if isinstance(field.default, bool) and not isinstance(value, bool):
             raise ValueError(f"{field.name} = {shown(value)} must be True or False.")
-        if field.name in known and not (value is None and field.default is None):
-            known[field.name].check(field.name, value)
+        if field.name in by_name and not (value is None and field.default is None):
+            by_name[field.name].check(field.name, value)
 
 
 class KeywordError(TypeError, ValueError):
@@ -67,24 +67,24 @@ class KeywordError(TypeError, ValueError):
 def span(name: str, value: Any, low: float, unit: str, high: float = math.inf) -> tuple[float, float]:
     """Return a range from one number or from ``[lowest, highest]``. ValueError for anything else."""
     ends = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value, value]
-    told = f" ({unit})" if unit else ""
+    suffix = f" ({unit})" if unit else ""
     if len(ends) != 2:
-        raise ValueError(f"{name} = {shown(value)} must be one number or [lowest, highest]{told}.")
+        raise ValueError(f"{name} = {shown(value)} must be one number or [lowest, highest]{suffix}.")
     first, last = (at_least(name, end, low, unit, high) for end in ends)
     if first > last:
-        raise ValueError(f"{name} = {shown(value)} must rise: write [{last:g}, {first:g}]{told}.")
+        raise ValueError(f"{name} = {shown(value)} must rise: write [{last:g}, {first:g}]{suffix}.")
     return first, last
 
 
 def ranges_of(randomise: Mapping[str, Any] | None) -> dict[tuple[str, str], tuple[float, float]]:
     """Return what episodes draw parameters from, by effect and name. ValueError for what is no range."""
-    found = {}
+    spans = {}
     for effect, part in nested(randomise or {}, "randomise").items():
         for name, value in part.items():
             if isinstance(value, str) or not isinstance(value, Sequence):
                 raise ValueError(f"randomise.{effect}.{name} = {shown(value)} must be [lowest, highest].")
-            found[effect, name] = span(f"randomise.{effect}.{name}", value, -math.inf, "")
-    return found
+            spans[effect, name] = span(f"randomise.{effect}.{name}", value, -math.inf, "")
+    return spans
 
 
 def limits_of(max_command: Any) -> tuple[float, float]:

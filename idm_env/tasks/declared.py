@@ -29,7 +29,7 @@ def one_declared(entry: object, kind: type[T], known: Mapping[str, T], where: st
             f"{where}: {shown(entry)} is code of {shown(place)}, which is not run unasked. Read it, then give --trust, "
             f"trusted=True in Python, or {trust.VARIABLE}=1."
         )
-    found = registry.member(entry, where)[1]
-    if not isinstance(found, kind):
+    member = registry.member(entry, where)[1]
+    if not isinstance(member, kind):
         raise ValueError(f"{where}: {shown(entry)} is no {kind.__name__}. Name one that the file declares.")
-    return found
+    return member

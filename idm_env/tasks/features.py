@@ -216,14 +216,14 @@ def chosen(observation: Any, read: Callable[[Any, str], Any]) -> tuple[str, tupl
     for key in observation:
         one_of("observation", key, ("features", "vehicles", "scaling"))
     scaling = one_of("observation.scaling", observation.get("scaling", "scaled"), SCALINGS)
-    wanted = observation.get("features")
-    if wanted is None:
+    entries = observation.get("features")
+    if entries is None:
         if "vehicles" in observation:
             raise ValueError("observation.vehicles needs observation.features: name them.")
         return scaling, None
-    if isinstance(wanted, (str, Mapping)) or not isinstance(wanted, Sequence) or not wanted:
+    if isinstance(entries, (str, Mapping)) or not isinstance(entries, Sequence) or not entries:
         raise ValueError('observation.features must be a list of at least one, such as ["speed", "gap"].')
-    features = [read(each, "observation.features") for each in wanted]
+    features = [read(each, "observation.features") for each in entries]
     names = [each.name for each in features]
     if len(set(names)) < len(names):
         raise ValueError(f"observation.features = {names} must name none twice.")

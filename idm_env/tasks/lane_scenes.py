@@ -50,11 +50,11 @@ def recorded_lanes(path: str, dt: float, run: str | None, first_lane: str) -> La
     runs = sorted({track.key.rsplit("/", 1)[0] for track in tracks})
     if len(runs) > 1:
         raise DataError(f"{path} has {len(runs)} runs, and they are different roads. Name one: runs=['{runs[0]}'].")
-    known = np.unique(np.concatenate([track.lanes[np.isfinite(track.lanes)] for track in tracks]))
-    if not len(known):
+    numbers = np.unique(np.concatenate([track.lanes[np.isfinite(track.lanes)] for track in tracks]))
+    if not len(numbers):
         raise DataError(f"{path}: no vehicle has a lane. Give a column 'lane', or take task 'replay'.")
-    if len(known) == 1:
-        raise DataError(f"{path} has one lane, {known[0]:g}. Take task 'replay'.")
+    if len(numbers) == 1:
+        raise DataError(f"{path} has one lane, {numbers[0]:g}. Take task 'replay'.")
     for track in tracks:
         nowhere = np.isfinite(track.position) & ~np.isfinite(track.lanes)
         if nowhere.any():
@@ -64,16 +64,16 @@ def recorded_lanes(path: str, dt: float, run: str | None, first_lane: str) -> La
             )
     lane = np.zeros((len(tracks[0].position), len(tracks)), int)
     for i, track in enumerate(tracks):
-        lane[:, i] = _filled(np.searchsorted(known, track.lanes), np.isfinite(track.lanes))
-    return _scene(tracks, len(known) - 1 - lane if first_lane == "left" else lane, len(known), dt)
+        lane[:, i] = _filled(np.searchsorted(numbers, track.lanes), np.isfinite(track.lanes))
+    return _scene(tracks, len(numbers) - 1 - lane if first_lane == "left" else lane, len(numbers), dt)
 
 
-def _filled(values: np.ndarray, there: np.ndarray) -> np.ndarray:
+def _filled(values: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Return values where nobody is as they were before; at the beginning as they are first."""
-    at = np.flatnonzero(there)
-    if not len(at):
+    rows = np.flatnonzero(present)
+    if not len(rows):
         return np.zeros_like(values)
-    return np.asarray(values[at[np.clip(np.searchsorted(at, np.arange(len(values)), side="right") - 1, 0, None)]])
+    return np.asarray(values[rows[np.clip(np.searchsorted(rows, np.arange(len(values)), side="right") - 1, 0, None)]])
 
 
 def _scene(tracks: list[Track], lane: np.ndarray, count: int, dt: float) -> LanesScene:
@@ -131,7 +131,7 @@ def made_up_lanes(dt: float, vehicles: int = 24, seconds: float = 90.0) -> Lanes
         return torch.stack((now.position, now.speed, now.accel), -1), now.links.lane
 
     with torch.no_grad():
-        _, kept = simulator.rollout(state, {}, params, round(seconds / dt), keep=seen)
-    motion, lane = (torch.cat((x[None], later)).numpy() for x, later in zip(seen(state), kept, strict=True))
-    there, length = np.ones(lane.shape, bool), np.full(vehicles, 4.5)
-    return _seen(motion, there, lane, length, tuple(f"made-up/{i}" for i in range(vehicles)), 3)
+        _, steps = simulator.rollout(state, {}, params, round(seconds / dt), keep=seen)
+    motion, lane = (torch.cat((x[None], later)).numpy() for x, later in zip(seen(state), steps, strict=True))
+    present, length = np.ones(lane.shape, bool), np.full(vehicles, 4.5)
+    return _seen(motion, present, lane, length, tuple(f"made-up/{i}" for i in range(vehicles)), 3)

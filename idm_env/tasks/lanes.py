@@ -111,22 +111,22 @@ class LanesTask(Task):
 
         Both count, whichever is nearer: a leader may leave the lane.
         """
-        found = super().safe_command(world)
+        highest = super().safe_command(world)
         if not self.road.closed:
-            return found
+            return highest
         state = world.state
         assert state.links is not None
         room = self.pick(self.road.closed_at(state.links.lane, state.position) - state.position)
-        return torch.minimum(found, self._safe_behind(state, torch.zeros_like(room), room))
+        return torch.minimum(highest, self._safe_behind(state, torch.zeros_like(room), room))
 
     def inputs(
         self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, in which lanes are left to the drivers."""
-        found = super().inputs(world, command, normals, live)
+        inputs = super().inputs(world, command, normals, live)
         if self.lane_commands:
-            found = {**found, "lane_command": torch.full_like(world.state.speed, torch.nan)}
-        return found
+            inputs = {**inputs, "lane_command": torch.full_like(world.state.speed, torch.nan)}
+        return inputs
 
     def with_lane_commands(self, inputs: Inputs, action: Tensor | None, live: Tensor | None = None) -> Inputs:
         """Return the inputs with the lanes that agents command."""
@@ -206,12 +206,15 @@ class LanesTask(Task):
         def beside(x: Tensor) -> Tensor:
             return x.gather(-1, which).unflatten(-1, (count, agents)) - self.pick(x).unsqueeze(-2)
 
-        found = away.gather(-1, near) <= FAR_AWAY
-        there = torch.stack([found[..., k] for k in range(count)], -2).to(lane.dtype)
-        told = [there, *(x * there for x in (self.apart(beside(state.position)), beside(lane), beside(state.speed)))]
+        in_sight = away.gather(-1, near) <= FAR_AWAY
+        present = torch.stack([in_sight[..., k] for k in range(count)], -2).to(lane.dtype)
+        columns = [
+            present,
+            *(x * present for x in (self.apart(beside(state.position)), beside(lane), beside(state.speed))),
+        ]
         if count < self.seen:
-            told = [torch.cat((x, x.new_zeros(*x.shape[:-2], self.seen - count, agents)), dim=-2) for x in told]
-        return tuple(told)
+            columns = [torch.cat((x, x.new_zeros(*x.shape[:-2], self.seen - count, agents)), dim=-2) for x in columns]
+        return tuple(columns)
 
 
 def _nearby(what: int, k: int, view: AgentView) -> Tensor:

@@ -54,15 +54,15 @@ def recorded_leaders(path: str, dt: float) -> Leaders:
     """
     from idm_env.data import episodes, load
 
-    found = episodes(load(path), smooth=True, dt=dt)
-    longest = max(len(e) for e in found)
-    motion = np.zeros((len(found), longest, 3))
-    for row, episode in zip(motion, found, strict=True):
+    records = episodes(load(path), smooth=True, dt=dt)
+    longest = max(len(e) for e in records)
+    motion = np.zeros((len(records), longest, 3))
+    for row, episode in zip(motion, records, strict=True):
         lead = episode.leader
         n = len(episode)
         row[:n] = np.stack((lead.position_m - lead.position_m[0], lead.speed_mps, lead.accel_mps2), axis=-1)
         row[n:] = row[n - 1]
-    return Leaders(motion, np.array([len(e) for e in found]))
+    return Leaders(motion, np.array([len(e) for e in records]))
 
 
 def starts(draw: Draw, steps: Tensor, wanted: int) -> tuple[Tensor, Tensor]:

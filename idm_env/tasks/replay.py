@@ -104,11 +104,11 @@ class ReplayTask(Task):
     @cached_property
     def _longest(self) -> int:
         """Most steps from any beginning until the last of the agents has left."""
-        there = self.scene.present[:, list(self.agents)]
-        remaining = np.zeros(there.shape[1], int)
+        present = self.scene.present[:, list(self.agents)]
+        remaining = np.zeros(present.shape[1], int)
         longest = 1
-        for t in range(len(there) - 1, -1, -1):
-            remaining = (remaining + 1) * there[t]
+        for t in range(len(present) - 1, -1, -1):
+            remaining = (remaining + 1) * present[t]
             if self._together[t]:
                 longest = max(longest, int(remaining.max()) - 1)
         return longest
@@ -187,17 +187,17 @@ class ReplayTask(Task):
         return picked
 
     def _slot(self, vehicle: Any) -> int:
-        known = {key: i for i, key in enumerate(self.scene.ids) if key != NOBODY}
-        found = [i for key, i in known.items() if str(vehicle) in (key, key.rsplit("/", 1)[-1])]
-        if not found:
+        by_id = {key: i for i, key in enumerate(self.scene.ids) if key != NOBODY}
+        slots = [i for key, i in by_id.items() if str(vehicle) in (key, key.rsplit("/", 1)[-1])]
+        if not slots:
             raise ValueError(
-                f"vehicle '{vehicle}' is not in the recording.{nearest(str(vehicle), list(known)[:200])[:160]}"
+                f"vehicle '{vehicle}' is not in the recording.{nearest(str(vehicle), list(by_id)[:200])[:160]}"
             )
-        if len(found) > 1:
+        if len(slots) > 1:
             raise ValueError(
-                f"vehicle '{vehicle}' is in {len(found)} runs. Name one of them: '{self.scene.ids[found[0]]}'."
+                f"vehicle '{vehicle}' is in {len(slots)} runs. Name one of them: '{self.scene.ids[slots[0]]}'."
             )
-        return found[0]
+        return slots[0]
 
     @cached_property
     def _simulated(self) -> np.ndarray:

@@ -99,14 +99,14 @@ class ReplayLanesTask(ReplayTask, LanesTask):
         self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
     ) -> Inputs:
         """Return the inputs of one step, with the record at its end, lanes included where they are recorded."""
-        found = dict(super().inputs(world, command, normals, live))
+        inputs = dict(super().inputs(world, command, normals, live))
         state = world.state
         assert state.present is not None
         free = self.constant("free", self._free, state.speed.device, torch.bool) & (state.present > 0)
         lane = self.lane_at(world.episode["start"] + state.step + 1)
-        found["replay"] = found["replay"]._replace(lane=torch.where(free, -1, lane))
-        found["lane_command"] = torch.where(free, torch.nan, torch.zeros_like(state.speed))
-        return found
+        inputs["replay"] = inputs["replay"]._replace(lane=torch.where(free, -1, lane))
+        inputs["lane_command"] = torch.where(free, torch.nan, torch.zeros_like(state.speed))
+        return inputs
 
     def _free(self) -> list[bool]:
         """Return which slots' lanes are not recorded."""

@@ -212,8 +212,8 @@ class RingTask(Task):
         since = [step - round(begin / dt) for begin in self.shocks]
         now = reduce(torch.logical_or, [(x >= 0) & (x < lasts) for x in since])
         who = self.constant("shocked", self._is_shocked, step.device, torch.bool)
-        given, brakes = inputs["control"], now & who
-        return {**inputs, "control": Command(torch.where(brakes, -self.shock, given.accel), given.active | brakes)}
+        control, brakes = inputs["control"], now & who
+        return {**inputs, "control": Command(torch.where(brakes, -self.shock, control.accel), control.active | brakes)}
 
     def _is_shocked(self) -> list[bool]:
         return [i == self.shocked for i in range(self.vehicles)]

@@ -31,30 +31,30 @@ class DriverClass(NamedTuple):
 
 def classes_of(given: Mapping[str, Any] | None, usual: float) -> dict[str, DriverClass]:
     """Return the classes by name; ValueError, in one line, for what cannot be."""
-    found = {}
-    for name, said in (given or {}).items():
-        if not isinstance(said, Mapping):
-            raise ValueError(f"classes.{name} = {shown(said)} must give share, length (m) and parameters.")
-        for key in said:
+    classes = {}
+    for name, entry in (given or {}).items():
+        if not isinstance(entry, Mapping):
+            raise ValueError(f"classes.{name} = {shown(entry)} must give share, length (m) and parameters.")
+        for key in entry:
             one_of(f"classes.{name}", key, ("share", "length", "parameters"))
-        length = at_least(f"classes.{name}.length", said.get("length", usual), 0.1, "m", 100.0)
-        parameters = nested(said.get("parameters") or {}, f"classes.{name}.parameters")
-        found[str(name)] = DriverClass(said.get("share", 0.0), length, parameters)
-    table.shares("classes", {name: x.share for name, x in found.items()})
-    return found
+        length = at_least(f"classes.{name}.length", entry.get("length", usual), 0.1, "m", 100.0)
+        parameters = nested(entry.get("parameters") or {}, f"classes.{name}.parameters")
+        classes[str(name)] = DriverClass(entry.get("share", 0.0), length, parameters)
+    table.shares("classes", {name: x.share for name, x in classes.items()})
+    return classes
 
 
-def _stretch(where: str, said: Any, keys: Sequence[str], lanes: int) -> tuple[float, float, float]:
+def _stretch(where: str, entry: Any, keys: Sequence[str], lanes: int) -> tuple[float, float, float]:
     """Return lane (−1 for all), beginning and end (m) of what is said of a stretch."""
-    if not isinstance(said, Mapping):
-        raise ValueError(f"{where} = {shown(said)} must give {', '.join(keys)}.")
-    for key in said:
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"{where} = {shown(entry)} must give {', '.join(keys)}.")
+    for key in entry:
         one_of(where, key, keys)
-    lane = said.get("lane")
+    lane = entry.get("lane")
     if lane is not None and not (isinstance(lane, int) and not isinstance(lane, bool) and 0 <= lane < lanes):
         raise ValueError(f"{where}.lane = {shown(lane)} does not exist: this road has lanes 0 to {lanes - 1}.")
-    begin = at_least(f"{where}.begin", said.get("begin", 0.0), 0.0, "m", 1e6)
-    end = at_least(f"{where}.end", said.get("end", 1e6), 0.0, "m", 1e6)
+    begin = at_least(f"{where}.begin", entry.get("begin", 0.0), 0.0, "m", 1e6)
+    end = at_least(f"{where}.end", entry.get("end", 1e6), 0.0, "m", 1e6)
     return float(EVERY_LANE if lane is None else lane), begin, end
 
 
@@ -85,26 +85,26 @@ def loops_of(detectors: Any, lanes: int, length: float, dt: float) -> tuple[Loop
 
 def rules_of(limits: Any, closures: Any, lanes: int) -> tuple[Effect, ...]:
     """Return the effects of speed limits and closed lanes; ValueError, in one line, for what cannot be."""
-    made: list[Effect] = []
+    rules: list[Effect] = []
     zones = []
-    for i, said in enumerate(limits):
-        where = _stretch(f"limits[{i}]", said, ("lane", "begin", "end", "speed"), lanes)
-        if "speed" not in said:
+    for i, entry in enumerate(limits):
+        where = _stretch(f"limits[{i}]", entry, ("lane", "begin", "end", "speed"), lanes)
+        if "speed" not in entry:
             raise ValueError(f"limits[{i}] has no speed (m/s).")
-        zones.append((*where, at_least(f"limits[{i}].speed", said["speed"], 0.1, "m/s", 100.0)))
+        zones.append((*where, at_least(f"limits[{i}].speed", entry["speed"], 0.1, "m/s", 100.0)))
     if zones:
-        made.append(SpeedLimit(zones=tuple(zones)))
+        rules.append(SpeedLimit(zones=tuple(zones)))
     rows = []
-    for i, said in enumerate(closures):
-        where = _stretch(f"closures[{i}]", said, ("lane", "begin", "end", "since", "until"), lanes)
+    for i, entry in enumerate(closures):
+        where = _stretch(f"closures[{i}]", entry, ("lane", "begin", "end", "since", "until"), lanes)
         if where[0] == EVERY_LANE:
             raise ValueError(f"closures[{i}] must name one lane.")
-        since, until = (float(said.get(name, usual)) for name, usual in (("since", -ALWAYS), ("until", ALWAYS)))
+        since, until = (float(entry.get(name, usual)) for name, usual in (("since", -ALWAYS), ("until", ALWAYS)))
         rows.append((*where, since, until))
     _leaves_a_way(rows, lanes)
     if rows:
-        made.append(LaneClosure(closures=tuple(rows)))
-    return tuple(made)
+        rules.append(LaneClosure(closures=tuple(rows)))
+    return tuple(rules)
 
 
 def _leaves_a_way(rows: Sequence[tuple[float, ...]], lanes: int) -> None:
@@ -131,15 +131,15 @@ def with_classes(
 
     ValueError for a parameter that is not there.
     """
-    made = {effect: dict(part) for effect, part in values.items()}
-    for name, of in classes.items():
+    result = {effect: dict(part) for effect, part in values.items()}
+    for name, group in classes.items():
         mine = torch.tensor([kind == name for kind in kinds])
-        for effect, part in of.parameters.items():
+        for effect, part in group.parameters.items():
             for parameter, number in part.items():
-                old = made.get(effect, {}).get(parameter)
+                old = result.get(effect, {}).get(parameter)
                 if old is None:
                     raise ValueError(f"classes.{name}: parameter '{effect}.{parameter}' does not exist here.")
                 new = torch.full((len(kinds),), float(number), dtype=old.dtype, device=old.device)
                 new = new * factors.get((effect, parameter), 1.0)
-                made[effect][parameter] = torch.where(mine.to(old.device), new, old)
-    return made
+                result[effect][parameter] = torch.where(mine.to(old.device), new, old)
+    return result

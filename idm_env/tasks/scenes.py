@@ -96,9 +96,9 @@ def _tracks(table: Any, runs: Sequence[str], dt: float) -> list[Track]:
         rows_of[keys[row]].append(row)
     tracks = []
     for key, mine in rows_of.items():
-        at = step[mine]
+        steps = step[mine]
         # A step of time to which two rows are rounded keeps the first.
-        at, first = np.unique(at, return_index=True)
+        steps, first = np.unique(steps, return_index=True)
         part = {name: values[mine][first] for name, values in columns.items()}
         position, speed, gap = (np.full(step.max() + 1, np.nan) for _ in range(3))
         track = Track(
@@ -112,11 +112,11 @@ def _tracks(table: Any, runs: Sequence[str], dt: float) -> list[Track]:
             leader=np.full(step.max() + 1, "", object),
             lanes=np.full(step.max() + 1, np.nan),
         )
-        track.position[at], track.speed[at] = part["position_m"].astype(float), part["speed_mps"].astype(float)
-        track.gap[at] = part["gap_m"].astype(float)
-        track.lanes[at] = part["lane"].astype(float)
-        track.measured[at] = part["gap_measured"].astype(bool)
-        track.leader[at] = ["" if x is None else f"{part['run_id'][0]}/{x}" for x in part["leader_id"]]
+        track.position[steps], track.speed[steps] = part["position_m"].astype(float), part["speed_mps"].astype(float)
+        track.gap[steps] = part["gap_m"].astype(float)
+        track.lanes[steps] = part["lane"].astype(float)
+        track.measured[steps] = part["gap_measured"].astype(bool)
+        track.leader[steps] = ["" if x is None else f"{part['run_id'][0]}/{x}" for x in part["leader_id"]]
         tracks.append(track)
     return tracks
 
@@ -161,10 +161,10 @@ def _only_leader(track: Track, by_key: dict[str, Track]) -> str | None:
 
 def _align(track: Track, leader: Track) -> None:
     """Shift positions so that measured gaps hold; between them the last shift holds."""
-    known = np.flatnonzero(track.measured & np.isfinite(track.gap) & np.isfinite(leader.position))
-    if len(known):
-        shift = leader.position[known] - leader.length - track.gap[known] - track.position[known]
-        track.position += np.interp(np.arange(len(track.position)), known, shift)
+    rows = np.flatnonzero(track.measured & np.isfinite(track.gap) & np.isfinite(leader.position))
+    if len(rows):
+        shift = leader.position[rows] - leader.length - track.gap[rows] - track.position[rows]
+        track.position += np.interp(np.arange(len(track.position)), rows, shift)
 
 
 def _seat(track: Track, by_key: dict[str, Track]) -> np.ndarray:
@@ -202,9 +202,9 @@ def smoothed(track: Track, seat: np.ndarray | None, dt: float) -> tuple[np.ndarr
     from idm_env.data.smooth import fuse
 
     position, speed = (track.position, track.speed) if seat is None else seat
-    there = np.isfinite(position) & np.isfinite(speed)
+    present = np.isfinite(position) & np.isfinite(speed)
     motion = np.zeros((len(position), 3))
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], there.view(np.int8), [0]))))
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], present.view(np.int8), [0]))))
     for begin, end in edges.reshape(-1, 2):
         part = slice(begin, end)
         motion[part, 0], motion[part, 1] = position[part], np.clip(speed[part], 0.0, None)
@@ -212,11 +212,11 @@ def smoothed(track: Track, seat: np.ndarray | None, dt: float) -> tuple[np.ndarr
         if seat is None and end - begin >= 4:
             smooth = fuse(position[part], speed[part], dt)
             motion[part] = np.stack((smooth.position, np.clip(smooth.speed, 0.0, None), smooth.accel), axis=-1)
-    known = np.flatnonzero(there)
-    if len(known):
-        last = known[np.clip(np.searchsorted(known, np.arange(len(position)), side="right") - 1, 0, None)]
-        motion[~there, 0] = motion[last[~there], 0]
-    return motion, there
+    rows = np.flatnonzero(present)
+    if len(rows):
+        last = rows[np.clip(np.searchsorted(rows, np.arange(len(position)), side="right") - 1, 0, None)]
+        motion[~present, 0] = motion[last[~present], 0]
+    return motion, present
 
 
 @lru_cache(maxsize=4)

@@ -78,23 +78,23 @@ def from_table(frame: Any, dtype: torch.dtype = torch.float32) -> Trips:
     return read(frame).trips(dtype)
 
 
-def _columns(given: Any) -> dict[str, list[Any]]:
-    if isinstance(given, (str, Path)):
-        if not Path(given).is_file():
-            raise ValueError(f"trips = {shown(str(given))} is not a file. Give the path of a CSV file, or rows.")
+def _columns(source: Any) -> dict[str, list[Any]]:
+    if isinstance(source, (str, Path)):
+        if not Path(source).is_file():
+            raise ValueError(f"trips = {shown(str(source))} is not a file. Give the path of a CSV file, or rows.")
         try:
-            given = list(csv.DictReader(Path(given).read_text(encoding="utf-8").splitlines()))
+            source = list(csv.DictReader(Path(source).read_text(encoding="utf-8").splitlines()))
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"trips = {shown(str(given))} is not CSV in UTF-8: {error}. Save it as such.") from None
-    if isinstance(given, Sequence) and not isinstance(given, str):
-        if not given or not all(isinstance(row, Mapping) for row in given):
-            raise ValueError(f"trips = {shown(given)} must be rows of {', '.join(COLUMNS)}, columns, or a CSV file.")
-        names = dict.fromkeys(name for row in given for name in row)
-        return {str(name): [row.get(name) for row in given] for name in names}
+            raise ValueError(f"trips = {shown(str(source))} is not CSV in UTF-8: {error}. Save it as such.") from None
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        if not source or not all(isinstance(row, Mapping) for row in source):
+            raise ValueError(f"trips = {shown(source)} must be rows of {', '.join(COLUMNS)}, columns, or a CSV file.")
+        names = dict.fromkeys(name for row in source for name in row)
+        return {str(name): [row.get(name) for row in source] for name in names}
     try:
-        return {str(name): list(given[name]) for name in given}
+        return {str(name): list(source[name]) for name in source}
     except (TypeError, KeyError, IndexError):
-        raise ValueError(f"trips = {shown(given)} must be a table, rows of it, or a CSV file.") from None
+        raise ValueError(f"trips = {shown(source)} must be a table, rows of it, or a CSV file.") from None
 
 
 def _number(name: str, value: Any, row: int, least: float) -> float:
@@ -162,19 +162,19 @@ def shares(name: str, given: Mapping[str, float]) -> None:
         raise ValueError(f"{name}: shares of {sum(given.values()):g} in all must not exceed 1.")
 
 
-def _of_shares(name: str, given: Mapping[str, float], at: Sequence[float]) -> list[str]:
+def _of_shares(name: str, portions: Mapping[str, float], numbers: Sequence[float]) -> list[str]:
     """Return the names that numbers from 0 to 1 mean, '' for what is left."""
-    shares(name, given)
-    found = []
-    for x in at:
+    shares(name, portions)
+    names = []
+    for x in numbers:
         chosen = ""
-        for key, share in given.items():
+        for key, share in portions.items():
             if x < share:
                 chosen = key
                 break
             x -= share
-        found.append(chosen)
-    return found
+        names.append(chosen)
+    return names
 
 
 def spread(name: str, given: Mapping[str, float], count: int, by: float = FIRST) -> list[str]:
