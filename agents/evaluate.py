@@ -12,7 +12,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -371,30 +371,13 @@ def picture(path: Path, environment: Mapping[str, Any], policy: Policy, human: i
 
     Roads of several lanes get a panel for each.
     """
-    from idm_env.reports.diagrams import lane_panels, rollout_panel, space_time
+    from idm_env.envs.render import panels_of
+    from idm_env.reports.diagrams import space_time
 
-    states = []
-    for env in shown(environment, policy, human, steps, seed):
-        states.append(env.state)
-    dt = env.task.step_time
-    motion = Motion(*(torch.cat([getattr(s, name) for s in states]) for name in Motion._fields))
-    if states[0].links is None:
-        lap = env.task.road.lap(states[0])
-        ring = None if lap is None else float(lap)
-        drawn = [rollout_panel(motion, dt=dt, ring_length=ring, marked=env.task.agents)]
-    else:
-        lane = torch.cat([s.links.lane for s in states if s.links is not None])
-        present = torch.cat([s.present for s in states if s.present is not None])
-        drawn = lane_panels(motion, lane, present, dt=dt, marked=env.task.agents)
-    first = f"human drivers; from {human * dt:.0f} s on the" if human else "the"
-    space_time(drawn, title=f"{first} agent drives what is blue").savefig(path)
-
-
-class Motion(NamedTuple):
-    """What a diagram takes, time first."""
-
-    position: Tensor
-    speed: Tensor
+    states = [env.state for env in shown(environment, policy, human, steps, seed)]
+    task = task_of(environment)
+    first = f"human drivers; from {human * task.step_time:.0f} s on the" if human else "the"
+    space_time(panels_of(task, states), title=f"{first} agent drives what is blue").savefig(path)
 
 
 @dataclass

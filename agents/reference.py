@@ -21,8 +21,9 @@ from agents.environments import first_seed, human_driving, task_of
 from agents.evaluate import STEPS, evaluate_ring, judge_ring, score
 from agents.policy import Policy
 from agents.rollout import FRESH, LENGTHS, Act, Driven, Start, drive, ring_start, uniform_speed
-from idm_env.tasks import EnvState, Task
+from idm_env.tasks import Task
 from idm_env.tasks.failsafe import safe_accel
+from idm_env.types import mapped
 
 ROWS_AT_ONCE = 192
 """Rings that are driven together: every step of all of them is kept."""
@@ -154,14 +155,7 @@ def families(environment: Mapping[str, Any], count: int = 200) -> dict[str, Call
 
 def repeated(start: Start, times: int) -> Start:
     """Return the rings of a start over and over, with the same noise for each."""
-
-    def many(x: Tensor) -> Tensor:
-        return x.repeat(times, *(1 for _ in x.shape[1:]))
-
-    state = start.world.state
-    fields: Any = {k: many(x) for k, x in state._asdict().items() if isinstance(x, Tensor)}
-    memory = {name: many(x) for name, x in state.memory.items()}
-    world = EnvState(state._replace(**fields, memory=memory), {k: many(x) for k, x in start.world.episode.items()})
+    world = mapped(lambda x: x.repeat(times, *(1 for _ in x.shape[1:])), start.world)
     return start._replace(world=world, seeds=start.seeds * times)
 
 

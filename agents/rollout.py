@@ -17,15 +17,13 @@ from idm_env.envs.batch import Batch
 from idm_env.envs.settings import settings
 from idm_env.simulator import stacked
 from idm_env.tasks import Draw, EnvState, Task
-from idm_env.types import Params
+from idm_env.types import Params, mapped
 
 LENGTHS = (220.0, 230.0, 240.0, 250.0, 260.0, 270.0)
 UNSEEN = tuple(float(x) for x in range(200, 301, 10))
 WARMUP = 3000
 """Steps of human driving before the take-over: the wave has grown by then. A vehicle that keeps its speed, with no
 command at all, dissolves the young wave that is there after 750 steps."""
-BLOCK = 250
-"""Steps for which the drivers' noise is drawn at once."""
 SEED = 1 << 40
 """Of evaluations; training uses smaller seeds."""
 FRESH = range(1, 6)
@@ -59,34 +57,9 @@ class Start(NamedTuple):
         return Draw.of(torch.tensor(self.seeds), torch.zeros(len(self.seeds), dtype=torch.int64))
 
 
-class Moment(NamedTuple):
-    """A step of a rollout: the worlds before and after it, actions and what they command (None of human drivers)."""
-
-    before: EnvState
-    action: Tensor | None
-    command: Tensor | None
-    after: EnvState
-
-
 def begun(act: Act | None) -> Act | None:
     """Return what acts at the beginning of a rollout: a policy with nothing remembered, others as they are."""
     return Driving(act) if isinstance(act, Policy) else act
-
-
-def moments(start: Start, act: Act | None, steps: int) -> Iterator[Moment]:
-    """Roll a policy out from given worlds, a step at a time; ``act`` None leaves everybody to the human drivers."""
-    task, world, _, params = start
-    draw, act = start.draw, begun(act)
-    for t in range(steps):
-        with torch.no_grad():
-            if t % BLOCK == 0:
-                normals = task.normals(draw, world.state.step, BLOCK, world.state.speed.dtype)
-            action = None if act is None else act(task.observe(world).flatten(1))
-            command = None if action is None else task.command(action)
-            now = {name: x[t % BLOCK] for name, x in normals.items()}
-            after = task.step(world, command, now, params, advance=task.simulator.advance)
-        yield Moment(world, action, command, after)
-        world = after
 
 
 def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[EnvState, Tensor | None, EnvState]]:
@@ -162,22 +135,13 @@ def _ring_start(environment: str, lengths: tuple[float, ...], warmup: int, draws
     chosen = {**json.loads(environment), "warmup_pool": 0, "start": "uniform", "warmup": warmup}
     task = task_of({**chosen, "length": [min(lengths), max(lengths)]})
     params = task.params(torch.float32, "cpu")
-    seeds, states, episodes = [], [], []
+    seeds, worlds = [], []
     for i, length in enumerate(lengths):
         own = [SEED + 1000 * k + i for k in draws]
         draw = Draw.of(torch.tensor(own), torch.zeros(len(own), dtype=torch.int64))
-        one = task_of({**chosen, "length": length})
-        world = one.reset(draw, params)
-        states.append(world.state)
-        episodes.append(world.episode)
+        worlds.append(task_of({**chosen, "length": length}).reset(draw, params))
         seeds += own
-    memory = {name: torch.cat([s.memory[name] for s in states]) for name in states[0].memory}
-    columns: Any = {
-        k: torch.cat([getattr(s, k) for s in states]) for k in ("position", "speed", "accel", "gap", "length", "step")
-    }
-    episode = {name: torch.cat([e[name] for e in episodes]) for name in episodes[0]}
-    world = EnvState(states[0]._replace(**columns, memory=memory), episode)
-    return Start(task, world, tuple(seeds), params)
+    return Start(task, mapped(lambda *x: torch.cat(x), *worlds), tuple(seeds), params)
 
 
 def ring_start(

@@ -605,37 +605,23 @@ def plot(
 
 def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress) -> list[Any]:
     """Return the panel of a rollout, or one for each of several lanes."""
-    import torch
-
     from idm_env.envs.gym import DiffIDMEnv
+    from idm_env.envs.render import panels_of
     from idm_env.model_file import load_environment
-    from idm_env.reports.diagrams import lane_panels, rollout_panel
-    from idm_env.simulator import Trajectory
 
     _work_begins()
     # The picture is as long as it was asked for, whatever the limit of an episode.
     env: Any = DiffIDMEnv(**{**load_environment(config), "max_episode_steps": -1})
     env.reset(seed=seed)
     dt = env.task.step_time  # of a step of the environment, for which an action is held
-    samples, lanes, presence = [], [], []
-    steps = max(1, round(seconds / dt))
+    states, steps = [], max(1, round(seconds / dt))
     for step in range(steps):
         _, _, terminated, truncated, _ = env.step(None)
-        state = env.batch.world.state
-        samples.append((state.position[0], state.speed[0], state.accel[0], state.gap[0]))
-        if state.links is not None:
-            lanes.append(state.links.lane[0])
-            presence.append(torch.ones_like(state.speed[0]) if state.present is None else state.present[0])
+        states.append(env.state)
         report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
         if terminated or truncated:
             break
-    states = Trajectory(*(torch.stack(column) for column in zip(*samples, strict=True)))
-    lap = env.task.road.lap(state)
-    ring = None if lap is None else float(lap.reshape(-1)[0])
-    if lanes:
-        lane, present = torch.stack(lanes), torch.stack(presence)
-        return lane_panels(states, lane, present, dt=dt, ring_length=ring, marked=env.task.agents)
-    return [rollout_panel(states, dt=dt, ring_length=ring, marked=env.task.agents)]
+    return panels_of(env.task, states)
 
 
 @app.command("filter")

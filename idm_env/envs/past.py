@@ -19,8 +19,8 @@ _ROOM = 64
 class Past:
     """The past of worlds of one shape: ``rows`` (steps · signals, vehicles), oldest first; ``newest`` is the last step.
 
-    ``slots`` of these steps count. Without a past in the state it is empty, with no slots. ``writes_once`` says that what
-    was written stays as it is, for those who have the array.
+    ``slots`` of these steps count. Without a past in the state it is empty, with no slots. ``writes_once`` says that
+    what was written stays as it is, for those who have the array.
     """
 
     def __init__(self, state: State, writes_once: bool = False) -> None:

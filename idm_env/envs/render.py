@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from idm_env.extras import needed
-from idm_env.reports.diagrams import COLOURS, space_time
+from idm_env.reports.diagrams import COLOURS, Panel, lane_panels, rollout_panel, space_time
 from idm_env.types import Mark, Params, State
 
 if TYPE_CHECKING:
     from idm_env.tasks import Task
 
-__all__ = ["SIZE", "Viewer", "colour", "space_time"]
+__all__ = ["SIZE", "Viewer", "colour", "panels_of", "space_time"]
 
 SIZE, WIDE = 600, 1000
 """Width and height of a ring's picture, and width of a road's (pixels)."""
@@ -48,6 +49,18 @@ def colour(speed: float, fastest: float) -> tuple[int, int, int]:
     left = min(int(x), len(COLOURS) - 2)
     mixed = COLOURS[left] + (x - left) * (COLOURS[left + 1] - COLOURS[left])
     return int(mixed[0]), int(mixed[1]), int(mixed[2])
+
+
+def panels_of(task: Task, states: Sequence[State]) -> list[Panel]:
+    """Return the panel of what one environment went through ``(1, vehicles)``, or one for each of several lanes."""
+    position, speed = (torch.cat([getattr(state, name) for state in states]) for name in ("position", "speed"))
+    motion, lap = states[0]._replace(position=position, speed=speed), task.road.lap(states[0])
+    ring = None if lap is None else float(lap.reshape(-1)[0])
+    if states[0].links is None:
+        return [rollout_panel(motion, dt=task.step_time, ring_length=ring, marked=task.agents)]
+    lane = torch.cat([state.links.lane for state in states if state.links is not None])
+    present = torch.cat([torch.ones_like(s.speed) if s.present is None else s.present for s in states])
+    return lane_panels(motion, lane, present, dt=task.step_time, ring_length=ring, marked=task.agents)
 
 
 def _pygame() -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 
 from idm_env.jobs import trust
 from idm_env.tasks.approach import ApproachTask
-from idm_env.tasks.base import Advance, Bounds, Ended, EnvState, Features, RewardRange, Task
+from idm_env.tasks.base import Bounds, Ended, EnvState, Features, RewardRange, Task
 from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.features import FEATURES, AgentView, Feature
 from idm_env.tasks.follow import FollowTask
@@ -82,7 +82,6 @@ __all__ = [
     "FEATURES",
     "REWARD_TERMS",
     "TASKS",
-    "Advance",
     "AgentView",
     "ApproachTask",
     "BottleneckTask",

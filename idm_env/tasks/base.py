@@ -30,7 +30,7 @@ from idm_env.tasks.failsafe import safe_accel
 from idm_env.tasks.features import FEATURES, AgentView, Feature, ObservedFeature, chosen
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, Weighted, weighted
-from idm_env.tasks.types import Advance, Bounds, Ended, EnvState, Features, RewardRange
+from idm_env.tasks.types import Bounds, Ended, EnvState, Features, RewardRange
 from idm_env.types import Command, Inputs, Params, State
 from idm_env.validation import shown
 
@@ -537,24 +537,13 @@ class Task(abc.ABC):
         return inputs
 
     def step(
-        self,
-        world: EnvState,
-        command: Tensor | None,
-        normals: Mapping[str, Tensor] | None,
-        params: Params,
-        *,
-        live: Tensor | None = None,
-        advance: Advance | None = None,
-        limited: bool = False,
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, params: Params
     ) -> EnvState:
-        """Return the world Δt later. ``command`` (m/s²) is ``(…, agents)``, each of ``normals`` ``(…, vehicles)``.
-
-        ``limited`` says that ``limit`` was called already.
-        """
-        if command is not None and not limited:
+        """Return the world Δt later. ``command`` (m/s²) is ``(…, agents)``, each of ``normals`` ``(…, vehicles)``."""
+        if command is not None:
             command = self.limit(world, command)
         params = self.episode_params(world.episode, params)
-        state = (advance or self.simulator.step)(world.state, self.inputs(world, command, normals, live), params)
+        state = self.simulator.step(world.state, self.inputs(world, command, normals), params)
         return world._replace(state=state)
 
     def observe(self, world: EnvState) -> Tensor:
@@ -633,4 +622,4 @@ class Task(abc.ABC):
         return (seen / self.constant("scales", lambda: self.scales, device, dtype)).clamp(low, high)
 
 
-__all__ = ["Advance", "Bounds", "Draw", "Ended", "EnvState", "Features", "RewardRange", "Task"]
+__all__ = ["Bounds", "Draw", "Ended", "EnvState", "Features", "RewardRange", "Task"]

@@ -1,20 +1,17 @@
-"""Words of tasks: what a step carries over, how episodes end, what agents see, and who advances a state.
+"""Words of tasks: what a step carries over, how episodes end, and what agents see.
 
 Shapes: what belongs to agents is ``(…, agents)``, what belongs to vehicles ``[..., n]``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
 from idm_env.roads import Road
-from idm_env.types import Inputs, Params, State
-
-Advance = Callable[[State, Inputs, Params], State]
-"""One step of a simulator: ``Simulator.step``, or a kernel that gives the same."""
+from idm_env.types import State
 
 NOBODY = "—"
 """Id of a slot in which no recorded vehicle is."""

@@ -13,7 +13,7 @@ from agents.classical import FollowerStopper, PISaturation, Seen, controllers, n
 from agents.environments import task_of
 from agents.evaluate import kinds, solved_at
 from agents.policy import Policy
-from agents.rollout import Driven, drive, moments, ring_start, uniform_speed
+from agents.rollout import Driven, drive, ring_start, uniform_speed
 from idm_env.effects.idm import equilibrium_speed
 from idm_env.tasks import make_task
 
@@ -46,13 +46,16 @@ def test_a_driven_policy_moves_as_pure_steps_do(controlled):
         assert seen.shape == (4, 3 * controlled)
         return (seen[:, :controlled] - 0.2).clamp(-1.0, 1.0)
 
-    fast, slow = drive(start, act, 60), list(moments(start, act, 60))
-    for name in ("speed", "accel", "gap"):
-        wanted = torch.stack([getattr(moment.after.state, name) for moment in slow])
-        assert torch.allclose(getattr(fast, name), wanted, atol=1e-4)
-    assert torch.allclose(fast.action, torch.stack([moment.action for moment in slow]), atol=1e-5)
-    rewards = torch.stack([start.task.rewards(m.before, m.command, m.after) for m in slow])
-    assert torch.allclose(fast.reward, rewards, atol=1e-5)
+    fast, task, world = drive(start, act, 60), start.task, start.world
+    normals = task.normals(start.draw, world.state.step, 60, torch.float32)
+    for t in range(60):
+        action, before = act(task.observe(world).flatten(1)), world
+        command = task.command(action)
+        world = task.step(before, command, {name: x[t] for name, x in normals.items()}, start.params)
+        for name in ("speed", "accel", "gap"):
+            assert torch.allclose(getattr(fast, name)[t], getattr(world.state, name), atol=1e-4)
+        assert torch.allclose(fast.action[t], action, atol=1e-5)
+        assert torch.allclose(fast.reward[t], task.rewards(before, command, world), atol=1e-5)
     assert float(fast.accel[30, :, start.task.shocked].min()) == pytest.approx(-4.0)  # the shock is among them
 
 
