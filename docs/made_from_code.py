@@ -328,9 +328,8 @@ def _effect(name: str, cls: Any, pictures: Path) -> list[str]:
         lines.append("")
     if cls.looks_like:
         lines += [f"**Looks like** {', '.join(cls.looks_like)}. **Told by** {cls.told_by}.", ""]
-    told = [
-        f"*{words}* ({where} its null)" for words, where in zip(cls.wording, ("below", "above"), strict=True) if words
-    ]
+    said = [text.replace("{law}", "IDM") for text in cls.wording]
+    told = [f"*{text}* ({where} its null)" for text, where in zip(said, ("below", "above"), strict=True) if text]
     if told:
         lines += [f"In a report: {', '.join(told)}.", ""]
     lines += [f"Source: {source}\n" for source in cls.sources]

@@ -7,13 +7,16 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 import torch
 
 from idm_env.data import synthetic
+from idm_env.discovery.result import Location
 from idm_env.fitting import job
 from idm_env.fitting.job import fit_file, simulate_file
 from idm_env.fitting.options import Options, Source
@@ -396,3 +399,12 @@ def test_explain_and_fit_refuse_inputs_among_their_outputs(data: Path, tmp_path:
     for command in ("explain", "fit"):
         assert "is an input" in refused(command, data, "--out", tmp_path)
     assert link.is_symlink() and sorted(p.name for p in tmp_path.iterdir()) == ["data.csv", "report.json"]
+
+
+def test_a_typed_result_is_written_with_its_fields_as_keys() -> None:
+    """What has no end in JSON is null; what is not there by default is left out."""
+    part = Location("time", (np.float64(3.0), float("inf")))
+    assert storage.plain({"a": [part], "b": np.arange(2)}) == {
+        "a": [{"coordinate": "time", "interval": [3.0, None]}], "b": [0, 1],
+    }  # fmt: skip
+    assert storage.plain(replace(part, profile={"position_m": [1.0]}))["profile"] == {"position_m": [1.0]}

@@ -314,6 +314,7 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
     if not result["models"]:
         _undecided(result, out)
         return
+    from idm_env.discovery.result import Ceilings, Weight
     from idm_env.discovery.words import ERRORS, ceilings, laws, weight
     from idm_env.reports.page import account
     from idm_env.reports.undecided import FOUND
@@ -328,9 +329,9 @@ def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> No
         ])  # fmt: skip
     if result["interval"]:
         console.print(result["interval"], style="dim", highlight=False)
-    console.print(weight(result["prior"]), style="dim", highlight=False)
+    console.print(weight(Weight(**result["prior"])), style="dim", highlight=False)
     if before is not None:
-        limits = ceilings(result["ceilings"], before["gap_rmse_m"], result["error"]["floor"]["gap_rmse_m"])
+        limits = ceilings(Ceilings(**result["ceilings"]), before["gap_rmse_m"], result["error"]["floor"]["gap_rmse_m"])
         console.print(f"What could be explained at all: {limits}", style="dim", highlight=False)
     if result["bases"]:
         console.print(laws(result["bases"]), soft_wrap=True, highlight=False)

@@ -5,15 +5,15 @@ The law that is completed is among them once more, with the strengths of effects
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from idm_env.discovery import model as terms
 from idm_env.discovery.compare import Comparison, ErrorChange, compare
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.result import Against, LawErrors
 from idm_env.discovery.verdict import HOLDS, improves, mean_ratio
 from idm_env.effects import ALL, BASES, CarFollowing, base_named, make
 
@@ -122,23 +122,12 @@ def best_of(laws: Iterable[Law]) -> Law:
     return min((law for law in others if law.is_better), key=lambda law: law.mean_ratio, default=first)
 
 
-def rows(laws: Iterable[Law]) -> list[dict[str, Any]]:
-    """Return what a report says of laws: errors, and ``against`` the first the ratio, its interval, and a word."""
+def rows(laws: Iterable[Law]) -> list[LawErrors]:
+    """Return what a report says of laws."""
     return [
-        {
-            "base": each.law.kind, "title": each.title, "equation": each.law.equation, "own": list(each.own),
-            "fitted_to_what_is_judged": each.at_best,
-            **{key: _finite(x) for key, x in each.errors.summary().items()},
-            "against": {
-                key: {
-                    "verdict": c.light.value, "ratio": _finite(c.ratio), "low": _finite(c.low), "high": _finite(c.high),
-                }
-                for key, c in each.against.items()
-            },
-        }
+        LawErrors(
+            each.law.kind, each.title, each.law.equation, list(each.own), each.at_best, **each.errors.summary(),
+            against={key: Against(c.light.value, c.ratio, c.low, c.high) for key, c in each.against.items()},
+        )
         for each in laws
     ]  # fmt: skip
-
-
-def _finite(x: float) -> float | None:
-    return x if math.isfinite(x) else None

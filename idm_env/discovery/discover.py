@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,30 +14,17 @@ import numpy as np
 
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import (
-    bases,
-    calibrate,
-    ceilings,
-    crossed,
-    found,
-    free,
-    judge,
-    places,
-    records,
-    search,
-    shared,
-    summary,
-    words,
-)
+from idm_env.discovery import bases, calibrate, ceilings, found, judge, places, records, search, shared, summary
 from idm_env.discovery import march as twin
 from idm_env.discovery import model as terms
+from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
 from idm_env.discovery.model import Hypothesis, Term
-from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Records
+from idm_env.discovery.result import Ceilings, Result
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, Round, decide
 from idm_env.discovery.solve import Solution, Task
-from idm_env.discovery.verdict import Reason, Refusal, Verdict
+from idm_env.discovery.verdict import Verdict
 from idm_env.effects import (
     ALL,
     CANDIDATES,
@@ -58,32 +46,38 @@ from idm_env.validation import nearest
 
 @dataclass(eq=False)
 class Discovery:
-    """Result: the report's content, models by the name of their file, and what the pictures are drawn from.
+    """What is said, models by the name of their file, and what the pictures are drawn from.
 
     ``final`` has what was added or, where nothing was, what came nearest; ``judgement`` compares it with ``null``.
     """
 
-    report: dict[str, Any]
+    result: Result
     models: dict[str, SavedModel]
     records: Records
     null: Solution
     final: Solution
     task: Task
     rounds: list[Round]
-    judgement: summary.Judgement
+    judgement: Judgement
     responses: places.Responses
 
     @property
     def verdict(self) -> Verdict:
         """What is concluded."""
-        return Verdict(self.report["verdict"])
+        return Verdict(self.result.verdict)
+
+    @cached_property
+    def report(self) -> dict[str, Any]:
+        """The content of ``report.json``."""
+        content: dict[str, Any] = storage.plain(self.result)
+        return content
 
     @property
     def found_effect(self) -> str:
         """What was found in a state of the driver and has no name, as the text of a file with effects; "" for none."""
-        told = {f["label"]: f["parameters"] for f in self.report["found"]}
-        added = [(term, told[term.label]) for term in self.judgement.terms if term.label in told]
-        return found.source(added, self.report["sentence"])
+        estimates = {f.label: f.parameters for f in self.result.found}
+        added = [(term, estimates[term.label]) for term in self.judgement.terms if term.label in estimates]
+        return found.source(added, self.result.sentence)
 
     @property
     def model(self) -> SavedModel:
@@ -158,9 +152,9 @@ def discover(
     def on_law(*state: Any) -> None:
         progress("other laws", *state)
 
-    return _finish(
-        trajectories, prepared, fit_runs, kept_runs, searching, decided, refused | searching.unplaced, by, seed, on_law
-    )
+    test = prepared.of_runs(kept_runs) if kept_runs else None
+    evaluation = Evaluation(searching, decided.null, prepared, test, by == "driver", seed)
+    return _finish(trajectories, evaluation, decided, refused | searching.unplaced, by, on_law)
 
 
 # -- before the search -----------------------------------------------------------------------------------------------
@@ -266,87 +260,31 @@ def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]
 
 
 def _finish(
-    trajectories: Trajectories, prepared: Records, fit_runs: list[str], kept_runs: list[str], searching: Search,
-    decided: Decided, refused: dict[str, str], by: str, seed: int, on_law: Callable[[int, int, str], None],
+    trajectories: Trajectories, evaluation: Evaluation, decided: Decided, refused: dict[str, str], by: str,
+    on_law: Callable[[int, int, str], None],
 ) -> Discovery:  # fmt: skip
-    adapt = by == "driver"
-    null, rounds = decided.null, decided.rounds
-    fit_records = searching.task.rows.records
-    kept = prepared.of_runs(kept_runs) if kept_runs else None
-
-    fold = crossed.folds_of(prepared.runs, kept_runs, seed)
-
-    def own(model: Hypothesis, values: np.ndarray, start: np.ndarray | None) -> tuple[Solution, judge.Judged | None]:
-        found = searching.calibrated(model, values, start)
-        return calibrate.judged(found, fit_records, None if adapt else kept, prepared, adapt)
-
-    def noise() -> Noise:
-        assert searching.task.noise is not None
-        return searching.task.noise
-
-    # The null, what is added and other laws go the same way: whatever is calibrated better looks better.
-    def judged(
-        s: Solution, task: Task, whitened: bool | None = None, pooled: bool = False
-    ) -> tuple[Solution, judge.Judged | None]:
-        theta, errors = own(s.model, s.values, s.theta)
-        if adapt and kept is not None:
-            values = crossed.values_of(task, s, prepared.runs, fold)
-            errors = crossed.crossed(prepared, s.model, values, fold, noise(), theta.theta, pooled, whitened)
-        return theta, errors
-
-    first, before = judged(null, searching.task)
-    whitened = before is not None and before.whitened
-
-    def alike(s: Solution, task: Task) -> tuple[Solution, judge.Judged | None]:
-        return judged(s, task, whitened)
-
-    judgement, last = _judgement(searching, decided, kept, fit_records, alike, (first, before), seed)
-    laws = []
-
+    null, prepared, task = decided.null, evaluation.records, evaluation.searching.task
+    judgement, last = judgement_of(evaluation, decided)
+    first, before = evaluation.of_null
+    laws: list[bases.Law] = []
     if before is not None:
-        best = crossed.at_best(prepared, null.model, null.values, first.theta)[0] if adapt else before
-
-        def alone(model: Hypothesis) -> tuple[judge.Judged, judge.Judged]:
-            if not adapt:
-                errors = own(model, null.values, None)[1]
-                assert errors is not None
-                return errors, before
-            at_best, theta = crossed.at_best(prepared, model, null.values)
-            if bases.is_far(at_best, best, bool(model.catalogue.personal)):
-                return at_best, best
-            values = crossed.values_of(searching.task, null, prepared.runs, fold)
-            return crossed.crossed(prepared, model, values, fold, noise(), theta, whitened=whitened), before
-
-        laws = bases.compared(null.model, before, alone, seed, on_law)
+        laws = bases.compared(null.model, before, evaluation.against_null, evaluation.seed, on_law)
         judgement = judgement.beside(bases.best_of(laws))
     final = judgement.compared if judgement.added and judgement.compared is not None else null
-    judgement = replace(judgement, shared=shared.find(judge.everywhere(prepared, searching.task, final), seed))
-    scored = prepared if kept is None else kept
+    judgement = replace(judgement, shared=shared.find(judge.everywhere(prepared, task, final), evaluation.seed))
+    scored = prepared if evaluation.test is None else evaluation.test
     floor = ceilings.floor(scored, ceilings.drift(trajectories))
-    if adapt and before is not None:
-        pooled = judged(null, searching.task, whitened, True)[1]
+    if evaluation.adapt and before is not None:
+        pooled = evaluation.judged(null, pooled=True)[1]
         judgement = replace(judgement, ladder=judgement.climbed(prepared, pooled, floor["horizon_rmse_m"]))
-    report = summary.report(
-        trajectories, prepared, fit_runs, kept_runs, searching.task, judgement, rounds, refused, [first, last], by
-    )
-    report["prior"] = {
-        "alike_s": decided.stand.task.prior.alike_s, "tried_s": list(decided.stand.rmse_m),
-        "gap_rmse_m": list(decided.stand.rmse_m.values()),
-    }  # fmt: skip
-    report["ceilings"] = ceilings.told(decided.stand, scored, decided.null, rounds[0].smooth_gain)
-    report["error"]["floor"] = floor
-    report["bases"] = bases.rows(laws)
-    for key in ("sentence", "details", "found", "partial"):
-        report[key] = words.of_law(report[key], null.model.catalogue.base.title)
-    of_law = None
-    if judgement.law is not None:
-        of_law = own(judgement.law.model, null.values, None)[0]
-        first_words = words.law_first(judgement.law, null.model.catalogue.base.title, of_law)
-        report["sentence"] = f"{first_words} {report['sentence']}"
-    report["details"] += words.by_use(laws, judgement.law)
-    report["details"] += words.cautions(report["data"]["at_bounds"], len(np.unique(prepared.group)))
+    of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
+    result = summary.summarise(
+        trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor, refused, by,
+        Ceilings(**ceilings.told(decided.stand, scored, null, decided.rounds[0].smooth_gain)),
+    )  # fmt: skip
     # Drivers who adapt are calibrated on parts of the held-out runs too.
-    seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in (prepared if adapt else fit_records).episodes])
+    fit = prepared if evaluation.adapt else task.rows.records
+    seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fit.episodes])
     shown = null if judgement.compared is None else judgement.compared
     pairs = [(null, first), (shown, last)][: len(judgement.titles)]
     if of_law is not None:
@@ -354,73 +292,8 @@ def _finish(
     saved = [replace(corrected(prepared, s, theta.theta, by), fitted_on=seen) for s, theta in pairs]
     models = dict(zip(judgement.names(), saved, strict=True))
     return Discovery(
-        report, models, prepared, null, shown, searching.task, rounds, judgement, places.respond(searching.task, shown)
+        result, models, prepared, null, shown, task, decided.rounds, judgement, places.respond(task, shown)
     )
-
-
-Calibrates = Callable[[Solution, Task], tuple[Solution, judge.Judged | None]]
-"""A model, and what its φ was fitted to → drivers' parameters, and errors by cross-fitting if there are runs for it."""
-
-
-def _judgement(
-    searching: Search, decided: Decided, kept: Records | None, fit_records: Records, calibrates: Calibrates,
-    first: tuple[Solution, judge.Judged | None], seed: int,
-) -> tuple[summary.Judgement, Solution]:  # fmt: skip
-    """Return what the runs kept back say of what was found, and the drivers' parameters beside it."""
-    null, rounds = decided.null, decided.rounds
-    final, refusal = null, rounds[0].refusal
-    confirmed: list[Solution] = []
-    if kept is not None:
-        # The lockbox is looked into once for every addition, and only to end there.
-        for s in decided.steps:
-            if judge.confirmed(kept, searching.task, final, s) <= 0:
-                refusal = Refusal(Reason.LOCKBOX)
-                break
-            final = s
-            confirmed.append(s)
-
-    def judged(s: Solution) -> tuple[Solution, judge.Judged | None]:
-        return calibrates(s, searching.task)
-
-    # Where nothing was added, what came nearest is compared with the null and says what it would have done.
-    added = final is not null
-    nearest_one = None if kept is None or rounds[0].partial is None else rounds[0].scored[rounds[0].partial].solution
-    compared = final if added else nearest_one
-    before = first[1]
-    last, after = first if compared is None else judged(compared)
-    judgement = summary.Judgement(null, compared, added, refusal, before, after, seed)
-    if added and judgement.errors and not judgement.improves:
-        judgement = replace(judgement, added=False, refusal=Refusal(Reason.HELD_OUT))
-        # What the last additions spoil does not speak against the first.
-        for s in reversed(confirmed[:-1]):
-            theta, there = judged(s)
-            fewer = replace(judgement, compared=s, added=True, refusal=None, after=there)
-            if fewer.improves:
-                judgement, compared, last, after = fewer, s, theta, there
-                break
-    if compared is not None and judgement.errors and not judgement.added and added:
-        # The right effect with a strength fitted in windows may be off over minutes: it is fitted by these once more.
-        again, intervals = free.refitted(fit_records, compared)
-        theta, there = calibrates(again, decided.stand.task)
-        other = replace(
-            judgement, compared=free.in_windows(searching.task, again), added=True, refusal=None, after=there,
-            intervals=intervals,
-        )  # fmt: skip
-        if other.improves:
-            judgement, last, after = other, theta, there
-    if decided.joined is not None and before is not None:
-        # What was found in free simulation takes the place of what windows found where it does better there.
-        theta, there = calibrates(decided.joined.solution, decided.stand.task)
-        assert there is not None
-        now = after if judgement.added and after is not None else before
-        if there.summary()["gap_rmse_m"] < now.summary()["gap_rmse_m"]:
-            other = replace(
-                judgement, compared=free.in_windows(searching.task, decided.joined.solution), added=True, refusal=None,
-                after=there, intervals=decided.joined.intervals,
-            )  # fmt: skip
-            if other.improves:
-                judgement, last = other, theta
-    return judgement, last
 
 
 def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:

@@ -8,6 +8,7 @@ from typing import Any
 
 from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import Term
+from idm_env.discovery.result import ParameterEstimate
 from idm_env.discovery.slots import TARGETS
 from idm_env.discovery.words import ALONG, CHANGES
 from idm_env.effects.free import FEATURES, PER
@@ -59,11 +60,11 @@ class {name}(Effect):
 _DEEP: dict[str, Any] = {"initial_indent": 12 * " ", "subsequent_indent": 12 * " "}
 
 
-def source(terms: Sequence[tuple[Term, Mapping[str, Mapping[str, Any]]]], sentence: str) -> str:
+def source(terms: Sequence[tuple[Term, Mapping[str, ParameterEstimate]]], sentence: str) -> str:
     """Return the text of a file with one effect for every curve over a state, "" where there is none.
 
     Args:
-        terms: What was added, and its parameters: estimate, low and high of each by name.
+        terms: What was added, and the estimates of its parameters by name.
         sentence: What is said of it.
     """
     curves = [(t, p) for t, p in terms if t.located and t.form == CURVE and t.fades]
@@ -82,16 +83,16 @@ def _kind(term: Term) -> str:
     return f"{term.what}_over_{term.coordinate}" + (f"_by_{term.by}" if term.by else "")
 
 
-def _class(term: Term, parameters: Mapping[str, Mapping[str, Any]]) -> str:
+def _class(term: Term, parameters: Mapping[str, ParameterEstimate]) -> str:
     first, distance, count = term.drawn
     unit = term.parameters[0].unit
     declared = [
-        f'        Parameter("{p.name}", "{p.symbol}", "{unit}", {parameters[p.name]["estimate"]!r}, {p.low}, {p.high}, '
+        f'        Parameter("{p.name}", "{p.symbol}", "{unit}", {parameters[p.name].estimate!r}, {p.low}, {p.high}, '
         "null=0.0),"
         for p in term.parameters
     ]
     intervals = ", ".join(
-        f"{p.symbol} {parameters[p.name]['low']:.3g} to {parameters[p.name]['high']:.3g}" for p in term.parameters
+        f"{p.symbol} {parameters[p.name].low:.3g} to {parameters[p.name].high:.3g}" for p in term.parameters
     )
     intervals = fill(f"95 % intervals: {intervals}.", 110, initial_indent="    ", subsequent_indent="    ")
     inner = ", ".join(("0.0 * x", *(f'p["{p.name}"]' for p in term.parameters), "0.0 * x"))

@@ -11,7 +11,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from idm_env.discovery import march as twin
 from idm_env.discovery import words
 from idm_env.effects.free import FEATURES
 from idm_env.reports.page import Block, picture
@@ -101,13 +100,16 @@ def ranking(this: Round) -> Figure:
 
 def absorption(d: Discovery) -> Figure | None:
     """Bars of the absorbed share."""
-    rows = [c for c in d.report["candidates"] if c["round"] == 1 and c["named"] and c["absorbed_share"] is not None]
-    if not rows:
+    shares = [
+        (c.absorbed_share, words.plain(c.effect)) for c in d.result.candidates
+        if c.round == 1 and c.named and c.absorbed_share is not None
+    ]  # fmt: skip
+    if not shares:
         return None
-    rows.sort(key=lambda c: c["absorbed_share"])
-    figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.22 * len(rows) + 0.9))
-    axes.barh(range(len(rows)), [100 * c["absorbed_share"] for c in rows], color=GREY)
-    axes.set_yticks(range(len(rows)), [words.plain(c["effect"]) for c in rows])
+    shares.sort(key=lambda x: x[0])
+    figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.22 * len(shares) + 0.9))
+    axes.barh(range(len(shares)), [100 * share for share, _ in shares], color=GREY)
+    axes.set_yticks(range(len(shares)), [name for _, name in shares])
     axes.set_xlim(0, 100)
     axes.set_xlabel("absorbed by re-calibration (%)")
     return figure
@@ -187,21 +189,21 @@ def added_variable(d: Discovery) -> Figure | None:
 def curves(d: Discovery) -> Figure | None:
     """Estimate and interval of every added curve over its coordinate."""
     shown = []
-    for f in d.report["found"]:
-        term = next(t for t in d.judgement.terms if t.label == f["label"])
-        if len(f["parameters"]) > words.MANY:
-            shown.append((term, list(f["parameters"].values())))
+    for f in d.result.found:
+        term = next(t for t in d.judgement.terms if t.label == f.label)
+        if len(f.parameters) > words.MANY:
+            shown.append((term, list(f.parameters.values())))
     if not shown:
         return None
     figure, axes = plt.subplots(len(shown), 1, figsize=(8.0, 2.6 * len(shown)), squeeze=False, layout="constrained")
     for axis, (term, knots) in zip(axes[:, 0], shown, strict=True):
         first, distance, count = term.knots
         x = first + distance * np.arange(count)
-        axis.plot(x, [k["estimate"] for k in knots], color=AFTER, marker=".")
-        axis.fill_between(x, [k["low"] for k in knots], [k["high"] for k in knots], color=AFTER, alpha=0.15)
+        axis.plot(x, [k.estimate for k in knots], color=AFTER, marker=".")
+        axis.fill_between(x, [k.low for k in knots], [k.high for k in knots], color=AFTER, alpha=0.15)
         axis.axhline(0, color=TRUTH, lw=0.5)
         axis.set_xlabel(term.coordinate)
-        axis.set_ylabel(f"{term.what}" + ("" if knots[0]["unit"] == "1" else f" ({knots[0]['unit']})"))
+        axis.set_ylabel(f"{term.what}" + ("" if knots[0].unit == "1" else f" ({knots[0].unit})"))
     return figure
 
 
@@ -277,7 +279,7 @@ def _trace(judged: Judged, follower: int) -> tuple[np.ndarray, ...]:
     for i in np.flatnonzero(judged.follower[rows.record] == follower):
         valid = rows.valid[i]
         at = rows.samples[i][valid]
-        time = rows.records.signals[at, twin.COLUMNS.index("time")]
+        time = rows.records.column("time")[at]
         piece = np.stack([time, rows.records.gap[at], judged.gap[i][valid]])
         pieces += [piece, np.array([[time[-1]], [np.nan], [np.nan]])]
     time, measured, simulated = np.concatenate(pieces, axis=1)

@@ -46,12 +46,16 @@ class Records:
     @cached_property
     def gap(self) -> np.ndarray:
         """Measured gap (m)."""
-        return self.signals[:, 0] - self.signals[:, 14]
+        return self.column("lead_rear") - self.column("position")
 
     @property
     def speed(self) -> np.ndarray:
         """Measured speed (m/s)."""
-        return self.signals[:, 15]
+        return self.column("speed")
+
+    def column(self, name: str) -> np.ndarray:
+        """Return one of ``march.COLUMNS`` [samples]."""
+        return self.signals[:, twin.COLUMNS.index(name)]
 
     def __len__(self) -> int:
         return len(self.episodes)

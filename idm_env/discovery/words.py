@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +12,7 @@ from idm_env.discovery.bases import Law
 from idm_env.discovery.compare import Comparison, ErrorChange
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Strength
+from idm_env.discovery.result import Ceilings, TermFinding, Weight
 from idm_env.discovery.score import Contrast
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Solution
@@ -78,10 +78,10 @@ def told(p: Parameter, estimate: float, low: float, high: float) -> str:
     return f"{p.symbol or p.name} = {number(estimate)}{unit} [{number(low)}, {number(high)}]"
 
 
-def clause(term: Term, values: Sequence[Sequence[float]], contrast: Contrast | None = None) -> str:
+def clause(term: Term, values: Sequence[Sequence[float]], contrast: Contrast | None = None, law: str = "IDM") -> str:
     """Return what drivers do with a term in the model, its equation and its parameters [(estimate, low, high)].
 
-    Of a curve without a name its ``contrast`` is told.
+    Of a curve without a name its ``contrast`` is told. ``law`` is the title of what the term was added to.
     """
     estimates = [v[0] for v in values]
     if len(values) <= MANY:
@@ -94,10 +94,11 @@ def clause(term: Term, values: Sequence[Sequence[float]], contrast: Contrast | N
         effect = ALL[term.effect]
         null = term.parameters[0].null or 0.0
         below, above = effect.wording
-        text = below if len(values) <= MANY and estimates[0] < null else above
+        text = (below if len(values) <= MANY and estimates[0] < null else above) or below
         name = plain(term.effect)
         told_as = f"{name}: {effect.equation}" if effect.equation else name
-        return f"{text or below or f'an effect is missing that {name} describes'} ({told_as}, with {numbers})"
+        text = text.replace("{law}", law) or f"an effect is missing that {name} describes"
+        return f"{text} ({told_as}, with {numbers})"
     below, above, noun, equation = CHANGES[term.what]
     if contrast is not None:
         return f"the {noun} {_contrast(term, estimates, contrast)} ({equation}, with {numbers})"
@@ -141,8 +142,8 @@ def _interval(term: Term, estimates: Sequence[float]) -> str:
     return f"between {estimates[1]:.0f} and {estimates[2]:.0f} {unit}"
 
 
-def reason(refusal: Refusal | None, tried: str = "") -> str:
-    """Say why nothing (more) was added; ``tried`` is the plain name of what came nearest."""
+def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
+    """Say why nothing (more) was added to a ``law``; ``tried`` is the plain name of what came nearest."""
     if refusal is None:
         return ""
     figure = refusal.figure
@@ -159,13 +160,14 @@ def reason(refusal: Refusal | None, tried: str = "") -> str:
             f"a smooth function of the scene takes {refusal.figure:.0%} off the squared error 5 s ahead, "
             "and no candidate does"
         ),
-        Reason.LAW: "another law predicts better than all that was added to IDM",
+        Reason.LAW: f"another law predicts better than all that was added to {law}",
     }[refusal.reason]  # fmt: skip
 
 
 def headline(
     verdict: Verdict, clauses: Sequence[str], refusal: Refusal | None, tried: str, errors: Mapping[str, Comparison],
     shared: Shared | None = None, others: Sequence[str] = (), strengths: Mapping[str, Strength] | None = None,
+    law: str = "IDM",
 ) -> str:  # fmt: skip
     """Say in one sentence what is missing, or why nothing can be said.
 
@@ -178,10 +180,11 @@ def headline(
         shared: What vehicles of one run do alike, told where nothing was added.
         others: Effects that these data do not tell from what was added.
         strengths: What the data say of the strengths of absent effects, by name.
+        law: Title of the law that was to be completed.
     """
     if refusal is not None and refusal.reason is Reason.LAW:
         nearest = f" The nearest was {tried}." if tried else ""
-        return f"No effect added to IDM predicts as well.{nearest}"
+        return f"No effect added to {law} predicts as well.{nearest}"
     if shared is not None and not clauses:
         return common(shared)
     if verdict in (Verdict.NAMED, Verdict.ONE_OF, Verdict.SHAPE, Verdict.LOCATED):
@@ -244,26 +247,25 @@ def _but(errors: Mapping[str, Comparison]) -> str:
     return ""
 
 
-def details(
-    verdict: Verdict, found: Sequence[Mapping[str, Any]], nearest: Sequence[Mapping[str, Any]], left: float
-) -> list[str]:
+def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[TermFinding], left: float) -> list[str]:
     """Say how sure it is, what it is confused with and what data would tell.
 
     ``nearest`` are the terms that came nearest where nothing was added; ``left`` is what could still be gained.
     """
     parts = []
     for f in found:
-        name = plain(f["effect"] or f["label"])
-        parts.append(f"{name[0].upper()}{name[1:]}: p = {number(f['p_value'], 2)} over the whole list of candidates.")
-        if f["equivalent"]:
-            parts.append(f"These data cannot tell it from {', '.join(plain(x) for x in f['equivalent'])}.")
-        rivals = [plain(x) for x in f["rivals"] if x not in f["equivalent"]]
+        parts.append(
+            f"{f.title[0].upper()}{f.title[1:]}: p = {number(f.p_value, 2)} over the whole list of candidates."
+        )
+        if f.equivalent:
+            parts.append(f"These data cannot tell it from {', '.join(plain(x) for x in f.equivalent)}.")
+        rivals = [plain(x) for x in f.rivals if x not in f.equivalent]
         if rivals:
             parts.append(f"Rivals, whose gain is not lower beyond chance: {', '.join(rivals)}.")
-        if f["looks_like"] and not f["equivalent"] and not rivals:
-            parts.append(f"It is most easily confused with {', '.join(spoken(x) for x in f['looks_like'][:3])}.")
-        if f["told_by"]:
-            parts.append(f"What would tell: {f['told_by']}.")
+        if f.looks_like and not f.equivalent and not rivals:
+            parts.append(f"It is most easily confused with {', '.join(spoken(x) for x in f.looks_like[:3])}.")
+        if f.told_by:
+            parts.append(f"What would tell: {f.told_by}.")
     if verdict is Verdict.NONE:
         parts.append(
             f"A smooth function of the state without a name would lower the 5 s error by {100 * max(left, 0.0):.1f} % "
@@ -272,7 +274,7 @@ def details(
     if verdict is Verdict.CANNOT_TELL:
         parts.append("The ranking below is a hint, not a finding.")
     if nearest:
-        parts.append(f"Nearest came, without being added: {', and '.join(f['clause'] for f in nearest)}.")
+        parts.append(f"Nearest came, without being added: {', and '.join(f.clause for f in nearest)}.")
     if verdict is Verdict.UNEXPLAINED:
         parts.append("The ranking and the maps of the residual below say where to look.")
     return parts
@@ -377,45 +379,33 @@ def _of_drivers(drivers: Solution) -> list[str]:
     return told
 
 
-def weight(prior: Mapping[str, Any]) -> str:
+def weight(prior: Weight) -> str:
     """Say how much the population weighs for one driver, and what other weights would have done."""
     tried = ", ".join(
-        f"{number(seconds)} s {number(error)} m"
-        for seconds, error in zip(prior["tried_s"], prior["gap_rmse_m"], strict=True)
+        f"{number(seconds)} s {number(error)} m" for seconds, error in zip(prior.tried_s, prior.gap_rmse_m, strict=True)
     )
     return (
         f"Every driver's parameters are drawn towards the population's. How strongly was chosen before any effect was "
         "tested, by the gap in free simulation of validation runs: errors within "
-        f"{number(prior['alike_s'])} s count as one (tried: {tried})."
+        f"{number(prior.alike_s)} s count as one (tried: {tried})."
     )
 
 
-def ceilings(told: Mapping[str, float | None], before_m: float | None, floor_m: float | None = None) -> str:
+def ceilings(of: Ceilings, before_m: float | None, floor_m: float | None = None) -> str:
     """Say how much of the error could be explained at all, as far as these data tell; sensors leave ``floor_m``."""
-    share, halves, refit = (told[k] for k in ("repeats_share", "time_gap_between_halves", "refitted_gap_rmse_m"))
     parts = []
-    if share is not None:
+    if (share := of.repeats_share) is not None:
         parts.append(f"{100 * share:.0f} % of the gap's squared error repeats in matched situations of other runs")
-    if halves is not None:
+    if (halves := of.time_gap_between_halves) is not None:
         parts.append(f"a driver's time gaps in the first and second half of a record correlate by {number(halves, 2)}")
-    if refit is not None and before_m is not None:
+    if (refit := of.refitted_gap_rmse_m) is not None and before_m is not None:
         parts.append(f"parameters fitted to the test set itself leave {number(refit)} m of {number(before_m)} m")
-    smooth = told.get("smooth_function_gain")
-    if smooth is not None:
+    if (smooth := of.smooth_function_gain) is not None:
         parts.append(f"the best smooth function of the state lowers the error 5 s ahead by {100 * smooth:.1f} %")
     if floor_m is not None:
         parts.append(f"sensor noise alone leaves {number(floor_m, 2)} m")
     text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}." if text else ""
-
-
-def of_law(texts: Any, title: str) -> Any:
-    """Return texts, and what contains them, with the name of another law in the place of IDM's."""
-    if isinstance(texts, str):
-        return re.sub(r"\bIDM\b", title, texts)
-    if isinstance(texts, list):
-        return [of_law(x, title) for x in texts]
-    return {k: of_law(v, title) for k, v in texts.items()} if isinstance(texts, dict) else texts
 
 
 def laws(rows: Sequence[Mapping[str, Any]]) -> str:

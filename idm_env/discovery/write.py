@@ -7,7 +7,6 @@ from pathlib import Path
 from idm_env.discovery.discover import Discovery
 from idm_env.jobs.storage import results, write_json
 from idm_env.model_file import save_model
-from idm_env.reports.page import write_page
 from idm_env.reports.undecided import EXPLAINED, FOUND
 
 
@@ -31,5 +30,5 @@ def write_report(discovery: Discovery, out: str | Path) -> dict[str, Path]:
             save_model(paths[name], model)
         if found_effect:
             paths[FOUND].write_text(found_effect, encoding="utf-8")
-        write_page(paths["report.html"], page.title(discovery), page.blocks(discovery))
+        page.write(paths["report.html"], discovery)
     return paths

@@ -25,8 +25,8 @@ class SpeedDependentGap(Effect):
     title: ClassVar[str] = "speed-dependent gap"
     equation: ClassVar[str] = "s* += s1 √(v/v0)"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers keep shorter gaps at speed than IDM's constant time gap",
-        "drivers keep longer gaps at speed than IDM's constant time gap",
+        "drivers keep shorter gaps at speed than {law}'s constant time gap",
+        "drivers keep longer gaps at speed than {law}'s constant time gap",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("drag", "time_gap")
     told_by: ClassVar[str] = "following at 5 to 30 m/s by one driver tells the gap from drag"
@@ -55,8 +55,8 @@ class LongMemory(Effect):
     title: ClassVar[str] = "memory of congestion"
     equation: ClassVar[str] = "T (1 + β (1 − λ)), τ dλ/dt = v/v0 − λ"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers keep shorter time gaps the longer they have driven slowly, where IDM keeps one",
-        "drivers keep longer time gaps the longer they have driven slowly, where IDM keeps one",
+        "drivers keep shorter time gaps the longer they have driven slowly, where {law} keeps one",
+        "drivers keep longer time gaps the longer they have driven slowly, where {law} keeps one",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("regime_shift", "time_gap")
     told_by: ClassVar[str] = "runs that begin at different times of the day tell memory from a shift of regime"
@@ -91,8 +91,8 @@ class SpeedZone(Effect):
     title: ClassVar[str] = "speed zone"
     equation: ClassVar[str] = "v0 → f v0 between x1 and x2"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers want to go slower in one stretch of the road, where IDM has one desired speed",
-        "drivers want to go faster in one stretch of the road, where IDM has one desired speed",
+        "drivers want to go slower in one stretch of the road, where {law} has one desired speed",
+        "drivers want to go faster in one stretch of the road, where {law} has one desired speed",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("grade", "time_gap over position")
     told_by: ClassVar[str] = "the same place at low and high speed, with and without leader, tells a zone from a grade"
@@ -127,8 +127,8 @@ class RegimeShift(Effect):
     title: ClassVar[str] = "shift of regime"
     equation: ClassVar[str] = "T → T (1 + k) after t*"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers keep shorter time gaps from one moment on, where IDM keeps one",
-        "drivers keep longer time gaps from one moment on, where IDM keeps one",
+        "drivers keep shorter time gaps from one moment on, where {law} keeps one",
+        "drivers keep longer time gaps from one moment on, where {law} keeps one",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("memory", "time_gap over time")
     told_by: ClassVar[str] = "runs with different clock offsets tell a shift of regime from memory"

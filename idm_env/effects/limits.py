@@ -28,8 +28,8 @@ class Asymmetry(Effect):
     title: ClassVar[str] = "asymmetry"
     equation: ClassVar[str] = "a > 0: (1 − k) a, a < 0: (1 + k) a"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers accelerate harder and brake softer than IDM",
-        "drivers accelerate softer and brake harder than IDM",
+        "drivers accelerate harder and brake softer than {law}",
+        "drivers accelerate softer and brake harder than {law}",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("brake_light", "max_accel and comfort_decel together")
     told_by: ClassVar[str] = (
@@ -59,7 +59,7 @@ class ActionPoint(Effect):
     equation: ClassVar[str] = "a is held until the wanted one differs by Δa"
     wording: ClassVar[tuple[str, str]] = (
         "",
-        "drivers hold an acceleration until a clearly different one is wanted, where IDM adjusts all the time",
+        "drivers hold an acceleration until a clearly different one is wanted, where {law} adjusts all the time",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("lag", "leader_acceleration")
     told_by: ClassVar[str] = (
@@ -86,7 +86,7 @@ class PowerLimit(Effect):
     title: ClassVar[str] = "power limit"
     equation: ClassVar[str] = "a ≤ (P/m) / v"
     wording: ClassVar[tuple[str, str]] = (
-        "vehicles accelerate less at high speed than IDM, as an engine's power allows",
+        "vehicles accelerate less at high speed than {law}, as an engine's power allows",
         "",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("drag", "desired_speed")
@@ -126,7 +126,7 @@ class Lag(Effect):
     equation: ClassVar[str] = "τ dA/dt = a − A"
     wording: ClassVar[tuple[str, str]] = (
         "",
-        "vehicles take longer than IDM to reach the acceleration that is wanted",
+        "vehicles take longer than {law} to reach the acceleration that is wanted",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("delay", "leader_acceleration with the other sign")
     told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells lag from delay"

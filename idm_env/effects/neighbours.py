@@ -33,8 +33,8 @@ class SecondLeader(Effect):
     title: ClassVar[str] = "second leader"
     equation: ClassVar[str] = "(1 − w) (s*₁/s₁)² + w (s*₂/(s₂/2))² in place of (s*₁/s₁)²"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers go by their own leader even more than IDM, against what the vehicle ahead of it does",
-        "drivers look past their leader to the vehicle ahead of it, which IDM does not see",
+        "drivers go by their own leader even more than {law}, against what the vehicle ahead of it does",
+        "drivers look past their leader to the vehicle ahead of it, which {law} does not see",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("brake_light", "leader_acceleration", "delay")
     told_by: ClassVar[str] = (
@@ -68,7 +68,7 @@ class LeaderAcceleration(Effect):
     equation: ClassVar[str] = "+ c a_lead"
     wording: ClassVar[tuple[str, str]] = (
         "drivers answer their leader's acceleration with the opposite sign, as late ones do",
-        "drivers follow their leader's acceleration at once, which IDM does not see",
+        "drivers follow their leader's acceleration at once, which {law} does not see",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("delay", "lag", "brake_light", "second_leader")
     told_by: ClassVar[str] = (
@@ -92,8 +92,8 @@ class BrakeLight(Effect):
     title: ClassVar[str] = "brake lights"
     equation: ClassVar[str] = "+ c min(a_lead, 0)"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers brake less than IDM while their leader brakes",
-        "drivers brake as soon as their leader does, which IDM does not see",
+        "drivers brake less than {law} while their leader brakes",
+        "drivers brake as soon as their leader does, which {law} does not see",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("leader_acceleration", "asymmetry", "second_leader")
     told_by: ClassVar[str] = (
@@ -114,8 +114,8 @@ class Follower(Effect):
     title: ClassVar[str] = "pressure from behind"
     equation: ClassVar[str] = "+ c a min(((s0 + v T)/s_behind)², 4)"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers slow down when a vehicle is close behind, which IDM does not see",
-        "drivers speed up when a vehicle is close behind, which IDM does not see",
+        "drivers slow down when a vehicle is close behind, which {law} does not see",
+        "drivers speed up when a vehicle is close behind, which {law} does not see",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("time_gap", "max_accel")
     told_by: ClassVar[str] = "followers that come and go behind one driver tell their pressure from a shorter time gap"
@@ -157,7 +157,7 @@ class Courtesy(Effect):
     equation: ClassVar[str] = "− w min(b, v / 1 s, a max(0, (s*_m/s_m)² − (s*/s)²))"
     wording: ClassVar[tuple[str, str]] = (
         "drivers close up to keep out whoever signals beside them",
-        "drivers let in whoever signals beside them, which IDM does not see",
+        "drivers let in whoever signals beside them, which {law} does not see",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("second_leader", "lateral", "time_gap")
     told_by: ClassVar[str] = "gaps that open beside a vehicle that wants in, while one's own leader keeps his speed"
@@ -190,8 +190,8 @@ class Lateral(Effect):
     title: ClassVar[str] = "friction with the adjacent lane"
     equation: ClassVar[str] = "− c max(v − v_adjacent, 0) exp(−|dx| / 25 m)"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers speed up beside a slower lane, which IDM does not see",
-        "drivers slow down beside a slower lane, which IDM does not see",
+        "drivers speed up beside a slower lane, which {law} does not see",
+        "drivers slow down beside a slower lane, which {law} does not see",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("desired_speed", "drag")
     told_by: ClassVar[str] = "free driving beside empty and beside slow lanes tells friction from a lower desired speed"

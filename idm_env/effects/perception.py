@@ -26,10 +26,10 @@ class Delay(Effect):
     sources: ClassVar[tuple[str, ...]] = (references.TREIBER_2006,)
     rank: ClassVar[int] = -10
     title: ClassVar[str] = "reaction delay"
-    equation: ClassVar[str] = "all that IDM sees is taken at t − τ"
+    equation: ClassVar[str] = "all that is seen is taken at t − τ"
     wording: ClassVar[tuple[str, str]] = (
         "",
-        "drivers react later than IDM",
+        "drivers react later than {law}",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("lag", "leader_acceleration with the other sign")
     told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells delay from lag"
@@ -68,7 +68,7 @@ class DeadZone(Effect):
     equation: ClassVar[str] = "Δv is seen as 0 while 1.8 |Δv| / s² < θ"
     wording: ClassVar[tuple[str, str]] = (
         "",
-        "drivers do not notice the small closing speeds that IDM reacts to",
+        "drivers do not notice the small closing speeds that {law} reacts to",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel", "action_point")
     told_by: ClassVar[str] = "slow approaches at long gaps tell a threshold from softer braking"
@@ -101,8 +101,8 @@ class ClosingGain(Effect):
     title: ClassVar[str] = "gain on the closing speed"
     equation: ClassVar[str] = "Δv is seen as k Δv"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers answer to closing speeds less than IDM",
-        "drivers answer to closing speeds more than IDM",
+        "drivers answer to closing speeds less than {law}",
+        "drivers answer to closing speeds more than {law}",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("comfort_decel",)
     told_by: ClassVar[str] = "nothing within the bounds of b tells it from the comfortable deceleration"

@@ -27,8 +27,8 @@ class SpeedProfile(Effect):
     title: ClassVar[str] = "desired speed by place"
     equation: ClassVar[str] = "v0 → v0 (1 + c(x))"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers want to go slower at some places of the road, where IDM has one desired speed",
-        "drivers want to go faster at some places of the road than at others, where IDM has one desired speed",
+        "drivers want to go slower at some places of the road, where {law} has one desired speed",
+        "drivers want to go faster at some places of the road than at others, where {law} has one desired speed",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("speed_zone", "grade", "time_gap over position")
     told_by: ClassVar[str] = (
@@ -77,7 +77,7 @@ class CurveSpeed(Effect):
     title: ClassVar[str] = "speed in bends"
     equation: ClassVar[str] = "v0 → min(v0, √(a_lat / |κ(x)|))"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers go through bends no faster than a lateral acceleration allows, where IDM has one desired speed",
+        "drivers go through bends no faster than a lateral acceleration allows, where {law} has one desired speed",
         "",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("speed_profile", "speed_zone", "grade")

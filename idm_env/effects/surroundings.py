@@ -30,8 +30,8 @@ class Grade(Effect):
     title: ClassVar[str] = "slope of the road"
     equation: ClassVar[str] = "− g sin(arctan(slope(x)))"
     wording: ClassVar[tuple[str, str]] = (
-        "vehicles go faster uphill and slower downhill, which IDM does not know",
-        "vehicles are held back uphill and pushed on downhill, which IDM does not know",
+        "vehicles go faster uphill and slower downhill, which {law} does not know",
+        "vehicles are held back uphill and pushed on downhill, which {law} does not know",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("speed_zone", "time_gap over position")
     told_by: ClassVar[str] = (
@@ -76,8 +76,8 @@ class Drag(Effect):
     title: ClassVar[str] = "drag"
     equation: ClassVar[str] = "− c v²"
     wording: ClassVar[tuple[str, str]] = (
-        "vehicles are pushed on by the square of their speed, beyond IDM",
-        "vehicles are held back by the square of their speed, beyond IDM",
+        "vehicles are pushed on by the square of their speed, beyond {law}",
+        "vehicles are held back by the square of their speed, beyond {law}",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("speed_dependent_gap", "power_limit", "desired_speed")
     told_by: ClassVar[str] = "free starts from standstill to above 25 m/s tell drag from v0 and power"

@@ -29,8 +29,8 @@ class SpeedTimeGap(Effect):
     title: ClassVar[str] = "speed-dependent time gap"
     equation: ClassVar[str] = "T → T (1 + k (v / (20 m/s) − 1))"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers keep shorter time gaps the faster they go, where IDM keeps one",
-        "drivers keep longer time gaps the faster they go, where IDM keeps one",
+        "drivers keep shorter time gaps the faster they go, where {law} keeps one",
+        "drivers keep longer time gaps the faster they go, where {law} keeps one",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("speed_dependent_gap", "drag", "min_gap and time_gap together")
     told_by: ClassVar[str] = "following at 5 to 35 m/s by one driver tells a line over speed from a root and from drag"
@@ -64,8 +64,8 @@ class SetPointAsymmetry(Effect):
     title: ClassVar[str] = "asymmetric time gap"
     equation: ClassVar[str] = "T → T (1 + k a_lead / √(a_lead² + 0.09 m²/s⁴))"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers keep shorter time gaps behind accelerating leaders than behind braking ones, where IDM keeps one",
-        "drivers keep longer time gaps behind accelerating leaders than behind braking ones, where IDM keeps one",
+        "drivers keep shorter time gaps behind accelerating leaders than behind braking ones, where {law} keeps one",
+        "drivers keep longer time gaps behind accelerating leaders than behind braking ones, where {law} keeps one",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("leader_acceleration", "asymmetry", "brake_light")
     told_by: ClassVar[str] = (
@@ -106,7 +106,7 @@ class Relaxation(Effect):
     equation: ClassVar[str] = "T → T (1 + β (m − 1)), τ dm/dt = s √(1 − (v/v0)⁴) / (s0 + v T) − m"
     wording: ClassVar[tuple[str, str]] = (
         "",
-        "drivers accept the time gap that they have had for a while and return to their own slowly, where IDM goes "
+        "drivers accept the time gap that they have had for a while and return to their own slowly, where {law} goes "
         "back to it at once",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("memory", "regime_shift", "max_accel")
@@ -161,8 +161,8 @@ class GapStiffness(Effect):
     title: ClassVar[str] = "stiffness of the pull to one's own gap"
     equation: ClassVar[str] = "s* → s* (s/s_e)^(1 − w), s_e = (s0 + v T)/√(1 − (v/v0)⁴)"
     wording: ClassVar[tuple[str, str]] = (
-        "drivers pull back to their own gap less hard than IDM",
-        "drivers pull back to their own gap harder than IDM",
+        "drivers pull back to their own gap less hard than {law}",
+        "drivers pull back to their own gap harder than {law}",
     )
     looks_like: ClassVar[tuple[str, ...]] = ("relaxation", "max_accel", "comfort_decel")
     told_by: ClassVar[str] = "gaps far from the usual one at steady speeds, closing and opening, tell it from a and b"

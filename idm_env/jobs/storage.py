@@ -21,6 +21,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import quote
@@ -86,7 +87,15 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: NaN and infinities are null."""
+    """Return a value as JSON can hold it: NaN and infinities are null, numpy's arrays and numbers Python's.
+
+    Of a dataclass the fields; one whose default is None is left out where it is None.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        items = [(f, getattr(value, f.name)) for f in fields(value)]
+        return {f.name: plain(x) for f, x in items if x is not None or f.default is not None}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -6,7 +6,7 @@ import base64
 import io
 import platform
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -173,12 +173,25 @@ def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (9.0, 3.
     return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
 
 
-def write_page(path: Path, title: str, blocks: Iterable[Block]) -> None:
-    """Write a self-contained HTML page."""
-    from jinja2 import Environment
+def write_page(
+    path: Path,
+    title: str,
+    blocks: Iterable[Block] = (),
+    template: Path | None = None,
+    filters: Mapping[str, Callable[..., str]] | None = None,
+    **content: Any,
+) -> None:
+    """Write a self-contained HTML page of blocks, or of a ``template`` that extends ``page.html``, with its content."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-    page = Environment(autoescape=True).from_string(template).render(title=title, blocks=list(blocks))
+    here = Path(__file__).with_name("page.html")
+    template = template or here
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, extensions=["jinja2.ext.do"],
+        loader=FileSystemLoader([here.parent, template.parent]),
+    )  # fmt: skip
+    environment.filters |= filters or {}
+    page = environment.get_template(template.name).render(title=title, blocks=list(blocks), **content)
     write_text(path, page)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -16,11 +17,12 @@ from idm_env.discovery import model as terms
 from idm_env.discovery.bases import Law, best_of
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.compare import ERRORS, Comparison, ErrorChange
+from idm_env.discovery.judgement import Judgement
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.power import Strength
 from idm_env.discovery.records import gather
-from idm_env.discovery.summary import Judgement
+from idm_env.discovery.shared import Shared
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
 from idm_env.effects import ALL, CANDIDATES, base_named
 
@@ -156,7 +158,9 @@ def test_every_effect_is_told_with_equation_and_sign(name: str) -> None:
         values = [(side, side, side)] + [(p.default,) * 3 for p in term.parameters[1:]]
         if text and cls.sought != "profile":
             told = words.clause(term, values)
-            assert told.startswith(text) and cls.equation in told and f"{strength.symbol} = " in told
+            assert told.startswith(text.replace("{law}", "IDM"))
+            assert cls.equation in told and f"{strength.symbol} = " in told
+            assert "IDM" not in words.clause(term, values, law="Gipps' model"), "the law that is completed"
 
 
 def test_what_is_located_is_told_with_place_and_sign() -> None:
@@ -300,25 +304,21 @@ def test_nothing_is_excluded_by_an_interval_that_power_contradicts() -> None:
 
 def test_ceilings_are_told_with_the_smooth_function_and_the_sensors(lag: Discovery) -> None:
     """A hidden lag of 0.5 s is much of the error of IDM's predictions, so a smooth function takes much of it, too."""
-    told = lag.report["ceilings"]
-    assert 0.05 < told["smooth_function_gain"] < 1.0
-    text = words.ceilings(told, lag.report["error"]["before"]["gap_rmse_m"], lag.report["error"]["floor"]["gap_rmse_m"])
-    assert (
-        f"error 5 s ahead by {100 * told['smooth_function_gain']:.1f} %" in text
-        and "sensor noise alone leaves 0.0" in text
-    )
+    gain, error = lag.result.ceilings.smooth_function_gain, lag.result.error
+    assert gain is not None and 0.05 < gain < 1.0 and error.before is not None
+    text = words.ceilings(lag.result.ceilings, error.before["gap_rmse_m"], error.floor["gap_rmse_m"])
+    assert f"error 5 s ahead by {100 * gain:.1f} %" in text and "sensor noise alone leaves 0.0" in text
 
 
 def test_what_is_not_compared_has_cards_all_the_same() -> None:
     """Where it lies and how much it is, or what to do: on the first screen, of every verdict without a second model."""
-    data = {"runs": 4, "runs_to_choose_on": 3}
-    error = {"before": {"gap_rmse_m": 2.0}, "floor": {"gap_rmse_m": 0.5}}
-    shared = {"run": "a", "vehicles": 3, "begin_s": 10.0, "end_s": 20.0, "accel_mps2": -0.4}
-    for told, common, names in (("cannot_tell", None, ["Runs", "What to do"]),
+    data = SimpleNamespace(runs=4, runs_to_choose_on=3)
+    error = SimpleNamespace(before={"gap_rmse_m": 2.0}, floor={"gap_rmse_m": 0.5})
+    shared = Shared("a", 10.0, 20.0, -0.4, 3, 0.001)
+    for said, common, names in (("cannot_tell", None, ["Runs", "What to do"]),
                                    ("located", shared, ["Runs", "Where", "How much"])):  # fmt: skip
-        cards = page.known_instead(
-            {"verdict": told, "data": data, "shared": common, "error": error, "helps": {}}, "IDM"
-        )
-        assert [name for name, _ in cards] == [*names, "Gap in free simulation, IDM"]
-        assert all(card for _, card in cards) and "2 m on the test set" in cards[-1][1]
-    assert cards[1][1] == "run a, 10 to 20 s, 3 followers"
+        result = SimpleNamespace(verdict=said, data=data, shared=common, error=error, helps={})
+        cards = page.cards(result, "IDM")  # type: ignore[arg-type]
+        assert [name for name, _, _ in cards] == [*names, "Gap in free simulation, IDM"]
+        assert all(card for _, _, card in cards) and "2 m on the test set" in cards[-1][2]
+    assert cards[1][2] == "run a, 10 to 20 s, 3 followers"

@@ -11,6 +11,7 @@ from idm_env.discovery import free, judge, words
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
+from idm_env.discovery.result import Weight
 from idm_env.discovery.search import first_noise
 from idm_env.discovery.solve import Solution, Task, solve
 
@@ -59,5 +60,5 @@ def test_long_clean_records_of_unlike_drivers_speak_for_themselves() -> None:
 
 
 def test_the_weight_is_told() -> None:
-    told = words.weight({"alike_s": 50.0, "tried_s": (5.0, 50.0), "gap_rmse_m": (5.04, 3.82)})
+    told = words.weight(Weight(50.0, (5.0, 50.0), (5.04, 3.82)))
     assert "errors within 50 s count as one (tried: 5 s 5.04 m, 50 s 3.82 m)" in told

@@ -1,0 +1,262 @@
+"""What the test set says: how every model is calibrated and judged alike, and what of the additions holds there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from idm_env.discovery import bases, calibrate, crossed, free, judge, words
+from idm_env.discovery import ladder as ladders
+from idm_env.discovery.compare import Comparison, compare
+from idm_env.discovery.ladder import Ladder
+from idm_env.discovery.model import Hypothesis, Term
+from idm_env.discovery.records import Records
+from idm_env.discovery.search import Search
+from idm_env.discovery.selection import Decided
+from idm_env.discovery.shared import Shared
+from idm_env.discovery.solve import Solution, Task
+from idm_env.discovery.verdict import Reason, Refusal, improves, mean_ratio
+
+Calibration = tuple[Solution, judge.Judged | None]
+"""Parameters of all drivers, and errors on the test set where there is one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Two models on the runs kept back: IDM, and IDM with what was added, or with what came nearest to that.
+
+    ``refusal`` says why nothing (more) was added; ``compared`` is None where nothing came near.
+    """
+
+    null: Solution
+    compared: Solution | None
+    added: bool
+    refusal: Refusal | None
+    before: judge.Judged | None
+    after: judge.Judged | None
+    seed: int
+    intervals: np.ndarray | None = None
+    """Estimates of φ with their intervals [Q, 3], where they are not those of predictions in windows."""
+    shared: Shared | None = None
+    """What vehicles of one run do alike, beyond the model."""
+    law: bases.Law | None = None
+    """A law that predicts better than the null, and than what was added to it."""
+    ladder: Ladder | None = None
+    """What is left of predictions 5 s ahead, rung by rung, where every run is held out once."""
+
+    @cached_property
+    def errors(self) -> dict[str, Comparison]:
+        """How the errors on runs kept back changed; empty where nothing can be compared."""
+        if self.compared is None or self.before is None or self.after is None:
+            return {}
+        return compare(self.before, self.after, self.seed)
+
+    @property
+    def mean_ratio(self) -> float:
+        """Geometric mean of the ratios of errors on runs kept back, compared model / null; 1 where there is none."""
+        return mean_ratio(self.errors)
+
+    @property
+    def corrected_is_best(self) -> bool:
+        """Whether the compared model predicts better than the null."""
+        return self.mean_ratio < 1.0
+
+    @property
+    def improves(self) -> bool:
+        """Whether the compared model may be called better than the null."""
+        if self.before is None or self.after is None:
+            return False
+        return improves(self.errors)
+
+    def beside(self, best: bases.Law) -> Judgement:
+        """Return the judgement beside the best law: where that is better than an addition, nothing is added.
+
+        What takes an addition's place must hold against it as it had to hold against the null.
+        """
+        if not best.against:
+            return self
+        if self.added and self.after is not None and not improves(compare(self.after, best.errors, self.seed)):
+            return self
+        if self.refusal is not None and self.refusal.reason is Reason.FEW_RUNS:
+            return replace(self, law=best)
+        return replace(self, law=best, added=False, refusal=Refusal(Reason.LAW))
+
+    def climbed(self, records: Records, pooled: judge.Judged | None, floor_m: float) -> Ladder:
+        """Return the ladder, from the ``pooled`` null to what sensors alone leave 5 s ahead (m)."""
+        assert self.before is not None and pooled is not None
+        models = {"one set of parameters for all": pooled, (own := "parameters of every driver"): self.before}
+        last = own
+        if self.law is not None:
+            models[last := self.law.title] = self.law.errors
+        elif self.added and self.after is not None:
+            models[last := f"with {self.tried}"] = self.after
+        return ladders.climb(records, models, own, last, floor_m, self.seed)
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """What the compared model has more than the null."""
+        return () if self.compared is None else self.compared.model.terms[len(self.null.model.terms) :]
+
+    @property
+    def tried(self) -> str:
+        """Plain names of ``terms``."""
+        return " and ".join(words.plain(t.effect or t.label) for t in self.terms)
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """Plain names of the models: the null and, where there is one, the model beside it."""
+        known = [words.plain(t.effect or t.label) for t in self.null.model.terms]
+        lists = [known] if self.compared is None else [known, [*known, self.tried]]
+        law = self.null.model.catalogue.base.title
+        return tuple(" with ".join([law, *([" and ".join(names)] if names else [])]) for names in lists)
+
+    def names(self) -> dict[str, str]:
+        """Return which model every file holds: the law alone, then the model beside it, then another law.
+
+        ``model.yaml`` is the one that predicts best on the runs kept back.
+        """
+        if self.law is not None:
+            files = ("model_idm.yaml", *(["model_corrected.yaml"] if self.compared is not None else []), "model.yaml")
+            return dict(zip(files, (*self.titles, self.law.title), strict=True))
+        if self.compared is None:
+            return {"model.yaml": self.titles[0]}
+        files = ("model_idm.yaml", "model.yaml") if self.corrected_is_best else ("model.yaml", "model_corrected.yaml")
+        return dict(zip(files, self.titles, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """One way to calibrate and to judge the ``null``, what is added and other laws: better calibrated looks better.
+
+    ``test`` are the runs of the test set, None where there are too few. Drivers who ``adapt`` have parameters of their
+    own; their errors are those of cross-fitting, in which every run of ``records`` is held out once.
+    """
+
+    searching: Search
+    null: Solution
+    records: Records
+    test: Records | None
+    adapt: bool
+    seed: int
+
+    @cached_property
+    def _fold(self) -> np.ndarray:
+        return crossed.folds_of(self.records.runs, () if self.test is None else self.test.runs, self.seed)
+
+    @cached_property
+    def of_null(self) -> Calibration:
+        """Calibration of the null, which says how predictions 5 s ahead of every other model are calibrated."""
+        return self._judged(self.null, self.searching.task, None)
+
+    @cached_property
+    def _null_at_best(self) -> judge.Judged:
+        return crossed.at_best(self.records, self.null.model, self.null.values, self.of_null[0].theta)[0]
+
+    def calibrated(self, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibration:
+        """Return a model with values [Q], calibrated from log θ [G, P]; errors only where drivers do not adapt."""
+        fit = self.searching.calibrated(model, values, start)
+        test = None if self.adapt else self.test
+        return calibrate.judged(fit, self.searching.task.rows.records, test, self.records, self.adapt)
+
+    def _judged(self, s: Solution, task: Task, whitened: bool | None, pooled: bool = False) -> Calibration:
+        theta, errors = self.calibrated(s.model, s.values, s.theta)
+        if self.adapt and self.test is not None:
+            values = crossed.values_of(task, s, self.records.runs, self._fold)
+            errors = self._crossed(s.model, values, theta.theta, whitened, pooled)
+        return theta, errors
+
+    def _crossed(
+        self, model: Hypothesis, values: np.ndarray, theta: np.ndarray, whitened: bool | None, pooled: bool = False
+    ) -> judge.Judged:
+        noise = self.searching.task.noise
+        assert noise is not None
+        return crossed.crossed(self.records, model, values, self._fold, noise, theta, pooled, whitened)
+
+    def judged(self, s: Solution, task: Task | None = None, pooled: bool = False) -> Calibration:
+        """Return the calibration of a model; ``task`` is what φ was fitted to, if not predictions in windows.
+
+        With ``pooled`` all drivers have one set of parameters.
+        """
+        before = self.of_null[1]
+        return self._judged(s, task or self.searching.task, None if before is None else before.whitened, pooled)
+
+    def against_null(self, model: Hypothesis) -> tuple[judge.Judged, judge.Judged]:
+        """Return the errors of another law, and those of the null that they are compared with (see ``bases``)."""
+        before = self.of_null[1]
+        assert before is not None
+        if not self.adapt:
+            errors = self.calibrated(model, self.null.values)[1]
+            assert errors is not None
+            return errors, before
+        at_best, theta = crossed.at_best(self.records, model, self.null.values)
+        if bases.is_far(at_best, self._null_at_best, bool(model.catalogue.personal)):
+            return at_best, self._null_at_best
+        values = crossed.values_of(self.searching.task, self.null, self.records.runs, self._fold)
+        return self._crossed(model, values, theta, before.whitened), before
+
+
+def judgement_of(evaluation: Evaluation, decided: Decided) -> tuple[Judgement, Solution]:
+    """Return what the test set says of what was decided, and the drivers' parameters beside what is compared."""
+    null, rounds, last = decided.null, decided.rounds, evaluation.of_null[0]
+    confirmed, refusal = _confirmed(evaluation, decided)
+    # Where nothing was added, what came nearest is compared with the null and says what it would have done.
+    nearest = rounds[0].partial if evaluation.test is not None else None
+    compared = confirmed[-1] if confirmed else None if nearest is None else rounds[0].scored[nearest].solution
+    before = after = evaluation.of_null[1]
+    if compared is not None:
+        last, after = evaluation.judged(compared)
+    judgement = Judgement(null, compared, bool(confirmed), refusal, before, after, evaluation.seed)
+    if judgement.added and judgement.errors and not judgement.improves:
+        judgement = replace(judgement, added=False, refusal=Refusal(Reason.HELD_OUT))
+        # What the last additions spoil does not speak against the first.
+        for s in reversed(confirmed[:-1]):
+            theta, errors = evaluation.judged(s)
+            fewer = replace(judgement, compared=s, added=True, refusal=None, after=errors)
+            if fewer.improves:
+                judgement, compared, last = fewer, s, theta
+                break
+        if not judgement.added and compared is not None:
+            # The right effect with a strength fitted in windows may be off over minutes: these fit it once more.
+            again, intervals = free.refitted(evaluation.searching.task.rows.records, compared)
+            theta, after = evaluation.judged(again, decided.stand.task)
+            other = _in_closed_loop(judgement, evaluation, again, intervals, after)
+            if other.improves:
+                judgement, last = other, theta
+    if decided.joined is not None and before is not None:
+        # What was found in closed loop takes the place of what windows found where it does better there.
+        joined = decided.joined
+        theta, after = evaluation.judged(joined.solution, decided.stand.task)
+        now = judgement.after if judgement.added and judgement.after is not None else before
+        assert after is not None
+        if after.summary()["gap_rmse_m"] < now.summary()["gap_rmse_m"]:
+            other = _in_closed_loop(judgement, evaluation, joined.solution, joined.intervals, after)
+            if other.improves:
+                judgement, last = other, theta
+    return judgement, last
+
+
+def _confirmed(evaluation: Evaluation, decided: Decided) -> tuple[list[Solution], Refusal | None]:
+    """Return the additions that the test set confirms, and why no more.
+
+    It is looked into once for every addition, and only to end there.
+    """
+    confirmed: list[Solution] = []
+    test = evaluation.test
+    if test is None:
+        return confirmed, decided.rounds[0].refusal
+    for s in decided.steps:
+        final = confirmed[-1] if confirmed else decided.null
+        if judge.confirmed(test, evaluation.searching.task, final, s) <= 0:
+            return confirmed, Refusal(Reason.LOCKBOX)
+        confirmed.append(s)
+    return confirmed, decided.rounds[0].refusal
+
+
+def _in_closed_loop(
+    judgement: Judgement, evaluation: Evaluation, s: Solution, intervals: np.ndarray, after: judge.Judged | None
+) -> Judgement:
+    """Return the judgement of what was fitted in closed loop, with its intervals [Q, 3] and errors."""
+    compared = free.in_windows(evaluation.searching.task, s)
+    return replace(judgement, compared=compared, added=True, refusal=None, after=after, intervals=intervals)
