@@ -38,11 +38,46 @@ def asked_of_make() -> int | None:
     return getattr(frame.get("env_spec"), LIMIT, None) if limit is None else limit
 
 
-class Face:
-    """Mixin: a ``spec`` that says after how many steps episodes are cut off, and what gradients go through."""
+class Pictures:
+    """Mixin: pictures of a batch's environments, and windows that go with their face."""
 
     task: Task
     batch: Batch
+    render_mode: str | None
+    _viewers: tuple[Any, ...] = ()
+
+    def _pictures(self, count: int) -> list[np.ndarray | None]:
+        """Return pictures of the first environments (``rgb_array``), or show them (``human``, and no ``render_mode``).
+
+        RuntimeError before ``reset``.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array'.")
+            return [None] * count
+        if not self.batch.begun:
+            raise RuntimeError("there is nothing to see before reset. Call reset() first.")
+        from idm_env.envs.render import Viewer
+
+        fps = max(1, round(1.0 / self.task.step_time))
+        missing = range(len(self._viewers), count)
+        self._viewers = (*self._viewers, *(Viewer(self.render_mode, fps) for _ in missing))
+        state, params = self.batch.glance().state, self.batch.episode_params()
+        return [viewer.show(self.task, state, row, params) for row, viewer in enumerate(self._viewers[:count])]
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the windows, if there are any."""
+        for viewer in self._viewers:
+            viewer.close()
+        self._viewers = ()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the windows: everything else can be pickled."""
+        return {**self.__dict__, "_viewers": ()}
+
+
+class Face(Pictures):
+    """Mixin: a ``spec`` that says after how many steps episodes are cut off, and what gradients go through."""
+
     _spec: EnvSpec | None = None
 
     @property
@@ -159,7 +194,6 @@ class DiffIDMEnv(Face, gymnasium.Env):
         self._shape = (agents * len(self.task.commands),)
         self.action_space = action_space(self.task, agents)
         self._numpy = own.output == "numpy"
-        self._viewer: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for ``seed`` and ``options``."""
@@ -190,26 +224,10 @@ class DiffIDMEnv(Face, gymnasium.Env):
         flat = observation.reshape(-1)
         return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
-    # -- pictures ------------------------------------------------------------------------------------------------
-
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """Return a picture (``rgb_array``), or show it (``human``)."""
-        if self.render_mode is None:
-            gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array' to make.")
-            return None
-        from idm_env.envs.render import Viewer
-
-        if self._viewer is None:
-            self._viewer = Viewer(self.render_mode, self.metadata["render_fps"])
-        picture: np.ndarray | None = self._viewer.show(self.task, self.state, 0, self.batch.episode_params())
-        return picture
+        """Return a picture (``rgb_array``), or show it (``human``). RuntimeError before ``reset``."""
+        return self._pictures(1)[0]
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the window: everything else can be pickled."""
-        return {**self.__dict__, "_viewer": None}
+        self.close_extras()

@@ -21,6 +21,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from idm_env.envs.batch import Batch, Outcome
+from idm_env.envs.gym import Pictures
 from idm_env.envs.info import ids
 from idm_env.envs.settings import RENDER_MODES, settings
 from idm_env.envs.spaces import action_space, continuous, numpy_dtype, observation_box
@@ -29,7 +30,7 @@ from idm_env.validation import shown
 _SPEED_SCALE, _GAP_SCALE, _FARTHEST = 30.0, 100.0, 1000.0
 
 
-class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (PettingZoo's name)
+class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (PettingZoo's name)
     """All agents step at once: agent ``vehicle_i`` commands vehicle i.
 
     An agent that has terminated or been truncated leaves ``agents``, and its vehicle goes back to its driver. Where
@@ -69,7 +70,6 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
         low = np.repeat(np.array([0.0, -1.0], kind), n)
         high = np.repeat(np.array([10.0, _FARTHEST / _GAP_SCALE], kind), n)
         self.state_space = Box(low, high, dtype=kind)
-        self._viewer: Any = None
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Return the space of an agent's observations: the same object at every call."""
@@ -205,28 +205,11 @@ class parallel_env(ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa: N801  (Pe
 
     def render(self) -> np.ndarray | None:
         """Return a picture (``rgb_array``), or show it (``human``). RuntimeError before ``reset``."""
-        if self.render_mode is None:
-            gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array'.")
-            return None
-        from idm_env.envs.render import Viewer
-
-        if self._viewer is None:
-            self._viewer = Viewer(self.render_mode, max(1, round(1.0 / self.task.step_time)))
-        if not self.batch.begun:
-            raise RuntimeError("there is nothing to see before reset. Call reset() first.")
-        state, params = self.batch.glance().state, self.batch.episode_params()
-        picture: np.ndarray | None = self._viewer.show(self.task, state, 0, params)
-        return picture
+        return self._pictures(1)[0]
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the window: everything else can be pickled."""
-        return {**self.__dict__, "_viewer": None}
+        self.close_extras()
 
 
 def raw_env(**keywords: Any) -> Any:

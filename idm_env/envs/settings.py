@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any, Literal, cast
 
 import torch
@@ -24,19 +25,6 @@ INFO = (
     "queued", "inside", "outflow", "ramp", "standing", "co2", "travel",
     "stops",
 )  # fmt: skip
-KEYWORDS = (
-    "task",
-    "config",
-    "output",
-    "device",
-    "dtype",
-    "autoreset_mode",
-    "render_mode",
-    "max_episode_steps",
-    "info",
-    "num_envs",
-    "trusted",
-)
 TENSORS, SPACES, ROW_BYTES = 25, 8, 400
 """Memory of one environment: tensors per vehicle, arrays per observed feature, and bytes besides, as measured."""
 _MODES = {"NextStep": AutoresetMode.NEXT_STEP, "SameStep": AutoresetMode.SAME_STEP, "Disabled": AutoresetMode.DISABLED}
@@ -123,6 +111,10 @@ def settings(
     )
     affordable(result, 1)
     return result
+
+
+KEYWORDS = (*(name for name in signature(settings).parameters if name != "choices"), "num_envs")
+"""Keywords of environments that are none of their tasks'."""
 
 
 def _mode(value: Any) -> AutoresetMode:

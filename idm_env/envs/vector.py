@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -46,7 +45,6 @@ class DiffIDMVectorEnv(Face, VectorEnv):
     }
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **keywords: Any) -> None:
-        self._viewers: list[Any] = []  # before anything can fail: Gymnasium 1.1 closes what was never made, too
         own = settings(render_mode=render_mode, **keywords)
         self.settings = own
         self.task = own.task
@@ -185,28 +183,10 @@ class DiffIDMVectorEnv(Face, VectorEnv):
         flat = observation.reshape(self.num_envs, -1)
         return flat.detach().cpu().numpy() if self._numpy and isinstance(flat, Tensor) else flat
 
-    # -- pictures ------------------------------------------------------------------------------------------------
-
     def render(self) -> Any:
-        """Return a picture of every environment (``rgb_array``), or show the first one (``human``)."""
-        if self.render_mode is None:
-            gymnasium.logger.warn("render was called without a render_mode. Pass render_mode='rgb_array' to make_vec.")
-            return None
-        from idm_env.envs.render import Viewer
+        """Return a picture of every environment (``rgb_array``), or show the first one (``human``).
 
-        shown = self.num_envs if self.render_mode == "rgb_array" else 1
-        while len(self._viewers) < shown:
-            self._viewers.append(Viewer(self.render_mode, self.metadata["render_fps"]))
-        params, viewers = self.batch.episode_params(), enumerate(self._viewers[:shown])
-        pictures = [viewer.show(self.task, self.state, row, params) for row, viewer in viewers]
+        RuntimeError before ``reset``.
+        """
+        pictures = self._pictures(self.num_envs if self.render_mode == "rgb_array" else 1)
         return tuple(pictures) if self.render_mode == "rgb_array" else None
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the windows, if there are any."""
-        for viewer in self._viewers:
-            viewer.close()
-        self._viewers = []
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the windows: everything else can be pickled."""
-        return {**self.__dict__, "_viewers": []}
