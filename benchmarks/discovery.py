@@ -173,18 +173,12 @@ def oracle(found: Any, truth: Any) -> float | None:
 
     model, values = terms.Hypothesis(), []
     for name, strength in truth.effects.items():
-        if name == "grade":
-            place = found.records.signals[:, 18]
-            first, count = float(place.min()), 60
-            distance = float(np.ptp(place)) / (count - 1)
-            term = terms.unknown_profile("grade", first, distance, count, 0.0)
-            values += hidden.slope(first + distance * np.arange(count), strength).tolist()
-        elif name == "speed_profile":
-            place = found.records.signals[:, 18]
-            first, count = float(place.min()), 60
-            distance = float(np.ptp(place)) / (count - 1)
-            term = terms.unknown_profile("speed_profile", first, distance, count, 0.0)
-            values += (hidden.dips(first + distance * np.arange(count), strength) - 1.0).tolist()
+        if name in ("grade", "speed_profile"):
+            place, count = found.records.signals[:, 18], 60
+            first, distance = float(place.min()), float(np.ptp(place)) / (count - 1)
+            term = terms.unknown_profile(name, first, distance, count, 0.0)
+            profile = hidden.slope if name == "grade" else lambda x, by: hidden.dips(x, by) - 1.0
+            values += profile(first + distance * np.arange(count), strength).tolist()
         elif name == "curve_speed":
             term = terms.given_profile(found.final.model.catalogue.by_name[name])
             model, values = terms.Hypothesis(model.terms, found.final.model.catalogue), [*values, strength]

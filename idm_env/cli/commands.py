@@ -21,16 +21,15 @@ from idm_env.cli.options import (
     Data,
     DataOrFolder,
     FileOptions,
-    FixedParameters,
     JobOptions,
     Layout,
     MaxGap,
     MinSeconds,
     Out,
-    Recipe,
     RingLength,
     Seed,
     Step,
+    TrackOptions,
     Trust,
     Where,
     Window,
@@ -630,12 +629,7 @@ def filter_(
     *,
     data: DataOrFolder,
     out: Out = Path("out/filter"),
-    recipe: Recipe = "default",
-    fixed_parameters: FixedParameters = False,
-    model: Corrected = None,
-    layout: Layout = "auto",
-    columns: Columns = None,
-    ring_length: RingLength = None,
+    tracks: TrackOptions,
     job: JobOptions,
     trusted: Trust = False,
 ) -> None:
@@ -645,10 +639,8 @@ def filter_(
 
         _work_begins()
         with job.workers() as workers:
-            result = filter_file(
-                data, out, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=job.resume,  # type: ignore[arg-type]
-                columns=columns, ring_length=ring_length, model=model, executor=workers, on_progress=report,
-            )  # fmt: skip
+            options: dict[str, Any] = dataclasses.asdict(tracks)
+            result = filter_file(data, out, **options, resume=job.resume, executor=workers, on_progress=report)
     _methods(result)
     _done(out, result["account"])
 
@@ -670,12 +662,7 @@ def reconstruct(
     data: DataOrFolder,
     out: Out = Path("out/reconstruct"),
     dt: Annotated[float, ranged(help="Step of the dense trajectories (s).", low=0.01, high=2.0, unit="s")] = 0.1,
-    recipe: Recipe = "default",
-    fixed_parameters: FixedParameters = False,
-    model: Corrected = None,
-    layout: Layout = "auto",
-    columns: Columns = None,
-    ring_length: RingLength = None,
+    tracks: TrackOptions,
     job: JobOptions,
     trusted: Trust = False,
 ) -> None:
@@ -685,10 +672,8 @@ def reconstruct(
 
         _work_begins()
         with job.workers() as workers:
-            result = reconstruct_file(
-                data, out, dt=dt, recipe=recipe, fixed_parameters=fixed_parameters, layout=layout, resume=job.resume,  # type: ignore[arg-type]
-                columns=columns, ring_length=ring_length, model=model, executor=workers, on_progress=report,
-            )  # fmt: skip
+            options: dict[str, Any] = {**dataclasses.asdict(tracks), "dt": dt}
+            result = reconstruct_file(data, out, **options, resume=job.resume, executor=workers, on_progress=report)
     _methods(result)
     _done(out, result["account"])
 

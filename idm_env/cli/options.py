@@ -107,6 +107,18 @@ class FileOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class TrackOptions:
+    """How trajectories are filtered or reconstructed."""
+
+    recipe: Recipe = "default"
+    fixed_parameters: FixedParameters = False
+    model: Corrected = None
+    layout: Layout = "auto"
+    columns: Columns = None
+    ring_length: RingLength = None
+
+
+@dataclasses.dataclass(frozen=True)
 class JobOptions:
     """Work that takes long: where its parts run, and whether an interrupted run goes on."""
 

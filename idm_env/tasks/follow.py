@@ -7,21 +7,19 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from idm_env import metrics
-from idm_env.effects import IDM, Brakes, Control, Effect, Replay
-from idm_env.effects.idm import equilibrium_gap
+from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Ended, EnvState, RewardRange, Task
+from idm_env.tasks.base import Ended, EnvState, RewardRange
 from idm_env.tasks.checks import Range
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import FEATURES, Feature, feature
 from idm_env.tasks.random import Draw
-from idm_env.tasks.recorded import Leaders, head, made_up_leader, queue, recorded_leaders, starts
-from idm_env.types import Inputs, Params
+from idm_env.tasks.recorded import BehindHeadTask, Leaders, made_up_leader, recorded_leaders, starts
+from idm_env.types import Params
 from idm_env.validation import one_of
 
 HORIZON = 1000
@@ -49,7 +47,7 @@ def headway_penalty(gap: Tensor, speed: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FollowTask(Task):
+class FollowTask(BehindHeadTask):
     """A controlled vehicle and five IDM followers behind a recorded leader (vehicle 0).
 
     After Lichtlé, Vinitsky, Nice, Seibold, Work, Bayen 2022, "Deploying traffic smoothing cruise controllers learned
@@ -81,8 +79,6 @@ class FollowTask(Task):
     own_parameters: ClassVar = {
         "idm": {"max_accel": 1.3, "comfort_decel": 2.0, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 45.0}
     }
-    machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
-    first_free: ClassVar[int] = 1
     ranges: ClassVar[Mapping[str, Range]] = {"fuel_weight": Range(0.0, 1e6), "lag_weight": Range(0.0, 1e6)}
 
     vehicles: int = 7
@@ -130,39 +126,13 @@ class FollowTask(Task):
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return a queue in equilibrium behind a drawn stretch of a drawn leader."""
-        base = self.simulator.base
-        like = self.like(params)
-        device = draw.key.device
-        steps = self.constant("steps", self.leaders.steps, device, torch.int64)
+        steps = self.constant("steps", self.leaders.steps, draw.key.device, torch.int64)
         trace, start = starts(draw, steps, self.steps + self.warmup)
-        episode = {"trace": trace, "start": start + self.warmup}
-        first = self._motion(episode, torch.full_like(start, -self.warmup), like.dtype)
-        speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()
-        driver = base.driver(dict(params[base.name]))
-        gaps = equilibrium_gap(driver, speed).expand_as(speed)[:, 1:]
-        state = self.simulator.state(
-            queue(first[:, :1], gaps, self.vehicle_length),
-            speed,
-            params,
-            length=self.vehicle_length,
-            step=torch.full((len(start),), -self.warmup, device=device),
-        )
-        return EnvState(state, episode)
+        return self._in_equilibrium({"trace": trace, "start": start + self.warmup}, params)
 
-    def _motion(self, episode: dict[str, Tensor], step: Tensor, dtype: torch.dtype) -> Tensor:
-        """Return position, speed and acceleration of the leaders at a step, shape ``(n, 3)``."""
+    def _motion(self, episode: Mapping[str, Tensor], step: Tensor, dtype: torch.dtype) -> Tensor:
         motion = self.constant("motion", self.leaders.motion, step.device, dtype)
         return motion[episode["trace"], (episode["start"] + step).clamp(0, motion.shape[1] - 1)]
-
-    def inputs(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
-    ) -> Inputs:
-        """Return the inputs of one step, with the leader's record at its end."""
-        inputs = dict(super().inputs(world, command, normals, live))
-        state = world.state
-        first = self.constant("first", lambda: np.arange(self.vehicles) == 0, state.speed.device, torch.bool)
-        inputs["replay"] = head(self._motion(dict(world.episode), state.step + 1, state.speed.dtype), first)
-        return inputs
 
     def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return ``1 − w fuel − 0.002 u² − 2 p − l clip(v_lead − v, ±20)``, saturated below −2."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from idm_env.tasks.scenes import Track, recorded_tracks, smoothed
+from idm_env.tasks.scenes import Track, filled, recorded_tracks, smoothed
 
 if TYPE_CHECKING:
     import torch
@@ -64,16 +64,8 @@ def recorded_lanes(path: str, dt: float, run: str | None, first_lane: str) -> La
             )
     lane = np.zeros((len(tracks[0].position), len(tracks)), int)
     for i, track in enumerate(tracks):
-        lane[:, i] = _filled(np.searchsorted(numbers, track.lanes), np.isfinite(track.lanes))
+        lane[:, i] = filled(np.searchsorted(numbers, track.lanes), np.isfinite(track.lanes))
     return _scene(tracks, len(numbers) - 1 - lane if first_lane == "left" else lane, len(numbers), dt)
-
-
-def _filled(values: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Return values where nobody is as they were before; at the beginning as they are first."""
-    rows = np.flatnonzero(present)
-    if not len(rows):
-        return np.zeros_like(values)
-    return np.asarray(values[rows[np.clip(np.searchsorted(rows, np.arange(len(values)), side="right") - 1, 0, None)]])
 
 
 def _scene(tracks: list[Track], lane: np.ndarray, count: int, dt: float) -> LanesScene:

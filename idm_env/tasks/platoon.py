@@ -8,20 +8,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Control, Effect, Replay
-from idm_env.effects.idm import equilibrium_gap
+from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import EnvState, RewardRange, Task
+from idm_env.tasks.base import EnvState, RewardRange
 from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import FEATURES, AgentView, Feature, feature, speed
 from idm_env.tasks.random import Draw
-from idm_env.tasks.recorded import head, queue
-from idm_env.types import Inputs, Params
+from idm_env.tasks.recorded import BehindHeadTask
+from idm_env.types import Params
 
 _WAVE_STREAM = 21
 _WAVES = 3
@@ -29,7 +27,7 @@ _KNEE, _LOWEST = -4.0, -8.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PlatoonTask(Task):
+class PlatoonTask(BehindHeadTask):
     """k controlled vehicles of N behind a head (vehicle 0) whose speed oscillates; damp it, front to back.
 
     The head drives ``v(t) = v̄ + Σ A_j [cos(ω_j t + φ_j) − cos φ_j e^{−t/10 s}]`` with three waves of drawn periods,
@@ -57,8 +55,6 @@ class PlatoonTask(Task):
     own_parameters: ClassVar = {
         "idm": {"max_accel": 0.6, "comfort_decel": 1.5, "time_gap": 1.0, "min_gap": 2.0, "desired_speed": 30.0}
     }
-    machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
-    first_free: ClassVar[int] = 1
     ranges: ClassVar[Mapping[str, Range]] = {
         "speed": Range(0.0, 70.0, "m/s"),
         "disturbance": Range(1e-3, 35.0, "m/s"),
@@ -89,7 +85,6 @@ class PlatoonTask(Task):
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return a platoon in equilibrium at v̄, with drawn waves ahead of it."""
-        base = self.simulator.base
         like = self.like(params)
         low, high = span("period", self.period, 1.0, "s")
         u = draw.uniforms(_WAVE_STREAM, 3 * _WAVES, like.dtype).view(-1, 3, _WAVES)
@@ -102,20 +97,12 @@ class PlatoonTask(Task):
             ),
             dim=1,
         )
-        step = torch.full((len(waves),), -self.warmup, device=waves.device)
-        first = self._motion(waves, step)
-        speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()
-        driver = base.driver(dict(params[base.name]))
-        gaps = equilibrium_gap(driver, speed).expand_as(speed)[:, 1:]
-        positions = queue(first[:, :1], gaps, self.vehicle_length)
-        state = self.simulator.state(positions, speed, params, length=self.vehicle_length, step=step)
-        return EnvState(state, {"waves": waves})
+        return self._in_equilibrium({"waves": waves}, params)
 
-    def _motion(self, waves: Tensor, step: Tensor) -> Tensor:
-        """Return position, speed and acceleration of the head at a step, shape ``(n, 3)``."""
-        frequency, phase, amplitude = waves.unbind(1)
+    def _motion(self, episode: Mapping[str, Tensor], step: Tensor, dtype: torch.dtype) -> Tensor:
+        frequency, phase, amplitude = episode["waves"].unbind(1)
         # Integers times dt are float32 until they are told otherwise.
-        t = (step + self.warmup).to(waves.dtype).unsqueeze(-1) * self.simulator.dt
+        t = (step + self.warmup).to(frequency.dtype).unsqueeze(-1) * self.simulator.dt
         angle, fade = frequency * t + phase, torch.exp(-0.1 * t)
         start = phase.cos()
         moved = (angle.sin() - phase.sin()) / frequency - start * 10.0 * (1.0 - fade)
@@ -123,16 +110,6 @@ class PlatoonTask(Task):
         speed = self.speed + (amplitude * (angle.cos() - start * fade)).sum(-1)
         accel = (amplitude * (-frequency * angle.sin() + 0.1 * start * fade)).sum(-1)
         return torch.stack((position, speed, accel), dim=-1)
-
-    def inputs(
-        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
-    ) -> Inputs:
-        """Return the inputs of one step, with the head's motion at its end."""
-        inputs = dict(super().inputs(world, command, normals, live))
-        state = world.state
-        first = self.constant("first", lambda: np.arange(self.vehicles) == 0, state.speed.device, torch.bool)
-        inputs["replay"] = head(self._motion(world.episode["waves"], state.step + 1), first)
-        return inputs
 
     def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
         """Return minus the quadratic costs of speed and effort, and of time gaps out of bounds."""

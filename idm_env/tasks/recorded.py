@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from idm_env.effects import Control, Effect, Replay
+from idm_env.effects.idm import equilibrium_gap
+from idm_env.tasks.base import EnvState, Task
 from idm_env.tasks.random import Draw
-from idm_env.types import Record
+from idm_env.types import Inputs, Params, Record
 
 _TRACE_STREAM, _START_STREAM = 11, 12
 
@@ -88,3 +94,35 @@ def queue(lead_position: Tensor, gaps: Tensor, length: float) -> Tensor:
     """Return positions of a queue behind a leader ``(n, 1)``; ``gaps`` are those of all but the first."""
     behind = lead_position - torch.cumsum(gaps + length, dim=-1)
     return torch.cat((lead_position, behind), dim=-1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BehindHeadTask(Task):
+    """A queue on one lane behind a head (vehicle 0) that is where its motion says, whatever is behind it."""
+
+    machinery: ClassVar[tuple[Effect, ...]] = (Control(), Replay())
+    first_free: ClassVar[int] = 1
+
+    @abc.abstractmethod
+    def _motion(self, episode: Mapping[str, Tensor], step: Tensor, dtype: torch.dtype) -> Tensor:
+        """Return position, speed and acceleration of the heads at a step, shape ``(n, 3)``."""
+
+    def _in_equilibrium(self, episode: Mapping[str, Tensor], params: Params) -> EnvState:
+        """Return everybody at the speed of the head, and at the gap that keeps it."""
+        base, like = self.simulator.base, self.like(params)
+        step = torch.full((len(next(iter(episode.values()))),), -self.warmup, device=like.device)
+        first = self._motion(episode, step, like.dtype)
+        speed = first[:, 1:2].expand(-1, self.vehicles).contiguous()
+        gaps = equilibrium_gap(base.driver(dict(params[base.name])), speed).expand_as(speed)[:, 1:]
+        positions = queue(first[:, :1], gaps, self.vehicle_length)
+        state = self.simulator.state(positions, speed, params, length=self.vehicle_length, step=step)
+        return EnvState(state, episode)
+
+    def inputs(
+        self, world: EnvState, command: Tensor | None, normals: Mapping[str, Tensor] | None, live: Tensor | None = None
+    ) -> Inputs:
+        """Return the inputs of one step, with the head's motion at its end."""
+        state = world.state
+        first = self.constant("first", lambda: np.arange(self.vehicles) == 0, state.speed.device, torch.bool)
+        replay = head(self._motion(world.episode, state.step + 1, state.speed.dtype), first)
+        return {**super().inputs(world, command, normals, live), "replay": replay}

@@ -212,11 +212,16 @@ def smoothed(track: Track, seat: np.ndarray | None, dt: float) -> tuple[np.ndarr
         if seat is None and end - begin >= 4:
             smooth = fuse(position[part], speed[part], dt)
             motion[part] = np.stack((smooth.position, np.clip(smooth.speed, 0.0, None), smooth.accel), axis=-1)
-    rows = np.flatnonzero(present)
-    if len(rows):
-        last = rows[np.clip(np.searchsorted(rows, np.arange(len(position)), side="right") - 1, 0, None)]
-        motion[~present, 0] = motion[last[~present], 0]
+    motion[:, 0] = filled(motion[:, 0], present)
     return motion, present
+
+
+def filled(values: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Return values [T] where nobody is as they were before; at the beginning as they are first."""
+    rows = np.flatnonzero(present)
+    if not len(rows):
+        return np.zeros_like(values)
+    return np.asarray(values[rows[np.clip(np.searchsorted(rows, np.arange(len(values)), side="right") - 1, 0, None)]])
 
 
 @lru_cache(maxsize=4)
