@@ -82,7 +82,7 @@ def test_platoons_clock_is_as_precise_as_its_dtype():
     # An integer times dt is float32 whatever comes after: 2.8e-5 m after 600 steps.
     task = make_task("platoon", vehicles=3)
     waves = torch.tensor([[[0.11, 0.13, 0.15], [0.1, 2.0, 4.0], [1.0, 1.2, 0.8]]], dtype=torch.float64)
-    position, speed, _ = task._motion(waves, torch.tensor([601]))[0].tolist()
+    position, speed, _ = task._motion({"waves": waves}, torch.tensor([601]), torch.float64)[0].tolist()
     t, moved, now = 60.1, 0.0, 0.0
     for w, phi, a in waves[0].T.tolist():
         moved += a * ((math.sin(w * t + phi) - math.sin(phi)) / w - math.cos(phi) * 10.0 * (1.0 - math.exp(-0.1 * t)))
