@@ -37,6 +37,16 @@ class Noise:
         white = np.where(joined[:, None], rest @ self.later.T, rest @ self.first.T)
         return white * np.sqrt(self.weight)[:, None]
 
+    @property
+    def wander(self) -> float:
+        """By how much errors of the speed grow (m/s) from the first sample to half the horizon: drivers' own noise.
+
+        Noise of sensors is the same at both.
+        """
+        spread = np.linalg.inv(self.first)
+        variance = (spread**2).sum(1)[: len(spread) - 2]
+        return float(np.sqrt(max(variance[len(variance) // 2 - 1] - variance[0], 0.0)))
+
     def alike(self, rows: int) -> Noise:
         """Return the same noise for so many other rows, of which none is weighed down."""
         return replace(self, weight=np.ones(rows))

@@ -15,8 +15,12 @@ FREE_SHARE = 0.2
 """Share of the level that goes to candidates in free simulation, the rest to the same in windows (Bonferroni)."""
 FAINT = 0.003
 """Gain in log RMSE of a run that is hardly worth the name."""
-SYSTEMATIC = 0.01
-"""Error of a strength that averages do not remove: 0.6 % in the median of generated sets without drivers' noise."""
+SYSTEMATIC, NOISY, MOST_NOISY = 0.01, 0.5, 0.25
+"""Share of a strength that averages do not remove, the same per m/s that drivers' noise moves the speed, and at most.
+
+In generated sets without drivers' noise it was 0.6 % in the median; with 0.1 m/s² of it, which moves the speed by 0.1
+m/s, 5 of 24 strengths were off by 4 to 20 %, three to seven times what runs differ by (2026-11-23).
+"""
 
 
 def held_out(task: Task, solution: Solution) -> np.ndarray:
@@ -183,10 +187,12 @@ def at_level(tested: Tested, share: float) -> Tested:
 
 
 def half_width(solution: Solution, task: Task) -> np.ndarray:
-    """Return half the 95 % interval [Q] of φ: cluster-robust over runs, t with runs − 1 degrees of freedom.
+    """Return half the 95 % interval [Q] of φ: jackknife over runs, t with runs − 1 degrees of freedom.
 
-    Where the runs' spread is smaller than the noise allows, the noise decides. ``SYSTEMATIC`` of the strength is added
-    in squares: what smoothing and steps of 0.1 s do, alike in every run, so that no spread shows it.
+    A run that says much of φ pulls it towards itself, which a spread of gradients at the common φ does not show. Where
+    the jackknife's spread is smaller than the noise allows, the noise decides. ``SYSTEMATIC`` of the strength is added
+    in squares, and ``NOISY`` of it: what smoothing, steps of 0.1 s, and the noise of drivers, which changes what they
+    see, do alike in every run, so that no spread shows it.
     """
     spread, noise, times = _variances(solution, task)
     width = np.maximum(
@@ -194,21 +200,21 @@ def half_width(solution: Solution, task: Task) -> np.ndarray:
     )
     null = np.array([p.null or 0.0 if p.role == "strength" else 0.0 for p in solution.model.parameters])
     own = np.array([p.role != "place" for p in solution.model.parameters])
-    result: np.ndarray = np.sqrt(width**2 + (1.96 * SYSTEMATIC * own * (solution.values - null)) ** 2)
+    share = SYSTEMATIC + min(NOISY * (0.0 if task.noise is None else task.noise.wander), MOST_NOISY)
+    result: np.ndarray = np.sqrt(width**2 + (1.96 * share * own * (solution.values - null)) ** 2)
     return result
 
 
 def _variances(solution: Solution, task: Task) -> tuple[np.ndarray, np.ndarray, float]:
     """Return φ's covariance [Q, Q] by the spread of runs, and by the noise, and Student's t of the former."""
     runs = len(task.rows.records.runs)
-    gradient, matrix = per_run(task, solution)
-    big = matrix.sum(0) + np.diag(prior_of(solution.model))
+    big = per_run(task, solution)[1].sum(0) + np.diag(prior_of(solution.model))
     big = big + np.diag(1e-9 * np.diag(big) + 1e-12)
-    inverse = np.linalg.inv(big)
-    spread = gradient - gradient.mean(0)
-    sandwich = inverse @ (spread.T @ spread * runs / max(runs - 1, 1)) @ inverse
+    off = without_own_run(task, solution)
+    off = off - off.mean(0)
+    jackknife = off.T @ off * (runs - 1) / max(runs, 1)
     variance = float((solution.linear.residual**2).mean())
-    return sandwich, inverse * variance, float(student.ppf(0.975, max(runs - 1, 1)))
+    return jackknife, np.linalg.inv(big) * variance, float(student.ppf(0.975, max(runs - 1, 1)))
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.stats import t as student
 
 from idm_env.data import episodes, synthetic
 from idm_env.discovery import model as terms
@@ -12,7 +15,7 @@ from idm_env.discovery import search
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
-from idm_env.discovery.score import held_out
+from idm_env.discovery.score import SYSTEMATIC, half_width, held_out
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import _same_class
 from idm_env.discovery.solve import Solution, Task, _Nested, linearise, solve
@@ -66,6 +69,22 @@ def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypa
             elif hidden is None:
                 assert share.max() < search.FAINT and lowered < 2 * search.FAINT and sum(copies) < 60
         monkeypatch.undo()
+
+
+def test_an_interval_is_as_wide_as_fits_without_a_run_differ() -> None:
+    searching, null = begun(made(31, runs=8, followers=2, seconds=150.0, effect="memory", ou=0.05), "memory")
+    model, task = Hypothesis((terms.simple("memory"),)), searching.task
+    found = solve(task, model, null.theta, np.array(model.terms[0].starts[-1]), iterations=30, tolerance=1e-8)
+    runs = np.unique(task.rows.run)
+    without = [task.of_rows(task.rows.run != run) for run in runs]
+    left = [solve(t, model, found.theta, found.values, iterations=20, tolerance=1e-7).values[0] for t in without]
+    jackknife = np.std(left) * np.sqrt(len(runs) - 1)
+    quiet = replace(task, noise=None)
+    share = half_width(found, quiet)[0] ** 2 - (1.96 * SYSTEMATIC * found.values[0]) ** 2
+    assert np.sqrt(share) / student.ppf(0.975, len(runs) - 1) == pytest.approx(jackknife, rel=0.12)
+    # Drivers' noise, alike in all runs, does not show in how these differ.
+    assert task.noise is not None and 0.03 < task.noise.wander < 0.08
+    assert half_width(found, task)[0] > half_width(found, quiet)[0]
 
 
 def test_a_law_alone_has_a_loop_of_its_own(platoon: Records) -> None:
