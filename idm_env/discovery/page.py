@@ -17,7 +17,6 @@ from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
 from idm_env.discovery.verdict import HOLDS, Verdict
 from idm_env.discovery.words import percent as change
 from idm_env.reports import page as pages
-from idm_env.reports.page import Block
 
 TITLES = {
     Verdict.NAMED: "What {law} lacks here has a name",
@@ -41,8 +40,8 @@ def write(path: Path, d: Discovery) -> None:
             "plain": words.plain, "amount": words.amount,
             "shares": lambda parts: " · ".join(f"{name} {percent(share)}" for name, share in parts.items()),
         },
-        r=r, law=law, titles=judgement.titles, cards=cards(r, law), first=_first_picture(d),
-        pictures=pictures.all_of(d), error_names=words.ERRORS, most=words.MANY, shortened=pages.shortened,
+        r=r, law=law, titles=judgement.titles, cards=cards(r, law), d=d, draw=pictures,
+        picture=pages.picture, error_names=words.ERRORS, most=words.MANY, shortened=pages.shortened,
         results={} if judgement.before is None else {name: j.summary() for name, j, *_ in pictures.named(d)},
         declared={p.name: p for p in d.null.model.catalogue.own}, weight=words.weight(r.prior),
         ceilings="" if before is None
@@ -101,17 +100,3 @@ def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
         known.append((f"Gap in free simulation, {law}", f"{number(before['gap_rmse_m'])} m on the test set; "
                       f"sensor noise alone leaves {number(r.error.floor['gap_rmse_m'])} m"))  # fmt: skip
     return [(name, "", text) for name, text in known]
-
-
-def _first_picture(d: Discovery) -> Block | None:
-    """Return the picture of the typical follower, or None without a test set."""
-    figure, follower, before = pictures.first_screen(d), pictures.typical(d), d.judgement.before
-    if figure is None or follower is None or before is None:
-        return None
-    run, vehicle = before.followers[follower]
-    return pages.picture(
-        figure,
-        f"The follower of the test set with the median error by {d.judgement.titles[0]}: run {run}, vehicle "
-        f"{vehicle}. Below: simulated less measured gap.",
-        pictures.first_screen(d, (4.2, 4.6)),
-    )

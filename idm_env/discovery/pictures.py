@@ -1,4 +1,4 @@
-"""Pictures of a discovery, as blocks of its page."""
+"""Pictures of a discovery; None where there is nothing to show. What they show is said in ``report.html``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from idm_env.discovery import words
 from idm_env.effects.free import FEATURES
-from idm_env.reports.page import Block, picture
 
 if TYPE_CHECKING:
     from idm_env.discovery.discover import Discovery
@@ -24,59 +23,6 @@ BEFORE, AFTER, TRUTH, GREY = "#c0392b", "#1f6fb2", "#222222", "#9aa5b1"
 plt.rcParams.update(
     {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "figure.dpi": 110, "legend.frameon": False}
 )
-
-
-def all_of(d: Discovery) -> list[tuple[str, Block]]:
-    """Return title and picture of everything that this discovery has."""
-    made: list[tuple[str, Block]] = []
-
-    def put(title: str, caption: str, figure: Figure | None) -> None:
-        if figure is not None:
-            made.append((title, picture(figure, caption)))
-
-    put(
-        "What each candidate gains",
-        "Fall of the 5 s prediction error on runs that the candidate was not fitted to, in units of its noise, with "
-        "95 % intervals over runs. Grey: not significant after correction for the whole list.",
-        ranking(d.rounds[0]),
-    )
-    put(
-        "What re-calibration hides",
-        "Share of each candidate's response that the drivers' own parameters absorb: an effect at the right end cannot "
-        "be seen in the residual of a calibrated model.",
-        absorption(d),
-    )
-    put(
-        "Who looks like whom, on these data",
-        "Cosine between responses, after the drivers' own parameters are projected out: ±1 cannot be told apart.",
-        look_alikes(d),
-    )
-    put(
-        "Added-variable plot of the winner",
-        "Residual of the model before against the response of the added effect, both projected off the drivers' own "
-        "parameters; each point is one 5 s window.",
-        added_variable(d),
-    )
-    put("Curves that were found", "Estimate and 95 % interval at every knot.", curves(d))
-    put(
-        "Residual against features",
-        "By how much the measured driver accelerated more than the predicted one (m/s²), second by second in windows "
-        "of 5 s, averaged in bins, with two standard errors.",
-        features(d),
-    )
-    put("Residual over position and time", "The same acceleration as a map.", maps(d))
-    put(
-        "Measured and simulated gap",
-        "Best, median and worst follower of the test set, in free simulation behind the measured leader; in every "
-        "stretch (up to 30 s) with the driver's own parameters from those before and after it.",
-        gaps(d),
-    )
-    put(
-        "Error of every follower of the test set",
-        "Free simulation; below the line the model on the axis is better.",
-        scatter(d),
-    )
-    return made
 
 
 def ranking(this: Round) -> Figure:
