@@ -108,8 +108,8 @@ def is_far(law: Judged, null: Judged, has_null: bool = False) -> bool:
 
 def personal(null: Hypothesis) -> Hypothesis:
     """Return the null with all effects whose strengths may be each driver's own."""
-    given = {e.name for e in null.named}
-    effects = tuple(make(name) for name, cls in ALL.items() if cls.per_driver and name not in given)
+    named = {e.name for e in null.named}
+    effects = tuple(make(name) for name, cls in ALL.items() if cls.per_driver and name not in named)
     own = Catalogue(
         (*null.named, *effects), null.catalogue.base, located=False, personal=tuple(e.name for e in effects)
     )

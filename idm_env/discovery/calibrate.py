@@ -47,8 +47,8 @@ def calibrate(records: Records, model: Hypothesis, values: np.ndarray, start: np
     """
     own = model.catalogue.own
     task, theta = judge.unweighed(records, model, values, first_prior(own), start=start)
-    there = stand(records, model, values, population(theta, task.rows, own), theta)
-    return Calibrated(model, values, there.theta, there.task.prior, there)
+    fit = stand(records, model, values, population(theta, task.rows, own), theta)
+    return Calibrated(model, values, fit.theta, fit.task.prior, fit)
 
 
 def judged(

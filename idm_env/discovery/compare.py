@@ -86,11 +86,11 @@ def _of_drivers(was: np.ndarray, now: np.ndarray, runs: np.ndarray) -> tuple[flo
     Student's t over what ``sampling`` draws. Deviations of followers of one run, which depend on each other, are
     added before they are squared.
     """
-    told = (was > 0.0) & (now > 0.0)
-    if not told.any():
+    seen = (was > 0.0) & (now > 0.0)
+    if not seen.any():
         return float("nan"), 0.0, float("inf")
-    change = 0.5 * np.log(now[told] / was[told])
-    strata, freedom = sampling(runs[told])
+    change = 0.5 * np.log(now[seen] / was[seen])
+    strata, freedom = sampling(runs[seen])
     mean = float(change.mean())
     off = [np.array([(change[unit] - mean).sum() for unit in stratum]) for stratum in strata]
     units = sum(len(s) for s in strata)
@@ -117,11 +117,11 @@ def _width(was: np.ndarray, now: np.ndarray, runs: np.ndarray, seed: int) -> flo
         for total, squares in zip(totals, (was, now), strict=True):
             total += weights @ np.array([squares[unit].sum() for unit in stratum])
     with np.errstate(divide="ignore", invalid="ignore"):
-        drawn = 0.5 * np.log(totals[1] / totals[0])
-    drawn = drawn[np.isfinite(drawn)]
-    if len(drawn) < DRAWS // 2:
+        changes = 0.5 * np.log(totals[1] / totals[0])
+    changes = changes[np.isfinite(changes)]
+    if len(changes) < DRAWS // 2:
         return float("inf")
-    return float(student.ppf(0.975, freedom) * drawn.std(ddof=1) * np.sqrt(units / freedom))
+    return float(student.ppf(0.975, freedom) * changes.std(ddof=1) * np.sqrt(units / freedom))
 
 
 def sampling(runs: np.ndarray) -> tuple[list[list[np.ndarray]], int]:

@@ -137,10 +137,10 @@ def discover(
     mark = storage.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
     saved = storage.Store(None if out is None else out / storage.UNFINISHED / "explain", mark, resume)
     task = Task(rows, search.first_noise(rows), calibrate.first_prior(law.declared))
-    told = tuple(_known_term(prepared, name) for name in known)
+    known_terms = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
-    given = [*own, *(terms.known_effect(term) for term in told)]
-    bare = Hypothesis(told, twin.Catalogue.of(given, prepared.period, law))
+    extra = [*own, *(terms.known_effect(term) for term in known_terms)]
+    bare = Hypothesis(known_terms, twin.Catalogue.of(extra, prepared.period, law))
     searching = Search(task, names, located and effects is None, saved, progress, bare)
     progress("null", 0, 0, law.name)
     values = search.starting_values(bare)
@@ -160,20 +160,20 @@ def discover(
 # -- before the search -----------------------------------------------------------------------------------------------
 
 
-def _chosen(effects: Sequence[str | Effect | type[Effect]] | None, known: Sequence[str]) -> list[Effect]:
+def _chosen(effects: Sequence[str | Effect | type[Effect]] | None, null_effects: Sequence[str]) -> list[Effect]:
     """Return the candidates as effects, those of the user's own registered."""
     chosen: list[Effect] = []
-    for given in candidates() if effects is None else effects:
-        if isinstance(given, str):
-            name = named(given)
+    for candidate in candidates() if effects is None else effects:
+        if isinstance(candidate, str):
+            name = named(candidate)
         else:
-            name = register(given if isinstance(given, type) else type(given)).kind
+            name = register(candidate if isinstance(candidate, type) else type(candidate)).kind
         if name not in candidates():
             raise ValueError(f"effect '{name}' is no candidate.{nearest(name, candidates())}")
-        chosen.append(given if isinstance(given, Effect) else make(name))
+        chosen.append(candidate if isinstance(candidate, Effect) else make(name))
         if chosen[-1].name != name:
             raise ValueError(f"effect '{name}' calls itself '{chosen[-1].name}': a candidate needs its class's name.")
-    for name in known:
+    for name in null_effects:
         if name not in CANDIDATES:
             raise ValueError(f"effect '{name}' is no candidate.{nearest(name, CANDIDATES)}")
         if not ALL[name].column:
@@ -196,7 +196,7 @@ def prepare(trajectories: Trajectories, by: str, place: str | None = None) -> Re
         if place not in trajectories.table.columns:
             raise ValueError(f"place column '{place}' is missing.{nearest(place, trajectories.table.columns)}")
         trajectories = replace(trajectories, place=place)
-    found = episodes(trajectories, smooth=True, min_seconds=12.0)
+    measured = episodes(trajectories, smooth=True, min_seconds=12.0)
     column = trajectories.table[trajectories.place]
     period = 0.0
     if trajectories.place != "position_m":
@@ -207,7 +207,7 @@ def prepare(trajectories: Trajectories, by: str, place: str | None = None) -> Re
     if "ring_length_m" in trajectories.table.columns:
         rings = trajectories.table["ring_length_m"].drop_nulls()
         period = float(rings[0]) if len(rings) and rings.n_unique() == 1 else period
-    return records.gather(list(found), by, period, trajectories)
+    return records.gather(list(measured), by, period, trajectories)
 
 
 def _split(prepared: Records, share: float, seed: int) -> tuple[list[str], list[str]]:
@@ -216,8 +216,8 @@ def _split(prepared: Records, share: float, seed: int) -> tuple[list[str], list[
         return runs, []
     count = min(max(1, round(share * len(runs))), len(runs) - 1)
     order = np.random.default_rng(seed).permutation(len(runs))
-    kept = {runs[i] for i in order[:count]}
-    return [r for r in runs if r not in kept], [r for r in runs if r in kept]
+    test = {runs[i] for i in order[:count]}
+    return [r for r in runs if r not in test], [r for r in runs if r in test]
 
 
 def _measured(prepared: Records, effect: Effect) -> Effect:
@@ -237,13 +237,13 @@ def _known_term(prepared: Records, name: str) -> Term:
 def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]:
     """Return first place, distance and values of a column over places; DataError where no record tells."""
     # Where a record does not tell, the profile of the others is taken for the same place.
-    told = [e for e in prepared.episodes if column in e.columns]
-    if not told:
+    recorded = [e for e in prepared.episodes if column in e.columns]
+    if not recorded:
         raise ValueError(
             f"a profile over places needs the column {column} without holes, and no record has it. Fill it in."
         )
-    place = np.concatenate([e.place_m for e in told])
-    value = np.concatenate([e.columns[column] for e in told])
+    place = np.concatenate([e.place_m for e in recorded])
+    value = np.concatenate([e.columns[column] for e in recorded])
     period = prepared.period
     place = np.mod(place, period) if period else place
     low, high = (0.0, period) if period else (float(place.min()), float(place.max()))
@@ -306,10 +306,10 @@ def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) ->
     law = final.model.catalogue.base
 
     def bounded(values: np.ndarray) -> dict[str, dict[str, float]]:
-        told: dict[str, dict[str, float]] = {}
+        by_effect: dict[str, dict[str, float]] = {}
         for v, (name, p) in zip(values, final.model.catalogue.of_driver, strict=True):
-            told.setdefault(name, {})[p.name] = float(np.clip(v, p.low, p.high))
-        return told
+            by_effect.setdefault(name, {})[p.name] = float(np.clip(v, p.low, p.high))
+        return by_effect
 
     drivers = {prepared.groups[group]: bounded(np.exp(theta[group])) for group in seen}
     return SavedModel(

@@ -84,15 +84,15 @@ def stand(records: Records, model: Hypothesis, values: np.ndarray, prior: Prior,
     heard = replace(task, rows=replace(rows, valid=scored))
     fits: dict[float, tuple[Task, Solution]] = {}
     square: dict[float, float] = {}
-    wanted: Sequence[float] = GRID_S
-    while wanted:
-        for seconds in wanted:
+    grid: Sequence[float] = GRID_S
+    while grid:
+        for seconds in grid:
             heavier = judge.scaled(replace(task, prior=replace(task.prior, alike_s=seconds)), model, values, near)
-            start = min(fits.items(), key=lambda known: abs(np.log(known[0] / seconds)))[1][1].theta if fits else near
+            start = min(fits.items(), key=lambda fit: abs(np.log(fit[0] / seconds)))[1][1].theta if fits else near
             fits[seconds] = heavier, solve(heavier, frozen, start, np.zeros(0), iterations=10, tolerance=1e-4)
             errors = heard.errors(fits[seconds][1].theta[None], frozen, np.zeros((1, 0)))
             square[seconds] = float((errors**2).sum()) / max(int(scored.sum()), 1)
-        wanted = further(square)
+        grid = further(square)
     alike_s = min(square, key=lambda seconds: square[seconds])
     task, fitted = fits[alike_s]
     matrix = task.per_group(np.einsum("rmi,rmj->rij", fitted.linear.by_theta, fitted.linear.by_theta))
@@ -109,11 +109,11 @@ def stand(records: Records, model: Hypothesis, values: np.ndarray, prior: Prior,
 
 def further(square: dict[float, float]) -> Sequence[float]:
     """Return the next weight (s) where the best of those tried is at an end and better than its neighbour, or none."""
-    known = sorted(square)
-    best = min(known, key=lambda seconds: square[seconds])
-    if best == known[-1] and best < ENDS_S[1] and square[best] < (1.0 - 1e-3) * square[known[-2]]:
+    tried = sorted(square)
+    best = min(tried, key=lambda seconds: square[seconds])
+    if best == tried[-1] and best < ENDS_S[1] and square[best] < (1.0 - 1e-3) * square[tried[-2]]:
         return (best * BEYOND,)
-    if best == known[0] and best > ENDS_S[0] and square[best] < (1.0 - 1e-3) * square[known[1]]:
+    if best == tried[0] and best > ENDS_S[0] and square[best] < (1.0 - 1e-3) * square[tried[1]]:
         return (max(best / BEYOND, ENDS_S[0]),)
     return ()
 
@@ -171,9 +171,9 @@ def joint(at: ClosedLoopFit, model: Hypothesis, values: np.ndarray) -> Solution:
 
 def refitted(records: Records, solution: Solution) -> tuple[Solution, np.ndarray]:
     """Fit φ of a model of windows once more, in free simulation over all time; also return intervals [Q, 3]."""
-    at = stand(records, solution.model, solution.values, solution.prior, solution.theta)
-    again = joint(at, solution.model, solution.values)
-    return again, interval_of(again, at.task)
+    fit = stand(records, solution.model, solution.values, solution.prior, solution.theta)
+    again = joint(fit, solution.model, solution.values)
+    return again, interval_of(again, fit.task)
 
 
 def gains(before: ClosedLoopFit, solution: Solution) -> np.ndarray:

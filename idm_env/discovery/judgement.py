@@ -107,8 +107,8 @@ class Judgement:
     @property
     def titles(self) -> tuple[str, ...]:
         """Plain names of the models: the null and, where there is one, the model beside it."""
-        known = [words.plain(t.effect or t.label) for t in self.null.model.terms]
-        lists = [known] if self.compared is None else [known, [*known, self.tried]]
+        null_terms = [words.plain(t.effect or t.label) for t in self.null.model.terms]
+        lists = [null_terms] if self.compared is None else [null_terms, [*null_terms, self.tried]]
         law = self.null.model.catalogue.base.title
         return tuple(" with ".join([law, *([" and ".join(names)] if names else [])]) for names in lists)
 

@@ -58,10 +58,10 @@ class Term:
         """Return the places in φ of the parameters, for a term without a name in ``slot``."""
         if self.form == twin.NONE or self.profile is not None:
             return [catalogue.index[f"{self.effect}.{p.name}"] for p in self.parameters]
-        at = catalogue.table_at(self.effect or str(slot))
+        row = catalogue.table_at(self.effect or str(slot))
         if self.form == twin.INTERVAL:
-            return [at + 4, at, at + 1][: self.size]
-        return [at + 4 + self.fades + i for i in range(self.size)]
+            return [row + 4, row, row + 1][: self.size]
+        return [row + 4 + self.fades + i for i in range(self.size)]
 
     @property
     def drawn(self) -> tuple[float, float, int]:
@@ -146,14 +146,14 @@ class Hypothesis:
         for term, slot in self._slots:
             if term.form == twin.NONE:
                 continue
-            at = self.catalogue.table_at(term.effect or str(slot))
-            phi[..., at + 3] = term.period
+            row = self.catalogue.table_at(term.effect or str(slot))
+            phi[..., row + 3] = term.period
             if term.form == twin.CURVE:
-                phi[..., at], phi[..., at + 1] = term.drawn[0], 1.0 / term.drawn[1]
+                phi[..., row], phi[..., row + 1] = term.drawn[0], 1.0 / term.drawn[1]
                 if term.profile is not None:
-                    phi[..., at + 4 : at + 4 + len(term.profile)] = term.profile
+                    phi[..., row + 4 : row + 4 + len(term.profile)] = term.profile
             else:
-                phi[..., at + 2] = EDGES[term.coordinate]
+                phi[..., row + 2] = EDGES[term.coordinate]
             if term.located:
                 for name, weight in self.catalogue.shape(term.what, term.coordinate, str(slot), term.by)[1].items():
                     phi[..., self.catalogue.index[name]] = weight
@@ -327,16 +327,16 @@ def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
 
 def effects_of(model: Hypothesis, values: np.ndarray) -> tuple[list[Effect], dict[str, dict[str, float]]]:
     """Return the simulator's effects of a model's terms and their parameters as numbers."""
-    made: list[Effect] = []
+    effects: list[Effect] = []
     numbers: dict[str, dict[str, float]] = {}
-    at = 0
+    begin = 0
     for term in model.terms:
-        mine = np.asarray(values[at : at + term.size], float)
-        at += term.size
-        for effect, given in _effects(term, mine):
-            made.append(effect)
-            numbers[effect.name] = given
-    return made, numbers
+        mine = np.asarray(values[begin : begin + term.size], float)
+        begin += term.size
+        for effect, strengths in _effects(term, mine):
+            effects.append(effect)
+            numbers[effect.name] = strengths
+    return effects, numbers
 
 
 def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, float]]]:
@@ -359,12 +359,12 @@ def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, flo
     if term.effect is not None:
         numbers = values if term.profile is not None else heights
         return [(_made(term, knots), dict(zip(names, map(float, numbers), strict=True)))]
-    given = {f"knot_{i}": float(h) for i, h in enumerate(heights)}
+    strengths = {f"knot_{i}": float(h) for i, h in enumerate(heights)}
     if term.what == "acceleration":
-        return [(catalogue.Curve(feature=term.coordinate, knots=knots, period=period, by=term.by), given)]
+        return [(catalogue.Curve(feature=term.coordinate, knots=knots, period=period, by=term.by), strengths)]
     targets = {"accel_and_decel": ("max_accel", "comfort_decel")}.get(term.what, (term.what,))
     return [
-        (catalogue.DriverCurve(target=t, feature=term.coordinate, knots=knots, period=period, by=term.by), given)  # type: ignore[arg-type]
+        (catalogue.DriverCurve(target=t, feature=term.coordinate, knots=knots, period=period, by=term.by), strengths)  # type: ignore[arg-type]
         for t in targets
     ]
 

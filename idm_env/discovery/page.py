@@ -90,13 +90,13 @@ def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
             )
             for key, h in r.helps.items()
         ]  # fmt: skip
-    known = [("Runs", f"{r.data.runs}, of them {r.data.runs_to_choose_on} for model selection")]
+    facts = [("Runs", f"{r.data.runs}, of them {r.data.runs_to_choose_on} for model selection")]
     if r.verdict == Verdict.CANNOT_TELL.value:
-        known.append(("What to do", "record more runs: seven decide, ten are better"))
-    if (at := r.shared) is not None:
-        known.append(("Where", f"run {at.run}, {at.begin_s:.0f} to {at.end_s:.0f} s, {at.vehicles} followers"))
-        known.append(("How much", f"{number(at.accel_mps2, 2)} m/s² beside {law}"))
+        facts.append(("What to do", "record more runs: seven decide, ten are better"))
+    if (spot := r.shared) is not None:
+        facts.append(("Where", f"run {spot.run}, {spot.begin_s:.0f} to {spot.end_s:.0f} s, {spot.vehicles} followers"))
+        facts.append(("How much", f"{number(spot.accel_mps2, 2)} m/s² beside {law}"))
     if (before := r.error.before) is not None:
-        known.append((f"Gap in free simulation, {law}", f"{number(before['gap_rmse_m'])} m on the test set; "
+        facts.append((f"Gap in free simulation, {law}", f"{number(before['gap_rmse_m'])} m on the test set; "
                       f"sensor noise alone leaves {number(r.error.floor['gap_rmse_m'])} m"))  # fmt: skip
-    return [(name, "", text) for name, text in known]
+    return [(name, "", text) for name, text in facts]

@@ -30,8 +30,8 @@ def ranking(this: Round) -> Figure:
     order = np.argsort(this.tested.gain)[-22:]
     gain = 100 * (1 - np.exp(-this.tested.gain[order]))
     ends = this.tested.interval[order]
-    known = np.isfinite(ends).all(1)  # a single run tells no interval
-    low, high = (np.where(known, 100 * (1 - np.exp(-np.where(known, e, 0.0))), gain) for e in ends.T)
+    finite = np.isfinite(ends).all(1)  # a single run tells no interval
+    low, high = (np.where(finite, 100 * (1 - np.exp(-np.where(finite, e, 0.0))), gain) for e in ends.T)
     figure, axes = plt.subplots(layout="constrained", figsize=(7.2, 0.24 * len(order) + 1.0))
     colours = [AFTER if p < 0.05 else GREY for p in this.tested.p_value[order]]
     axes.barh(range(len(order)), gain, color=colours)
@@ -224,9 +224,9 @@ def _trace(judged: Judged, follower: int) -> tuple[np.ndarray, ...]:
     pieces: list[np.ndarray] = []
     for i in np.flatnonzero(judged.follower[rows.record] == follower):
         valid = rows.valid[i]
-        at = rows.samples[i][valid]
-        time = rows.records.column("time")[at]
-        piece = np.stack([time, rows.records.gap[at], judged.gap[i][valid]])
+        sample = rows.samples[i][valid]
+        time = rows.records.column("time")[sample]
+        piece = np.stack([time, rows.records.gap[sample], judged.gap[i][valid]])
         pieces += [piece, np.array([[time[-1]], [np.nan], [np.nan]])]
     time, measured, simulated = np.concatenate(pieces, axis=1)
     return time - time[0], measured, simulated

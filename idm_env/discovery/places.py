@@ -50,12 +50,12 @@ class Responses:
         np.add.at(cross, rows.group, np.einsum("rmi,rmb->rib", self.by_theta, response))
         follow = np.einsum("gij,gjb->gib", self.absorbed, cross)
         response -= np.einsum("rmi,rib->rmb", self.by_theta, follow[rows.group])
-        of = self.units.of_record[rows.record]
+        unit_of_row = self.units.of_record[rows.record]
         matrix, vector = np.zeros((len(self.units), count, count)), np.zeros((len(self.units), count))
         for unit in range(len(self.units)):
-            mine = response[of == unit].reshape(-1, count)
+            mine = response[unit_of_row == unit].reshape(-1, count)
             matrix[unit] = mine.T @ mine
-            vector[unit] = -mine.T @ self.residual[of == unit].reshape(-1)
+            vector[unit] = -mine.T @ self.residual[unit_of_row == unit].reshape(-1)
         return matrix, vector
 
 
@@ -73,17 +73,17 @@ def respond(task: Task, solution: Solution) -> Responses:
     values = np.repeat(solution.values[None], copies, axis=0)
     residual = task.residual(task.errors(theta, solution.model, values, pulses))
     change = (residual[1:] - residual[0]).reshape(len(WHATS), pieces, len(rows), -1) / PULSE
-    at = rows.start[:, None] + seconds * np.arange(pieces) + seconds // 2
+    middle = rows.start[:, None] + seconds * np.arange(pieces) + seconds // 2
     signals = records.signals
-    place = signals[at, 18]
+    place = signals[middle, 18]
     coordinates = {
         "position": np.mod(place, records.period) if records.period else place,
-        "time": signals[at, 17],
-        "speed": signals[at, 15],
-        "gap": signals[at, 0] - signals[at, 14],
-        "closing_speed": signals[at, 15] - signals[at, 1],
-        "lead_accel": signals[at, 2],
-        "relative_gap": relative_gap(solution, rows, at),
+        "time": signals[middle, 17],
+        "speed": signals[middle, 15],
+        "gap": signals[middle, 0] - signals[middle, 14],
+        "closing_speed": signals[middle, 15] - signals[middle, 1],
+        "lead_accel": signals[middle, 2],
+        "relative_gap": relative_gap(solution, rows, middle),
     }
     linear = solution.linear
     matrix = equations(task, solution.theta, linear)[1][:, : linear.own, : linear.own]
@@ -102,8 +102,8 @@ def relative_gap(solution: Solution, rows: Rows, at: np.ndarray) -> np.ndarray:
     own = {p.name: theta[:, i] for i, (_, p) in enumerate(catalogue.of_driver[: len(catalogue.base.parameters)])}
     driver = catalogue.base.driver(own)
     speed = torch.from_numpy(signals[at, 15])
-    kept = driver.min_gap + driver.extra_gap + driver.time_gap * speed
-    return np.clip((signals[at, 0] - signals[at, 14]) / kept.numpy(), 0.0, FREE)
+    desired = driver.min_gap + driver.extra_gap + driver.time_gap * speed
+    return np.clip((signals[at, 0] - signals[at, 14]) / desired.numpy(), 0.0, FREE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,8 +211,8 @@ def _best(matrix: np.ndarray, vector: np.ndarray, allowed: np.ndarray) -> tuple[
     weight = weight + 0.02 * np.trace(matrix) / count
     weight = np.maximum(weight, 1e-12)  # of a single run, left out, nothing remains
     gain = np.where(allowed, push**2 / weight, -np.inf)
-    at = np.unravel_index(gain.argmax(), gain.shape)
-    return int(at[0]), int(at[1]), float(push[at] / weight[at]), float(gain[at])
+    best = np.unravel_index(gain.argmax(), gain.shape)
+    return int(best[0]), int(best[1]), float(push[best] / weight[best]), float(gain[best])
 
 
 def linear_curve(responses: Responses, what: str, basis: np.ndarray, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -229,17 +229,17 @@ def linear_curve(responses: Responses, what: str, basis: np.ndarray, spread: flo
 
 def hats(values: np.ndarray, first: float, distance: float, count: int, period: float = 0.0) -> np.ndarray:
     """Return the hat functions of a piecewise-linear curve at values [R, J]: [R, J, count]."""
-    at = (np.mod(values, period) if period else values) - first
-    at = at / distance
+    knot = (np.mod(values, period) if period else values) - first
+    knot = knot / distance
     if period:
-        low = np.floor(at).astype(int)
-        share = at - low
+        low = np.floor(knot).astype(int)
+        share = knot - low
         low %= count
         high = (low + 1) % count
     else:
-        at = np.clip(at, 0.0, count - 1.0)
-        low = np.minimum(at.astype(int), count - 2)
-        share, high = at - low, low + 1
+        knot = np.clip(knot, 0.0, count - 1.0)
+        low = np.minimum(knot.astype(int), count - 2)
+        share, high = knot - low, low + 1
     basis = np.zeros((*values.shape, count))
     np.put_along_axis(basis, low[..., None], (1.0 - share)[..., None], axis=-1)
     held = np.take_along_axis(basis, high[..., None], axis=-1)
@@ -260,14 +260,14 @@ def best_period(
     none = np.zeros(0, int)
 
     def best(skip: np.ndarray) -> tuple[int, np.ndarray]:
-        top, found = -np.inf, (0, np.zeros(2))
+        top, winner = -np.inf, (0, np.zeros(2))
         for k, (matrix, vector) in enumerate(designs):
             a, g = matrix.sum(0), vector.sum(0)
             a, g = a - matrix[skip].sum(0), g - vector[skip].sum(0)
             c = np.linalg.solve(a + 1e-6 * np.trace(a) * np.eye(2) + 1e-12 * np.eye(2), g)
             if c @ g > top:
-                top, found = c @ g, (k, c)
-        return found
+                top, winner = c @ g, (k, c)
+        return winner
 
     gains = np.zeros(len(designs[0][1]))
     for mine in _by_run(responses):

@@ -62,10 +62,10 @@ class Records:
 
     def of_runs(self, runs: Sequence[str]) -> Records:
         """Return the records of some runs; groups and their numbers stay."""
-        wanted = set(runs)
-        keep = [i for i, e in enumerate(self.episodes) if e.run_id in wanted]
+        chosen = set(runs)
+        keep = [i for i, e in enumerate(self.episodes) if e.run_id in chosen]
         pieces = [self.signals[self.bounds[i] : self.bounds[i + 1]] for i in keep]
-        names = tuple(r for r in self.runs if r in wanted)
+        names = tuple(r for r in self.runs if r in chosen)
         return replace(
             self,
             episodes=tuple(self.episodes[i] for i in keep),
@@ -137,7 +137,7 @@ def _histories(episodes: Sequence[Episode], trajectories: Trajectories | None) -
             ["run_id", "vehicle_id"], as_dict=True, maintain_order=True
         ).items()
     }
-    found = []
+    histories = []
     for e in episodes:
         time, speed = tracks[e.run_id, e.vehicle_id]
         end = int(np.searchsorted(time, e.time_s[0] - 1e-6))
@@ -145,8 +145,9 @@ def _histories(episodes: Sequence[Episode], trajectories: Trajectories | None) -
         holes = np.flatnonzero(np.diff(time[: end + 1]) > 1.5 * step)
         begin = int(holes[-1]) + 1 if len(holes) else 0
         stride = max(1, round(e.dt / step))
-        found.append(speed[end - stride : begin - 1 if begin else None : -stride][::-1] if end > stride else speed[:0])
-    return found
+        past = speed[end - stride : begin - 1 if begin else None : -stride][::-1]
+        histories.append(past if end > stride else speed[:0])
+    return histories
 
 
 def _with_history(signals: np.ndarray, speeds: np.ndarray, dt: float) -> np.ndarray:
@@ -255,8 +256,8 @@ def whole(records: Records, longest_s: float = 300.0, every_s: float = 0.5) -> R
         lasts += cuts[1:].tolist()
     first = np.array(start)
     count = int(max(np.array(lasts) - first) - 1) // every
-    at = first[:, None] + every * (1 + np.arange(count))
-    valid = at < np.array(lasts)[:, None]
+    samples = first[:, None] + every * (1 + np.arange(count))
+    valid = samples < np.array(lasts)[:, None]
     return Rows(
         records, np.array(record), first, count * every, every, valid, np.zeros(len(first), bool),
         np.zeros(len(first), int),

@@ -59,17 +59,17 @@ def explain(
                 path, ring_length=question.ring_length, place=question.place, layout=question.layout,
                 columns=question.columns, where=question.where, seconds=question.split_s,
             )  # fmt: skip
-        said = cure(trajectories)
-        if said is not None:
-            return undecided.write(trajectories, said, out), ()
-        found = discover(
+        advice = cure(trajectories)
+        if advice is not None:
+            return undecided.write(trajectories, advice, out), ()
+        discovery = discover(
             trajectories, by=question.by, effects=question.effects, known=question.known, out=out, resume=resume,
             seed=question.seed, base=question.base, on_progress=progress,
         )  # fmt: skip
         progress("writing the report", 0, 0, "")
-        write_report(found, out)
+        write_report(discovery, out)
     result: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    return result, found.judgement.titles
+    return result, discovery.judgement.titles
 
 
 @dataclass(frozen=True)
@@ -130,26 +130,26 @@ def _explain_set(one: _Set, on_progress: OnProgress) -> None:
     before, after = report["error"]["before"], (report["partial"] or report["error"])["after"]
     one.parts.finish(one.number, row | {
         "verdict": report["verdict"], "sentence": report["sentence"],
-        "effects": " ".join(found["effect"] or found["label"] for found in report["found"]),
+        "effects": " ".join(finding["effect"] or finding["label"] for finding in report["found"]),
         "gap_rmse_before_m": before and before["gap_rmse_m"], "gap_rmse_after_m": after and after["gap_rmse_m"],
     })  # fmt: skip
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
     """Return a folder's name for every file: its own without extension, numbered where that is there twice."""
-    found: list[str] = []
+    names: list[str] = []
     for path in paths:
         name = path.name.split(".")[0]
-        count = sum(n == name or n.startswith(f"{name}-") for n in found)
-        found.append(f"{name}-{count + 1}" if count else name)
-    return found
+        count = sum(n == name or n.startswith(f"{name}-") for n in names)
+        names.append(f"{name}-{count + 1}" if count else name)
+    return names
 
 
 def _page(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
     verdicts: dict[str, int] = {}
     for row in rows:
         verdicts[row["verdict"]] = verdicts.get(row["verdict"], 0) + 1
-    told = ", ".join(f"{verdict.replace('_', ' ')}: {count}" for verdict, count in sorted(verdicts.items()))
+    counts = ", ".join(f"{verdict.replace('_', ' ')}: {count}" for verdict, count in sorted(verdicts.items()))
     table = [
         {
             "data set": row["set"], "verdict": row["verdict"].replace("_", " "), "effects": row["effects"],
@@ -159,7 +159,7 @@ def _page(rows: Sequence[dict[str, Any]]) -> list[page.Block]:
         for row in rows
     ]  # fmt: skip
     return [
-        page.lead(f"{told}."),
+        page.lead(f"{counts}."),
         page.table(table, digits={"gap RMSE before (m)": 2, "after (m)": 2}),
         page.note(
             "Errors are of each set's test runs. Each set was judged by itself: over many sets some verdicts "

@@ -64,13 +64,13 @@ def find(responses: Responses, seed: int) -> Shared | None:
     if p_value > ALPHA or np.nanmedian(np.delete(score, run)) > USUAL:
         return None
     mine = rows.run == run
-    alone = replace(responses, change=responses.change * mine[:, None], residual=responses.residual * mine[:, None])
+    of_run = replace(responses, change=responses.change * mine[:, None], residual=responses.residual * mine[:, None])
     # Of an interval and the rest of the run drivers' parameters make one and the same: it is the shorter one.
     time = responses.coordinates["time"][mine]
-    found = scan(alone, "acceleration", "time", 5.0, longest=0.5 * float(time.max() - time.min()))
-    if found is None:
+    stretch = scan(of_run, "acceleration", "time", 5.0, longest=0.5 * float(time.max() - time.min()))
+    if stretch is None:
         return None
-    return Shared(records.runs[run], found.begin, found.end, found.amount, int(vehicles[run]), p_value)
+    return Shared(records.runs[run], stretch.begin, stretch.end, stretch.amount, int(vehicles[run]), p_value)
 
 
 def _tables(responses: Responses, run: int, number: np.ndarray) -> np.ndarray:
@@ -92,11 +92,11 @@ def standing_out(table: np.ndarray, random: np.random.Generator) -> float:
     vehicles, count, _ = table.shape
     # As it is, and with every vehicle's residuals turned by a random time.
     by = np.concatenate([np.zeros((1, vehicles), int), random.integers(0, count, (TURNS, vehicles))])
-    at = (np.arange(count) + by[..., None]) % count
+    turned = (np.arange(count) + by[..., None]) % count
     total = np.zeros(len(by))
     unsteady = 0.0
     for i, j in combinations(range(vehicles), 2):
-        product = np.einsum("ntm,ntm->nt", table[i][at[:, i]], table[j][at[:, j]])
+        product = np.einsum("ntm,ntm->nt", table[i][turned[:, i]], table[j][turned[:, j]])
         total += product.sum(1)
         unsteady += float((product[0] ** 2).sum())
     return float((total[0] - total[1:].mean()) / (max(total[1:].std(), np.sqrt(unsteady)) + 1e-12))

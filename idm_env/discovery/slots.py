@@ -39,8 +39,8 @@ BY = Parameter("by", "", "1", 0.0, 0.0, float(len(PER)), role="shape")
 def _value(effect: Slot | Push, scene: Scene, driver: Driver, p: P) -> Tensor:
     """Return c."""
     if effect.given:
-        given: Tensor = scene.input(effect.name)
-        return given
+        value: Tensor = scene.input(effect.name)
+        return value
     x: Any = 0.0
     for number, feature in enumerate(FEATURES):
         # Chosen, not summed: the loop need not wait for what does not count.

@@ -205,10 +205,10 @@ def _findings(
 ) -> list[result.TermFinding]:
     """Return the terms of a model after the first ``base``; ``intervals`` [Q, 3] where they are not its own."""
     intervals = interval_of(compared, task) if intervals is None else intervals
-    findings, at = [], sum(t.size for t in compared.model.terms[:base])
+    findings, begin = [], sum(t.size for t in compared.model.terms[:base])
     for term in compared.model.terms[base:]:
-        findings.append(_finding(term, compared, rounds, intervals[at : at + term.size], task, law))
-        at += term.size
+        findings.append(_finding(term, compared, rounds, intervals[begin : begin + term.size], task, law))
+        begin += term.size
     return findings
 
 
@@ -226,9 +226,9 @@ def _finding(
     }
     contrast = contrast_of(compared, task, term.label) if term.located and term.form == CURVE else None
     gains = np.array([s.gains for s in this.scored])
-    beside = [] if this.free else rivals(gains, winner, units(task.rows.records).run)
+    close = [] if this.free else rivals(gains, winner, units(task.rows.records).run)
     equivalent, near = (
-        [this.scored[i].term.effect or this.scored[i].term.label for i in which] for which in (this.equivalent, beside)
+        [this.scored[i].term.effect or this.scored[i].term.label for i in which] for which in (this.equivalent, close)
     )
     effect = None if term.effect is None else ALL[term.effect]
     return result.TermFinding(
@@ -292,9 +292,9 @@ def absorbed(solution: Solution | None, term: Term) -> float | None:
         return None
     first = solution.model.where(term.label).start
     j = solution.linear.by_phi[..., first]
-    alone = float((j**2).sum())
+    total = float((j**2).sum())
     projected = float(np.einsum("gqq->gq", solution.reduced_hessian)[:, first].sum())
-    return None if alone <= 0 else float(np.clip(1.0 - projected / alone, 0.0, 1.0))
+    return None if total <= 0 else float(np.clip(1.0 - projected / total, 0.0, 1.0))
 
 
 def _parameters(before: Solution, after: Solution, seen: np.ndarray) -> list[result.Moved]:
@@ -320,10 +320,10 @@ def standard_errors(solution: Solution) -> np.ndarray:
     variance = np.ones(groups)
     count = np.zeros(groups)
     square = np.zeros(groups)
-    of = solution.row_group
-    np.add.at(matrix, of, np.einsum("rmi,rmj->rij", linear.by_theta, linear.by_theta) / 10.0)
-    np.add.at(square, of, (linear.residual**2).sum(1))
-    np.add.at(count, of, (linear.by_theta != 0).any(-1).sum(1))
+    group = solution.row_group
+    np.add.at(matrix, group, np.einsum("rmi,rmj->rij", linear.by_theta, linear.by_theta) / 10.0)
+    np.add.at(square, group, (linear.residual**2).sum(1))
+    np.add.at(count, group, (linear.by_theta != 0).any(-1).sum(1))
     variance = np.maximum(square / np.maximum(count, 1), 1e-9)
     inverse = np.linalg.inv(matrix / variance[:, None, None] + 1e-9 * np.eye(matrix.shape[-1]))
     return np.sqrt(np.einsum("gii->gi", inverse))

@@ -59,15 +59,15 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
         base: Number of terms that belong to the null.
         seed: Of the signs.
     """
-    at, solution = start, None
+    fit, solution = start, None
     steps: list[Step] = []
-    while len(at.model.terms) - base < MOST_TERMS:
-        step, found = _forward(searching, at, seed)
+    while len(fit.model.terms) - base < MOST_TERMS:
+        step, grown = _forward(searching, fit, seed)
         steps.append(step)
-        if found is None:
+        if grown is None:
             break
-        solution = found
-        at = free.stand(at.task.rows.records, found.model, found.values, at.task.prior, found.theta)
+        solution = grown
+        fit = free.stand(fit.task.rows.records, grown.model, grown.values, fit.task.prior, grown.theta)
     if solution is None:
         return None, steps
     solution = _backward(start, solution, base)
@@ -76,28 +76,28 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
     return Joined(solution, interval_of(solution, start.task), free.gains(start, solution)), steps
 
 
-def _forward(searching: Search, at: ClosedLoopFit, seed: int) -> tuple[Step, Solution | None]:
-    lines = looks(searching, at)
+def _forward(searching: Search, fit: ClosedLoopFit, seed: int) -> tuple[Step, Solution | None]:
+    lines = looks(searching, fit)
     if not lines:
         nothing = np.zeros(0)
         return Step([], Tested(nothing, nothing, np.zeros((0, 2))), None, []), None
     scored = [Scored(line.term, None, line.gains) for line in lines]
 
     def test() -> Tested:
-        return at_level(westfall_young(np.array([s.gains for s in scored]), seed, at.units.run), FREE_SHARE)
+        return at_level(westfall_young(np.array([s.gains for s in scored]), seed, fit.units.run), FREE_SHARE)
 
     tested = test()
     first = tested
     for i in [i for i in np.argsort(-first.gain) if first.p_value[i] < ALPHA and first.gain[i] >= LEAST_GAIN][:TRIED]:
-        found = free.nested(at, scored[i].term, lines[i].start)
-        scored[i] = Scored(scored[i].term, found, free.gains(at, found))
+        fitted = free.nested(fit, scored[i].term, lines[i].start)
+        scored[i] = Scored(scored[i].term, fitted, free.gains(fit, fitted))
         tested = test()
         if tested.p_value[i] < ALPHA and tested.gain[i] >= LEAST_GAIN:
             same = [
                 int(j) for j in range(len(scored))
                 if j != i and first.p_value[j] < ALPHA and first.gain[j] >= (1.0 - SAME) * first.gain[i]
             ]  # fmt: skip
-            return Step(scored, tested, int(i), same), found
+            return Step(scored, tested, int(i), same), fitted
     return Step(scored, tested, None, []), None
 
 
@@ -119,8 +119,8 @@ def _backward(start: ClosedLoopFit, solution: Solution, base: int) -> Solution:
 def _without(start: ClosedLoopFit, solution: Solution, index: int) -> Solution:
     begin = sum(t.size for t in solution.model.terms[:index])
     gone = np.arange(begin, begin + solution.model.terms[index].size)
-    at = replace(start, theta=solution.theta)
-    return free.joint(at, solution.model.without(index), np.delete(solution.values, gone))
+    fit = replace(start, theta=solution.theta)
+    return free.joint(fit, solution.model.without(index), np.delete(solution.values, gone))
 
 
 def contains_null(solution: Solution, intervals: np.ndarray, index: int) -> bool:
@@ -130,6 +130,6 @@ def contains_null(solution: Solution, intervals: np.ndarray, index: int) -> bool
     strengths = [(p, i) for i, p in enumerate(term.parameters) if p.role == "strength" and p.null is not None]
     if len(strengths) != 1:
         return False
-    parameter, at = strengths[0]
-    _, low, high = intervals[begin + at]
+    parameter, entry = strengths[0]
+    _, low, high = intervals[begin + entry]
     return bool(low <= parameter.null <= high)

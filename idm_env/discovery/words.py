@@ -116,17 +116,17 @@ def _contrast(term: Term, estimates: Sequence[float], c: Contrast) -> str:
     high, low = (first + distance * knot for knot in (c.high_knot, c.low_knot))
     unit = "s" if term.coordinate == "time" else "m" if term.coordinate == "position" else FEATURES[term.coordinate]
     if term.what == "acceleration":
-        told = f"{number(c.estimate, 2)} m/s² [{number(c.low, 2)}, {number(c.high, 2)}] higher"
+        difference = f"{number(c.estimate, 2)} m/s² [{number(c.low, 2)}, {number(c.high, 2)}] higher"
     else:  # of relative changes c: (1 + c at the higher knot) / (1 + c at the lower one)
         below = 1.0 + estimates[c.low_knot]
-        told = f"{100 * c.estimate / below:.0f} % [{100 * c.low / below:.0f}, {100 * c.high / below:.0f}] higher"
+        difference = f"{100 * c.estimate / below:.0f} % [{100 * c.low / below:.0f}, {100 * c.high / below:.0f}] higher"
     where = f"{amount(high, unit)} than at {amount(low, unit)}"
     if "phase" in term.label:
         where += f" of a cycle of {term.period:.0f} s"
     prefix = f"a {ALONG[term.coordinate]} of " if term.fades else ""
     if term.by:
         where += f", for each {amount(PER[term.by], FEATURES[term.by])} of {ALONG[term.by]}"
-    return f"is {told} at {prefix}{where}".replace("[-", "[−")
+    return f"is {difference} at {prefix}{where}".replace("[-", "[−")
 
 
 def _over(term: Term) -> str:
@@ -287,10 +287,10 @@ def _limits(strengths: Mapping[str, Strength]) -> str:
     agreed = [name for name, s in strengths.items() if s.is_agreed]
     best = sorted(agreed, key=lambda name: strengths[name].beyond / strengths[name].typical)[:SHOWN]
     worst = sorted(strengths, key=lambda name: -strengths[name].seen / strengths[name].typical)[:SHOWN]
-    known = ", ".join(f"no {plain(n)} beyond {_strength(strengths[n], strengths[n].beyond)}" for n in best)
+    bounds = ", ".join(f"no {plain(n)} beyond {_strength(strengths[n], strengths[n].beyond)}" for n in best)
     hidden = ", ".join(f"a {plain(n)} {_below(_strength(strengths[n], strengths[n].seen))}" for n in worst)
-    known = f"there is {known} (95 %), and " if known else ""
-    return f"; {known}{hidden} would not have been seen"
+    bounds = f"there is {bounds} (95 %), and " if bounds else ""
+    return f"; {bounds}{hidden} would not have been seen"
 
 
 def _below(strength: str) -> str:
@@ -310,7 +310,7 @@ def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:
     """Say which strengths of absent effects the data exclude, and which they would not have shown."""
     if verdict not in (Verdict.NONE, Verdict.CANNOT_TELL) or not strengths:
         return []
-    told = [
+    bounds = [
         f"{plain(name)} beyond {number(s.low, 2)} … {amount(float(f'{s.high:.2g}'), s.parameter.unit)}"
         for name, s in strengths.items() if s.is_agreed
     ]  # fmt: skip
@@ -319,7 +319,7 @@ def excluded(verdict: Verdict, strengths: Mapping[str, Strength]) -> list[str]:
         for name, s in strengths.items()
     ]
     return [
-        *([f"Excluded (95 %): {'; '.join(told)}."] if told else []),
+        *([f"Excluded (95 %): {'; '.join(bounds)}."] if bounds else []),
         f"Would have been missed one time in five or more: {'; '.join(unseen)}, from what is without the effect.",
     ]
 
@@ -351,7 +351,7 @@ def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
 
 def by_use(laws: Sequence[Law], chosen: Law | None) -> list[str]:
     """Say of every error which law is best for it, where that is another one and better beyond chance."""
-    told = []
+    sentences = []
     for key, (name, _) in ERRORS.items():
         fair = [law for law in laws if key in law.against and not law.at_best]
         better = [law for law in fair if law.against[key].light is ErrorChange.BETTER]
@@ -361,22 +361,22 @@ def by_use(laws: Sequence[Law], chosen: Law | None) -> list[str]:
         worse = [ERRORS[k][0] for k, c in best.against.items() if c.light is ErrorChange.WORSE]
         but = f"; {' and '.join(worse)} worse" if worse else ""
         title, c = best.title, best.against[key]
-        told.append(
+        sentences.append(
             f"{title[:1].upper()}{title[1:]} errs least in the {name}: {percent(c.ratio)} "
             f"(95 %: {percent(c.low)} to {percent(c.high)}){but}."
         )
-    return told
+    return sentences
 
 
 def _of_drivers(drivers: Solution) -> list[str]:
     """Return the strengths that are each driver's own: median and the range of 80 % of the drivers."""
     catalogue, theta = drivers.model.catalogue, np.exp(drivers.theta[np.unique(drivers.row_group)])
-    told = []
+    strengths = []
     for i, (name, p) in enumerate(catalogue.of_driver):
         if name in catalogue.personal:
             low, middle, high = np.quantile(theta[:, i], [0.1, 0.5, 0.9])
-            told.append(f"{p.symbol} = {number(middle, 2)} ({number(low, 2)} to {number(high, 2)})")
-    return told
+            strengths.append(f"{p.symbol} = {number(middle, 2)} ({number(low, 2)} to {number(high, 2)})")
+    return strengths
 
 
 def weight(prior: Weight) -> str:
@@ -411,12 +411,12 @@ def ceilings(of: Ceilings, before_m: float | None, floor_m: float | None = None)
 def laws(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return in one line how the gap's error of other car-following laws compares with that of the first."""
     first, *others = rows
-    told = [
+    changes = [
         f"{row['title']} {percent(row['against']['gap_rmse_m']['ratio'])} ({row['against']['gap_rmse_m']['verdict']})"
         for row in sorted(others, key=lambda row: float(row["gap_rmse_m"] or 0.0))
         if row["against"].get("gap_rmse_m", {}).get("ratio") is not None
     ]
-    return f"Other laws alone, gap in free simulation against {first['title']}: {', '.join(told)}."
+    return f"Other laws alone, gap in free simulation against {first['title']}: {', '.join(changes)}."
 
 
 def spoken(item: str) -> str:
