@@ -98,7 +98,8 @@ ROAD = tuple(
 
 
 def _ahead(each: ObservedFeature, view: AgentView) -> Tensor:
-    return each.feature.read(AgentView(view.task, view.world, each.ahead))
+    # One view for all of the agent itself, so that what they share is worked out once.
+    return each.feature.read(AgentView(view.task, view.world, each.ahead) if each.ahead else view)
 
 
 def with_road(environment: Mapping[str, Any]) -> dict[str, Any]:

@@ -154,7 +154,7 @@ class Batch:
     def glance(self) -> EnvState:
         """Return the worlds as they are now, for reading only and until the next step."""
         if self._world is None and self._loaded and self._values is not None:
-            return self._values.current(own=False)
+            return self._values.glance()
         assert self._world is not None
         return self._world
 
@@ -326,12 +326,13 @@ class Batch:
             assert state.present is not None
             on_road = self.task.pick(state.present) > 0
             live = on_road if live is None else live & on_road
-        outcome = self._once(action, live)
-        for _ in range(self.task.held - 1):
+        held = self.task.held
+        outcome = self._once(action, live, held == 1)
+        for left in reversed(range(held - 1)):
             over = outcome.whole.terminated | outcome.whole.truncated
             if bool(over.all()):
                 break
-            outcome = _held(outcome, self._once(action, live), over)
+            outcome = _held(outcome, self._once(action, live, not left or bool(over.any())), over)
         if self.counters is None or "stops" not in self.settings.info:
             return outcome
         self.counters.decided(self.glance().state)
@@ -343,9 +344,9 @@ class Batch:
         """Return how a row has crashed in this step, or one of its agents."""
         return self._reasons.get(row) or self.task.crash_reason(self.glance(), row, agent)
 
-    def _once(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> Outcome:
-        """Advance every row by Δt."""
-        outcome = self._stepped(action, live)
+    def _once(self, action: Tensor | np.ndarray | None, live: Tensor | None, observed: bool) -> Outcome:
+        """Advance every row by Δt; observations need not be read where nobody decides next."""
+        outcome = self._stepped(action, live, observed)
         if self.counters is not None and self.counters.loops:
             self.counters.after(self.glance().state)
         if self.task.held > 1 and self.count > 1 and "crash" in outcome.details:
@@ -354,7 +355,7 @@ class Batch:
                 self._reasons[row] = self.crash_reason(row)
         return outcome
 
-    def _stepped(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> Outcome:
+    def _stepped(self, action: Tensor | np.ndarray | None, live: Tensor | None, observed: bool) -> Outcome:
         self._on_lanes += isinstance(self.task.road, Lanes)
         eager = self.task.simulator.untried or 0 < self._on_lanes <= EAGER_STEPS
         if self._values is not None and not eager:
@@ -362,9 +363,9 @@ class Batch:
             if outputs is not None:
                 return Outcome.of(outputs)
         with torch.no_grad() if self.settings.output == "numpy" else contextlib.nullcontext():
-            return Outcome.of(self._step_torch(action, live))
+            return Outcome.of(self._step_torch(action, live, observed))
 
-    def _step_torch(self, action: Tensor | np.ndarray | None, live: Tensor | None) -> dict[str, Any]:
+    def _step_torch(self, action: Tensor | np.ndarray | None, live: Tensor | None, observed: bool) -> dict[str, Any]:
         if isinstance(action, np.ndarray):
             action = torch.as_tensor(action, device=self.settings.device)
         before = self.world
@@ -372,7 +373,7 @@ class Batch:
         block = self._normals(lambda: before.state.step)
         normals = None if block is None else {name: x[self.used - 1] for name, x in block.items()}
         driven = self.task.episode_params(before.episode, self.params)
-        self.world, outputs = self._moves.step(before, action, live, normals, driven)
+        self.world, outputs = self._moves.step(before, action, live, normals, driven, observed)
         # What a task tells may be a part of its state: whoever is told gets numbers of his own.
         outputs = {name: x.clone() for name, x in outputs.items()}
         return {n: x.cpu().numpy() for n, x in outputs.items()} if self.settings.output == "numpy" else outputs

@@ -32,14 +32,18 @@ class Moves:
         live: Tensor | None,
         normals: Mapping[str, Tensor] | None,
         driven: Params,
+        observed: bool = True,
     ) -> tuple[EnvState, dict[str, Tensor]]:
-        """Return the worlds Δt later and all that faces tell of the step; ``driven`` are ``task.episode_params``."""
+        """Return the worlds Δt later and all that faces tell of the step; ``driven`` are ``task.episode_params``.
+
+        Without ``observed`` observations are read only where an episode ends, and otherwise empty.
+        """
         command, limited, inputs = self.commanded(world, action, normals, live)
         after = world._replace(state=self._advance(world.state, inputs, driven))
         if command is None:
             none = after.state.speed.new_zeros(len(after.state.speed), len(self.task.agents))
-            return after, self.told(world, none, limited, after, False)
-        return after, self.told(world, command, limited, after, True)
+            return after, self.told(world, none, limited, after, False, observed)
+        return after, self.told(world, command, limited, after, True, observed)
 
     def commanded(
         self,
@@ -58,7 +62,13 @@ class Moves:
         return command, limited, inputs
 
     def told(
-        self, before: EnvState, command: Tensor, given: Tensor | None, after: EnvState, commanded: bool
+        self,
+        before: EnvState,
+        command: Tensor,
+        given: Tensor | None,
+        after: EnvState,
+        commanded: bool,
+        observed: bool = True,
     ) -> dict[str, Tensor]:
         """Return everything that faces tell of a step, by name."""
         task = self.task
@@ -71,8 +81,9 @@ class Moves:
             ends, cut = terminated[..., 0], truncated[..., 0]
         else:
             ends, cut = terminated.any(-1), (truncated | terminated).all(-1) & truncated.any(-1)
+        reads = observed or bool((ends | cut).any())
         return {
-            "observation": task.observe(after),
+            "observation": task.observe(after) if reads else reward.new_empty(0),
             "reward": reward,
             "terminated": terminated,
             "truncated": truncated,

@@ -50,6 +50,7 @@ class Values:
         self._chain: Chain | None = None
         self.past: Past
         self._world: EnvState
+        self._glance: EnvState | None = None
 
     # -- worlds --------------------------------------------------------------------------------------------------
 
@@ -58,7 +59,7 @@ class Values:
 
         Untraceable where something carries a graph that no step changes.
         """
-        leaves = named(world)
+        leaves, self._glance = named(world), None
         key = (world.state.speed.shape, world.state.speed.dtype, tuple(world.state.memory), tuple(world.episode))
         blocks = tuple(n for n in leaves if n in _DYNAMIC or n.startswith("memory_"))
         fixed = next((n for n, x in leaves.items() if x.requires_grad and n not in blocks), None)
@@ -85,7 +86,7 @@ class Values:
     def replace(self, rows: Array, fresh: EnvState) -> None:
         """Replace some rows (indices) by the worlds of ``fresh``, with their graph; that of the rows before is cut."""
         index, blocks = torch.from_numpy(np.asarray(rows)), _block(fresh, self.layout.blocks)
-        leaves = {n: x.detach().numpy() for n, x in named(fresh).items()}
+        leaves, self._glance = {n: x.detach().numpy() for n, x in named(fresh).items()}, None
         if self._graph:
             self.blocks = self.blocks.index_copy(1, index, blocks)
             self._clock, self.past = self._clock.copy(), self.past.copy()
@@ -113,22 +114,26 @@ class Values:
                 self.layout = self.layout._replace(still=still, version=self.layout.version + 1)
             old[rows] = values
 
-    def current(self, own: bool = True) -> EnvState:
-        """Return the worlds as tensors of their own, or as views until the next step, without graph and past."""
-        held, clock, layout = self.blocks if own else self.blocks.detach(), self._clock, self.layout
-        whole = self._whole
-        if own:
-            clock, layout = clock.copy(), layout._replace(still={n: x.copy() for n, x in layout.still.items()})
-            whole = None if whole is None else whole.copy()
-            held = held if self._graph else held.clone()
-        past = self.past.tensor() if own and self.past.slots else None
+    def current(self) -> EnvState:
+        """Return the worlds as tensors of their own."""
+        layout = self.layout._replace(still={n: x.copy() for n, x in self.layout.still.items()})
+        whole = None if self._whole is None else self._whole.copy()
+        past = self.past.tensor() if self.past.slots else None
         if past is not None and self._token is not None:
             past = _Leave.apply(self._token, past)
-        return _world(self._world, layout, held, clock, past, whole)
+        held = self.blocks if self._graph else self.blocks.clone()
+        return _world(self._world, layout, held, self._clock.copy(), past, whole)
+
+    def glance(self) -> EnvState:
+        """Return the worlds as views until the next step, without graph and past: the same until then."""
+        if self._glance is None:
+            held = self.blocks.detach()
+            self._glance = _world(self._world, self.layout, held, self._clock, None, self._whole)
+        return self._glance
 
     def detach(self) -> None:
         """Cut the graph behind the worlds."""
-        self.blocks, self._token = self.blocks.detach(), None
+        self.blocks, self._token, self._glance = self.blocks.detach(), None, None
 
     def clock(self) -> Tensor:
         """Return the steps of all rows, as they are now."""
@@ -167,7 +172,7 @@ class Values:
             if self._graph:
                 clock = outputs.pop("clock")
                 outputs = {n: torch.from_numpy(x) for n, x in outputs.items()} | {"clock": clock}
-        self._clock = outputs.pop("clock")
+        self._clock, self._glance = outputs.pop("clock"), None
         if moment.lanes is not None:
             self._whole, self._chain = moment.lanes.whole_later, moment.lanes.chain
         if self.past.slots:
@@ -196,7 +201,7 @@ class Values:
         """Return the plan of steps of a kind (``Plan``), made once."""
         plan = self._plans.get(kind)
         if plan is None:
-            world = self.current(own=False)
+            world = self.glance()
             make = Plan if world.state.links is None else LanePlan
             plan = make(self._moves, world, self.layout, kind, draws)
             if self._graph:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 import idm_env  # noqa: F401
 from idm_env.tasks import TASKS, make_task
@@ -55,6 +56,21 @@ def test_rows_that_end_while_an_action_is_held_tell_of_their_end() -> None:
             assert reward[row] == pytest.approx(sum(paid[20 * step :]), rel=1e-5)
             assert info["final_info"]["crash_reason"][row] == told["crash_reason"]
     assert len(ended) == 4
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_observations_are_read_once_a_decision(output: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By torch, where every reading costs as much as a step; and where a row ends in between."""
+    env = gym.make_vec("DiffIDM-v0", num_envs=2, task="merge", vehicles=12, output=output)
+    env.reset(seed=3)
+    task, read = env.unwrapped.task, []
+    observe = type(task).observe
+    monkeypatch.setattr(type(task), "observe", lambda self, world: (read.append(1), observe(self, world))[1])
+    action = torch.zeros(env.action_space.shape)
+    for _ in range(3):
+        seen = env.step(action if output == "torch" else action.numpy())[0]
+    assert task.held == 10 and len(read) == 3
+    np.testing.assert_array_equal(np.asarray(seen), observe(task, env.unwrapped.batch.world).flatten(1))
 
 
 def test_a_hold_that_is_no_whole_number_of_steps_is_one_line() -> None:
