@@ -7,6 +7,8 @@ does (``added=True``), so that ends of lanes and those who merge are minded as b
 * *evolution*: five numbers for each lane, by CMA-ES (Hansen 2016, arXiv 1604.00772; library ``cma``), from humans on.
   It sees returns of whole episodes only, and so who merges.
 * *gradients*: the same numbers by APG: through traffic and driver, 24 windows of 120 s, from humans on.
+* *ppo*, *shac*: networks that see what these tasks show, with added commands of a second, from humans on
+  (``configs/merge-ppo.yaml``, ``configs/merge-shac.yaml``), in the CPU time of an evolution times ``--budget``.
 
 The first two have the same ``GENERATIONS · DRIVERS · EPISODES`` episodes. What each seed finds is judged on
 ``JUDGED_ON`` fresh ones of 600 s, the same for all rows. Each row is kept in ``--out`` when it is done.
@@ -14,10 +16,12 @@ The first two have the same ``GENERATIONS · DRIVERS · EPISODES`` episodes. Wha
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -27,6 +31,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
+from agents.common import load, load_agent
 from agents.environments import make_env
 from agents.evaluate import judge_lanes
 from agents.rollout import Act, episodes_start
@@ -46,6 +51,8 @@ ROUNDS = (75, 4), (15, 20), (3, 100)
 """Drivers that a random search compares, and on how many episodes: as many in all as an evolution has."""
 UPDATES, WINDOW, ROWS, RATE = 24, 120, 8, 0.03
 JUDGED_ON, STUDENT = 64, 1.998
+NETWORKS = ("ppo", "shac")
+CONFIGS = Path(__file__).parents[1] / "configs"
 
 
 class Drivers(nn.Module):
@@ -84,6 +91,8 @@ class Part:
     share: float
     how: str
     seed: int
+    budget: float = 1.0
+    """Of a network: the share of its file's updates and CPU seconds."""
 
     def __str__(self) -> str:
         return f"{self.name}, {self.share:g}, {self.how}, {self.seed}"
@@ -166,9 +175,26 @@ def pathwise(given: dict[str, Any], seed: int) -> Tensor:
 FOUND_BY = {"random search": blind, "evolution": evolved, "gradients": pathwise}
 
 
+def network(part: Part) -> dict[str, Any]:
+    """Return the row of a policy of ``agents``, trained as its file says but for where."""
+    module: Any = importlib.import_module(f"agents.{part.how}")
+    given = {name: x for name, x in part.given.items() if name != "observation"}
+    with TemporaryDirectory() as folder:
+        arguments = load_agent(CONFIGS / f"merge-{part.how}.yaml", module.Arguments, part.how)
+        updates, seconds = round(part.budget * arguments.updates), part.budget * arguments.cpu_seconds
+        own = {"updates": updates, "evaluate_every": updates, "cpu_seconds": seconds}
+        arguments = replace(arguments, environment=given, seed=part.seed, out=Path(folder), **own)
+        spent = module.train(arguments)[-1]["cpu_seconds"]
+        policy, _ = load(arguments.out / "last.pt")
+    found = judge_lanes(episodes_start(given, JUDGED_ON, draws=(1,)), policy, 1)[0]
+    return {"seconds": spent, "numbers": None, "found": found}
+
+
 def row_of(part: Part, on_progress: OnProgress) -> dict[str, Any]:
     """Return one row: who was found, in how many CPU seconds, and how he is judged."""
     torch.set_num_threads(1)
+    if part.how in NETWORKS:
+        return network(part)
     if part.how == "humans":
         found = judge_lanes(episodes_start(part.given, JUDGED_ON, draws=(1,)), None, 1)[0]
         return {"seconds": 0.0, "numbers": None, "found": found}
@@ -198,7 +224,7 @@ def shown(title: str, rows: dict[Part, dict[str, Any]]) -> Table:
 
 def main(
     name: tyro.conf.Positional[Literal[tuple(DEMANDS)]], share: float = 0.3,
-    how: Sequence[Literal[tuple(FOUND_BY)]] = tuple(FOUND_BY), seeds: int = 5,
+    how: Sequence[Literal[(*FOUND_BY, *NETWORKS)]] = (*FOUND_BY, *NETWORKS), seeds: int = 5, budget: float = 1.0,
     out: Path = Path("runs/lane_search.jsonl"), place: Place = HERE,
 ) -> None:  # fmt: skip
     """Search where that is not done yet, and print all rows.
@@ -208,11 +234,14 @@ def main(
         share: Of those who enter.
         how: Ways to find drivers.
         seeds: Of each way.
+        budget: Of ppo and shac: share of their files' updates and CPU seconds.
         out: File of rows.
         place: Where searches run.
     """
     wanted = [("humans", 0), *((way, seed) for seed in range(seeds) for way in how)]
-    parts = {str(part): part for part in (Part(name, share, way, seed) for way, seed in wanted)}
+    budgets = dict.fromkeys(NETWORKS, budget)
+    rows = [Part(name, share, way, seed, budgets.get(way, 1.0)) for way, seed in wanted]
+    parts = {str(part): part for part in rows}
     done = named_rows(row_of, parts, out, place)
     Console(width=140).print(shown(name, {part: done[label] for label, part in parts.items()}))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from benchmarks import Place, kept_rows, lane_search, lane_tasks, lanes, named_rows
 from idm_env.jobs.progress import OnProgress
@@ -113,15 +114,25 @@ def test_each_way_to_find_drivers_leaves_a_row_that_is_not_made_again(monkeypatc
         monkeypatch.setattr(lane_search, name, value)
     monkeypatch.setattr(lane_search, "ROUNDS", ((3, 1), (2, 1)))
     monkeypatch.setattr(lane_search, "JUDGED_ON", 2)
+    for how in lane_search.NETWORKS:
+        name, small = f"merge-{how}.yaml", {"count": 2, "n_steps": 3, "batch_size": 18, "window": 3, "updates": 4}
+        given = yaml.safe_load((lane_search.CONFIGS / name).read_text())
+        (tmp_path / name).write_text(yaml.safe_dump({k: small.get(k, x) for k, x in given.items()}))
+    (tmp_path / "merge.yaml").write_text("{configures: environment, task: merge}")
+    monkeypatch.setattr(lane_search, "CONFIGS", tmp_path)
     for _ in range(2):
-        lane_search.main("small", seeds=1, out=tmp_path / "rows.jsonl")
+        lane_search.main("small", seeds=1, budget=0.5, out=tmp_path / "rows.jsonl")
         printed = capsys.readouterr().out
-        assert all(how in printed for how in ("humans", *lane_search.FOUND_BY))
+        assert all(how in printed for how in ("humans", *lane_search.FOUND_BY, *lane_search.NETWORKS))
     rows = kept_rows(tmp_path / "rows.jsonl", "name")
-    assert len(rows) == len((tmp_path / "rows.jsonl").read_text().splitlines()) == 4
+    assert len(rows) == len((tmp_path / "rows.jsonl").read_text().splitlines()) == 6
     for how, count in (("random search", 1), ("evolution", 3), ("gradients", 3)):
         found = torch.tensor(rows[f"small, 0.3, {how}, 0"]["found"]["numbers"])
         assert found.shape == (1, count, 5) and bool((found != torch.tensor(lane_search.HUMAN)).any())
+    humans = rows["small, 0.3, humans, 0"]["found"]["found"]["rewards"]
+    for how in lane_search.NETWORKS:
+        found = rows[f"small, 0.3, {how}, 0"]["found"]
+        assert found["found"]["rewards"] != humans and 0.0 < found["seconds"] < 47.5
 
 
 def test_a_search_keeps_what_is_best_on_other_episodes(monkeypatch):
