@@ -66,7 +66,10 @@ def judged(
 
 
 def population(theta: np.ndarray, rows: Rows, own: Sequence[Parameter] = BASE.declared) -> Prior:
-    """Return the drivers' own spread as prior: median and scaled median deviation of log θ over fitted groups."""
+    """Return the drivers' own spread as prior: median and scaled median deviation of log θ [G, P].
+
+    Of fewer than five groups with rows it is the first, weak prior.
+    """
     seen = np.unique(rows.group)
     if len(seen) < 5:
         return first_prior(own)

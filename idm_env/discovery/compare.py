@@ -125,7 +125,7 @@ def _width(was: np.ndarray, now: np.ndarray, runs: np.ndarray, seed: int) -> flo
 
 
 def sampling(runs: np.ndarray) -> tuple[list[list[np.ndarray]], int]:
-    """Return what is drawn, strata of units of followers' numbers, and the degrees of freedom.
+    """Return what is drawn of followers in ``runs`` [F]: strata of units of their numbers, and the degrees of freedom.
 
     Whole runs, because followers of one run share leader, road and weather, where there are at least ``RUNS``; else
     followers within their runs, or followers alone where runs have hardly more than one.
@@ -139,7 +139,7 @@ def sampling(runs: np.ndarray) -> tuple[list[list[np.ndarray]], int]:
 
 
 def unit_of(runs: np.ndarray) -> str:
-    """Return in words what is drawn, for a report."""
+    """Return in words what is drawn of followers in ``runs`` [F], for a report."""
     strata, _ = sampling(runs)
     if len(np.unique(runs)) >= RUNS:
         return f"{len(strata[0])} whole runs"

@@ -297,7 +297,10 @@ def _finish(
 
 
 def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:
-    """Return the corrected model as it is saved: effects, shared parameters, the median driver and every driver."""
+    """Return the corrected model as it is saved: effects, shared parameters, the median driver and every driver.
+
+    ``theta`` [G, P] is log θ of all groups, of which those of ``prepared`` are saved.
+    """
     added, numbers = terms.effects_of(final.model, final.values)
     # Effects that adapt a driver are chained as in discovery's loop.
     added.sort(key=lambda e: e.rank if e.hook == "adapt" else 0)

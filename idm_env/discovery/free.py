@@ -160,12 +160,12 @@ def look(at: ClosedLoopFit, term: Term) -> Line:
 
 
 def nested(at: ClosedLoopFit, term: Term, start: np.ndarray) -> Solution:
-    """Fit the model with one term more in free simulation over all time, every driver's θ following."""
+    """Fit the model with one term more, from its values ``start`` [q], in free simulation over all time; θ follows."""
     return joint(at, at.model.adding(term), np.append(at.values, start))
 
 
 def joint(at: ClosedLoopFit, model: Hypothesis, values: np.ndarray) -> Solution:
-    """Fit all terms of a model at once in free simulation over all time, from φ ``values``."""
+    """Fit all terms of a model at once in free simulation over all time, from φ ``values`` [Q]."""
     return solve(at.task, model, at.theta, values, iterations=8, tolerance=1e-3)
 
 

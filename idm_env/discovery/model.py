@@ -123,7 +123,7 @@ class Hypothesis:
 
     @property
     def on(self) -> np.ndarray:
-        """Flags of the effects that are at work."""
+        """Flags [effects] of those that are at work."""
         on = np.zeros(len(self.catalogue.flags), np.int8)
         for term, slot in self._slots:
             name = term.effect or self.catalogue.shape(term.what, term.coordinate, str(slot))[0]
@@ -132,7 +132,7 @@ class Hypothesis:
 
     @property
     def tables(self) -> np.ndarray:
-        """Form, number of knots and place in φ of every table."""
+        """Form, number of knots and place in φ of every table [tables, 3]."""
         tables = np.array([(twin.NONE, 2, self.catalogue.table_at(n)) for n in self.catalogue.tables], np.int64)
         for term, slot in self._slots:
             if term.form != twin.NONE:
@@ -326,7 +326,7 @@ def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
 
 
 def effects_of(model: Hypothesis, values: np.ndarray) -> tuple[list[Effect], dict[str, dict[str, float]]]:
-    """Return the simulator's effects of a model's terms and their parameters as numbers."""
+    """Return the simulator's effects of a model's terms with values [Q], and their parameters as numbers."""
     effects: list[Effect] = []
     numbers: dict[str, dict[str, float]] = {}
     begin = 0

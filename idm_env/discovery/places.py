@@ -126,7 +126,7 @@ class Found:
 
 
 def bins_of(values: np.ndarray, width: float, most: int = 60) -> tuple[np.ndarray, float]:
-    """Return the first edge and edges of at most ``most`` bins over a coordinate."""
+    """Return the edges [bins + 1] of at most ``most`` bins over a coordinate's values, in its unit, and their width."""
     low, high = float(values.min()), float(values.max()) + 1e-6
     width = max(width, (high - low) / most)
     count = max(1, int(np.ceil((high - low) / width)))
@@ -250,7 +250,7 @@ def hats(values: np.ndarray, first: float, distance: float, count: int, period: 
 def best_period(
     responses: Responses, what: str, shortest: float = 6.0, longest: float = 90.0
 ) -> tuple[float, np.ndarray]:
-    """Return the period (s) of the clock at which a sine of ``what`` explains most, and honest gains per unit."""
+    """Return the period (s) of the clock at which a sine of ``what`` explains most, and honest gains [units]."""
     time = responses.coordinates["time"]
     periods = np.geomspace(shortest, longest, 60)
     designs = []

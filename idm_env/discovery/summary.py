@@ -130,7 +130,7 @@ def _verdict(
 
 
 def bar(first: Round, run: np.ndarray, seed: int, kept: int) -> Bar:
-    """Return what a candidate had to reach in the first round, on units of runs ``run``, and on ``kept`` runs."""
+    """Return what a candidate had to reach in the first round, on units of ``run`` [units], and on ``kept`` runs."""
     # It has to explain half of what any smooth function of the state explains.
     rest = 0.5 * np.log(2.0 - np.exp(-2.0 * max(float(first.left.mean()), 0.0)))
     gains = np.array([s.gains for s in first.scored])

@@ -124,7 +124,7 @@ def _without(start: ClosedLoopFit, solution: Solution, index: int) -> Solution:
 
 
 def contains_null(solution: Solution, intervals: np.ndarray, index: int) -> bool:
-    """Tell whether the interval of a term's strength contains its null; a curve has no one strength."""
+    """Tell whether the interval of a term's strength, in ``intervals`` [Q, 3], contains its null; a curve has none."""
     term = solution.model.terms[index]
     begin = sum(t.size for t in solution.model.terms[:index])
     strengths = [(p, i) for i, p in enumerate(term.parameters) if p.role == "strength" and p.null is not None]

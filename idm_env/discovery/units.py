@@ -97,7 +97,7 @@ def rho(roots: np.ndarray, run: np.ndarray) -> float:
 
 
 def smallest_p(run: np.ndarray) -> float:
-    """Return the smallest p-value that units of these runs can have."""
+    """Return the smallest p-value that units of these runs [units] can have."""
     sizes = np.unique(run, return_counts=True)[1]
     if (sizes == 1).all():
         return float(2.0 ** -len(sizes))
