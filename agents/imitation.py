@@ -14,7 +14,6 @@ observes what task ``follow`` gives, so the saved policy also drives there.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import time
 from collections.abc import Sequence
@@ -36,9 +35,8 @@ from idm_env.data import Episode, Trajectories, episodes, load
 from idm_env.data.episode import windows
 from idm_env.effects import Control
 from idm_env.fitting.batch import Batch
-from idm_env.fitting.evaluate import errors
+from idm_env.fitting.evaluate import pooled_errors
 from idm_env.fitting.fit import base_simulator, fit
-from idm_env.fitting.problem import group_of
 from idm_env.tasks import Task
 from idm_env.tasks.follow import SEEN
 from idm_env.types import Command
@@ -132,10 +130,7 @@ def judge(policy: Policy, items: Sequence[Episode], task: Task) -> dict[str, flo
 def calibrated(training: Sequence[Episode], test: Sequence[Episode]) -> dict[str, float]:
     """Return the errors of IDM, one parameter set for all drivers, calibrated on spacing."""
     found = fit(training, by="all")
-    batch = Batch.of(test, substeps=found.problem.batch.substeps)
-    group, groups = group_of(batch.episodes, "all")
-    problem = dataclasses.replace(found.problem, batch=batch, group=group, groups=groups)
-    return errors(problem, found.own, found.shared)[0].summary()
+    return pooled_errors(found.problem, found.own, found.shared, test).summary()
 
 
 def split(a: Arguments) -> tuple[Sequence[Episode], Sequence[Episode]]:

@@ -58,11 +58,14 @@ class Monitor:
     def untrained(self, policy: Policy) -> None:
         """Evaluate and log a policy before its first update: what the test gives for nothing."""
         begin = time.process_time()
-        row = {"updates": 0, "steps": self.steps, "cpu_seconds": self.cpu_seconds}
-        row |= evaluate(policy, self.test)
-        self.history.append(row)
+        row = self._evaluated(policy, 0, self.cpu_seconds)
         self._log(row, row)
         self._aside += time.process_time() - begin
+
+    def _evaluated(self, policy: Policy, updates: int, spent: float) -> dict[str, Any]:
+        row = {"updates": updates, "steps": self.steps, "cpu_seconds": spent, **evaluate(policy, self.test)}
+        self.history.append(row)
+        return row
 
     def _log(self, logged: Mapping[str, Any], row: Mapping[str, Any]) -> None:
         """Log figures, and print those of an evaluation, if there was one."""
@@ -93,9 +96,7 @@ class Monitor:
         begin = time.process_time()
         row: dict[str, Any] = {}
         if over or (update + 1) % self.arguments.evaluate_every == 0:
-            row = {"updates": update + 1, "steps": self.steps, "cpu_seconds": spent}
-            row |= evaluate(policy, self.test)
-            self.history.append(row)
+            row = self._evaluated(policy, update + 1, spent)
         kept = {**training, "update": update, "steps": self.steps, "cpu_seconds": spent, "history": self.history}
         kept["arguments"] = common.choices(self.arguments)
         if keep is not None:

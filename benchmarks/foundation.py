@@ -6,7 +6,6 @@ Times are CPU seconds of this process and wall seconds beside them.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import platform
@@ -21,7 +20,7 @@ from benchmarks import DATA, command, table
 from idm_env.data import Episodes, episodes, load, synthetic
 from idm_env.effects import IDM, Brakes, Replay, make
 from idm_env.fitting.batch import Batch
-from idm_env.fitting.evaluate import errors
+from idm_env.fitting.evaluate import errors, pooled_errors
 from idm_env.fitting.fit import Fit, fit
 from idm_env.fitting.problem import IDM_NAMES, Problem, group_of
 from idm_env.roads import Lane
@@ -33,10 +32,7 @@ NAMES = tuple(name.split(".")[1] for name in IDM_NAMES)
 
 def judge(items: Episodes, found: Fit) -> dict[str, float]:
     """Return the errors of a pooled fit on other episodes."""
-    batch = Batch.of(items, substeps=found.problem.batch.substeps)
-    group, names = group_of(batch.episodes, "all")
-    problem = dataclasses.replace(found.problem, batch=batch, group=group, groups=names)
-    return errors(problem, found.own, found.shared)[0].summary()
+    return pooled_errors(found.problem, found.own, found.shared, items).summary()
 
 
 def published(items: Episodes) -> dict[str, float]:

@@ -28,11 +28,11 @@ from idm_env.cli.options import (
     Out,
     RingLength,
     Seed,
+    SourceOptions,
     Step,
     TrackOptions,
     Trust,
     Where,
-    Window,
     ranged,
     spread,
 )  # fmt: skip
@@ -137,11 +137,7 @@ def fit(
     model: Corrected = None,
     base: Base = None,
     seed: Seed = 0,
-    file: FileOptions,
-    max_gap: MaxGap = 80.0,
-    min_seconds: MinSeconds = 5.0,
-    window: Window = None,
-    dt: Step = None,
+    file: SourceOptions,
     job: JobOptions,
     sumo: Annotated[
         Path | None, typer.Option(help="Also write the drivers as SUMO's vTypes, an additional file: vtypes.add.xml.")
@@ -184,9 +180,7 @@ def fit(
             storage.not_an_input(sumo, [data])
             vtypes.refuse(sumo, base or "idm")
         _work_begins()
-        source = Source(
-            data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, window=window, **dataclasses.asdict(file)
-        )
+        source = Source(data, **dataclasses.asdict(file))
         options = Options(
             by, share, objective, relative, loss, method, integration, starts, seed, substeps, model, base,  # type: ignore[arg-type]
         )  # fmt: skip
@@ -412,11 +406,7 @@ def simulate(
     base: Base = None,
     out: Out = Path("out/simulate"),
     seed: Seed = 0,
-    file: FileOptions,
-    max_gap: MaxGap = 80.0,
-    min_seconds: MinSeconds = 5.0,
-    window: Window = None,
-    dt: Step = None,
+    file: SourceOptions,
     trusted: Trust = False,
 ) -> None:
     """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
@@ -427,9 +417,7 @@ def simulate(
         from idm_env.fitting.options import Source
 
         _work_begins()
-        source = Source(
-            data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, window=window, **dataclasses.asdict(file)
-        )
+        source = Source(data, **dataclasses.asdict(file))
         result = simulate_file(source, model, out, base=base, seed=seed, on_progress=report)
     _show("Errors in free simulation", in_words([result["error"]]))
     console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)

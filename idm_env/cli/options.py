@@ -107,6 +107,16 @@ class FileOptions:
 
 
 @dataclasses.dataclass(frozen=True)
+class SourceOptions(FileOptions):
+    """How stretches behind one leader are taken from a file of traffic."""
+
+    max_gap: MaxGap = 80.0
+    min_seconds: MinSeconds = 5.0
+    window: Window = None
+    dt: Step = None
+
+
+@dataclasses.dataclass(frozen=True)
 class TrackOptions:
     """How trajectories are filtered or reconstructed."""
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from idm_env import compat
 from idm_env.envs.batch import Batch
 from idm_env.envs.info import begun, single
-from idm_env.envs.settings import RENDER_MODES, reset_options, settings
+from idm_env.envs.settings import RENDER_MODES, Settings, reset_options, settings
 from idm_env.envs.spaces import action_of, action_space, observation_box
 from idm_env.envs.unrolled import Unrolled, unroll
 from idm_env.tasks import Task
@@ -78,7 +78,15 @@ class Pictures:
 class Face(Pictures):
     """Mixin: a ``spec`` that says after how many steps episodes are cut off, and what gradients go through."""
 
+    metadata: dict[str, Any]
     _spec: EnvSpec | None = None
+
+    def _take(self, own: Settings, count: int) -> int:
+        """Take over what ``count`` environments are made of; return how many agents each has."""
+        self.settings, self.task, self.render_mode = own, own.task, own.render_mode
+        self.batch, self._numpy = Batch(own, count), own.output == "numpy"
+        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.task.step_time))}
+        return len(self.task.agents)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -184,16 +192,10 @@ class DiffIDMEnv(Face, gymnasium.Env):
     def __init__(self, render_mode: str | None = None, **keywords: Any) -> None:
         limit = asked_of_make()
         own = settings(render_mode=render_mode, **(keywords if limit is None else {**keywords, LIMIT: limit}))
-        self.settings = own
-        self.render_mode = own.render_mode
-        self.batch = Batch(own, 1)
-        self.task = own.task
-        agents = len(self.task.agents)
-        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.task.step_time))}
+        agents = self._take(own, 1)
         self.observation_space = observation_box(self.task, own.dtype, agents)
         self._shape = (agents * len(self.task.commands),)
         self.action_space = action_space(self.task, agents)
-        self._numpy = own.output == "numpy"
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see the class for ``seed`` and ``options``."""

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from idm_env.envs.batch import Batch, Outcome
+from idm_env.envs.batch import Outcome
 from idm_env.envs.gym import Face
 from idm_env.envs.info import Rows
 from idm_env.envs.settings import RENDER_MODES, affordable, reset_options, settings
@@ -46,26 +46,17 @@ class DiffIDMVectorEnv(Face, VectorEnv):
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **keywords: Any) -> None:
         own = settings(render_mode=render_mode, **keywords)
-        self.settings = own
-        self.task = own.task
         self.num_envs = whole("num_envs", num_envs, 1)
         affordable(own, num_envs)
-        self.render_mode = own.render_mode
+        agents = self._take(own, num_envs)
         self.autoreset_mode = own.autoreset_mode
-        self.metadata = {
-            **type(self).metadata,
-            "render_fps": max(1, round(1.0 / self.task.step_time)),
-            "autoreset_mode": own.autoreset_mode,
-        }
-        agents = len(self.task.agents)
+        self.metadata["autoreset_mode"] = own.autoreset_mode
         self.single_observation_space = observation_box(self.task, own.dtype, agents)
         self.single_action_space = action_space(self.task, agents)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.batch = Batch(own, num_envs)
         self._rows = Rows(self.batch)
         self._shape = (num_envs, agents * len(self.task.commands))
-        self._numpy = own.output == "numpy"
         self._ended = np.zeros(num_envs, dtype=bool)
 
     # -- reset and step ------------------------------------------------------------------------------------------

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from idm_env.fitting.problem import Problem, Simulated
+from idm_env.data import Episode
+from idm_env.fitting.batch import Batch
+from idm_env.fitting.problem import Problem, Simulated, group_of
 
 
 class Errors(NamedTuple):
@@ -58,3 +61,10 @@ def errors(problem: Problem, own: Tensor, shared: Tensor) -> tuple[Errors, Simul
 def like(problem: Problem, other: Problem) -> Problem:
     """Return ``problem`` with the batch and groups of ``other``."""
     return dataclasses.replace(problem, batch=other.batch, group=other.group, groups=other.groups)
+
+
+def pooled_errors(problem: Problem, own: Tensor, shared: Tensor, items: Sequence[Episode]) -> Errors:
+    """Return the errors on other episodes of values ``own`` [1, free] and ``shared`` that all drivers have."""
+    batch = Batch.of(items, substeps=problem.batch.substeps)
+    group, groups = group_of(batch.episodes, "all")
+    return errors(dataclasses.replace(problem, batch=batch, group=group, groups=groups), own, shared)[0]

@@ -38,7 +38,19 @@ class Moments:
         return (rows - mean) * scale
 
 
-class NormalizeObservation(gymnasium.Wrapper):
+class _Normalising:
+    """Observations less their running mean, over their running deviation."""
+
+    moments: Moments
+    update_running_mean = True
+
+    def _normalised(self, rows: Tensor) -> Tensor:
+        if self.update_running_mean:
+            self.moments.update(rows)
+        return self.moments.normalise(rows)
+
+
+class NormalizeObservation(_Normalising, gymnasium.Wrapper):
     """Normalise the observations of one environment by running moments; ``update_running_mean=False`` freezes them.
 
     Observations keep the shape of the environment's ``observation_space``, and have no unit any more.
@@ -47,22 +59,16 @@ class NormalizeObservation(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, epsilon: float = 1e-8) -> None:
         super().__init__(env)
         self.moments = Moments(env.observation_space.shape or (), epsilon)
-        self.update_running_mean = True
 
     def reset(self, **keywords: Any) -> tuple[Tensor, dict[str, Any]]:
         """Reset, and return the normalised observation."""
         observation, info = self.env.reset(**keywords)
-        return self._normalised(observation), info
+        return self._normalised(observation.unsqueeze(0)).squeeze(0), info
 
     def step(self, action: Any) -> tuple[Tensor, Any, bool, bool, dict[str, Any]]:
         """Step, and return the normalised observation with its graph."""
         observation, *rest = self.env.step(action)
-        return (self._normalised(observation), *rest)  # type: ignore[return-value]
-
-    def _normalised(self, observation: Tensor) -> Tensor:
-        if self.update_running_mean:
-            self.moments.update(observation.unsqueeze(0))
-        return self.moments.normalise(observation)
+        return (self._normalised(observation.unsqueeze(0)).squeeze(0), *rest)  # type: ignore[return-value]
 
 
 class RecordEpisodeStatistics(gymnasium.Wrapper):
@@ -90,13 +96,12 @@ class RecordEpisodeStatistics(gymnasium.Wrapper):
         return observation, reward, terminated, truncated, info
 
 
-class VectorNormalizeObservation(VectorWrapper):
+class VectorNormalizeObservation(_Normalising, VectorWrapper):
     """Normalise the observations of a vector ``(environments, …)`` by running moments, ``final_obs`` included."""
 
     def __init__(self, env: VectorEnv, epsilon: float = 1e-8) -> None:
         super().__init__(env)
         self.moments = Moments(env.single_observation_space.shape or (), epsilon)
-        self.update_running_mean = True
 
     def reset(self, **keywords: Any) -> tuple[Tensor, dict[str, Any]]:
         """Reset, and return the normalised observations."""
@@ -110,11 +115,6 @@ class VectorNormalizeObservation(VectorWrapper):
             mask = info["_final_obs"].unsqueeze(-1)
             info = {**info, "final_obs": torch.where(mask, self.moments.normalise(info["final_obs"]), 0.0)}
         return (self._normalised(observation), *rest, info)  # type: ignore[return-value]
-
-    def _normalised(self, observation: Tensor) -> Tensor:
-        if self.update_running_mean:
-            self.moments.update(observation)
-        return self.moments.normalise(observation)
 
 
 class VectorRecordEpisodeStatistics(VectorWrapper):
