@@ -39,36 +39,14 @@ from idm_env import metrics
 from idm_env.envs.gym import DiffIDMEnv
 from idm_env.jobs import trust
 from idm_env.model_file import nested
+from idm_env.tasks import TASKS, FollowTask, RingTask, Task
 from idm_env.tasks.open_lanes import OpenLanesTask
-from idm_env.tasks.ring import RingTask
 
 STEPS = 3000
 STEPS_OF_LANES = 6000
 JUDGED = 1000
 SPEED_RATIO, SPEED_STD, TIME_GAP, IN_A_ROW = 0.97, 0.15, 0.8, 5
 FOLLOW_REWARD = 0.88
-TEST: dict[str, dict[str, Any]] = {
-    "ring": {"shock": 4.0},
-    "follow": {},
-    "open_highway": {},
-    "merge": {},
-    "bottleneck": {},
-    "approach": {},
-}
-"""Keywords of the environment in which policies of a task are judged, over those in which they are trained."""
-
-
-def as_judged(environment: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the environment in which a policy trained in ``environment`` is judged.
-
-    ``changes`` are keywords of the test besides ``TEST``: an agent's ``judged_in``. Episodes of the test are as long as
-    the task's own. ValueError for a task without one.
-    """
-    task = environment.get("task", "ring")
-    if task not in TEST:
-        raise ValueError(f"task '{task}' has no test of agents. Tests exist for {' and '.join(TEST)}.")
-    trained = {name: value for name, value in environment.items() if name != "max_episode_steps"}
-    return {**trained, **TEST[task], **(changes or {})}
 
 
 def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
@@ -301,16 +279,38 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
 # -- any task --------------------------------------------------------------------------------------------------------
 
 
+TESTS: tuple[tuple[type[Task], Callable[..., dict[str, Any]], dict[str, Any]], ...] = (
+    (RingTask, evaluate_ring, {"shock": 4.0}), (FollowTask, evaluate_follow, {}), (OpenLanesTask, evaluate_lanes, {}),
+)  # fmt: skip
+"""Kinds of tasks, how policies are judged in them, and keywords of the environment besides those of training."""
+
+
+def _test_of(environment: Mapping[str, Any]) -> tuple[Callable[..., dict[str, Any]], dict[str, Any]]:
+    """Return how policies of an environment's task are judged; ValueError for a task without a test."""
+    name = environment.get("task", "ring")
+    for kind, judge, changes in TESTS:
+        if name in TASKS and issubclass(TASKS[name], kind):
+            return judge, changes
+    tested = [task for task, own in TASKS.items() if any(issubclass(own, kind) for kind, *_ in TESTS)]
+    raise ValueError(f"task '{name}' has no test of agents. Tests exist for {' and '.join(tested)}.")
+
+
+def as_judged(environment: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the environment in which a policy trained in ``environment`` is judged.
+
+    ``changes`` are keywords of the test besides those of ``TESTS``: an agent's ``judged_in``. Episodes of the test are
+    as long as the task's own. ValueError for a task without one.
+    """
+    trained = {name: value for name, value in environment.items() if name != "max_episode_steps"}
+    return {**trained, **_test_of(environment)[1], **(changes or {})}
+
+
 def evaluate(act: Act | None, environment: Mapping[str, Any], **options: Any) -> dict[str, Any]:
     """Return the figures of a policy in the environment of its test (``as_judged``); None is the human driver.
 
     ``options`` are those of the task's own function, such as ``draws``.
     """
-    tests: dict[str, Callable[..., dict[str, Any]]] = {
-        "ring": evaluate_ring, "follow": evaluate_follow, "open_highway": evaluate_lanes,
-        "merge": evaluate_lanes, "bottleneck": evaluate_lanes, "approach": evaluate_lanes,
-    }  # fmt: skip
-    return tests[environment.get("task", "ring")](act, environment, **options)
+    return _test_of(environment)[0](act, environment, **options)
 
 
 def score(row: Mapping[str, Any]) -> float:

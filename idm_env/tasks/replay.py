@@ -104,14 +104,8 @@ class ReplayTask(Task):
     @cached_property
     def _longest(self) -> int:
         """Most steps from any beginning until the last of the agents has left."""
-        present = self.scene.present[:, list(self.agents)]
-        remaining = np.zeros(present.shape[1], int)
-        longest = 1
-        for t in range(len(present) - 1, -1, -1):
-            remaining = (remaining + 1) * present[t]
-            if self._together[t]:
-                longest = max(longest, int(remaining.max()) - 1)
-        return longest
+        remaining = _remaining(self.scene.present[:, list(self.agents)])
+        return max(1, int(remaining[self._together].max(initial=0)) - 1)
 
     @cached_property
     def _together(self) -> np.ndarray:
@@ -179,9 +173,9 @@ class ReplayTask(Task):
         order = [int(i) for i in np.argsort(-led.sum(0), kind="stable") if self.scene.ids[i] != NOBODY]
         picked: list[int] = []
         together = np.ones(len(led), bool)
-        enough = min(self._wanted, _longest(led[:, order[0]]))
+        enough = min(self._wanted, _remaining(led[:, order[0]]).max())
         for slot in order:
-            if len(picked) < most and _longest(together & led[:, slot]) >= enough:
+            if len(picked) < most and _remaining(together & led[:, slot]).max() >= enough:
                 picked.append(slot)
                 together &= led[:, slot]
         return picked
@@ -215,15 +209,12 @@ class ReplayTask(Task):
     @cached_property
     def _starts(self) -> np.ndarray:
         """Time steps at which an episode may begin: all agents follow for the horizon, or for as long as any do."""
-        together = self._together
-        remaining = np.zeros(len(together) + 1, int)
-        for t in range(len(together) - 1, -1, -1):
-            remaining[t] = remaining[t + 1] + 1 if together[t] else 0
+        remaining = _remaining(self._together)
         longest = int(remaining.max())
         if longest < 2:
             ids = [self.scene.ids[i] for i in self.agents[:4]]
             raise ValueError(f"vehicles {ids} never follow recorded leaders at one time. Control others or fewer.")
-        return np.flatnonzero(remaining[:-1] >= min(self._wanted + 1, longest))
+        return np.flatnonzero(remaining >= min(self._wanted + 1, longest))
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return the recorded road at a drawn time."""
@@ -302,7 +293,7 @@ class ReplayTask(Task):
         return Ended(self.crashed(world), (self.pick(state.present) <= 0) | over.unsqueeze(-1))
 
 
-def _longest(mask: np.ndarray) -> int:
-    """Return the length of the longest run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.view(np.int8), [0]))))
-    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0
+def _remaining(mask: np.ndarray) -> np.ndarray:
+    """Return for how many steps from each on a mask [T, …] goes on being True."""
+    step = np.arange(len(mask)).reshape(-1, *(1,) * (mask.ndim - 1))
+    return np.minimum.accumulate(np.where(mask, len(mask), step)[::-1])[::-1] - step
