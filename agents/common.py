@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import io
 import math
@@ -102,25 +101,30 @@ class Arguments:
         return {**own, **self.environment}
 
 
+@dataclass
+class File:
+    """What is read before the other options, whose defaults the file gives."""
+
+    config: str | None = None
+    trust: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+
+
 A = TypeVar("A", bound=Arguments)
 R = TypeVar("R")
 
 
 def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
     """Return the arguments of ``--config FILE`` and of the other options, which win."""
-    before = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    before.add_argument("--config")
-    before.add_argument("--trust", action="store_true")
-    known, rest = before.parse_known_args(argv)
-    if known.trust:
+    file, rest = tyro.cli(File, args=argv, return_unknown_args=True, add_help=False)
+    if file.trust:
         trust.always()
-    default = kind() if known.config is None else load_agent(known.config, kind, agent)
+    default = kind() if file.config is None else load_agent(file.config, kind, agent)
     text = f"{kind.__doc__}\n\n--config FILE reads a YAML file first, such as configs/ring-apg.yaml. "
     text += "--trust runs Python code that YAML files and checkpoints name, such as my_file.py:MyEffect."
     found = tyro.cli(kind, default=default, args=rest, description=text)
     for path in (found.out / name for name in KEPT):
         storage.not_an_input(
-            path, (known.config, *(getattr(found, name, None) for name in ("data", "start", "teacher")))
+            path, (file.config, *(getattr(found, name, None) for name in ("data", "start", "teacher")))
         )
         if path.suffix == ".pt" and path.exists() and not found.resume and _content(path) is None:
             raise ValueError(
