@@ -90,7 +90,7 @@ def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
         "why": report["reason"],
         "partial": report["partial"],
         "law": None if law is None else law.title,
-        "helps": {key: (c.light.value, c.ratio, c.low, c.high) for key, c in helps.items()},
+        "helps": {key: (c.outcome.value, c.ratio, c.low, c.high) for key, c in helps.items()},
         "ceilings": report["ceilings"],
         "before": report["error"]["before"],
         "after": report["error"]["after"],

@@ -55,7 +55,7 @@ class Law(NamedTuple):
         With more parameters of the drivers' own it must predict 5 s ahead better beyond chance: in closed loop these
         may only spread a driver's noise over more of them.
         """
-        if self.own and self.against["horizon_rmse_m"].light is not ErrorChange.BETTER:
+        if self.own and self.against["horizon_rmse_m"].outcome is not ErrorChange.BETTER:
             return False
         return not self.at_best and improves(self.against) and self.mean_ratio < 1.0 - LEAST
 
@@ -127,7 +127,7 @@ def rows(laws: Iterable[Law]) -> list[LawErrors]:
     return [
         LawErrors(
             each.law.kind, each.title, each.law.equation, list(each.own), each.at_best, **each.errors.summary(),
-            against={key: Against(c.light.value, c.ratio, c.low, c.high) for key, c in each.against.items()},
+            against={key: Against(c.outcome.value, c.ratio, c.low, c.high) for key, c in each.against.items()},
         )
         for each in laws
     ]  # fmt: skip

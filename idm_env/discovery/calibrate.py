@@ -54,7 +54,7 @@ def calibrate(records: Records, model: Hypothesis, values: np.ndarray, start: np
 def judged(
     found: Calibrated, fit: Records, kept: Records | None, everybody: Records, adapt: bool
 ) -> tuple[Solution, judge.Judged | None]:
-    """Return every driver's parameters by a calibrated model, and its errors on the runs kept back, if any are given.
+    """Return every driver's parameters by a calibrated model, and its errors on the test set, if any are given.
 
     With ``adapt`` drivers have parameters of their own, for which their own runs are needed.
     """

@@ -1,4 +1,4 @@
-"""Is an error on runs kept back better, the same or worse, and how sure is that: bootstrap over followers or runs."""
+"""Is an error on the test set better, the same or worse, and how sure is that: bootstrap over followers or runs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Comparison:
     driver: tuple[float, float, float] = (float("nan"), float("-inf"), float("inf"))
 
     @property
-    def light(self) -> ErrorChange:
+    def outcome(self) -> ErrorChange:
         """``worse`` where an interval lies above 1, of the pooled errors or of the followers' ratios; so ``better``."""
         if self.low > 1.0 or self.driver[1] > 1.0:
             return ErrorChange.WORSE

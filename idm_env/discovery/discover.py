@@ -81,7 +81,7 @@ class Discovery:
 
     @property
     def model(self) -> SavedModel:
-        """The model that predicts best of those compared on runs kept back."""
+        """The model that predicts best of those compared on the test set."""
         return self.models["model.yaml"]
 
 
@@ -112,9 +112,9 @@ def discover(
         out: Folder in which an interrupted search keeps what is done, or None.
         resume: Go on from there.
         on_progress: Called with phase, done, total and the candidate; see ``idm_env.jobs.progress``.
-        seed: Of the draw of the lockbox and of sign flips.
+        seed: Of the draw of the test set and of sign flips.
         located: Whether effects without a name are looked for too.
-        lockbox: Share of the runs that neither fit nor choose.
+        lockbox: Share of the runs in the test set, which neither fit nor choose.
         base: The car-following law that is to be completed, if not IDM.
 
     Raises:
@@ -131,7 +131,7 @@ def discover(
     if not names:
         why = "; ".join(f"{name}: {reason}" for name, reason in refused.items()) or "all of them are known"
         raise ValueError(f"no candidate can be tried on these data ({why}). Name others, or leave out --effects.")
-    fit_runs, kept_runs = _split(prepared, lockbox, seed)
+    fit_runs, test_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
     options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
     mark = storage.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
@@ -147,12 +147,12 @@ def discover(
     null = searching.null(bare, judge.unweighed(rows.records, bare, values, task.prior)[1], values)
     decided = decide(searching, null, seed)
     saved.remove()
-    progress("final check", 0, 0, "runs kept for the end")
+    progress("final check", 0, 0, "test set")
 
     def on_law(*state: Any) -> None:
         progress("other laws", *state)
 
-    test = prepared.of_runs(kept_runs) if kept_runs else None
+    test = prepared.of_runs(test_runs) if test_runs else None
     evaluation = Evaluation(searching, decided.null, prepared, test, by == "driver", seed)
     return _finish(trajectories, evaluation, decided, refused | searching.unplaced, by, on_law)
 

@@ -74,7 +74,7 @@ def stand(records: Records, model: Hypothesis, values: np.ndarray, prior: Prior,
 
     The weight of the prior decides more on short or noisy records than any effect does: with too light a one drivers
     are over-fitted, and an effect that only regularises them looks like a finding. So every model has the weight with
-    which it predicts best what its drivers' parameters have not seen, on the runs that choose.
+    which it predicts best what its drivers' parameters have not seen, on the validation runs.
     """
     rows, frozen = whole(records).settled(), Frozen(model, values)
     scored = judge.halves(rows)

@@ -25,7 +25,7 @@ Calibration = tuple[Solution, judge.Judged | None]
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """Two models on the runs kept back: IDM, and IDM with what was added, or with what came nearest to that.
+    """Two models on the test set: IDM, and IDM with what was added, or with what came nearest to that.
 
     ``refusal`` says why nothing (more) was added; ``compared`` is None where nothing came near.
     """
@@ -48,14 +48,14 @@ class Judgement:
 
     @cached_property
     def errors(self) -> dict[str, Comparison]:
-        """How the errors on runs kept back changed; empty where nothing can be compared."""
+        """How the errors on the test set changed; empty where nothing can be compared."""
         if self.compared is None or self.before is None or self.after is None:
             return {}
         return compare(self.before, self.after, self.seed)
 
     @property
     def mean_ratio(self) -> float:
-        """Geometric mean of the ratios of errors on runs kept back, compared model / null; 1 where there is none."""
+        """Geometric mean of the ratios of errors on the test set, compared model / null; 1 where there is none."""
         return mean_ratio(self.errors)
 
     @property
@@ -115,7 +115,7 @@ class Judgement:
     def names(self) -> dict[str, str]:
         """Return which model every file holds: the law alone, then the model beside it, then another law.
 
-        ``model.yaml`` is the one that predicts best on the runs kept back.
+        ``model.yaml`` is the one that predicts best on the test set.
         """
         if self.law is not None:
             files = ("model_idm.yaml", *(["model_corrected.yaml"] if self.compared is not None else []), "model.yaml")
@@ -249,7 +249,7 @@ def _confirmed(evaluation: Evaluation, decided: Decided) -> tuple[list[Solution]
     for s in decided.steps:
         final = confirmed[-1] if confirmed else decided.null
         if judge.confirmed(test, evaluation.searching.task, final, s) <= 0:
-            return confirmed, Refusal(Reason.LOCKBOX)
+            return confirmed, Refusal(Reason.TEST_SET)
         confirmed.append(s)
     return confirmed, decided.rounds[0].refusal
 

@@ -75,7 +75,7 @@ def summarise(
         known=_known(final, interval_of(final, task), base),
         helps={
             key: result.Change(
-                c.light.value, c.ratio, c.low, c.high, c.before, c.after, words.ERRORS[key][1], *c.driver, c.improved
+                c.outcome.value, c.ratio, c.low, c.high, c.before, c.after, words.ERRORS[key][1], *c.driver, c.improved
             )
             for key, c in errors.items()
         },

@@ -37,7 +37,7 @@ class Reason(str, Enum):
     NO_GAIN = "no_gain"
     SMALL_SHARE = "small_share"
     FREE_SIMULATION = "free_simulation"
-    LOCKBOX = "lockbox"
+    TEST_SET = "lockbox"
     HELD_OUT = "held_out"
     LAW = "law"
     STRUCTURE = "structure"
@@ -67,8 +67,8 @@ def improves(errors: Mapping[str, Comparison]) -> bool:
     Args:
         errors: How errors changed where neither model was calibrated.
     """
-    lights = [c.light for c in errors.values()]
-    if ErrorChange.WORSE in lights or ErrorChange.BETTER not in lights:
+    outcomes = [c.outcome for c in errors.values()]
+    if ErrorChange.WORSE in outcomes or ErrorChange.BETTER not in outcomes:
         return False
     gap = errors.get("gap_rmse_m")
     holds = gap is None or not (gap.ratio > HOLDS or gap.most_worse)
@@ -88,7 +88,7 @@ def conclude(
     """Return the verdict.
 
     Args:
-        added: Whether anything was added to the model and held on the runs kept back.
+        added: Whether anything was added to the model and held on the test set.
         named: Whether any of it is an effect of the catalogue.
         refusal: Why nothing was added.
         structured: Whether a candidate was significant at all.

@@ -154,7 +154,7 @@ def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
         Reason.NO_GAIN: "no candidate gains enough on held-out runs",
         Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",
         Reason.FREE_SIMULATION: f"{tried} makes free simulation worse",
-        Reason.LOCKBOX: f"the test set does not confirm {tried}",
+        Reason.TEST_SET: f"the test set does not confirm {tried}",
         Reason.HELD_OUT: f"predictions of the test set get no better with {tried}",
         Reason.STRUCTURE: (
             f"a smooth function of the scene takes {refusal.figure:.0%} off the squared error 5 s ahead, "
@@ -176,7 +176,7 @@ def headline(
         clauses: Of every term that was added.
         refusal: Why nothing was added.
         tried: Plain names of what came nearest, "" for nothing.
-        errors: How errors on runs kept back changed with what was added or came nearest.
+        errors: How errors on the test set changed with what was added or came nearest.
         shared: What vehicles of one run do alike, told where nothing was added.
         others: Effects that these data do not tell from what was added.
         strengths: What the data say of the strengths of absent effects, by name.
@@ -222,8 +222,8 @@ def common(shared: Shared) -> str:
 
 
 def _rises(errors: Mapping[str, Comparison]) -> str:
-    """Say what the errors on runs kept back have against an addition."""
-    worse = [ERRORS[k][0] for k, c in errors.items() if c.light is ErrorChange.WORSE]
+    """Say what the errors on the test set have against an addition."""
+    worse = [ERRORS[k][0] for k, c in errors.items() if c.outcome is ErrorChange.WORSE]
     if not any(c.ratio < 1.0 for c in errors.values()):
         return "no error falls"
     if worse:
@@ -232,17 +232,17 @@ def _rises(errors: Mapping[str, Comparison]) -> str:
         return f"the error of the gap in free simulation rises by {percent(errors['gap_rmse_m'].ratio)}"
     if errors["gap_rmse_m"].most_worse:
         return f"the gap in free simulation errs more for {1.0 - errors['gap_rmse_m'].improved:.0%} of followers"
-    if not any(c.light is ErrorChange.BETTER for c in errors.values()):
+    if not any(c.outcome is ErrorChange.BETTER for c in errors.values()):
         return "no error falls beyond chance"
     return "errors rise on the whole"
 
 
 def _but(errors: Mapping[str, Comparison]) -> str:
-    """Say what the errors on runs kept back take from a finding."""
-    worse = [ERRORS[k][0] for k, c in errors.items() if c.light is ErrorChange.WORSE]
+    """Say what the errors on the test set take from a finding."""
+    worse = [ERRORS[k][0] for k, c in errors.items() if c.outcome is ErrorChange.WORSE]
     if worse:
         return f"; on the test set the error of the {' and the '.join(worse)} is larger with it"
-    if errors and not any(c.light is ErrorChange.BETTER for c in errors.values()):
+    if errors and not any(c.outcome is ErrorChange.BETTER for c in errors.values()):
         return "; no error on the test set is significantly lower with it"
     return ""
 
@@ -336,9 +336,9 @@ def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
     """Say that another law predicts better than the null, and in what; ``drivers`` are its parameters."""
     better = [
         f"{ERRORS[key][0]} {percent(c.ratio)} (95 %: {percent(c.low)} to {percent(c.high)})"
-        for key, c in law.against.items() if c.light is ErrorChange.BETTER
+        for key, c in law.against.items() if c.outcome is ErrorChange.BETTER
     ]  # fmt: skip
-    same = [ERRORS[key][0] for key, c in law.against.items() if c.light is ErrorChange.SAME]
+    same = [ERRORS[key][0] for key, c in law.against.items() if c.outcome is ErrorChange.SAME]
     rest = f"; {' and '.join(same)} the same beyond chance" if same else ""
     note = f"what it lacks: explain --base {law.law.kind}"
     if law.own and drivers is not None:
@@ -354,11 +354,11 @@ def by_use(laws: Sequence[Law], chosen: Law | None) -> list[str]:
     sentences = []
     for key, (name, _) in ERRORS.items():
         fair = [law for law in laws if key in law.against and not law.at_best]
-        better = [law for law in fair if law.against[key].light is ErrorChange.BETTER]
+        better = [law for law in fair if law.against[key].outcome is ErrorChange.BETTER]
         best = min(better, key=lambda law: law.against[key].ratio, default=None)
         if best is None or best is chosen:
             continue
-        worse = [ERRORS[k][0] for k, c in best.against.items() if c.light is ErrorChange.WORSE]
+        worse = [ERRORS[k][0] for k, c in best.against.items() if c.outcome is ErrorChange.WORSE]
         but = f"; {' and '.join(worse)} worse" if worse else ""
         title, c = best.title, best.against[key]
         sentences.append(

@@ -1,4 +1,4 @@
-"""Verdicts, lights and sentences follow held-out errors; figures are made up, or of small generated sets."""
+"""Verdicts, outcomes and sentences follow held-out errors; figures are made up, or of small generated sets."""
 
 from __future__ import annotations
 
@@ -101,9 +101,9 @@ def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
     assert conclude(False, False, Refusal(Reason.LAW), False, flat, shared=True) is Verdict.UNEXPLAINED
 
 
-def test_a_light_needs_the_whole_interval_on_one_side() -> None:
-    assert [c.light for c in (BETTER, SAME, WORSE)] == [ErrorChange.BETTER, ErrorChange.SAME, ErrorChange.WORSE]
-    assert Comparison(1.0, 1.0, 1.0, float("nan"), float("nan")).light is ErrorChange.SAME
+def test_an_outcome_needs_the_whole_interval_on_one_side() -> None:
+    assert [c.outcome for c in (BETTER, SAME, WORSE)] == [ErrorChange.BETTER, ErrorChange.SAME, ErrorChange.WORSE]
+    assert Comparison(1.0, 1.0, 1.0, float("nan"), float("nan")).outcome is ErrorChange.SAME
 
 
 def test_intervals_cover_the_true_change() -> None:
@@ -125,7 +125,7 @@ def test_intervals_cover_the_true_change() -> None:
 
 def test_one_follower_tells_nothing() -> None:
     found = compare.compared(np.ones(1), np.full(1, 0.1), 10.0, np.array(["a"]), 0)
-    assert found.light is ErrorChange.SAME and found.low == 0.0 and found.high == float("inf")
+    assert found.outcome is ErrorChange.SAME and found.low == 0.0 and found.high == float("inf")
 
 
 def test_a_driver_in_pieces_is_one_driver() -> None:
