@@ -16,6 +16,7 @@ from idm_env.discovery import model as terms
 from idm_env.discovery.compare import ERRORS
 from idm_env.discovery.march import PULSED, Catalogue
 from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.result import ParameterEstimate
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.effects.free import PER
 from idm_env.effects.registry import read
@@ -104,7 +105,7 @@ def test_every_shape_is_the_same_in_its_file_and_in_the_model(
 ) -> None:
     term = terms.curve(what, coordinate, 0.5, terms.STATES[coordinate], 3, by=by)
     heights = np.array([0.3, -0.2, 0.4])
-    told = {p.name: {"estimate": float(x), "low": 0.0, "high": 1.0}
+    told = {p.name: ParameterEstimate(p.symbol, float(x), 0.0, 1.0, p.unit)
             for p, x in zip(term.parameters, heights, strict=True)}  # fmt: skip
     path = tmp_path / FOUND
     path.write_text(found.source([(term, told)], "A sentence."), encoding="utf-8")
@@ -132,5 +133,5 @@ def test_every_shape_is_the_same_in_its_file_and_in_the_model(
 
 def test_what_has_a_place_or_a_time_is_no_file() -> None:
     place = terms.interval("time_gap", "position", 700.0, 1000.0, 0.4)
-    told = {p.name: {"estimate": 0.1, "low": 0.0, "high": 1.0} for p in place.parameters}
+    told = {p.name: ParameterEstimate(p.symbol, 0.1, 0.0, 1.0, p.unit) for p in place.parameters}
     assert found.source([(place, told)], "A sentence.") == ""
