@@ -19,6 +19,7 @@ from idm_env.discovery import judge
 from idm_env.discovery.free import ClosedLoopFit
 from idm_env.discovery.model import Frozen
 from idm_env.discovery.records import Records, whole
+from idm_env.discovery.result import Ceilings
 from idm_env.discovery.solve import Solution, Task, solve
 
 NEIGHBOURS = 10
@@ -31,22 +32,17 @@ CORRECTED_S = 10.0
 LAGS_S = (5.0, 20.0)
 
 
-def told(at: ClosedLoopFit, kept: Records, null: Solution, smooth_gain: float) -> dict[str, float | None]:
-    """Return the ceilings by name, None where these data have none.
+def ceilings_of(at: ClosedLoopFit, test: Records, null: Solution, smooth_gain: float) -> Ceilings:
+    """Return the ceilings, None where these data have none.
 
     Args:
-        at: IDM in free simulation of the runs that choose.
-        kept: Runs kept back.
+        at: IDM in free simulation of the validation runs.
+        test: Runs of the test set, or all.
         null: IDM.
         smooth_gain: Of the best smooth function of the state over IDM, in log RMSE in windows of 5 s.
     """
-    found = {
-        "repeats_share": repeats(at),
-        "time_gap_between_halves": between_halves(at),
-        "refitted_gap_rmse_m": refitted(kept, null),
-        "smooth_function_gain": 1.0 - float(np.exp(-smooth_gain)),
-    }
-    return {name: value if np.isfinite(value) else None for name, value in found.items()}
+    values = repeats(at), between_halves(at), refitted(test, null), 1.0 - float(np.exp(-smooth_gain))
+    return Ceilings(*(value if np.isfinite(value) else None for value in values))
 
 
 def repeats(at: ClosedLoopFit) -> float:
@@ -59,10 +55,10 @@ def repeats(at: ClosedLoopFit) -> float:
     valid = at.scored.copy()
     valid[:, np.arange(valid.shape[1]) % EVERY != 0] = False
     i, j = np.nonzero(valid)
-    signals = records.signals[rows.samples[i, j]]
-    error, run = at.errors[i, j], rows.run[i]
-    speed, gap = signals[:, 15], signals[:, 0] - signals[:, 14]
-    situation = np.stack([speed, np.log(np.maximum(gap, 1.0) / (speed + 2.0)), speed - signals[:, 1], signals[:, 2]], 1)
+    samples, error, run = rows.samples[i, j], at.errors[i, j], rows.run[i]
+    speed, gap = records.speed[samples], records.gap[samples]
+    closing, lead_accel = speed - records.column("lead_speed")[samples], records.column("lead_accel")[samples]
+    situation = np.stack([speed, np.log(np.maximum(gap, 1.0) / (speed + 2.0)), closing, lead_accel], 1)
     situation /= situation.std(0) + 1e-9
     error = np.clip(error, *np.quantile(error, [0.01, 0.99])) if len(error) else error
     square, product = 0.0, 0.0

@@ -31,7 +31,7 @@ EMPTY = np.zeros(0)
 
 
 def folds_of(runs: Sequence[str], kept: Sequence[str], seed: int) -> np.ndarray:
-    """Return the fold of every run: 0 of those kept back, whom no choice has seen, and up to three more."""
+    """Return the fold of every run [runs]: 0 of those kept back, whom no choice has seen, and up to three more."""
     left = [i for i, run in enumerate(runs) if run not in set(kept)]
     fold = np.zeros(len(runs), int)
     count = min(FOLDS - 1, len(left))
@@ -161,20 +161,20 @@ def _weighed(mine: list[Rows], prior: Prior, frozen: Frozen, near: np.ndarray) -
     left: dict[float, np.ndarray] = {}
     seen = np.unique(mine[0].group)
     count = np.sum([Task(half, None, prior).per_group(half.valid.sum(1)) for half in mine], axis=0)
-    wanted: Sequence[float] = GRID_S[::2]
-    while wanted:
-        for seconds in wanted:
+    grid: Sequence[float] = GRID_S[::2]
+    while grid:
+        for seconds in grid:
             begin = thetas[min(thetas, key=lambda s: abs(np.log(s / seconds)))] if thetas else near
             fitted, square = [], np.zeros(near.shape[1])
             for i, half in enumerate(mine):
                 task = Task(half, None, replace(prior, free=False, alike_s=seconds))
                 task = judge.scaled(task, frozen, EMPTY, near[i])
                 fitted.append(solve(task, frozen, begin[i], EMPTY, iterations=10, tolerance=1e-4).theta)
-                there = replace(task, rows=mine[1 - i])
-                errors = there.errors(fitted[i][None], frozen, EMPTY[None])[0]
-                square += there.per_group((errors**2).sum(1))
+                other_half = replace(task, rows=mine[1 - i])
+                errors = other_half.errors(fitted[i][None], frozen, EMPTY[None])[0]
+                square += other_half.per_group((errors**2).sum(1))
             thetas[seconds], left[seconds] = np.stack(fitted), square[seen] / np.maximum(count[seen], 1)
-        wanted = further({s: _loss(x) for s, x in left.items()})
+        grid = further({s: _loss(x) for s, x in left.items()})
     return _Fold(prior, frozen, thetas, left)
 
 
@@ -184,13 +184,13 @@ def _simulated(
     """Return gaps and speeds of closed-loop simulation with the weight that the other folds choose, and log θ there."""
     (gap, speed), chosen = np.zeros((2, *rows.valid.shape)), {}
     # Of two copies, the second is scored where the first was fitted.
-    there, known = (~second).astype(int), set.intersection(*(set(p.left) for p in parts.values()))
+    copy, weights = (~second).astype(int), set.intersection(*(set(p.left) for p in parts.values()))
     for k, part in parts.items():
         others = [p.left for j, p in parts.items() if j != k or len(parts) == 1]
-        best = min(sorted(known), key=lambda s: _loss(np.concatenate([left[s] for left in others])))
-        chosen[k], at = part.thetas[best], fold[rows.run] == k
-        one = Task(rows.some(at), None, part.prior).predict(chosen[k], part.frozen, np.zeros((2, 0)))
-        gap[at], speed[at] = (np.take_along_axis(x, there[at][None], 0)[0] for x in one)
+        best = min(sorted(weights), key=lambda s: _loss(np.concatenate([left[s] for left in others])))
+        chosen[k], in_fold = part.thetas[best], fold[rows.run] == k
+        one = Task(rows.some(in_fold), None, part.prior).predict(chosen[k], part.frozen, np.zeros((2, 0)))
+        gap[in_fold], speed[in_fold] = (np.take_along_axis(x, copy[in_fold][None], 0)[0] for x in one)
     return gap, speed, chosen
 
 
@@ -202,16 +202,16 @@ def _whitened(
     rows = replace(task.rows, joined=task.rows.joined & (task.rows.block == np.roll(task.rows.block, 1)))
     free, second = replace(task, rows=rows, prior=replace(task.prior, free=False)), rows.block % 2 == 1
     all_time = solve(free, Frozen(model, values.mean(0)), theta, EMPTY, iterations=15, tolerance=1e-3).theta
-    found = {}
+    thetas = {}
     for k in np.unique(fold[rows.run]):
         mine = fold[rows.run] == k
         prior = replace(population(all_time, rows.some(~mine), model.catalogue.own), free=False)
         own = replace(free, prior=prior)
-        found[int(k)] = np.stack([
+        thetas[int(k)] = np.stack([
             solve(own.of_rows(mine & half), Frozen(model, values[k]), all_time, EMPTY, iterations=10).theta
             for half in (~second, second)
         ])  # fmt: skip
-    return found
+    return thetas
 
 
 def _predicted(
@@ -219,10 +219,10 @@ def _predicted(
 ) -> np.ndarray:
     """Return errors of the gap 5 s ahead [windows] with log θ [2, G, P] of every fold, from the half not scored."""
     rows, ahead = task.rows, np.zeros(len(task.rows))
-    there = (rows.block % 2 == 0).astype(int)
+    copy = (rows.block % 2 == 0).astype(int)
     for k, theta in thetas.items():
         mine = fold[rows.run] == k
         if mine.any():
             both = Task(rows.some(mine), None, task.prior).errors(theta, Frozen(model, values[k]), np.zeros((2, 0)))
-            ahead[mine] = np.take_along_axis(both[..., -1], there[mine][None], 0)[0]
+            ahead[mine] = np.take_along_axis(both[..., -1], copy[mine][None], 0)[0]
     return ahead

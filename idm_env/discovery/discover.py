@@ -14,13 +14,12 @@ import numpy as np
 
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import bases, calibrate, ceilings, found, judge, places, records, search, shared, summary
-from idm_env.discovery import march as twin
+from idm_env.discovery import bases, calibrate, ceilings, found, judge, march, places, records, search, shared, summary
 from idm_env.discovery import model as terms
 from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records
-from idm_env.discovery.result import Ceilings, Result
+from idm_env.discovery.result import Result
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, Round, decide
 from idm_env.discovery.solve import Solution, Task
@@ -140,7 +139,7 @@ def discover(
     known_terms = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
     extra = [*own, *(terms.known_effect(term) for term in known_terms)]
-    bare = Hypothesis(known_terms, twin.Catalogue.of(extra, prepared.period, law))
+    bare = Hypothesis(known_terms, march.Catalogue.of(extra, prepared.period, law))
     searching = Search(task, names, located and effects is None, saved, progress, bare)
     progress("null", 0, 0, law.name)
     values = search.starting_values(bare)
@@ -280,7 +279,7 @@ def _finish(
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     result = summary.summarise(
         trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor, refused, by,
-        Ceilings(**ceilings.told(decided.stand, scored, null, decided.rounds[0].smooth_gain)),
+        ceilings.ceilings_of(decided.stand, scored, null, decided.rounds[0].smooth_gain),
     )  # fmt: skip
     # Drivers who adapt are calibrated on parts of the held-out runs too.
     fit = prepared if evaluation.adapt else task.rows.records

@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from idm_env.data import noise_sigma
-from idm_env.discovery import march as twin
-from idm_env.discovery import places
+from idm_env.discovery import march, places
 from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.noise import HEAVY
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
@@ -67,8 +66,8 @@ class Judged:
             "speed_rmse_mps": (self._summed(of_row, (speed_error**2).sum(1)), samples),
         }  # fmt: skip
 
-    def _summed(self, of: np.ndarray, values: np.ndarray) -> np.ndarray:
-        return np.bincount(of, values, minlength=len(self.followers)).astype(float)
+    def _summed(self, follower: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return np.bincount(follower, values, minlength=len(self.followers)).astype(float)
 
     @property
     def gap_rmse(self) -> np.ndarray:
@@ -90,10 +89,11 @@ def calibrate(
     records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, rows: Rows | None = None,
     start: np.ndarray | None = None,
 ) -> Solution:  # fmt: skip
-    """Fit θ of every group in free simulation behind the measured leader, with φ as it stands.
+    """Fit θ of every group in free simulation behind the measured leader, with φ as it stands: ``values`` [Q].
 
-    A first fit tells how large errors are; in the second, errors of ``prior.alike_s`` seconds count as one, so that the
-    population, as prior, speaks for a driver whose record is short or noisy.
+    A first fit, from the prior's centre and log θ ``start`` [G, P], tells how large errors are. In the second, errors
+    of ``prior.error_correlation_s`` seconds count as one, so that the population, as prior, speaks for a driver whose
+    record is short or noisy.
     """
     task, theta = unweighed(records, model, values, prior, rows, start)
     return weighed(task, model, values, theta)
@@ -127,7 +127,10 @@ def weighed(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray
 
 
 def scaled(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Task:
-    """Return a task of free simulation in whose cost errors of ``alike_s`` seconds, as large as at θ, count as one."""
+    """Return a problem of closed-loop simulation in whose cost errors of ``error_correlation_s`` count as one.
+
+    They are as large as at log θ [G, P] and φ [Q].
+    """
     rows = task.rows
     errors = task.errors(theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
     square = (errors**2).sum(1) / np.maximum(rows.valid.sum(1), 1)
@@ -136,7 +139,7 @@ def scaled(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray)
 
 
 def free_run_squares(records: Records, s: Solution) -> np.ndarray:
-    """Return every unit's squared gap errors (m²) of free simulation with θ fitted to it; one counts 30 m at most."""
+    """Return squared gap errors (m²) of closed-loop simulation [units], θ fitted to it; one counts 30 m at most."""
     model, values, prior = s.model, s.values, s.prior
     fitted = calibrate(records, model, values, prior, start=s.theta)
     rows = whole(records)
@@ -153,11 +156,11 @@ def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> 
     """
     rows = windows(records)
     assert task.noise is not None
-    there = Task(rows, task.noise.alike(len(rows)), task.prior)
+    on_test = Task(rows, task.noise.alike(len(rows)), task.prior)
     squares = []
     for s in (null, final):
-        start = np.tile(s.prior.centre, (there.groups, 1))
-        fitted = solve(there, Frozen(s.model, s.values), start, np.zeros(0), iterations=20)
+        start = np.tile(s.prior.centre, (on_test.groups, 1))
+        fitted = solve(on_test, Frozen(s.model, s.values), start, np.zeros(0), iterations=20)
         squares.append((np.minimum((fitted.linear.residual**2).mean(1), 9.0 * HEAVY**2)).sum())
     return float(0.5 * np.log(squares[0] / squares[1]))
 
@@ -166,9 +169,9 @@ def windowed(records: Records, task: Task, solution: Solution) -> tuple[Task, So
     """Return a model in windows of all records, and its task: φ as it stands, θ fitted, the noise of ``task``."""
     assert task.noise is not None
     rows = windows(records)
-    there = Task(rows, task.noise.alike(len(rows)), replace(task.prior, free=False))
-    start = np.tile(task.prior.centre, (there.groups, 1))
-    return there, solve(there, Frozen(solution.model, solution.values), start, np.zeros(0))
+    in_windows = Task(rows, task.noise.alike(len(rows)), replace(task.prior, free=False))
+    start = np.tile(task.prior.centre, (in_windows.groups, 1))
+    return in_windows, solve(in_windows, Frozen(solution.model, solution.values), start, np.zeros(0))
 
 
 def everywhere(records: Records, task: Task, solution: Solution) -> places.Responses:
@@ -183,8 +186,8 @@ def halves(rows: Rows) -> np.ndarray:
     for i in range(len(rows)):
         r = rows.record[i]
         span = float(records.bounds[r + 1] - records.first[r]) * records.dt
-        at = (rows.samples[i] - records.first[r]) * records.dt
-        scored[i] = (at // block_seconds(span)).astype(int) % 2 == 1
+        time = (rows.samples[i] - records.first[r]) * records.dt
+        scored[i] = (time // block_seconds(span)).astype(int) % 2 == 1
     return scored & rows.valid
 
 
@@ -226,23 +229,23 @@ def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarr
     signals, dt = rows.records.signals, rows.records.dt
     pieces = responses.change.shape[1]
     second = max(1, round(1.0 / dt))
-    at = rows.start[:, None] + second * np.arange(pieces) + second // 2
-    column = {name: i for i, name in enumerate(twin.COLUMNS)}
+    middle = rows.start[:, None] + second * np.arange(pieces) + second // 2
+    column = {name: i for i, name in enumerate(march.COLUMNS)}
 
-    v = signals[at, column["speed"]]
-    gap = signals[at, column["lead_rear"]] - signals[at, column["position"]]
-    closing = v - signals[at, column["lead_speed"]]
-    now = [v / 10.0, 2.0 * np.log(np.maximum(gap, 0.5) / 15.0), closing / 2.0, signals[at, column["lead_accel"]]]
+    v = signals[middle, column["speed"]]
+    gap = signals[middle, column["lead_rear"]] - signals[middle, column["position"]]
+    closing = v - signals[middle, column["lead_speed"]]
+    now = [v / 10.0, 2.0 * np.log(np.maximum(gap, 0.5) / 15.0), closing / 2.0, signals[middle, column["lead_accel"]]]
     features = [*now, *(a * b for i, a in enumerate(now) for b in now[i:])]
     features += [a * b * c for a in now[:3] for b in now[:3] for c in now[:3]][::3]
     features += [np.abs(now[2]), np.minimum(now[3], 0.0)]
     for lag in (0.5, 1.0, 1.5):
-        j = np.maximum(at - round(lag / dt), rows.records.bounds[rows.record][:, None])
-        change = (signals[j, column["lead_speed"]] - signals[at, column["lead_speed"]]) / 2.0
+        j = np.maximum(middle - round(lag / dt), rows.records.bounds[rows.record][:, None])
+        change = (signals[j, column["lead_speed"]] - signals[middle, column["lead_speed"]]) / 2.0
         features += [change, change * now[1], change * now[0], np.abs(change)]
     for name in ("second_speed", "behind_speed"):
-        there = signals[at, column[name.replace("speed", "present")]]
-        features.append((signals[at, column[name]] - signals[at, column["speed"]]) / 3.0 * there)
+        present = signals[middle, column[name.replace("speed", "present")]]
+        features.append((signals[middle, column[name]] - signals[middle, column["speed"]]) / 3.0 * present)
     basis = np.clip(np.stack(features, axis=-1), -10.0, 10.0)
     scale = basis.std((0, 1)) + 1e-9
     keep = scale > 1e-6

@@ -129,16 +129,16 @@ def corrected(rows: Rows, error: np.ndarray, plain: np.ndarray, smooth: np.ndarr
     weight = _weight(rows, error)
     unit = rows.run if len(np.unique(rows.run)) >= FOLDS else rows.group
     fold = np.searchsorted(np.unique(unit), unit) % FOLDS
-    found = np.zeros(len(rows))
+    correction = np.zeros(len(rows))
     for k in np.unique(fold):
         mine, inner = fold == k, (fold + k) % FOLDS % 2 == 0
         first, second = ~mine & inner, ~mine & ~inner
         loss = np.zeros(len(RIDGES))
         for one, other in ((first, second), (second, first)):
-            told = basis[other] @ _ridges(basis[one], error[one], weight[one])
-            loss += ((error[other, None] - told) ** 2 * weight[other, None]).sum(0)
-        found[mine] = basis[mine] @ _ridges(basis[~mine], error[~mine], weight[~mine])[:, loss.argmin()]
-    return found
+            predicted = basis[other] @ _ridges(basis[one], error[one], weight[one])
+            loss += ((error[other, None] - predicted) ** 2 * weight[other, None]).sum(0)
+        correction[mine] = basis[mine] @ _ridges(basis[~mine], error[~mine], weight[~mine])[:, loss.argmin()]
+    return correction
 
 
 def _ridges(basis: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -181,33 +181,33 @@ def _drift(rows: Rows, error: np.ndarray) -> np.ndarray:
 
 def _scene(rows: Rows) -> np.ndarray:
     """Return the scene where a window begins [W, 9]: its state, the driver's usual gap, and the leader's next 5 s."""
-    signals, at = rows.records.signals, rows.start
-    speed, lead, gap = _column(signals, at, "speed"), _column(signals, at, "lead_speed"), _gap(signals, at)
+    signals, begin = rows.records.signals, rows.start
+    speed, lead, gap = _column(signals, begin, "speed"), _column(signals, begin, "lead_speed"), _gap(signals, begin)
     headway = np.log(np.maximum(gap, 0.5) / (np.maximum(speed, 0.0) + 2.0))
-    ahead = [_column(signals, at + round(share * rows.steps), "lead_speed") - lead for share in (0.2, 0.5, 1.0)]
+    ahead = [_column(signals, begin + round(share * rows.steps), "lead_speed") - lead for share in (0.2, 0.5, 1.0)]
     usual = headway - _by_group(rows, headway)
-    return np.stack([speed, headway, usual, speed - lead, _column(signals, at, "lead_accel"), np.log1p(gap.clip(0)),
+    return np.stack([speed, headway, usual, speed - lead, _column(signals, begin, "lead_accel"), np.log1p(gap.clip(0)),
                      *ahead], axis=1)  # fmt: skip
 
 
 def _past(rows: Rows) -> np.ndarray:
     """Return how speed, gap and the leader's speed came about [W, 6]: their changes over ``PAST_S``."""
-    signals, at = rows.records.signals, rows.start
-    told = []
+    signals, begin = rows.records.signals, rows.start
+    past = []
     for seconds in PAST_S:
-        then = np.maximum(at - round(seconds / rows.records.dt), rows.records.bounds[rows.record])
-        told += [_column(signals, at, name) - _column(signals, then, name) for name in ("speed", "lead_speed")]
-        told.append(_gap(signals, at) - _gap(signals, then))
-    return np.stack(told, axis=1)
+        then = np.maximum(begin - round(seconds / rows.records.dt), rows.records.bounds[rows.record])
+        past += [_column(signals, begin, name) - _column(signals, then, name) for name in ("speed", "lead_speed")]
+        past.append(_gap(signals, begin) - _gap(signals, then))
+    return np.stack(past, axis=1)
 
 
-def _column(signals: np.ndarray, at: np.ndarray, name: str) -> np.ndarray:
-    result: np.ndarray = signals[np.minimum(at, len(signals) - 1), COLUMNS.index(name)]
+def _column(signals: np.ndarray, sample: np.ndarray, name: str) -> np.ndarray:
+    result: np.ndarray = signals[np.minimum(sample, len(signals) - 1), COLUMNS.index(name)]
     return result
 
 
-def _gap(signals: np.ndarray, at: np.ndarray) -> np.ndarray:
-    result: np.ndarray = _column(signals, at, "lead_rear") - _column(signals, at, "position")
+def _gap(signals: np.ndarray, sample: np.ndarray) -> np.ndarray:
+    result: np.ndarray = _column(signals, sample, "lead_rear") - _column(signals, sample, "position")
     return result
 
 

@@ -84,8 +84,8 @@ class Catalogue:
     @classmethod
     def of(cls, effects: Sequence[Effect] = (), period: float = 0.0, base: CarFollowing = BASE) -> Catalogue:
         """Return the package's candidates and ``effects``, which replace those of the same name, on a lap (m)."""
-        given = {e.name: e for e in (*(known.make(name) for name in known.CANDIDATES), *effects)}
-        return cls(tuple(_on_lap(e, period) for e in given.values()), base)
+        by_name = {e.name: e for e in (*(known.make(name) for name in known.CANDIDATES), *effects)}
+        return cls(tuple(_on_lap(e, period) for e in by_name.values()), base)
 
     @property
     def own(self) -> tuple[Parameter, ...]:
@@ -112,7 +112,7 @@ class Catalogue:
     def flagged(self) -> tuple[Effect, ...]:
         """Everything behind a flag, adaptations in the order in which they act."""
         labels = [(label, False) for label in map(str, range(SLOTS))] + [(PULSE, True)]
-        slots = [kind for label, given in labels for kind in _slots(label, given)] if self.located else []
+        slots = [kind for label, is_given in labels for kind in _slots(label, is_given)] if self.located else []
         return tuple(sorted((*self.effects, *slots), key=lambda e: e.rank if e.hook == "adapt" else 0))
 
     @cached_property
@@ -151,14 +151,14 @@ class Catalogue:
         changed = TARGETS.get(what, ())
         slots = {e.targets if isinstance(e, Changed) else (): e for e in _slots(label)}
         effect = slots[next((t for t in slots if set(t) & set(changed)), ())]
-        told = {"over": float(list(FEATURES).index(coordinate))} if coordinate else {}
-        told |= {"by": 1.0 + list(PER).index(by)} if by else {}
-        told |= {n: float(n in changed) for n in (effect.targets if isinstance(effect, Changed) else ())}
-        return effect.name, {f"{effect.name}.{name}": value for name, value in told.items()}
+        flags = {"over": float(list(FEATURES).index(coordinate))} if coordinate else {}
+        flags |= {"by": 1.0 + list(PER).index(by)} if by else {}
+        flags |= {n: float(n in changed) for n in (effect.targets if isinstance(effect, Changed) else ())}
+        return effect.name, {f"{effect.name}.{name}": value for name, value in flags.items()}
 
 
-def _slots(label: str, given: bool = False) -> tuple[Effect, ...]:
-    return (*(Changed(label=label, given=given, targets=t) for t in SETS), Push(label=label, given=given))
+def _slots(label: str, is_given: bool = False) -> tuple[Effect, ...]:
+    return (*(Changed(label=label, given=is_given, targets=t) for t in SETS), Push(label=label, given=is_given))
 
 
 def _on_lap(effect: Effect, period: float) -> Effect:
@@ -229,14 +229,14 @@ def back_steps(effects: Sequence[Effect], dt: float) -> int:
 
 def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
     graph = Regions()
-    made = _recorded(catalogue, dt, graph)
+    recorded = _recorded(catalogue, dt, graph)
     read_tables = {node.label for node in graph.serial if node.op == "table"}
     for name, number in catalogue.tables.items():
         if number not in read_tables:
             raise ValueError(
                 f"effect '{name}' is sought or given as a profile and does not read it by effects.places.curve."
             )
-    memories = list(made.begin)
+    memories = list(recorded.begin)
     driver = {f"{name}.{p.name}": f"th[{i}]" for i, (name, p) in enumerate(catalogue.of_driver)}
     inputs = {slot_name(e.name, ""): "pulse_now" for e in _slots(PULSE)}
     for effect in catalogue.effects:
@@ -259,18 +259,18 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
         raise ValueError(f"it reads '{name}' of a vehicle that records do not show.")
 
     straight = Straight(graph, read)
-    after = made.respond
+    after = recorded.respond
     moved = [("displacement", after["displacement"]), ("speed_after", after["speed"]), ("accel_after", after["accel"])]
     remembered = [(f"moved[{j}]", after[f"memory of {m}"]) for j, m in enumerate(memories)]
     blocks = {
-        "sense": straight.lines([(f"h[now, {j}]", node) for j, node in enumerate(made.sense)]),
-        "beginning": straight.lines([(f"memory[{j}]", made.begin[m]) for j, m in enumerate(memories)]),
+        "sense": straight.lines([(f"h[now, {j}]", node) for j, node in enumerate(recorded.sense)]),
+        "beginning": straight.lines([(f"memory[{j}]", recorded.begin[m]) for j, m in enumerate(memories)]),
         "wind": straight.lines(remembered),
         "respond": straight.lines([*moved, *remembered]),
     }
     blocks["constants"] = straight.constants()
     text = Path(march_loops.__file__).read_text(encoding="utf-8")
-    counts = f"SIGNALS, MEMORIES, CONSTANTS = {max(len(made.sense), 1)}, {len(memories)}, {straight.kept}\n"
+    counts = f"SIGNALS, MEMORIES, CONSTANTS = {max(len(recorded.sense), 1)}, {len(memories)}, {straight.kept}\n"
     text = text.replace("compiled = ", f"{counts}compiled = ", 1)
     for name, lines in blocks.items():
         text = _pasted(text, name, lines)
@@ -278,10 +278,10 @@ def _printed(catalogue: Catalogue, dt: float) -> tuple[str, np.ndarray]:
 
 
 def _pasted(text: str, name: str, lines: list[str]) -> str:
-    found = re.search(rf"^( *)# <{name}>\n *# </{name}>\n", text, re.MULTILINE)
-    assert found is not None, name
-    printed = "".join(f"{found[1]}{line}\n" for line in lines)
-    return text[: found.start()] + printed + text[found.end() :]
+    block = re.search(rf"^( *)# <{name}>\n *# </{name}>\n", text, re.MULTILINE)
+    assert block is not None, name
+    printed = "".join(f"{block[1]}{line}\n" for line in lines)
+    return text[: block.start()] + printed + text[block.end() :]
 
 
 def _recorded(catalogue: Catalogue, dt: float, graph: Regions) -> Recording:
@@ -290,8 +290,8 @@ def _recorded(catalogue: Catalogue, dt: float, graph: Regions) -> Recording:
     for effect in catalogue.flagged:
         table = tables.get(getattr(effect, "label", "") if isinstance(effect, (Changed, Push)) else effect.name)
         wrapped.append(Flagged(effect, graph, f"on {effect.name}", table))
-    beside = [e.name for e in catalogue.effects if e.beyond == "vehicle in an adjacent lane"]
-    inputs = [(name, tuple(_BESIDE), (False,) * len(_BESIDE)) for name in beside]
+    adjacent = [e.name for e in catalogue.effects if e.beyond == "vehicle in an adjacent lane"]
+    inputs = [(name, tuple(_BESIDE), (False,) * len(_BESIDE)) for name in adjacent]
     inputs += [(e.name, ("",), (False,)) for e in (_slots(PULSE) if catalogue.located else ())]
     memories = tuple(e.name for e in catalogue.effects if e.remembers)
     stepping = CarFollowingStep(Lane(), (catalogue.base, *wrapped, Brakes()), dt, "midpoint")  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from itertools import accumulate, product
 import numpy as np
 
 from idm_env import effects as catalogue
-from idm_env.discovery import march as twin
+from idm_env.discovery import march
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.records import Records
 from idm_env.effects import Effect
@@ -34,7 +34,7 @@ class Term:
     starts: tuple[tuple[float, ...], ...]
     what: str = ""
     coordinate: str = ""
-    form: int = twin.NONE
+    form: int = march.NONE
     knots: tuple[float, float, int] = (0.0, 1.0, 2)
     period: float = 0.0
     profile: tuple[float, ...] | None = None
@@ -56,10 +56,10 @@ class Term:
 
     def entries(self, catalogue: Catalogue, slot: int) -> list[int]:
         """Return the places in φ of the parameters, for a term without a name in ``slot``."""
-        if self.form == twin.NONE or self.profile is not None:
+        if self.form == march.NONE or self.profile is not None:
             return [catalogue.index[f"{self.effect}.{p.name}"] for p in self.parameters]
         row = catalogue.table_at(self.effect or str(slot))
-        if self.form == twin.INTERVAL:
+        if self.form == march.INTERVAL:
             return [row + 4, row, row + 1][: self.size]
         return [row + 4 + self.fades + i for i in range(self.size)]
 
@@ -75,7 +75,7 @@ class Hypothesis:
     """Terms that are in the model, in the order of adding, and the catalogue whose loop rolls it out."""
 
     terms: tuple[Term, ...] = ()
-    catalogue: Catalogue = field(default_factory=twin.default_catalogue)
+    catalogue: Catalogue = field(default_factory=march.default_catalogue)
     entries: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -88,8 +88,8 @@ class Hypothesis:
     def _slots(self) -> list[tuple[Term, int]]:
         """Terms with the slots of those that have no name."""
         slots = np.cumsum([t.located for t in self.terms]) - 1
-        if len(slots) and slots[-1] >= twin.SLOTS:
-            raise ValueError(f"a model can have {twin.SLOTS} effects without a name, and {slots[-1] + 1} were given.")
+        if len(slots) and slots[-1] >= march.SLOTS:
+            raise ValueError(f"a model can have {march.SLOTS} effects without a name, and {slots[-1] + 1} were given.")
         return [(t, int(s)) for t, s in zip(self.terms, slots, strict=True)]
 
     def adding(self, term: Term) -> Hypothesis:
@@ -133,9 +133,9 @@ class Hypothesis:
     @property
     def tables(self) -> np.ndarray:
         """Form, number of knots and place in φ of every table [tables, 3]."""
-        tables = np.array([(twin.NONE, 2, self.catalogue.table_at(n)) for n in self.catalogue.tables], np.int64)
+        tables = np.array([(march.NONE, 2, self.catalogue.table_at(n)) for n in self.catalogue.tables], np.int64)
         for term, slot in self._slots:
-            if term.form != twin.NONE:
+            if term.form != march.NONE:
                 tables[self.catalogue.tables[term.effect or str(slot)], :2] = term.form, term.drawn[2]
         return tables
 
@@ -144,11 +144,11 @@ class Hypothesis:
         values = np.asarray(values, float)
         phi = np.tile(self.catalogue.null, (*values.shape[:-1], 1))
         for term, slot in self._slots:
-            if term.form == twin.NONE:
+            if term.form == march.NONE:
                 continue
             row = self.catalogue.table_at(term.effect or str(slot))
             phi[..., row + 3] = term.period
-            if term.form == twin.CURVE:
+            if term.form == march.CURVE:
                 phi[..., row], phi[..., row + 1] = term.drawn[0], 1.0 / term.drawn[1]
                 if term.profile is not None:
                     phi[..., row + 4 : row + 4 + len(term.profile)] = term.profile
@@ -233,7 +233,7 @@ def unknown_profile(effect: str | Effect, first: float, distance: float, count: 
     declared = replace(one, knots=knots).parameters  # type: ignore[call-arg]
     parameters = tuple(replace(p, default=0.0) for p in declared)
     return Term(
-        one.name, one.name, parameters, ((0.0,) * count,), what=one.acts_on, coordinate="position", form=twin.CURVE,
+        one.name, one.name, parameters, ((0.0,) * count,), what=one.acts_on, coordinate="position", form=march.CURVE,
         knots=(first, distance, count), period=period, smoothness=abs(one.strength_of(SPREAD)), made=one,
     )  # fmt: skip
 
@@ -245,7 +245,7 @@ def known_profile(effect: str | Effect, first: float, distance: float, profile: 
     one = catalogue.make(kind, knots=places, profile=tuple(profile))
     starts = tuple(product(*(_starts(p) for p in one.parameters)))
     return Term(
-        one.name, one.name, one.parameters, starts, what="share", coordinate="position", form=twin.CURVE,
+        one.name, one.name, one.parameters, starts, what="share", coordinate="position", form=march.CURVE,
         knots=(first, distance, len(profile)), period=period, profile=tuple(profile), made=one,
     )  # fmt: skip
 
@@ -274,7 +274,7 @@ def interval(what: str, coordinate: str, begin: float, end: float, amount: float
     )
     return Term(
         f"{what} over {coordinate}", None, parameters, ((amount, begin, end),), what=what, coordinate=coordinate,
-        form=twin.INTERVAL, period=period,
+        form=march.INTERVAL, period=period,
     )  # fmt: skip
 
 
@@ -293,7 +293,7 @@ def curve(
     parameters = tuple(Parameter(f"knot_{i}", f"c{i}", unit, 0.0, *size, null=0.0) for i in range(count))
     return Term(
         label, None, parameters, ((0.0,) * count,), what=what,
-        coordinate=coordinate, form=twin.CURVE, knots=(first, distance, count), period=period,
+        coordinate=coordinate, form=march.CURVE, knots=(first, distance, count), period=period,
         smoothness=0.3 if what == "acceleration" else 0.5, fades=coordinate in STATES,
         by=by,
         pinned=nearest,
@@ -309,18 +309,18 @@ def testable(records: Records, effects: Sequence[Effect]) -> dict[str, str]:
     refused = {}
     for effect in effects:
         if effect.beyond in NEIGHBOURS:
-            column = twin.COLUMNS.index(f"{NEIGHBOURS[effect.beyond]}_present")
+            column = march.COLUMNS.index(f"{NEIGHBOURS[effect.beyond]}_present")
             if records.signals[:, column].mean() < 0.02:
                 refused[effect.name] = f"no {effect.beyond} is measured"
         if effect.sought == "given" and not any(effect.column in e.columns for e in records.episodes):
             refused[effect.name] = f"the file has no column {effect.column}"
-        if effect.sought in ("profile", "interval", "step") and effect.acts_on not in twin.PULSED:
+        if effect.sought in ("profile", "interval", "step") and effect.acts_on not in march.PULSED:
             refused[effect.name] = (
-                f"an effect that is sought at places or times must say which of {', '.join(twin.PULSED)} it changes, "
+                f"an effect that is sought at places or times must say which of {', '.join(march.PULSED)} it changes, "
                 f"and acts_on = '{effect.acts_on}'"
             )
         unknown = effect.name not in refused and effect.kind not in catalogue.PACKAGED
-        if unknown and (why := twin.why_not_recorded(effect, records.dt)):
+        if unknown and (why := march.why_not_recorded(effect, records.dt)):
             refused[effect.name] = why
     return refused
 
@@ -341,11 +341,11 @@ def effects_of(model: Hypothesis, values: np.ndarray) -> tuple[list[Effect], dic
 
 def _effects(term: Term, values: np.ndarray) -> list[tuple[Effect, dict[str, float]]]:
     names = [p.name for p in term.parameters]
-    if term.form == twin.NONE:
+    if term.form == march.NONE:
         assert term.effect is not None
         return [(_made(term), dict(zip(names, map(float, values), strict=True)))]
     period = term.period or None
-    if term.form == twin.INTERVAL:
+    if term.form == march.INTERVAL:
         amount, begin, end = values
         edge = EDGES[term.coordinate]
         middle = max(begin + edge, end - edge)

@@ -50,7 +50,7 @@ class Planted:
     """What an effect does to the errors of every unit, and draws.
 
     Of units: curvature [units, B, B], pull of their errors [units, B] and their ``square`` [units]. ``signs`` and
-    ``fresh`` [draws, runs] are those of runs that choose and of such as are kept back, ``picked`` [draws, kept];
+    ``fresh`` [draws, runs] are those of validation runs and of such as are kept back, ``picked`` [draws, kept];
     ``rest`` [runs, B, B] inverts the curvature of all other runs, ``whole`` [B, B] that of all.
     """
 
@@ -119,10 +119,10 @@ class Planted:
         gain = -0.5 * np.log(1.0 - np.clip(gained / np.maximum(own, 1e-12), -9.0, 0.9))
         roots = np.sign(gain) * np.sqrt(np.abs(gain))
         statistic = roots.sum(1) / np.sqrt(np.abs(gain).sum(1) + FAINT * gain.shape[1])
-        found = (statistic >= self.bar.level) & (gain.mean(1) >= self.bar.gain)
+        detected = (statistic >= self.bar.level) & (gain.mean(1) >= self.bar.gain)
         if self.bar.kept:
-            found &= self._confirmed(curved, of_run.sum(1) @ self.whole)
-        return float(found.mean())
+            detected &= self._confirmed(curved, of_run.sum(1) @ self.whole)
+        return float(detected.mean())
 
     def _confirmed(self, curved: np.ndarray, phi: np.ndarray) -> np.ndarray:
         """Tell of every draw whether φ [draws, B] of all runs helps runs like them that are kept back."""
@@ -179,8 +179,8 @@ def strength_of(solution: Solution, task: Task, label: str, bar: Bar) -> Strengt
     strengths = [i for i, p in enumerate(parameters) if p.null is not None and p.role == "strength"]
     if not strengths or 1 < len(strengths) < len(parameters):
         return None
-    at = where.start + np.array(strengths)
-    width, estimate = half_width(solution, task)[at], solution.values[at]
+    entries = where.start + np.array(strengths)
+    width, estimate = half_width(solution, task)[entries], solution.values[entries]
     p = parameters[strengths[0]]
     assert p.null is not None
     furthest = float(estimate[np.abs(estimate - p.null).argmax()])
@@ -188,7 +188,7 @@ def strength_of(solution: Solution, task: Task, label: str, bar: Bar) -> Strengt
     term = next(t for t in solution.model.terms if t.label == label)
     typical = abs(p.default - p.null) if len(strengths) == 1 else term.smoothness
     shape = np.ones(1) if len(strengths) == 1 else np.sin(2.0 * np.pi * np.arange(len(strengths)) / WAVE_KNOTS)
-    seen = BEYOND_LINES * Planted.of(solution, task, at, shape, bar).smallest(typical)
+    seen = BEYOND_LINES * Planted.of(solution, task, entries, shape, bar).smallest(typical)
     if term.effect is not None and ALL[term.effect].latency:
         # A latency that comes out below one step of the data becomes part of the null.
         seen = max(seen, task.rows.records.dt + float(normal.ppf(POWER) / 1.96 * np.median(width)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from idm_env.data import DataError, Episode, Trajectories
 from idm_env.data.samples import VEHICLES, Samples
-from idm_env.discovery import march as twin
+from idm_env.discovery import march
 from idm_env.fitting.problem import group_of
 
 WINDOW_S = 5.0
@@ -55,7 +55,7 @@ class Records:
 
     def column(self, name: str) -> np.ndarray:
         """Return one of ``march.COLUMNS`` [samples]."""
-        return self.signals[:, twin.COLUMNS.index(name)]
+        return self.signals[:, march.COLUMNS.index(name)]
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -123,7 +123,7 @@ def _signals(samples: Samples, period: float) -> np.ndarray:
         *samples.beside.T,
         position[:, driver], speed[:, driver], accel[:, driver], samples.time, place,
     ]  # fmt: skip
-    assert len(columns) == len(twin.COLUMNS)
+    assert len(columns) == len(march.COLUMNS)
     return np.stack(columns, axis=1)
 
 
@@ -153,7 +153,7 @@ def _histories(episodes: Sequence[Episode], trajectories: Trajectories | None) -
 def _with_history(signals: np.ndarray, speeds: np.ndarray, dt: float) -> np.ndarray:
     """Put the driver's past in front: his own speeds, everything else as at the episode's first sample."""
     before = np.repeat(signals[:1], len(speeds), axis=0)
-    column = {name: i for i, name in enumerate(twin.COLUMNS)}
+    column = {name: i for i, name in enumerate(march.COLUMNS)}
     before[:, column["speed"]] = speeds
     # Nobody knows where the others were: they stand still in the driver's eyes, rather than accelerate for minutes.
     for name in ("lead_accel", "second_accel", "behind_accel"):

@@ -101,9 +101,9 @@ def without_own_run(task: Task, solution: Solution) -> np.ndarray:
 
 
 def log_gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the gains in log RMSE of units from their squares before and after; 0 where a unit has nothing to tell."""
-    told = (before > 0.0) & (after > 0.0)
-    gains: np.ndarray = 0.5 * np.log(np.where(told, before, 1.0) / np.where(told, after, 1.0))
+    """Return the gains in log RMSE [units] from squares before and after; 0 where a unit has nothing to tell."""
+    seen = (before > 0.0) & (after > 0.0)
+    gains: np.ndarray = 0.5 * np.log(np.where(seen, before, 1.0) / np.where(seen, after, 1.0))
     return gains
 
 

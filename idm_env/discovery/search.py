@@ -45,7 +45,7 @@ class Scored:
 
 @dataclass(eq=False)
 class Search:
-    """The state of a search on the runs that may choose."""
+    """The state of a search on the validation runs."""
 
     task: Task
     names: Sequence[str]
@@ -77,25 +77,25 @@ class Search:
         return solution
 
     def weighed(self, now: Solution) -> tuple[ClosedLoopFit, Solution]:
-        """Return how a model of windows stands in free simulation of the runs that may choose, and it with that prior.
+        """Return how a model of windows stands in free simulation of the validation runs, and it with that prior.
 
         In windows its drivers stay as they are. The weight of the prior becomes that of the task.
         """
         if self.stood is None or self.stood[1] is not now:
-            found = self.calibrated(now.model, now.values, now.theta)
-            self.task = replace(self.task, prior=replace(self.task.prior, alike_s=found.prior.alike_s))
-            self.stood = found.stand, replace(now, prior=found.prior)
+            fit = self.calibrated(now.model, now.values, now.theta)
+            self.task = replace(self.task, prior=replace(self.task.prior, alike_s=fit.prior.alike_s))
+            self.stood = fit.stand, replace(now, prior=fit.prior)
         return self.stood
 
     def calibrated(self, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
-        """Return a model calibrated on the runs that may choose (``calibrate``), done once for the same beginning."""
+        """Return a model with values [Q] calibrated on the validation runs, done once for one ``start`` [G, P]."""
         key = (id(model), values.tobytes(), None if start is None else start.tobytes())
         if key not in self.calibrations:
             self.calibrations[key] = calibrate.calibrate(self.task.rows.records, model, values, start)
         return self.calibrations[key]
 
     def free_run_squares(self, now: Solution) -> np.ndarray:
-        """Return every unit's squared gap errors (m²) of free simulation of the runs that may choose."""
+        """Return squared gap errors (m²) of closed-loop simulation of the validation runs [units]."""
         if now not in self.squares:
             self.squares[now] = judge.free_run_squares(self.task.rows.records, now)
         return self.squares[now]
@@ -118,18 +118,18 @@ class Search:
             return self._curves(solution, places.respond(self.task, solution), before, number, _surfaces(shape)), before
         have = {t.label for t in solution.model.terms}
         before = held_out(self.task, solution)
-        wanted = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
-        wanted += [terms.given_profile(e) for e in self._sought("given") if e.name not in have]
-        found: list[Scored] = []
+        untried = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
+        untried += [terms.given_profile(e) for e in self._sought("given") if e.name not in have]
+        scored: list[Scored] = []
         responses = places.respond(self.task, solution)
-        promised = {t.label: self._promise(solution, t)[0].max() for t in wanted}
+        promised = {t.label: self._promise(solution, t)[0].max() for t in untried}
         # What promises most comes first: all others need not be fitted to the end where they stay far behind it.
-        for i, term in enumerate(sorted(wanted, key=lambda t: -promised[t.label])):
-            self.on_progress(f"round {number}", i, len(wanted) + 1, term.label)
-            found.append(self._nested(solution, term, before, f"{number}/{term.label}", worth=_worth(found)))
-        self.on_progress(f"round {number}", len(wanted), len(wanted) + 1, "places, times and shapes")
-        found += self._places(solution, responses, before, number, first, max(_worth(found), WORTH))
-        return found, before
+        for i, term in enumerate(sorted(untried, key=lambda t: -promised[t.label])):
+            self.on_progress(f"round {number}", i, len(untried) + 1, term.label)
+            scored.append(self._nested(solution, term, before, f"{number}/{term.label}", worth=_worth(scored)))
+        self.on_progress(f"round {number}", len(untried), len(untried) + 1, "places, times and shapes")
+        scored += self._places(solution, responses, before, number, first, max(_worth(scored), WORTH))
+        return scored, before
 
     def again(self, solution: Solution, best: Scored, scored: list[Scored]) -> tuple[Solution, list[Scored]]:
         """Judge the leading candidates once more, all by the noise that the best one leaves."""
@@ -149,7 +149,7 @@ class Search:
         return null, result
 
     def pair(self, solution: Solution, names: tuple[str, str], before: np.ndarray, number: int) -> Scored:
-        """Score two effects of the catalogue at once; the term that is named is the second."""
+        """Score two effects of the catalogue at once, against squares ``before`` [units]; the second gives the name."""
         first, second = (terms.simple(self.base.catalogue.by_name[n]) for n in names)
         self.on_progress(f"round {number}", 0, 1, f"{first.label} + {second.label}")
         base = replace(solution, model=solution.model.adding(first))
@@ -169,11 +169,11 @@ class Search:
     ) -> Scored:
         """Score a term by a fit, which goes no further where even on the very data it gains less than ``worth``."""
         model = solution.model.adding(term)
-        kept = self.saved.get(key)
-        if kept is not None:
-            theta, values = kept["theta"].numpy(), kept["values"].numpy()
+        stored = self.saved.get(key)
+        if stored is not None:
+            theta, values = stored["theta"].numpy(), stored["values"].numpy()
             linear = linearise(self.task, model, theta, values)
-            best = finish(self.task, model, theta, values, linear, kept["cost"])
+            best = finish(self.task, model, theta, values, linear, stored["cost"])
         else:
             starts = starts or [np.append(solution.values, s) for s in term.starts]
             share, scaled = self._promise(solution, term, starts)
@@ -181,8 +181,8 @@ class Search:
             if share.max() < FAINT + term.size / solution.linear.residual.size:
                 best = solve(self.task, model, solution.theta, scaled[share.argmax()], iterations=1)
             else:
-                wanted = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
-                first = [solve(self.task, model, solution.theta, s, iterations=5) for s in wanted]
+                promising = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
+                first = [solve(self.task, model, solution.theta, s, iterations=5) for s in promising]
                 best = min(first, key=lambda s: s.cost)
                 if 0.5 * np.log(solution.cost / best.cost) >= worth:
                     best = solve(self.task, model, best.theta, best.values, iterations=iterations)
@@ -192,14 +192,14 @@ class Search:
         return Scored(term, best, gains)
 
     def _promise(
-        self, solution: Solution, term: Term, given: Sequence[np.ndarray] | None = None
+        self, solution: Solution, term: Term, begin: Sequence[np.ndarray] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return by which share every start [S, Q] lowers the squared error [S], and the starts scaled to do so.
 
         A start's response, after θ has followed it, is scaled by one number, which scales strengths.
         """
         task, linear, model = self.task, solution.linear, solution.model.adding(term)
-        starts = np.array(given or [np.append(solution.values, s) for s in term.starts])
+        starts = np.array(begin or [np.append(solution.values, s) for s in term.starts])
         residual = task.residual(task.errors(np.repeat(solution.theta[None], len(starts), axis=0), model, starts))
         responses = np.concatenate([linear.jacobian[: linear.own], residual - linear.residual])
         tried = Linear(linear.residual, responses, linear.own)
@@ -253,22 +253,22 @@ class Search:
         def interval_of(what: str, coordinate: str, open_end: bool = False, named: Effect | None = None) -> None:
             width = {"position": 20.0, "time": 2.0}[coordinate]
             shortest = {"position": 2, "time": 3}[coordinate]
-            found = places.scan(responses, what, coordinate, width, open_end=open_end, shortest=shortest)
-            if found is None:
+            interval = places.scan(responses, what, coordinate, width, open_end=open_end, shortest=shortest)
+            if interval is None:
                 if named is not None and number == 1:
                     self.unplaced[named.name] = f"no {coordinate} in these data is covered for long enough to be tried"
                 return
-            term = _interval_term(what, coordinate, found, open_end, named, period)
+            term = _interval_term(what, coordinate, interval, open_end, named, period)
             if term.label in have:
                 return
-            if found.gains.mean() < worth and (named is None or worth > WORTH):
-                result.append(Scored(term, None, found.gains))
+            if interval.gains.mean() < worth and (named is None or worth > WORTH):
+                result.append(Scored(term, None, interval.gains))
                 return
-            starts = [np.append(solution.values, s) for s in _around(term, found, open_end)]
+            starts = [np.append(solution.values, s) for s in _around(term, interval, open_end)]
             one = self._nested(solution, term, before, f"{number}/{term.label}", starts)
             # Runs that chose another place than all together are judged by what they would have gained there.
-            gains = np.where(found.stable, one.gains, found.gains)
-            result.append(Scored(term, one.solution, gains, found.stable))
+            gains = np.where(interval.stable, one.gains, interval.gains)
+            result.append(Scored(term, one.solution, gains, interval.stable))
 
         def curve_of(*curves: Term) -> None:
             result.extend(self._curves(solution, responses, before, number, curves, worth))
@@ -309,9 +309,9 @@ class Search:
         return result
 
 
-def _worth(found: Sequence[Scored]) -> float:
+def _worth(scored: Sequence[Scored]) -> float:
     """Return the gain in log RMSE below which a candidate stays far behind the best of those found."""
-    return NEAR * max((float(s.gains.mean()) for s in found), default=0.0)
+    return NEAR * max((float(s.gains.mean()) for s in scored), default=0.0)
 
 
 def _surfaces(shape: Term) -> list[Term]:
@@ -330,26 +330,26 @@ def _line(responses: places.Responses, term: Term) -> tuple[np.ndarray, np.ndarr
 
 
 def _interval_term(
-    what: str, coordinate: str, found: places.Found, open_end: bool, named: Effect | None, period: float
+    what: str, coordinate: str, interval: places.Found, open_end: bool, named: Effect | None, period: float
 ) -> Term:
     if named is not None:
-        strength = named.strength_of(found.amount)
+        strength = named.strength_of(interval.amount)
         if open_end:
-            return terms.placed(named, strength, found.begin)
-        return terms.placed(named, strength, found.begin, found.end, period=period)
+            return terms.placed(named, strength, interval.begin)
+        return terms.placed(named, strength, interval.begin, interval.end, period=period)
     limit = 3.0 if what == "acceleration" else 0.6
-    amount = float(np.clip(found.amount, -limit, limit))
-    term = terms.interval(what, coordinate, found.begin, 1e6 if open_end else found.end, amount,
+    amount = float(np.clip(interval.amount, -limit, limit))
+    term = terms.interval(what, coordinate, interval.begin, 1e6 if open_end else interval.end, amount,
                           period if coordinate == "position" else 0.0)  # fmt: skip
     return replace(term, label=f"{what} step in {coordinate}") if open_end else term
 
 
-def _around(term: Term, found: places.Found, open_end: bool) -> list[np.ndarray]:
+def _around(term: Term, interval: places.Found, open_end: bool) -> list[np.ndarray]:
     """Return starts of an interval: with the edges found, and with each a bin before and after.
 
     An edge that is off by a bin may not reach the right one: in between, every driver's own parameters make up for it.
     """
-    start, shifts = np.array(term.starts[0]), (0.0, -found.width, found.width)
+    start, shifts = np.array(term.starts[0]), (0.0, -interval.width, interval.width)
     ends = (0.0,) if open_end else shifts
     moved = [(0.0, a, b)[: term.size] for a in shifts for b in ends]
     return [start + m for m in moved]

@@ -92,11 +92,11 @@ class Decided:
 
 
 def decide(searching: Search, null: Solution, seed: int) -> Decided:
-    """Decide what is added to the null, on the runs that may choose.
+    """Decide what is added to the null, on the validation runs.
 
     A latency shorter than a step of the data becomes part of the null: it is how they were integrated or recorded.
     """
-    at, null = searching.weighed(null)
+    fit, null = searching.weighed(null)
     null, steps, rounds = _rounds(searching, null, seed)
     if len(steps) == len(rounds) - 1 and not (steps and _is_shape(steps[-1])):
         pair = _pairs(searching, steps[-1] if steps else null, rounds[-1], seed)
@@ -108,7 +108,7 @@ def decide(searching: Search, null: Solution, seed: int) -> Decided:
     if steps:
         steps[-1] = searching.weighed(_delete(searching, steps[-1], len(null.model.terms)))[1]
     joined = _joined(searching, null, steps, rounds, seed)
-    return Decided(null, steps, rounds, joined, at)
+    return Decided(null, steps, rounds, joined, fit)
 
 
 def _joined(
@@ -187,9 +187,9 @@ def _is_a_step(now: Solution, dt: float) -> bool:
 
 def _at_floor(searching: Search, now: Solution) -> bool:
     """Tell whether only the noise of measurement is left; what smoothing does at sharp bends would be named next."""
-    kept = searching.task.rows.records
-    square = searching.free_run_squares(now).sum() / len(whole(kept).valid.nonzero()[0])
-    return bool(square <= (AT_FLOOR * judge.floor(kept)["gap_rmse_m"]) ** 2)
+    records = searching.task.rows.records
+    square = searching.free_run_squares(now).sum() / len(whole(records).valid.nonzero()[0])
+    return bool(square <= (AT_FLOOR * judge.floor(records)["gap_rmse_m"]) ** 2)
 
 
 def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | None:
@@ -200,15 +200,15 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     have = {t.label for t in now.model.terms}
     left = [n for n in searching.names if n not in have]
     late = any(_late(t.effect) for t in now.model.terms)
-    wanted = [
+    pairs = [
         (name, other) for name in left for other in ALL[name].cancels
         if other in left and not (late and (_late(name) or _late(other)))
     ]  # fmt: skip
-    if not wanted or (last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS):
+    if not pairs or (last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS):
         return None
     number = len(have) + 1
     before = held_out(searching.task, now)
-    scored = [searching.pair(now, pair, before, number) for pair in wanted]
+    scored = [searching.pair(now, pair, before, number) for pair in pairs]
     tested = _tested(searching, (*last.scored, *scored), seed)
     mine = Tested(*(x[len(last.scored) :] for x in (tested.p_value, tested.gain, tested.interval)))
     this = Round(scored, mine, before, last.left, None)
@@ -281,7 +281,7 @@ def _choose(searching: Search, now: Solution, this: Round) -> None:
 
 
 def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
-    """Tell whether free simulation of the runs that choose gets no worse: by 2 % at most, or not beyond chance.
+    """Tell whether free simulation of the validation runs gets no worse: by 2 % at most, or not beyond chance.
 
     Drivers' own noise adds up in free simulation: with 0.1 m/s² of it, right findings can miss the 2 %.
     """

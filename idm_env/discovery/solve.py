@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from idm_env.discovery import march as twin
+from idm_env.discovery import march
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Rows
@@ -86,12 +86,12 @@ class Task:
         catalogue, dt = model.catalogue, records.dt
         phi = np.ascontiguousarray(model.phi(values))
         on = np.tile(model.on, (copies, 1))
-        pulse = np.zeros((copies, 3)) if pulse is None else twin.pulsed(catalogue, pulse, on, phi)
-        loop = twin.loop(catalogue, dt)
+        pulse = np.zeros((copies, 3)) if pulse is None else march.pulsed(catalogue, pulse, on, phi)
+        loop = march.loop(catalogue, dt)
         loop.march(
             records.signals, records.bounds, rows.record, rows.start, rows.steps, rows.group, records.length,
-            np.exp(theta), phi, on, model.tables, twin.back_steps(model.named, dt),
-            *twin.lead_steps(model.named, dt), rows.every, dt, loop.varying, pulse, gap, speed,
+            np.exp(theta), phi, on, model.tables, march.back_steps(model.named, dt),
+            *march.lead_steps(model.named, dt), rows.every, dt, loop.varying, pulse, gap, speed,
         )  # fmt: skip
         return gap, speed
 
@@ -100,11 +100,11 @@ class Task:
     ) -> np.ndarray:
         """Return prediction errors [C, R, m]: in windows speed and two gaps, in free simulation the gap."""
         gap, speed = self.predict(theta, model, values, pulse)
-        at = self.rows.samples
-        gap = np.where(self.rows.valid, gap - self.rows.records.gap[at], 0.0)
+        samples = self.rows.samples
+        gap = np.where(self.rows.valid, gap - self.rows.records.gap[samples], 0.0)
         if self.noise is None:
             return np.nan_to_num(np.clip(gap, -100.0, 100.0), nan=100.0)
-        speed = speed - self.rows.records.speed[at]
+        speed = speed - self.rows.records.speed[samples]
         count = gap.shape[-1]
         both = np.concatenate([speed, gap[..., [count // 2 - 1, count - 1]]], axis=-1)
         return np.nan_to_num(np.clip(both, -30.0, 30.0), nan=30.0)
@@ -128,7 +128,7 @@ class Task:
 
     @cached_property
     def order(self) -> np.ndarray | slice:
-        """Rows in the order of their groups; as a rule they are so already."""
+        """Numbers of rows [R] in the order of their groups; as a rule they are so already."""
         group = self.rows.group
         return slice(None) if (np.diff(group) >= 0).all() else np.argsort(group, kind="stable")
 
@@ -138,10 +138,10 @@ class Task:
         total[[g for g, _ in self.of_group]] = np.add.reduceat(x[self.order], [r.start for _, r in self.of_group])
         return total
 
-    def of_rows(self, wanted: np.ndarray) -> Task:
-        """Return the task of some rows, all those of their groups."""
-        noise = self.noise and replace(self.noise, weight=self.noise.weight[wanted])
-        return replace(self, rows=self.rows.some(wanted), noise=noise)
+    def of_rows(self, mask: np.ndarray) -> Task:
+        """Return the problem of some rows ``mask`` [R], all those of their groups."""
+        noise = self.noise and replace(self.noise, weight=self.noise.weight[mask])
+        return replace(self, rows=self.rows.some(mask), noise=noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class Solution:
 
 
 def differences(parameters: tuple[Parameter, ...], values: np.ndarray) -> np.ndarray:
-    """Return the step of every entry of φ by which its derivative is taken, pointing into its bounds."""
+    """Return the steps [Q] by which derivatives by φ ``values`` [Q] are taken, in their units, into their bounds."""
     size = np.empty(len(parameters))
     for i, p in enumerate(parameters):
         if p.role == "place":
@@ -194,7 +194,7 @@ def differences(parameters: tuple[Parameter, ...], values: np.ndarray) -> np.nda
 
 
 def linearise(task: Task, model: Hypothesis, theta: np.ndarray, values: np.ndarray) -> Linear:
-    """Return the residual and its derivatives by forward differences."""
+    """Return the residual at log θ [G, P] and φ [Q], and its derivatives by forward differences."""
     count, own = model.entries.size, theta.shape[-1]
     step = np.append(np.full(own, STEP), differences(model.parameters, values))
     many = np.repeat(theta[None], 1 + own + count, axis=0)
@@ -208,7 +208,7 @@ def linearise(task: Task, model: Hypothesis, theta: np.ndarray, values: np.ndarr
 
 
 def prior_of(model: Hypothesis) -> np.ndarray:
-    """Return the inverse variance of the prior of every entry of φ: 0 but for knots of curves."""
+    """Return the inverse variance of the prior of φ [Q]: 0 but for knots of curves."""
     if not model.entries.size:
         return np.zeros(0)
     return np.concatenate([
@@ -240,8 +240,8 @@ def _sums(task: Task, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
 
 def cost_of(task: Task, theta: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return the cost of every copy and group [C, G]: squared residuals and the prior."""
-    known = (((theta - task.prior.centre) / task.prior.width) ** 2).sum(-1)
-    return np.asarray(task.per_group(_squares(residual).T).T + known)
+    pull = (((theta - task.prior.centre) / task.prior.width) ** 2).sum(-1)
+    return np.asarray(task.per_group(_squares(residual).T).T + pull)
 
 
 def _squares(residual: np.ndarray) -> np.ndarray:
@@ -307,9 +307,9 @@ def solve(
     """Minimise over θ of every group and φ, from log θ [G, P] and values [Q]."""
     nested = _Nested(task, model)
     begin = Progress.begin(torch.tensor(theta[None]), torch.tensor(values[None]), damping=1e-3)
-    found, now = minimise(nested, begin, iterations, tolerance=tolerance)
-    linear = nested.linear(found.own, found.shared)
-    own, shared = found.own[0].numpy(), found.shared[0].numpy()
+    optimum, now = minimise(nested, begin, iterations, tolerance=tolerance)
+    linear = nested.linear(optimum.own, optimum.shared)
+    own, shared = optimum.own[0].numpy(), optimum.shared[0].numpy()
     cost = float(now.cost.sum()) + float((prior_of(model) * shared**2).sum())
     return finish(task, model, own, shared, linear, cost)
 
@@ -317,7 +317,7 @@ def solve(
 def finish(
     task: Task, model: Hypothesis, theta: np.ndarray, values: np.ndarray, linear: Linear, cost: float
 ) -> Solution:
-    """Return the solution at a point: φ's matrix per group with θ eliminated, and the prior centred there."""
+    """Return the solution at log θ [G, P] and φ [Q]: φ's matrix per group without θ, and the prior centred there."""
     prior = task.known.following(torch.from_numpy(theta[None]))
     _, matrix = equations(replace(task, prior=prior), theta, linear)
     own = linear.own
