@@ -715,12 +715,9 @@ def picture(out: Path = OUT, path: Path = ROOT / "docs" / "agents_survival.png")
     print(path)
 
 
-def main() -> None:
-    """Run, or show."""
-    command({
-        "reference": reference, "run": run, "table": tables, "picture": picture, "takeover": takeover, "shocks": shocks,
-    })  # fmt: skip
-
+main = {
+    "reference": reference, "run": run, "table": tables, "picture": picture, "takeover": takeover, "shocks": shocks,
+}  # fmt: skip
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -544,11 +544,8 @@ def laws(steps: tyro.conf.Positional[float] = 1e9) -> None:
     print(counted(found))
 
 
-def main() -> None:
-    """Run what is asked for."""
-    torch.set_num_threads(1)
-    command({"speed": speed, "flow": flow, "standing": standing, "laws": laws})
-
+main = {"speed": speed, "flow": flow, "standing": standing, "laws": laws}
 
 if __name__ == "__main__":
-    main()
+    torch.set_num_threads(1)
+    command(main)

@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import Place, kept_rows, lane_search, lane_tasks, lanes, named_rows
+from benchmarks import Place, command, kept_rows, lane_search, lane_tasks, lanes, named_rows
 from idm_env.jobs.progress import OnProgress
 from idm_env.tasks import make_task
 
@@ -18,8 +18,13 @@ COMMANDS = sorted(p.stem for p in (Path(__file__).parents[1] / "benchmarks").glo
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_live_benchmark_is_imported_and_is_a_command(name: str) -> None:
-    assert callable(importlib.import_module(f"benchmarks.{name}").main)
+def test_every_live_benchmark_is_a_command_that_says_its_options(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", [name, "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        command(importlib.import_module(f"benchmarks.{name}").main)
+    assert capsys.readouterr().out.startswith(f"usage: python -m benchmarks.{name} ")
 
 
 def _squared(part: int, on_progress: OnProgress) -> int:
@@ -60,7 +65,7 @@ def test_what_would_not_be_heeded_is_refused(
 ) -> None:
     monkeypatch.setattr("sys.argv", ["lanes", *words.split()])
     with pytest.raises(SystemExit) as end:
-        lanes.main()
+        command(lanes.main)
     printed = "".join(c for c in capsys.readouterr().err if c not in "│╭╮╰╯─") + str(end.value)
     assert says in " ".join(printed.split())
 

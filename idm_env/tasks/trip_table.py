@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import csv
 import math
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -165,16 +167,8 @@ def shares(name: str, given: Mapping[str, float]) -> None:
 def _of_shares(name: str, portions: Mapping[str, float], numbers: Sequence[float]) -> list[str]:
     """Return the names that numbers from 0 to 1 mean, '' for what is left."""
     shares(name, portions)
-    names = []
-    for x in numbers:
-        chosen = ""
-        for key, share in portions.items():
-            if x < share:
-                chosen = key
-                break
-            x -= share
-        names.append(chosen)
-    return names
+    ends, names = list(accumulate(portions.values())), [*portions, ""]
+    return [names[bisect_right(ends, x)] for x in numbers]
 
 
 def spread(name: str, given: Mapping[str, float], count: int, by: float = FIRST) -> list[str]:
