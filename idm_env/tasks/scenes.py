@@ -100,24 +100,18 @@ def _tracks(table: Any, runs: Sequence[str], dt: float) -> list[Track]:
         # A step of time to which two rows are rounded keeps the first.
         steps, first = np.unique(steps, return_index=True)
         part = {name: values[mine][first] for name, values in columns.items()}
-        position, speed, gap = (np.full(step.max() + 1, np.nan) for _ in range(3))
-        track = Track(
-            key=key,
-            lane=f"{part['run_id'][0]}/{part['lane'][0]}",
-            length=float(part["length_m"][0]),
-            position=position,
-            speed=speed,
-            gap=gap,
-            measured=np.zeros(step.max() + 1, bool),
-            leader=np.full(step.max() + 1, "", object),
-            lanes=np.full(step.max() + 1, np.nan),
-        )
-        track.position[steps], track.speed[steps] = part["position_m"].astype(float), part["speed_mps"].astype(float)
-        track.gap[steps] = part["gap_m"].astype(float)
-        track.lanes[steps] = part["lane"].astype(float)
-        track.measured[steps] = part["gap_measured"].astype(bool)
-        track.leader[steps] = ["" if x is None else f"{part['run_id'][0]}/{x}" for x in part["leader_id"]]
-        tracks.append(track)
+
+        def laid(name: str, steps: np.ndarray = steps, part: dict[str, np.ndarray] = part) -> np.ndarray:
+            values = np.full(step.max() + 1, np.nan)
+            values[steps] = part[name].astype(float)
+            return values
+
+        run, leader = part["run_id"][0], np.full(step.max() + 1, "", object)
+        leader[steps] = ["" if x is None else f"{run}/{x}" for x in part["leader_id"]]
+        tracks.append(Track(
+            key, f"{run}/{part['lane'][0]}", float(part["length_m"][0]), laid("position_m"), laid("speed_mps"),
+            laid("gap_m"), laid("gap_measured") == 1.0, leader, laid("lane"),
+        ))  # fmt: skip
     return tracks
 
 
