@@ -14,7 +14,20 @@ import numpy as np
 
 from idm_env.data import Trajectories, episodes
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import bases, calibrate, ceilings, found, judge, march, places, records, search, shared, summary
+from idm_env.discovery import (
+    bases,
+    calibrate,
+    ceilings,
+    found,
+    judge,
+    march,
+    places,
+    records,
+    replica,
+    search,
+    shared,
+    summary,
+)
 from idm_env.discovery import model as terms
 from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
 from idm_env.discovery.model import Hypothesis, Term
@@ -270,12 +283,17 @@ def _finish(
         laws = bases.compared(null.model, before, evaluation.against_null, evaluation.seed, on_law)
         judgement = judgement.beside(bases.best_of(laws))
     final = judgement.compared if judgement.added and judgement.compared is not None else null
-    judgement = replace(judgement, shared=shared.find(judge.everywhere(prepared, task, final), evaluation.seed))
+    everywhere = judge.windowed(prepared, task, final)
+    judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
     scored = prepared if evaluation.test is None else evaluation.test
     floor = ceilings.floor(scored, ceilings.drift(trajectories))
     if evaluation.adapt and before is not None:
         pooled = evaluation.judged(null, pooled=True)[1]
-        judgement = replace(judgement, ladder=judgement.climbed(prepared, pooled, floor["horizon_rmse_m"]))
+        ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
+        if not judgement.added and judgement.law is None and not ladder.unnamed:
+            agreement = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed)
+            ladder = replace(ladder, agreement=agreement)
+        judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     result = summary.summarise(
         trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor, refused, by,

@@ -174,11 +174,6 @@ def windowed(records: Records, task: Task, solution: Solution) -> tuple[Task, So
     return in_windows, solve(in_windows, Frozen(solution.model, solution.values), start, np.zeros(0))
 
 
-def everywhere(records: Records, task: Task, solution: Solution) -> places.Responses:
-    """Return the responses of a model in windows of all records."""
-    return places.respond(*windowed(records, task, solution))
-
-
 def halves(rows: Rows) -> np.ndarray:
     """Return [R, samples] which samples lie in every second block of time: 30 s, or a quarter of a shorter record."""
     records = rows.records

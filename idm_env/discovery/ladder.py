@@ -34,6 +34,24 @@ The scene tells a part of drivers' noise, too: of six sets without an effect, no
 
 
 @dataclass(frozen=True)
+class Agreement:
+    """Whether errors 5 s ahead look like what drivers' and sensors' noise leave: see ``replica.agreement``.
+
+    ``share`` of the squared error a smooth function of the scene takes from drivers fitted to the very windows, and
+    ``p_value`` is how often it takes as much in ``replicas`` in which nothing is missing.
+    """
+
+    share: float
+    p_value: float
+    replicas: int
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether noise leaves so much hardly ever, and it is no trifle."""
+        return self.p_value < 0.05 and self.share > STRUCTURED
+
+
+@dataclass(frozen=True)
 class Ladder:
     """Errors 5 s ahead (m) by rung, the squared error's parts, and the share that is structure with its 95 % interval.
 
@@ -47,11 +65,16 @@ class Ladder:
     others: dict[str, dict[str, float]]
     """By rung, where it has them: the gap's error in closed-loop simulation, 10 s ahead, and the CRPS 5 s ahead (m)."""
 
+    agreement: Agreement | None = None
+    """Where nothing was added."""
+
     @property
-    def is_structured(self) -> bool:
-        """Whether something is left that the scene tells, beyond chance and beyond what drivers' noise looks like."""
+    def unnamed(self) -> float:
+        """Share that the scene tells, beyond chance and beyond what drivers' noise looks like; 0 if none does."""
         share, low, _ = self.structure
-        return share > STRUCTURED and low > 0.0
+        if share > STRUCTURED and low > 0.0:
+            return share
+        return self.agreement.share if self.agreement is not None and self.agreement.is_refused else 0.0
 
 
 def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, floor_m: float, seed: int) -> Ladder:
@@ -114,12 +137,21 @@ def _crps(rows: Rows, error: np.ndarray) -> float:
     return float(np.mean(wide * (z * (2.0 * normal.cdf(z) - 1.0) + 2.0 * normal.pdf(z) - np.pi**-0.5)))
 
 
-def corrected(rows: Rows, error: np.ndarray, plain: np.ndarray, smooth: np.ndarray | None, seed: int) -> np.ndarray:
+def structure(rows: Rows, error: np.ndarray, seed: int, features: int) -> tuple[float, float, float]:
+    """Return the share of squared errors [W] that a smooth function of the scene takes beside drift, and interval."""
+    scene = _scene(rows)
+    rest = error - corrected(rows, error, _drift(rows, error), None, seed)
+    return _share(rows, rest, rest - corrected(rows, rest, scene[:, :0], scene, seed, features), error)
+
+
+def corrected(
+    rows: Rows, error: np.ndarray, plain: np.ndarray, smooth: np.ndarray | None, seed: int, features: int = FEATURES
+) -> np.ndarray:
     """Return the errors [W] that a ridge on ``plain`` and random features of ``smooth`` predicts, runs left out."""
     basis = plain
     if smooth is not None:
         scaled = np.clip((smooth - smooth.mean(0)) / (smooth.std(0) + 1e-9), -FURTHEST, FURTHEST)
-        count = int(np.clip(len(rows) // 8, 20, FEATURES))
+        count = int(np.clip(len(rows) // 8, 20, features))
         random = np.random.default_rng(seed)
         turned = scaled @ (random.standard_normal((scaled.shape[1], count)) / np.sqrt(scaled.shape[1]))
         waves = np.cos(turned + random.uniform(0.0, 2.0 * np.pi, count))

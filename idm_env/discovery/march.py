@@ -50,7 +50,7 @@ PULSED = ("acceleration", "time_gap", "desired_speed", "accel_and_decel")
 COLUMNS = (
     "lead_rear", "lead_speed", "lead_accel", "second_rear", "second_speed", "second_accel", "second_present",
     "behind_front", "behind_speed", "behind_accel", "behind_present", "beside_distance", "beside_speed",
-    "beside_present", "position", "speed", "accel", "time", "place",
+    "beside_present", "position", "speed", "accel", "time", "place", "pushed",
 )  # fmt: skip
 
 _SEEN: dict[Leaf, str] = {

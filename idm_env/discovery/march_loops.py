@@ -94,8 +94,9 @@ def march(
     it is placed on the record and responds; ``whole`` winds memories up from the record's beginning. ``theta``
     [copies, groups, P]; ``phi`` [copies, groups, …] and ``on`` [copies, flags] as a catalogue lays them out;
     ``tables`` [tables, 3] is (form, number of knots, place in φ); ``back`` is how many steps of the past are kept;
-    ``pulse`` [copies, 3] is (first step, end step, amount); ``k`` are constants that depend on dt. Every ``every``
-    steps a sample is kept; rows in which a record ends keep their last state.
+    ``pulse`` [copies, 3] is (first step, end step, amount), times the last column of ``signals``;
+    ``k`` are constants that depend on dt. Every ``every`` steps a sample is kept; rows in which a record ends keep
+    their last state.
     """
     rows, per_dt = len(record), 1.0 / dt
     longest = 0
@@ -137,7 +138,9 @@ def march(
                 gap = signals[i, 0] - position
                 time = signals[i, 17]
                 place = position + offset
-                pulse_now = pulse[copy, 2] if i - origin >= pulse[copy, 0] and i - origin < pulse[copy, 1] else 0.0
+                pulse_now = 0.0
+                if i - origin >= pulse[copy, 0] and i - origin < pulse[copy, 1]:
+                    pulse_now = pulse[copy, 2] * signals[i, 19]
                 if back > 0:
                     carried = accel
                     if i < origin:

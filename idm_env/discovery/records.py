@@ -122,6 +122,7 @@ def _signals(samples: Samples, period: float) -> np.ndarray:
         position[:, behind], speed[:, behind], accel[:, behind], present[:, behind],
         *samples.beside.T,
         position[:, driver], speed[:, driver], accel[:, driver], samples.time, place,
+        np.ones(len(place)),
     ]  # fmt: skip
     assert len(columns) == len(march.COLUMNS)
     return np.stack(columns, axis=1)

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from idm_env.discovery.ladder import Agreement
 from idm_env.discovery.shared import Shared
 
 SCHEMA = 3
@@ -107,6 +108,7 @@ class Rungs:
     crps_m: Errors
     parts: dict[str, float]
     structure: Share
+    agreement: Agreement | None = None
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,7 @@ def summarise(
         sentence=sentence,
         details=[
             *words.details(verdict, added, nearest, 1.0 - float(np.exp(-first.smooth_gain))),
+            *words.agreement(None if judged.ladder is None else judged.ladder.agreement),
             *words.excluded(verdict, strengths), *words.by_use(laws, judged.law),
             *words.cautions(data.at_bounds, data.drivers),
         ],
@@ -114,16 +115,16 @@ def _verdict(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest_p(counted.run)
     )
     structured = any(r.significant for r in (first, *(r for r in rounds if r.free)))
-    unnamed = ladder is not None and ladder.is_structured
+    unnamed = 0.0 if ladder is None else ladder.unnamed
     verdict = conclude(
-        bool(added), any(f.effect for f in added), refusal, structured or unnamed, first.left, power,
+        bool(added), any(f.effect for f in added), refusal, structured or unnamed > 0.0, first.left, power,
         judged.shared is not None, apart=not others,
         in_a_state=all(f.where.coordinate in (*STATES, "state") for f in added),
     )  # fmt: skip
     if refusal is not None and refusal.reason is not Reason.NO_GAIN:
         return verdict, refusal
-    if verdict is Verdict.UNEXPLAINED and ladder is not None and unnamed and refusal is not None:
-        refusal = Refusal(Reason.STRUCTURE, ladder.structure[0])
+    if verdict is Verdict.UNEXPLAINED and unnamed and refusal is not None:
+        refusal = Refusal(Reason.STRUCTURE, unnamed)
     if verdict is Verdict.CANNOT_TELL and not power:
         refusal = Refusal(Reason.NO_POWER, len(task.rows.records.runs))
     return verdict, refusal
@@ -149,7 +150,10 @@ def _strengths(first: Round, task: Task, reached: Bar) -> dict[str, Strength]:
 
 
 def _rungs(ladder: Ladder) -> result.Rungs:
-    return result.Rungs(ladder.rungs, **ladder.others, parts=ladder.parts, structure=result.Share(*ladder.structure))
+    return result.Rungs(
+        ladder.rungs, **ladder.others, parts=ladder.parts, structure=result.Share(*ladder.structure),
+        agreement=ladder.agreement,
+    )  # fmt: skip
 
 
 def _how(before: judge.Judged) -> str:

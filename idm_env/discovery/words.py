@@ -10,6 +10,7 @@ import numpy as np
 
 from idm_env.discovery.bases import Law
 from idm_env.discovery.compare import Comparison, ErrorChange
+from idm_env.discovery.ladder import Agreement
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Strength
 from idm_env.discovery.result import Ceilings, TermFinding, Weight
@@ -330,6 +331,16 @@ def cautions(at_bounds: Mapping[str, int], groups: int) -> list[str]:
         f"The fitted {name.replace('_', ' ')} is at its bound for {n} of {groups} groups of drivers."
         for name, n in at_bounds.items() if n > 0.2 * groups
     ]  # fmt: skip
+
+
+def agreement(of: Agreement | None) -> list[str]:
+    """Say whether what is left looks like noise, where nothing was added."""
+    if of is None:
+        return []
+    return [
+        "A smooth function of the scene tells as much of the errors where drivers' and sensors' noise is all there is: "
+        f"p = {number(of.p_value, 2)}, from {of.replicas} simulations."
+    ]
 
 
 def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:

@@ -47,7 +47,7 @@ def closing(records: Records) -> np.ndarray:
 @pytest.mark.parametrize("carry", [0.0, 0.6])
 def test_what_lasts_in_a_driver_is_drift_and_no_structure(records: Records, carry: float) -> None:
     found = climbed(records, noise(records, carry))
-    assert not found.is_structured and found.parts["structure without a name"] < 0.02
+    assert not found.unnamed and found.parts["structure without a name"] < 0.02
     assert sum(found.parts.values()) == pytest.approx(1.0)
     assert (found.rungs["drift followed"] < 0.95 * found.rungs["own"]) == (carry > 0.0)
     # Of errors that carry on by 0.6 a third is foreseen by the last two; of new ones nothing.
@@ -65,7 +65,7 @@ def test_what_the_scene_tells_is_structure(records: Records) -> None:
     part = closing(records)
     part *= 0.5 / part.std()
     found = climbed(records, noise(records, 0.3) + part)
-    assert found.is_structured and 0.2 < found.structure[0] < 0.6
+    assert found.unnamed and 0.2 < found.structure[0] < 0.6
     assert found.parts["structure without a name"] == pytest.approx(found.structure[0], abs=1e-6)
 
 
@@ -74,7 +74,7 @@ def test_of_a_single_driver_nothing_is_foreseen() -> None:
     made, _ = synthetic.generate(4, runs=1, followers=1, seconds=120.0)
     alone = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     found = climbed(alone, noise(alone, 0.6))
-    assert not found.is_structured and found.rungs["drift followed"] == found.rungs["own"]
+    assert not found.unnamed and found.rungs["drift followed"] == found.rungs["own"]
 
 
 def test_nothing_is_not_said_of_an_effect_without_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
