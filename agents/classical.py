@@ -38,9 +38,9 @@ class Seen(NamedTuple):
 
 def seen(observation: Tensor, task: Task) -> Seen:
     """Return an observation ``(n, agents · features)`` of the ring."""
-    found = task.by_name(observation)
-    speed = found["speed"]
-    return Seen(speed, speed + found["relative_speed"], found["headway"] - task.vehicle_length)
+    columns = task.by_name(observation)
+    speed = columns["speed"]
+    return Seen(speed, speed + columns["relative_speed"], columns["headway"] - task.vehicle_length)
 
 
 @dataclass
@@ -158,10 +158,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per controller."""
     torch.set_num_threads(1)
     with one_line():
-        asked = tyro.cli(Arguments, args=argv)
-        if asked.trust:
+        options = tyro.cli(Arguments, args=argv)
+        if options.trust:
             trust.always()
-        arguments = load_agent(asked.config, apg.Arguments, "apg")
+        arguments = load_agent(options.config, apg.Arguments, "apg")
         environment = as_judged(arguments.environment, arguments.judged_in)
     print("controller | worst speed ratio | worst std (m/s) | smallest time gap (s) | collisions")
     for name, make in controllers(environment, LENGTHS, FRESH).items():

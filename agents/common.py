@@ -121,25 +121,25 @@ def parse(kind: type[A], agent: str, argv: Sequence[str] | None = None) -> A:
     default = kind() if file.config is None else load_agent(file.config, kind, agent)
     text = f"{kind.__doc__}\n\n--config FILE reads a YAML file first, such as configs/ring-apg.yaml. "
     text += "--trust runs Python code that YAML files and checkpoints name, such as my_file.py:MyEffect."
-    found = tyro.cli(kind, default=default, args=rest, description=text)
-    for path in (found.out / name for name in KEPT):
+    arguments = tyro.cli(kind, default=default, args=rest, description=text)
+    for path in (arguments.out / name for name in KEPT):
         storage.not_an_input(
-            path, (file.config, *(getattr(found, name, None) for name in ("data", "start", "teacher")))
+            path, (file.config, *(getattr(arguments, name, None) for name in ("data", "start", "teacher")))
         )
-        if path.suffix == ".pt" and path.exists() and not found.resume and _content(path) is None:
+        if path.suffix == ".pt" and path.exists() and not arguments.resume and _content(path) is None:
             raise ValueError(
                 f"{path} is not a checkpoint of an agent, or is broken. Move or delete it, or give another --out."
             )
-    return found
+    return arguments
 
 
 def command_line(train: Callable[[A], R], kind: type[A], agent: str, argv: Sequence[str] | None = None) -> R:
     """Train as the command line says, on one thread; what is wrong is told in one line."""
     torch.set_num_threads(1)
     with one_line():
-        found = parse(kind, agent, argv)
-        with storage.alone(found.out):
-            return train(found)
+        arguments = parse(kind, agent, argv)
+        with storage.alone(arguments.out):
+            return train(arguments)
 
 
 @contextmanager
@@ -171,10 +171,10 @@ def load_agent(path: str | Path, kind: type[A], agent: str) -> A:
         values[key] = _as(f"{path}: {key}", value, getattr(default, key))
     if "config" in values.get("environment", {}):
         own = dict(values["environment"])
-        beside = own.pop("config")
-        if not isinstance(beside, str):
-            raise ValueError(f"{path}: environment.config = {shown(beside)} must be the name of a file.")
-        values["environment"] = {**load_environment(file.parent / beside), **own}
+        file_name = own.pop("config")
+        if not isinstance(file_name, str):
+            raise ValueError(f"{path}: environment.config = {shown(file_name)} must be the name of a file.")
+        values["environment"] = {**load_environment(file.parent / file_name), **own}
     return kind(**values)
 
 
@@ -187,10 +187,10 @@ def _as(name: str, value: Any, like: Any) -> Any:
             raise ValueError(f"{name} = {shown(value)} must be {rule}.")
         return value
     if isinstance(like, (int, float)):
-        found = number(name, value)
-        if isinstance(like, int) and found != int(found):
+        parsed = number(name, value)
+        if isinstance(like, int) and parsed != int(parsed):
             raise ValueError(f"{name} = {shown(value)} must be a whole number.")
-        return type(like)(found)
+        return type(like)(parsed)
     if isinstance(like, dict) and not isinstance(value, dict):
         raise ValueError(f"{name} = {shown(value)} must be a mapping, such as {{task: ring}}.")
     if isinstance(like, tuple):
@@ -222,9 +222,9 @@ def save(path: Path, policy: Policy, agent: str, environment: Mapping[str, Any],
         "training": dict(training),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    kept = io.BytesIO()
-    torch.save(content, kept)
-    storage.write(path, lambda beside: beside.write_bytes(kept.getvalue()))
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    storage.write(path, lambda target: target.write_bytes(buffer.getvalue()))
 
 
 def load(path: str | Path, task: str | None = None, agent: str | None = None) -> tuple[Policy, dict[str, Any]]:
@@ -247,15 +247,15 @@ def load(path: str | Path, task: str | None = None, agent: str | None = None) ->
             f"{path} is broken (parts of a checkpoint are missing). Delete it and train anew, without --resume."
         )
     check_places(path, content)
-    for name, wanted in (("task", task), ("agent", agent)):
-        if wanted is not None and content[name] != wanted:
+    for name, expected in (("task", task), ("agent", agent)):
+        if expected is not None and content[name] != expected:
             raise ValueError(
-                f"{path} is of {name} '{content[name]}', and '{wanted}' is wanted. Give a file of that {name}."
+                f"{path} is of {name} '{content[name]}', and '{expected}' is wanted. Give a file of that {name}."
             )
-    made = task_of(content["environment"])
+    own_task = task_of(content["environment"])
     before, now = (
         [f"{name} / {scale:g}" for name, scale in zip(names, scales, strict=False)]
-        for names, scales in ((content["features"], content["scales"]), (made.bounds.names, made.scales))
+        for names, scales in ((content["features"], content["scales"]), (own_task.bounds.names, own_task.scales))
     )
     if before != now:
         raise ValueError(

@@ -84,7 +84,7 @@ def watch(
     The policy drives; None leaves it to the teacher behind the failsafe. ``guarded`` is the task with that failsafe,
     whose actions may have other limits than those of ``env``. Shapes ``(samples, features)`` and ``(samples,)``.
     """
-    task, seen, wanted = env.task, [], []
+    task, seen, actions = env.task, [], []
     with torch.no_grad():
         for _ in range(steps):
             world = env.batch.world
@@ -92,9 +92,9 @@ def watch(
             observation = task.observe(world).flatten(1)
             action = task.action(guarded.limit(world, guarded.command(teacher(observation))))
             seen.append(observation.reshape(-1, len(task.bounds.names)))
-            wanted.append(action.flatten())
+            actions.append(action.flatten())
             env.step(action if policy is None else policy(observation))
-    return torch.cat(seen), torch.cat(wanted)
+    return torch.cat(seen), torch.cat(actions)
 
 
 def train(arguments: Arguments) -> list[dict[str, Any]]:
@@ -108,11 +108,11 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     policy, saved = copy.deepcopy(teacher), {k: content["training"][k] for k in ("steps", "cpu_seconds")}
     guarded = environments.task_of(content["environment"])
     seen: list[Tensor] = []
-    wanted: list[Tensor] = []
+    actions: list[Tensor] = []
     if arguments.resume:
         policy, saved = common.begin(arguments, "distil")
         seen.append(saved["seen"])
-        wanted.append(saved["wanted"])
+        actions.append(saved["wanted"])
     done = saved.get("update", -1) + 1
     env = environments.make_env(arguments.trained_in, arguments.count, output="torch")
     with Monitor("distil", arguments, began, saved) as monitor:
@@ -125,8 +125,8 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
             env.reset(seed=first)
             new = watch(policy if update else None, teacher, guarded, env, arguments.steps)
             seen.append(new[0])
-            wanted.append(new[1])
-            data = {"seen": torch.cat(seen), "wanted": torch.cat(wanted)}
+            actions.append(new[1])
+            data = {"seen": torch.cat(seen), "wanted": torch.cat(actions)}
             error = common.clone(policy, data["seen"], data["wanted"], arguments.fits)
             if not math.isfinite(error):
                 advice = common.last_good(monitor.last, update)

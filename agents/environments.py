@@ -106,5 +106,5 @@ def human_driving(
         done.append(env.task.pick(torch.where(over, torch.nan, accel)))
     observations = torch.as_tensor(np.stack(seen[:-1])).float().reshape(-1, len(env.task.bounds.names))
     actions = env.task.action(torch.stack(done).float()).flatten()
-    known = actions.isfinite()
-    return observations[known], actions[known]
+    finite = actions.isfinite()
+    return observations[finite], actions[finite]

@@ -64,9 +64,9 @@ def judge_ring(start: Start, driven: Driven) -> dict[str, Any]:
     std = last.std((0, 2), correction=0)
     gap = metrics.time_gap(start.task.pick(driven.gap), start.task.pick(driven.speed)).amin((0, 2))
     crashed = driven.gap.amin((0, 2)) <= 0.0
-    asked = start.task.command(driven.action[-judged:])
+    commanded = start.task.command(driven.action[-judged:])
     return {
-        "cut": float((start.task.pick(driven.accel[-judged:]) < asked - 1e-3).float().mean()),
+        "cut": float((start.task.pick(driven.accel[-judged:]) < commanded - 1e-3).float().mean()),
         "speed_ratio": float(ratio.min()),
         "speed_std": float(std.max()),
         "time_gap": float(gap.min()),
@@ -132,11 +132,11 @@ def _times(value: Any, factor: Any) -> Any:
 def mixed(environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return an environment in which every driver's every parameter is drawn from ±20 %."""
     generator, vehicles = torch.Generator().manual_seed(SEED), task_of(environment).vehicles
-    drawn = {
+    drivers = {
         name: _times(value, 0.8 + 0.4 * torch.rand(vehicles, generator=generator))
         for name, value in drivers_of(environment).items()
     }
-    return among(environment, drawn)
+    return among(environment, drivers)
 
 
 def kinds(environment: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -248,19 +248,19 @@ def judge_lanes(start: Start, act: Act | None, policies: int) -> list[dict[str, 
     for _, _, world in held_moments(start, act, steps):
         state = world.state
         assert state.present is not None
-        there = state.present > 0
+        on_road = state.present > 0
         crashed |= task.crashed(world).any(-1)
         lost += dt * task.delay(world)
-        spent += dt * there.sum(-1)
-        stood += dt * (there & (state.speed < 0.5)).sum(-1)
+        spent += dt * on_road.sum(-1)
+        stood += dt * (on_road & (state.speed < 0.5)).sum(-1)
         infos = task.info(world)
         burnt += dt * infos["co2"][:, 0]
         waited += dt * infos["queued"][:, 0]
-    told = task.info(world)
-    hourly, left = 3600.0 / (steps * dt), told["outflow"][:, 0].double()
+    totals = task.info(world)
+    hourly, left = 3600.0 / (steps * dt), totals["outflow"][:, 0].double()
     columns = {
-        "reward": -lost, "outflow": left * hourly, "ramp": told["ramp"][:, 0].double() * hourly,
-        "queued": told["queued"][:, 0].double(), "travel": (spent + waited) / left.clamp_min(1.0),
+        "reward": -lost, "outflow": left * hourly, "ramp": totals["ramp"][:, 0].double() * hourly,
+        "queued": totals["queued"][:, 0].double(), "travel": (spent + waited) / left.clamp_min(1.0),
         "standing": stood / spent.clamp_min(1.0), "co2": burnt / left.clamp_min(1.0),
     }  # fmt: skip
     parts = {name: x.view(policies, -1) for name, x in columns.items()}
@@ -358,9 +358,9 @@ def film(path: Path, environment: Mapping[str, Any], policy: Policy, human: int,
     palette.putpalette([part for each in colours for part in each])
     for step, env in enumerate(shown(environment, policy, human, steps, seed, render_mode="rgb_array")):
         if step >= first and step % every == 0:
-            drawn = env.render()
-            assert drawn is not None
-            picture = Image.fromarray(drawn)
+            pixels = env.render()
+            assert pixels is not None
+            picture = Image.fromarray(pixels)
             picture = picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.LANCZOS)
             frames.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0, optimize=True)

@@ -47,8 +47,8 @@ SCALES = tuple(each.scale for each in SEEN)
 
 def default_data() -> Path:
     """Return where the I-80 pairs are expected: in the folder IDM_ENV_DATA, or beside the checkout."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
-    return Path(os.environ.get("IDM_ENV_DATA", beside)) / "ngsim_i80_pairs.parquet"
+    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    return Path(os.environ.get("IDM_ENV_DATA", folder)) / "ngsim_i80_pairs.parquet"
 
 
 @dataclass
@@ -129,8 +129,8 @@ def judge(policy: Policy, items: Sequence[Episode], task: Task) -> dict[str, flo
 
 def calibrated(training: Sequence[Episode], test: Sequence[Episode]) -> dict[str, float]:
     """Return the errors of IDM, one parameter set for all drivers, calibrated on spacing."""
-    found = fit(training, by="all")
-    return pooled_errors(found.problem, found.own, found.shared, test).summary()
+    result = fit(training, by="all")
+    return pooled_errors(result.problem, result.own, result.shared, test).summary()
 
 
 def split(a: Arguments) -> tuple[Sequence[Episode], Sequence[Episode]]:
@@ -172,8 +172,8 @@ def train(a: Arguments) -> list[dict[str, Any]]:
     last, first, before = a.out / "last.pt", 0, 0.0
     optimiser = torch.optim.Adam(policy.parameters(), lr=a.learning_rate)
     if a.resume:
-        found, content = common.load(last, "follow", "imitation")
-        policy.load_state_dict(found.state_dict())
+        trained, content = common.load(last, "follow", "imitation")
+        policy.load_state_dict(trained.state_dict())
         saved = content["training"]
         optimiser.load_state_dict(saved["optimiser"])
         first, before = saved["update"] + 1, saved["cpu_seconds"]
@@ -185,8 +185,8 @@ def train(a: Arguments) -> list[dict[str, Any]]:
             loss = spacing_error(simulate(policy, batch, task)[0], batch).mean()
             norm = common.descend(loss, policy.parameters(), optimiser, a.clip, update, last)
             spent = time.process_time() - began
-            kept = {"update": update, "cpu_seconds": spent, "optimiser": optimiser.state_dict()}
-            common.save(last, policy, "imitation", a.environment, kept)
+            training_state = {"update": update, "cpu_seconds": spent, "optimiser": optimiser.state_dict()}
+            common.save(last, policy, "imitation", a.environment, training_state)
             for name, value in (("rmse", float(loss.detach())), ("norm", norm), ("cpu_seconds", spent)):
                 logger.record(name, value)
             logger.dump(update)

@@ -75,8 +75,8 @@ class Monitor:
         self.logger.dump(self.steps)
         if row:
             shown = {k: v for k, v in row.items() if isinstance(v, (int, float)) and k not in ("updates", "steps")}
-            told = ", ".join(f"{k} {v:.3g}" for k, v in shown.items())
-            self._bar.write(f"{self.last}, after {row['updates']} updates: {told}")
+            words = ", ".join(f"{k} {v:.3g}" for k, v in shown.items())
+            self._bar.write(f"{self.last}, after {row['updates']} updates: {words}")
 
     def after(
         self,
@@ -97,13 +97,13 @@ class Monitor:
         row: dict[str, Any] = {}
         if over or (update + 1) % self.arguments.evaluate_every == 0:
             row = self._evaluated(policy, update + 1, spent)
-        kept = {**training, "update": update, "steps": self.steps, "cpu_seconds": spent, "history": self.history}
-        kept["arguments"] = common.choices(self.arguments)
+        content = {**training, "update": update, "steps": self.steps, "cpu_seconds": spent, "history": self.history}
+        content["arguments"] = common.choices(self.arguments)
         if keep is not None:
             keep()
-        common.save(self.last, policy, self.agent, self.arguments.environment, kept)
+        common.save(self.last, policy, self.agent, self.arguments.environment, content)
         if row and score(row) > max((score(r) for r in self.history[:-1] if r["updates"]), default=-float("inf")):
-            common.save(self.best, policy, self.agent, self.arguments.environment, kept)
+            common.save(self.best, policy, self.agent, self.arguments.environment, content)
         self._log({**figures, **row, "updates": update + 1, "steps": self.steps, "cpu_seconds": spent}, row)
         self._bar.update()
         self._bar.set_postfix({k: f"{v:.3g}" for k, v in figures.items()}, refresh=False)

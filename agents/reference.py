@@ -101,7 +101,7 @@ def random_policies(environment: Mapping[str, Any], count: int, hidden: Sequence
     before any update, then every weight moved by ± 0.01 (what a first step of Adam does), and the last bias by 0.025.
     """
     observations, _ = human_driving(environment, first_seed(0, 0))
-    made = []
+    policies = []
     for i in range(count):
         torch.manual_seed(i)
         policy = Policy(observations.shape[-1], hidden)
@@ -117,13 +117,13 @@ def random_policies(environment: Mapping[str, Any], count: int, hidden: Sequence
             else:
                 last.weight.mul_(10.0 ** (2.5 * torch.rand(())))
                 last.bias.add_(0.2 * (torch.rand(()) - 0.5))
-        made.append(policy)
-    return made
+        policies.append(policy)
+    return policies
 
 
 def families(environment: Mapping[str, Any], count: int = 200) -> dict[str, Callable[[], Family]]:
     """Return what makes every family, by name; ``count`` random policies of each kind."""
-    made: dict[str, Callable[[], Family]] = {
+    makers: dict[str, Callable[[], Family]] = {
         "constants": lambda: grid(
             lambda task, view, uniform, accel: accel, "{:g} m/s²", [round(0.005 * i, 3) for i in range(25)]
         ),
@@ -149,8 +149,8 @@ def families(environment: Mapping[str, Any], count: int = 200) -> dict[str, Call
     }  # fmt: skip
     numbers = [str(i) for i in range(count)]
     for name, hidden in zip(RANDOM, HIDDEN, strict=True):
-        made[name] = partial(lambda hidden: networks(random_policies(environment, count, hidden), numbers), hidden)
-    return made
+        makers[name] = partial(lambda hidden: networks(random_policies(environment, count, hidden), numbers), hidden)
+    return makers
 
 
 def repeated(start: Start, times: int) -> Start:
@@ -165,13 +165,13 @@ def judge(
     """Return the figures of the chosen policies of a family, each on one ring of every length and draw."""
     start = ring_start(environment, LENGTHS, draws=draws)
     rings = len(start.world.state.speed)
-    found, at_once = [], max(1, ROWS_AT_ONCE // rings)
+    rows, at_once = [], max(1, ROWS_AT_ONCE // rings)
     for part in (chosen[i : i + at_once] for i in range(0, len(chosen), at_once)):
         driven = drive(repeated(start, len(part)), family.acts(start, part), STEPS // start.task.held)
         for i in range(len(part)):
             own = Driven(*(x[:, i * rings : (i + 1) * rings] for x in driven))
-            found.append(judge_ring(start, own))
-    return found
+            rows.append(judge_ring(start, own))
+    return rows
 
 
 def passing(

@@ -82,8 +82,8 @@ def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[En
                 normals = task.normals(draw, world.state.step, count, world.state.speed.dtype)
                 for t in range(count):
                     now = {name: x[t] for name, x in normals.items()}
-                    given = None if command is None else task.limit(world, command)
-                    inputs = task.with_lane_commands(task.inputs(world, given, now, live), action, live)
+                    limited = None if command is None else task.limit(world, command)
+                    inputs = task.with_lane_commands(task.inputs(world, limited, now, live), action, live)
                     driven = task.episode_params(world.episode, params)
                     world = world._replace(state=task.simulator.advance(world.state, inputs, driven))
                     yield before, action, world
@@ -91,9 +91,9 @@ def held_moments(start: Start, act: Act | None, steps: int) -> Iterator[tuple[En
             inputs = task.with_lane_commands(task.inputs(world, command, None, live), action, live)
             repeated: dict[str, Any] = {name: _repeated(x, count) for name, x in inputs.items()}
             driven = task.episode_params(world.episode, params)
-            state, kept = task.simulator.rollout(world.state, repeated, driven, count)
+            state, trajectory = task.simulator.rollout(world.state, repeated, driven, count)
             for t in range(count):
-                motion: dict[str, Any] = {name: x[t] for name, x in kept._asdict().items()}
+                motion: dict[str, Any] = {name: x[t] for name, x in trajectory._asdict().items()}
                 world = before._replace(state=state._replace(**motion, step=before.state.step + t + 1))
                 yield before, action, world
             world = before._replace(state=state)
@@ -116,7 +116,7 @@ def drive(start: Start, act: Act | None, steps: int) -> Driven:
     batch.world, act = start.world, begun(act)
     seen = task.observe(start.world).flatten(1)
     none = torch.zeros(rows, len(task.agents))
-    kept: list[tuple[Tensor, ...]] = []
+    columns: list[tuple[Tensor, ...]] = []
     with torch.no_grad():
         for _ in range(steps):
             action = None if act is None else act(seen)
@@ -124,9 +124,9 @@ def drive(start: Start, act: Act | None, steps: int) -> Driven:
             state = batch.glance().state
             # What is glanced at holds until the next step.
             moved = (state.speed.clone(), state.accel.clone(), state.gap.clone())
-            kept.append((*moved, none if action is None else action, torch.tensor(outcome.reward)))
+            columns.append((*moved, none if action is None else action, torch.tensor(outcome.reward)))
             seen = torch.tensor(outcome.observation).flatten(1)
-    return Driven(*(torch.stack(column) for column in zip(*kept, strict=True)))
+    return Driven(*(torch.stack(column) for column in zip(*columns, strict=True)))
 
 
 @lru_cache(maxsize=64)
