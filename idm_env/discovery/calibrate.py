@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from idm_env.discovery import judge
-from idm_env.discovery.free import ClosedLoopFit, stand
+from idm_env.discovery.closed_loop import ClosedLoopFit, evaluate
 from idm_env.discovery.march import BASE
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, Rows
@@ -28,14 +28,14 @@ WIDTH = 0.6
 class Calibrated:
     """A model with values [Q] of its terms, calibrated on some runs: log θ [G, P] of their drivers, and the prior.
 
-    ``prior`` is the population with its weight; ``stand`` has what every weight that was tried leaves.
+    ``prior`` is the population with its weight; ``fit`` has what every weight that was tried leaves.
     """
 
     model: Hypothesis
     values: np.ndarray
     theta: np.ndarray
     prior: Prior
-    stand: ClosedLoopFit
+    fit: ClosedLoopFit
 
 
 def calibrate(records: Records, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
@@ -43,11 +43,11 @@ def calibrate(records: Records, model: Hypothesis, values: np.ndarray, start: np
 
     1. Drivers one by one, with a prior that hardly weighs anything, from the law's usual values and ``start`` [G, P].
     2. Their median and spread are the population, the prior of everyone.
-    3. Its weight is the one that predicts best what a driver's parameters have not seen (``free.stand``).
+    3. Its weight is the one that predicts best what a driver's parameters have not seen (``closed_loop.evaluate``).
     """
     own = model.catalogue.own
     task, theta = judge.unweighed(records, model, values, first_prior(own), start=start)
-    fit = stand(records, model, values, population(theta, task.rows, own), theta)
+    fit = evaluate(records, model, values, population(theta, task.rows, own), theta)
     return Calibrated(model, values, fit.theta, fit.task.prior, fit)
 
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from idm_env.data import Trajectories
 from idm_env.data.columns import with_step
 from idm_env.discovery import judge
-from idm_env.discovery.free import ClosedLoopFit
+from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.model import Frozen
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.result import Ceilings

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from idm_env.data import DataError
-from idm_env.discovery import free, judge
+from idm_env.discovery import closed_loop, judge
 from idm_env.discovery.calibrate import first_prior, population
-from idm_env.discovery.free import GRID_S, further
+from idm_env.discovery.closed_loop import GRID_S, further
 from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
@@ -21,7 +21,7 @@ from idm_env.discovery.score import without
 from idm_env.discovery.solve import Prior, Solution, Task, solve
 
 FOLDS = 4
-POOLED_S = free.ENDS_S[1]
+POOLED_S = closed_loop.ENDS_S[1]
 """Weight (s) of the population at which every driver is its middle."""
 FURTHER_S = 10.0
 """The longer horizon of predictions, whose windows must lie in a block that drivers were not fitted to."""
@@ -167,7 +167,7 @@ def _weighed(mine: list[Rows], prior: Prior, frozen: Frozen, near: np.ndarray) -
             begin = thetas[min(thetas, key=lambda s: abs(np.log(s / seconds)))] if thetas else near
             fitted, square = [], np.zeros(near.shape[1])
             for i, half in enumerate(mine):
-                task = Task(half, None, replace(prior, free=False, alike_s=seconds))
+                task = Task(half, None, replace(prior, free=False, error_correlation_s=seconds))
                 task = judge.scaled(task, frozen, EMPTY, near[i])
                 fitted.append(solve(task, frozen, begin[i], EMPTY, iterations=10, tolerance=1e-4).theta)
                 other_half = replace(task, rows=mine[1 - i])

@@ -297,7 +297,7 @@ def _finish(
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     result = summary.summarise(
         trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor, refused, by,
-        ceilings.ceilings_of(decided.stand, scored, null, decided.rounds[0].smooth_gain),
+        ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain),
     )  # fmt: skip
     # Drivers who adapt are calibrated on parts of the held-out runs too.
     fit = prepared if evaluation.adapt else task.rows.records

@@ -121,7 +121,7 @@ def unweighed(
 
 
 def weighed(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Solution:
-    """Return the calibration in which errors of ``alike_s`` seconds count as one, from a first fit [G, 5]."""
+    """Return the calibration in which errors of ``error_correlation_s`` count as one, from a first fit [G, P]."""
     task = scaled(task, model, values, theta)
     return solve(task, Frozen(model, values), theta, np.zeros(0), iterations=25, tolerance=1e-5)
 
@@ -134,11 +134,11 @@ def scaled(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray)
     rows = task.rows
     errors = task.errors(theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
     square = (errors**2).sum(1) / np.maximum(rows.valid.sum(1), 1)
-    correlated = task.prior.alike_s / (rows.every * rows.records.dt)
+    correlated = task.prior.error_correlation_s / (rows.every * rows.records.dt)
     return replace(task, sigma=float(np.sqrt(max(np.median(square), 1e-4) * correlated)))
 
 
-def free_run_squares(records: Records, s: Solution) -> np.ndarray:
+def closed_loop_squares(records: Records, s: Solution) -> np.ndarray:
     """Return squared gap errors (m²) of closed-loop simulation [units], θ fitted to it; one counts 30 m at most."""
     model, values, prior = s.model, s.values, s.prior
     fitted = calibrate(records, model, values, prior, start=s.theta)

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from idm_env.discovery import bases, calibrate, crossed, free, judge, words
+from idm_env.discovery import bases, calibrate, closed_loop, crossed, judge, words
 from idm_env.discovery import ladder as ladders
 from idm_env.discovery.compare import Comparison, compare
 from idm_env.discovery.ladder import Ladder
@@ -219,15 +219,15 @@ def judgement_of(evaluation: Evaluation, decided: Decided) -> tuple[Judgement, S
                 break
         if not judgement.added and compared is not None:
             # The right effect with a strength fitted in windows may be off over minutes: these fit it once more.
-            again, intervals = free.refitted(evaluation.searching.task.rows.records, compared)
-            theta, after = evaluation.judged(again, decided.stand.task)
+            again, intervals = closed_loop.refitted(evaluation.searching.task.rows.records, compared)
+            theta, after = evaluation.judged(again, decided.null_in_closed_loop.task)
             other = _in_closed_loop(judgement, evaluation, again, intervals, after)
             if other.improves:
                 judgement, last = other, theta
     if decided.joined is not None and before is not None:
         # What was found in closed loop takes the place of what windows found where it does better there.
         joined = decided.joined
-        theta, after = evaluation.judged(joined.solution, decided.stand.task)
+        theta, after = evaluation.judged(joined.solution, decided.null_in_closed_loop.task)
         now = judgement.after if judgement.added and judgement.after is not None else before
         assert after is not None
         if after.summary()["gap_rmse_m"] < now.summary()["gap_rmse_m"]:
@@ -258,5 +258,5 @@ def _in_closed_loop(
     judgement: Judgement, evaluation: Evaluation, s: Solution, intervals: np.ndarray, after: judge.Judged | None
 ) -> Judgement:
     """Return the judgement of what was fitted in closed loop, with its intervals [Q, 3] and errors."""
-    compared = free.in_windows(evaluation.searching.task, s)
+    compared = closed_loop.in_windows(evaluation.searching.task, s)
     return replace(judgement, compared=compared, added=True, refusal=None, after=after, intervals=intervals)

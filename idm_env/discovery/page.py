@@ -11,7 +11,7 @@ from pathlib import Path
 from idm_env.discovery import pictures, words
 from idm_env.discovery.discover import Discovery
 from idm_env.discovery.result import Against, Change, Result
-from idm_env.discovery.score import ALPHA, FREE_SHARE
+from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE
 from idm_env.discovery.selection import LEAST_GAIN, LEAST_SHARE
 from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
 from idm_env.discovery.verdict import HOLDS, Verdict
@@ -47,7 +47,7 @@ def write(path: Path, d: Discovery) -> None:
         ceilings="" if before is None
         else words.ceilings(r.ceilings, before["gap_rmse_m"], r.error.floor["gap_rmse_m"]),
         rules={
-            "enough_runs": ENOUGH_RUNS, "many_runs": MANY_RUNS, "free_share": f"{FREE_SHARE:.0%}",
+            "enough_runs": ENOUGH_RUNS, "many_runs": MANY_RUNS, "free_share": f"{CLOSED_LOOP_SHARE:.0%}",
             "level": percent(ALPHA), "least_gain": percent(LEAST_GAIN, 1), "least_share": percent(LEAST_SHARE),
             "holds": f"{HOLDS - 1.0:.0%}",
         },

@@ -11,7 +11,7 @@ from idm_env.discovery.solve import Linear, Solution, Task, cost_of, equations, 
 from idm_env.discovery.units import rho, signs, units
 
 ALPHA = 0.05
-FREE_SHARE = 0.2
+CLOSED_LOOP_SHARE = 0.2
 """Share of the level that goes to candidates in free simulation, the rest to the same in windows (Bonferroni)."""
 FAINT = 0.003
 """Gain in log RMSE of a run that is hardly worth the name."""

@@ -13,7 +13,7 @@ from idm_env.discovery import calibrate, judge, places
 from idm_env.discovery import model as terms
 from idm_env.discovery import noise as noises
 from idm_env.discovery.calibrate import Calibrated, population
-from idm_env.discovery.free import ClosedLoopFit
+from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out, log_gain
@@ -53,12 +53,12 @@ class Search:
     saved: Store
     on_progress: OnProgress
     base: Hypothesis = field(default_factory=Hypothesis)
-    stood: tuple[ClosedLoopFit, Solution] | None = None
-    """The model that was weighed last, and how it stands in free simulation."""
+    last_weighed: tuple[ClosedLoopFit, Solution] | None = None
+    """The model that was weighed last, and its errors in free simulation."""
     calibrations: dict[tuple[int, bytes, bytes | None], Calibrated] = field(default_factory=dict)
     """What ``calibrated`` has said, by model (held here, so that its id stays its), φ and log θ to begin with."""
     squares: dict[Solution, np.ndarray] = field(default_factory=dict)
-    """What ``free_run_squares`` has said."""
+    """What ``closed_loop_squares`` has said."""
     unplaced: dict[str, str] = field(default_factory=dict)
     """Effects that were sought at places or times and had none to be tried at, and why."""
 
@@ -77,15 +77,17 @@ class Search:
         return solution
 
     def weighed(self, now: Solution) -> tuple[ClosedLoopFit, Solution]:
-        """Return how a model of windows stands in free simulation of the validation runs, and it with that prior.
+        """Evaluate a model of windows in free simulation of the validation runs; return that, and it with that prior.
 
         In windows its drivers stay as they are. The weight of the prior becomes that of the task.
         """
-        if self.stood is None or self.stood[1] is not now:
+        if self.last_weighed is None or self.last_weighed[1] is not now:
             fit = self.calibrated(now.model, now.values, now.theta)
-            self.task = replace(self.task, prior=replace(self.task.prior, alike_s=fit.prior.alike_s))
-            self.stood = fit.stand, replace(now, prior=fit.prior)
-        return self.stood
+            self.task = replace(
+                self.task, prior=replace(self.task.prior, error_correlation_s=fit.prior.error_correlation_s)
+            )
+            self.last_weighed = fit.fit, replace(now, prior=fit.prior)
+        return self.last_weighed
 
     def calibrated(self, model: Hypothesis, values: np.ndarray, start: np.ndarray | None = None) -> Calibrated:
         """Return a model with values [Q] calibrated on the validation runs, done once for one ``start`` [G, P]."""
@@ -94,17 +96,19 @@ class Search:
             self.calibrations[key] = calibrate.calibrate(self.task.rows.records, model, values, start)
         return self.calibrations[key]
 
-    def free_run_squares(self, now: Solution) -> np.ndarray:
+    def closed_loop_squares(self, now: Solution) -> np.ndarray:
         """Return squared gap errors (m²) of closed-loop simulation of the validation runs [units]."""
         if now not in self.squares:
-            self.squares[now] = judge.free_run_squares(self.task.rows.records, now)
+            self.squares[now] = judge.closed_loop_squares(self.task.rows.records, now)
         return self.squares[now]
 
     def _renoised(self, solution: Solution) -> Task:
         errors = self.task.errors(solution.theta[None], solution.model, solution.values[None])[0]
         noise = noises.estimate(errors, self.task.rows.joined)
         prior = population(solution.theta, self.task.rows, solution.model.catalogue.own)
-        return replace(self.task, noise=noise, prior=replace(prior, alike_s=self.task.prior.alike_s))
+        return replace(
+            self.task, noise=noise, prior=replace(prior, error_correlation_s=self.task.prior.error_correlation_s)
+        )
 
     def round(self, solution: Solution, number: int, first: bool = True) -> tuple[list[Scored], np.ndarray]:
         """Score every candidate on top of ``solution``; return them and the null's held-out squares [units].
@@ -226,10 +230,10 @@ class Search:
     ) -> list[Scored]:  # fmt: skip
         """Score curves by their linear response, and those that promise most, and ``worth``, by a fit."""
         have, result = {t.label for t in solution.model.terms}, []
-        looked = [(t, *_line(responses, t)) for t in curves if t.label not in have]
-        looked.sort(key=lambda one: -one[2].mean())
-        for i, (term, start, gains) in enumerate(looked):
-            least = max(worth, NEAR * looked[0][2].mean())
+        screened = [(t, *_line(responses, t)) for t in curves if t.label not in have]
+        screened.sort(key=lambda one: -one[2].mean())
+        for i, (term, start, gains) in enumerate(screened):
+            least = max(worth, NEAR * screened[0][2].mean())
             faint = gains.mean() < least and (term.effect is None or term.what != "acceleration" or worth > WORTH)
             if faint or i >= RACED:
                 result.append(Scored(term, None, gains))

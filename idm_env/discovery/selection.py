@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import ttest_1samp
 
-from idm_env.discovery import free, judge, places, together
+from idm_env.discovery import closed_loop, judge, places, together
 from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import whole
 from idm_env.discovery.score import (
     ALPHA,
-    FREE_SHARE,
+    CLOSED_LOOP_SHARE,
     Tested,
     at_level,
     held_out,
@@ -59,7 +59,7 @@ class Round:
     share: float = float("nan")
     refusal: Refusal | None = None
     partial: int | None = None
-    free: bool = False
+    in_closed_loop: bool = False
     """Whether gains are those of free simulation, and not of predictions in windows."""
 
     @property
@@ -71,7 +71,7 @@ class Round:
     @property
     def significant(self) -> bool:
         """Whether any candidate gained enough, beyond chance."""
-        least = together.LEAST_GAIN if self.free else LEAST_GAIN
+        least = together.LEAST_GAIN if self.in_closed_loop else LEAST_GAIN
         return bool(((self.tested.p_value < ALPHA) & (self.tested.gain >= least)).any())
 
 
@@ -79,7 +79,7 @@ class Round:
 class Decided:
     """The null, models after every addition (the last without what is not needed), what was seen, and what joins.
 
-    ``stand`` is IDM in free simulation, before anything was added.
+    ``null_in_closed_loop`` is IDM in free simulation, before anything was added.
 
     ``joined`` are terms that hold together in free simulation, beside what predictions in windows tell.
     """
@@ -88,7 +88,7 @@ class Decided:
     steps: list[Solution]
     rounds: list[Round]
     joined: together.Joined | None
-    stand: free.ClosedLoopFit
+    null_in_closed_loop: closed_loop.ClosedLoopFit
 
 
 def decide(searching: Search, null: Solution, seed: int) -> Decided:
@@ -121,7 +121,7 @@ def _joined(
         return None
     joined, forward = together.grow(searching, searching.weighed(now)[0], len(null.model.terms), seed)
     rounds += [
-        Round(s.scored, s.tested, last.before, last.left, s.winner, equivalent=s.equivalent, free=True)
+        Round(s.scored, s.tested, last.before, last.left, s.winner, equivalent=s.equivalent, in_closed_loop=True)
         for s in forward if s.scored
     ]  # fmt: skip
     return joined
@@ -167,7 +167,9 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
 
 def _tested(searching: Search, scored: Sequence[Scored], seed: int) -> Tested:
     """Test candidates in windows, at their share of the level."""
-    return at_level(westfall_young(np.array([s.gains for s in scored]), seed, searching.units.run), 1.0 - FREE_SHARE)
+    return at_level(
+        westfall_young(np.array([s.gains for s in scored]), seed, searching.units.run), 1.0 - CLOSED_LOOP_SHARE
+    )
 
 
 def _is_whole(now: Solution) -> bool:
@@ -188,7 +190,7 @@ def _is_a_step(now: Solution, dt: float) -> bool:
 def _at_floor(searching: Search, now: Solution) -> bool:
     """Tell whether only the noise of measurement is left; what smoothing does at sharp bends would be named next."""
     records = searching.task.rows.records
-    square = searching.free_run_squares(now).sum() / len(whole(records).valid.nonzero()[0])
+    square = searching.closed_loop_squares(now).sum() / len(whole(records).valid.nonzero()[0])
     return bool(square <= (AT_FLOOR * judge.floor(records)["gap_rmse_m"]) ** 2)
 
 
@@ -242,7 +244,7 @@ def _choose(searching: Search, now: Solution, this: Round) -> None:
     """Set the winner of a round, or say why there is none."""
     run = searching.units.run
     runs = len(np.unique(run))
-    if runs < FEWEST_RUNS or smallest_p(run) >= ALPHA * (1.0 - FREE_SHARE):
+    if runs < FEWEST_RUNS or smallest_p(run) >= ALPHA * (1.0 - CLOSED_LOOP_SHARE):
         this.refusal = Refusal(Reason.FEW_RUNS, figure=runs)
         return
     tested, scored = this.tested, this.scored
@@ -273,19 +275,19 @@ def _choose(searching: Search, now: Solution, this: Round) -> None:
     if this.share < LEAST_SHARE:
         this.refusal = Refusal(Reason.SMALL_SHARE, figure=this.share)
         return
-    if not _free_run_holds(searching, now, chosen):
-        this.refusal = Refusal(Reason.FREE_SIMULATION)
+    if not _closed_loop_holds(searching, now, chosen):
+        this.refusal = Refusal(Reason.CLOSED_LOOP)
         return
     this.winner = winner
     this.equivalent = [i for i in same if i != winner]
 
 
-def _free_run_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
+def _closed_loop_holds(searching: Search, now: Solution, chosen: Solution) -> bool:
     """Tell whether free simulation of the validation runs gets no worse: by 2 % at most, or not beyond chance.
 
     Drivers' own noise adds up in free simulation: with 0.1 m/s² of it, right findings can miss the 2 %.
     """
-    before, after = (searching.free_run_squares(s) for s in (now, chosen))
+    before, after = (searching.closed_loop_squares(s) for s in (now, chosen))
     if after.sum() <= 1.02**2 * before.sum():
         return True
     return bool(ttest_1samp(log_gain(after, before), 0.0, alternative="greater").pvalue > ALPHA)

@@ -32,14 +32,14 @@ LONGEST = 0.5
 class Prior:
     """Log-normal prior of θ: centre [P] and width [P] of log θ; ``free`` lets the centre follow the drivers.
 
-    ``alike_s`` is its weight in free simulation, where errors of so many seconds count as one (``free.stand``).
+    ``error_correlation_s`` is its weight in closed loop: errors of so many seconds count as one (``closed_loop``).
     ``seen`` are the groups that have data: their mean is the centre, so that a shift of all of them costs nothing.
     """
 
     centre: np.ndarray
     width: np.ndarray
     free: bool = True
-    alike_s: float = 5.0
+    error_correlation_s: float = 5.0
     seen: tuple[int, ...] = ()
 
     def equations(self, own: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,7 +14,7 @@ from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.march import CURVE
 from idm_env.discovery.model import STATES, Term
 from idm_env.discovery.power import Bar, Strength, powerful, strength_of
-from idm_env.discovery.score import FREE_SHARE, contrast_of, interval_of, level, rivals
+from idm_env.discovery.score import CLOSED_LOOP_SHARE, contrast_of, interval_of, level, rivals
 from idm_env.discovery.selection import LEAST_GAIN, Decided, Round
 from idm_env.discovery.solve import Solution, Task
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
@@ -60,7 +60,7 @@ def summarise(
     if judged.law is not None:
         sentence = f"{words.law_first(judged.law, law, drivers[2])} {sentence}"
     after = judged.after if judged.added else before
-    weight = decided.stand
+    weight = decided.null_in_closed_loop
     return result.Result(
         schema=result.SCHEMA,
         verdict=verdict.value,
@@ -98,7 +98,7 @@ def summarise(
         data=data,
         seed=judged.seed,
         versions=versions(),
-        prior=result.Weight(weight.task.prior.alike_s, list(weight.rmse_m), list(weight.rmse_m.values())),
+        prior=result.Weight(weight.task.prior.error_correlation_s, list(weight.rmse_m), list(weight.rmse_m.values())),
         ceilings=ceilings,
         bases=bases.rows(laws),
     )  # fmt: skip
@@ -114,7 +114,7 @@ def _verdict(
     power = len(task.rows.records.runs) >= MANY_RUNS or powerful(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest_p(counted.run)
     )
-    structured = any(r.significant for r in (first, *(r for r in rounds if r.free)))
+    structured = any(r.significant for r in (first, *(r for r in rounds if r.in_closed_loop)))
     unnamed = 0.0 if ladder is None else ladder.unnamed
     verdict = conclude(
         bool(added), any(f.effect for f in added), refusal, structured or unnamed > 0.0, first.left, power,
@@ -135,7 +135,7 @@ def bar(first: Round, run: np.ndarray, seed: int, kept: int) -> Bar:
     # It has to explain half of what any smooth function of the state explains.
     rest = 0.5 * np.log(2.0 - np.exp(-2.0 * max(float(first.left.mean()), 0.0)))
     gains = np.array([s.gains for s in first.scored])
-    return Bar(level(gains, seed, run, 1.0 - FREE_SHARE), max(LEAST_GAIN, float(rest)), kept)
+    return Bar(level(gains, seed, run, 1.0 - CLOSED_LOOP_SHARE), max(LEAST_GAIN, float(rest)), kept)
 
 
 def _strengths(first: Round, task: Task, reached: Bar) -> dict[str, Strength]:
@@ -230,7 +230,7 @@ def _finding(
     }
     contrast = contrast_of(compared, task, term.label) if term.located and term.form == CURVE else None
     gains = np.array([s.gains for s in this.scored])
-    close = [] if this.free else rivals(gains, winner, units(task.rows.records).run)
+    close = [] if this.in_closed_loop else rivals(gains, winner, units(task.rows.records).run)
     equivalent, near = (
         [this.scored[i].term.effect or this.scored[i].term.label for i in which] for which in (this.equivalent, close)
     )
@@ -277,7 +277,7 @@ def _candidate(number: int, this: Round, i: int) -> result.Candidate:
     shown = len(values) <= words.MANY
     return result.Candidate(
         round=number,
-        errors="free simulation" if this.free else "windows",
+        errors="free simulation" if this.in_closed_loop else "windows",
         effect=s.term.effect or s.term.label,
         named=s.term.effect is not None,
         p_value=float(this.tested.p_value[i]),

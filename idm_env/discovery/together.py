@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from idm_env.discovery import free
+from idm_env.discovery import closed_loop
 from idm_env.discovery import model as terms
-from idm_env.discovery.free import ClosedLoopFit, Line
-from idm_env.discovery.score import ALPHA, FREE_SHARE, Tested, at_level, interval_of, westfall_young
+from idm_env.discovery.closed_loop import ClosedLoopFit, Line
+from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE, Tested, at_level, interval_of, westfall_young
 from idm_env.discovery.search import Scored, Search
 from idm_env.discovery.solve import Solution
 from idm_env.effects import ALL
@@ -41,13 +41,13 @@ class Joined:
     gains: np.ndarray
 
 
-def looks(searching: Search, at: ClosedLoopFit) -> list[Line]:
+def linear_screens(searching: Search, at: ClosedLoopFit) -> list[Line]:
     """Return a first look at every candidate without a place that the model has not."""
     have = {t.effect for t in at.model.terms}
     late = any(ALL[name].latency for name in have if name is not None)
     effects = [searching.base.catalogue.by_name[n] for n in searching.names if n not in have]
     simple = [e for e in effects if e.sought == "anywhere" and not (late and ALL[e.name].latency)]
-    return [free.look(at, terms.simple(e)) for e in simple]
+    return [closed_loop.linear_screen(at, terms.simple(e)) for e in simple]
 
 
 def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple[Joined | None, list[Step]]:
@@ -67,30 +67,30 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
         if grown is None:
             break
         solution = grown
-        fit = free.stand(fit.task.rows.records, grown.model, grown.values, fit.task.prior, grown.theta)
+        fit = closed_loop.evaluate(fit.task.rows.records, grown.model, grown.values, fit.task.prior, grown.theta)
     if solution is None:
         return None, steps
     solution = _backward(start, solution, base)
     if len(solution.model.terms) == base:
         return None, steps
-    return Joined(solution, interval_of(solution, start.task), free.gains(start, solution)), steps
+    return Joined(solution, interval_of(solution, start.task), closed_loop.gains(start, solution)), steps
 
 
 def _forward(searching: Search, fit: ClosedLoopFit, seed: int) -> tuple[Step, Solution | None]:
-    lines = looks(searching, fit)
+    lines = linear_screens(searching, fit)
     if not lines:
         nothing = np.zeros(0)
         return Step([], Tested(nothing, nothing, np.zeros((0, 2))), None, []), None
     scored = [Scored(line.term, None, line.gains) for line in lines]
 
     def test() -> Tested:
-        return at_level(westfall_young(np.array([s.gains for s in scored]), seed, fit.units.run), FREE_SHARE)
+        return at_level(westfall_young(np.array([s.gains for s in scored]), seed, fit.units.run), CLOSED_LOOP_SHARE)
 
     tested = test()
     first = tested
     for i in [i for i in np.argsort(-first.gain) if first.p_value[i] < ALPHA and first.gain[i] >= LEAST_GAIN][:TRIED]:
-        fitted = free.nested(fit, scored[i].term, lines[i].start)
-        scored[i] = Scored(scored[i].term, fitted, free.gains(fit, fitted))
+        fitted = closed_loop.nested(fit, scored[i].term, lines[i].start)
+        scored[i] = Scored(scored[i].term, fitted, closed_loop.gains(fit, fitted))
         tested = test()
         if tested.p_value[i] < ALPHA and tested.gain[i] >= LEAST_GAIN:
             same = [
@@ -104,11 +104,11 @@ def _forward(searching: Search, fit: ClosedLoopFit, seed: int) -> tuple[Step, So
 def _backward(start: ClosedLoopFit, solution: Solution, base: int) -> Solution:
     """Take back terms whose interval contains their null once all are in, or that the held-out score does not miss."""
     while len(solution.model.terms) > base:
-        intervals, gain = interval_of(solution, start.task), float(free.gains(start, solution).mean())
+        intervals, gain = interval_of(solution, start.task), float(closed_loop.gains(start, solution).mean())
         added = range(base, len(solution.model.terms))
         losses = {index: 0.0 for index in added if contains_null(solution, intervals, index)}
         if not losses:
-            losses = {i: gain - float(free.gains(start, _without(start, solution, i)).mean()) for i in added}
+            losses = {i: gain - float(closed_loop.gains(start, _without(start, solution, i)).mean()) for i in added}
         index = min(losses, key=lambda i: losses[i])
         if losses[index] >= 0.5 * LEAST_GAIN:
             break
@@ -120,7 +120,7 @@ def _without(start: ClosedLoopFit, solution: Solution, index: int) -> Solution:
     begin = sum(t.size for t in solution.model.terms[:index])
     gone = np.arange(begin, begin + solution.model.terms[index].size)
     fit = replace(start, theta=solution.theta)
-    return free.joint(fit, solution.model.without(index), np.delete(solution.values, gone))
+    return closed_loop.joint(fit, solution.model.without(index), np.delete(solution.values, gone))
 
 
 def contains_null(solution: Solution, intervals: np.ndarray, index: int) -> bool:

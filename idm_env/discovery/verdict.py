@@ -36,7 +36,7 @@ class Reason(str, Enum):
     NO_POWER = "no_power"
     NO_GAIN = "no_gain"
     SMALL_SHARE = "small_share"
-    FREE_SIMULATION = "free_simulation"
+    CLOSED_LOOP = "free_simulation"
     TEST_SET = "lockbox"
     HELD_OUT = "held_out"
     LAW = "law"

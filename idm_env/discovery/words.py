@@ -154,7 +154,7 @@ def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
         "usual strengths",
         Reason.NO_GAIN: "no candidate gains enough on held-out runs",
         Reason.SMALL_SHARE: f"{tried} explains only {figure:.0%} of what can be explained",
-        Reason.FREE_SIMULATION: f"{tried} makes free simulation worse",
+        Reason.CLOSED_LOOP: f"{tried} makes free simulation worse",
         Reason.TEST_SET: f"the test set does not confirm {tried}",
         Reason.HELD_OUT: f"predictions of the test set get no better with {tried}",
         Reason.STRUCTURE: (

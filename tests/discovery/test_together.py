@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import free, search, selection, together
+from idm_env.discovery import closed_loop, search, selection, together
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
@@ -29,14 +29,14 @@ def searching() -> Search:
 
 
 @pytest.fixture(scope="module")
-def start(searching: Search) -> free.ClosedLoopFit:
+def start(searching: Search) -> closed_loop.ClosedLoopFit:
     task = searching.task
     null = solve(task, Hypothesis(), np.tile(task.prior.centre, (task.groups, 1)), np.zeros(0))
-    return free.stand(task.rows.records, null.model, null.values, null.prior, null.theta)
+    return closed_loop.evaluate(task.rows.records, null.model, null.values, null.prior, null.theta)
 
 
 def test_what_is_there_is_added_in_free_simulation_and_nothing_else(
-    searching: Search, start: free.ClosedLoopFit
+    searching: Search, start: closed_loop.ClosedLoopFit
 ) -> None:
     joined, steps = together.grow(searching, start, 0, seed=0)
     assert joined is not None
@@ -44,12 +44,12 @@ def test_what_is_there_is_added_in_free_simulation_and_nothing_else(
     estimate, low, high = joined.intervals[0]
     assert estimate == pytest.approx(-0.4, rel=0.3) and low < estimate < high
     assert joined.gains.mean() > 0.1 and steps[0].tested.p_value[steps[0].winner] < 0.05
-    assert len(start.units) == 18 and set(start.rmse_m) >= set(free.GRID_S)
+    assert len(start.units) == 18 and set(start.rmse_m) >= set(closed_loop.GRID_S)
 
 
-def test_a_term_that_is_not_there_is_taken_back(start: free.ClosedLoopFit) -> None:
+def test_a_term_that_is_not_there_is_taken_back(start: closed_loop.ClosedLoopFit) -> None:
     model = Hypothesis((terms.simple("speed_time_gap"), terms.simple("drag")))
-    both = free.joint(start, model, np.array([-0.3, 1e-4]))
+    both = closed_loop.joint(start, model, np.array([-0.3, 1e-4]))
     kept = together._backward(start, both, 0)
     assert [t.label for t in kept.model.terms] == ["speed_time_gap"]
 
@@ -67,17 +67,19 @@ def test_a_term_of_windows_whose_interval_contains_its_null_is_taken_back_whatev
 
 
 def test_what_windows_found_is_fitted_in_free_simulation_once_more(
-    searching: Search, start: free.ClosedLoopFit
+    searching: Search, start: closed_loop.ClosedLoopFit
 ) -> None:
     """A strength that is a quarter of the true one comes back."""
     model = Hypothesis((terms.simple("speed_time_gap"),))
-    off = free.in_windows(searching.task, replace(free.joint(start, model, np.array([-0.3])), values=np.array([-0.1])))
-    again, intervals = free.refitted(start.task.rows.records, off)
+    off = closed_loop.in_windows(
+        searching.task, replace(closed_loop.joint(start, model, np.array([-0.3])), values=np.array([-0.1]))
+    )
+    again, intervals = closed_loop.refitted(start.task.rows.records, off)
     assert again.values[0] == pytest.approx(-0.4, rel=0.3)
     assert intervals[0, 1] < again.values[0] < intervals[0, 2]
 
 
-def test_theta_follows_on_time_that_is_not_scored(start: free.ClosedLoopFit) -> None:
+def test_theta_follows_on_time_that_is_not_scored(start: closed_loop.ClosedLoopFit) -> None:
     """A response that θ can make up for leaves next to nothing."""
     by_theta = start.linear.by_theta[..., [2]]
     left = start.across(by_theta)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from idm_env.data import episodes, synthetic
-from idm_env.discovery import free, judge, words
+from idm_env.discovery import closed_loop, judge, words
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
@@ -28,26 +28,26 @@ def fitted(seconds: float, ou: float, spread: float, seed: int = 5) -> tuple[Rec
 
 def weight(records: Records, null: Solution) -> tuple[float, dict[float, float]]:
     """Return the weight that was chosen and the errors of all; the best is no end of what was tried."""
-    at = free.stand(records, null.model, null.values, null.prior, null.theta)
-    tried, best = sorted(at.rmse_m), at.task.prior.alike_s
+    at = closed_loop.evaluate(records, null.model, null.values, null.prior, null.theta)
+    tried, best = sorted(at.rmse_m), at.task.prior.error_correlation_s
     for end, beside in ((0, 1), (-1, -2)):
-        if best == tried[end] and best not in free.ENDS_S:
+        if best == tried[end] and best not in closed_loop.ENDS_S:
             assert at.rmse_m[best] > 0.9994 * at.rmse_m[tried[beside]]
     return best, at.rmse_m
 
 
 def test_short_noisy_records_of_like_drivers_lean_on_the_population() -> None:
     records, null = fitted(60.0, ou=0.3, spread=0.05)
-    alike_s, errors_m = weight(records, null)
-    assert alike_s >= 50.0
+    error_correlation_s, errors_m = weight(records, null)
+    assert error_correlation_s >= 50.0
     assert min(errors_m.values()) < 0.9 * errors_m[5.0]
     # Drivers that were never seen are predicted better, too.
     others, _ = fitted(60.0, ou=0.3, spread=0.05, seed=6)
     rows, empty = whole(others), np.zeros(0)
     second = judge.halves(rows)
     errors = []
-    for seconds in (5.0, alike_s):
-        prior = replace(null.prior, alike_s=seconds)
+    for seconds in (5.0, error_correlation_s):
+        prior = replace(null.prior, error_correlation_s=seconds)
         theta = judge.calibrate(others, Hypothesis(), empty, prior, replace(rows, valid=rows.valid & ~second)).theta
         scored = Task(replace(rows, valid=second), None, prior)
         errors.append(np.linalg.norm(scored.errors(theta[None], Hypothesis(), empty[None])))

@@ -31,7 +31,7 @@ ENDS_S = (0.5, 5e5)
 class ClosedLoopFit:
     """A model in free simulation: ``task`` over all time, θ from the part that is not ``scored``, and errors (m) there.
 
-    ``rmse_m`` are the gap's errors on the scored time by weight (s), of which ``task.prior.alike_s`` is the best.
+    ``rmse_m`` are the gap's errors on the scored time by weight (s); ``task.prior.error_correlation_s`` is the best.
     ``absorb`` [G, P, P] is the inverse curvature of that calibration, ``weight`` [R] what a row's squares count: one
     over its own mean square plus the usual one, so that a few hopeless followers do not decide.
     """
@@ -69,8 +69,8 @@ class ClosedLoopFit:
         return result
 
 
-def stand(records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, theta: np.ndarray) -> ClosedLoopFit:
-    """Calibrate a model on every other block of time in free simulation, from log θ [G, P], and see how it stands.
+def evaluate(records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, theta: np.ndarray) -> ClosedLoopFit:
+    """Calibrate a model on every other block of time in closed loop, from log θ [G, P], and evaluate it on the rest.
 
     The weight of the prior decides more on short or noisy records than any effect does: with too light a one drivers
     are over-fitted, and an effect that only regularises them looks like a finding. So every model has the weight with
@@ -87,14 +87,16 @@ def stand(records: Records, model: Hypothesis, values: np.ndarray, prior: Prior,
     grid: Sequence[float] = GRID_S
     while grid:
         for seconds in grid:
-            heavier = judge.scaled(replace(task, prior=replace(task.prior, alike_s=seconds)), model, values, near)
+            heavier = judge.scaled(
+                replace(task, prior=replace(task.prior, error_correlation_s=seconds)), model, values, near
+            )
             start = min(fits.items(), key=lambda fit: abs(np.log(fit[0] / seconds)))[1][1].theta if fits else near
             fits[seconds] = heavier, solve(heavier, frozen, start, np.zeros(0), iterations=10, tolerance=1e-4)
             errors = heard.errors(fits[seconds][1].theta[None], frozen, np.zeros((1, 0)))
             square[seconds] = float((errors**2).sum()) / max(int(scored.sum()), 1)
         grid = further(square)
-    alike_s = min(square, key=lambda seconds: square[seconds])
-    task, fitted = fits[alike_s]
+    error_correlation_s = min(square, key=lambda seconds: square[seconds])
+    task, fitted = fits[error_correlation_s]
     matrix = task.per_group(np.einsum("rmi,rmj->rij", fitted.linear.by_theta, fitted.linear.by_theta))
     matrix += np.diag(prior.width**-2.0)
     meters = linearise(replace(task, rows=rows, sigma=1.0), frozen, fitted.theta, np.zeros(0))
@@ -127,7 +129,7 @@ class Line:
     start: np.ndarray
 
 
-def look(at: ClosedLoopFit, term: Term) -> Line:
+def linear_screen(at: ClosedLoopFit, term: Term) -> Line:
     """Score a candidate by its responses at its starts, each scaled by one number from other runs.
 
     Finite responses rather than derivatives at the null: what acts beyond a threshold shows, too.
@@ -171,7 +173,7 @@ def joint(at: ClosedLoopFit, model: Hypothesis, values: np.ndarray) -> Solution:
 
 def refitted(records: Records, solution: Solution) -> tuple[Solution, np.ndarray]:
     """Fit φ of a model of windows once more, in free simulation over all time; also return intervals [Q, 3]."""
-    fit = stand(records, solution.model, solution.values, solution.prior, solution.theta)
+    fit = evaluate(records, solution.model, solution.values, solution.prior, solution.theta)
     again = joint(fit, solution.model, solution.values)
     return again, interval_of(again, fit.task)
 
@@ -181,7 +183,7 @@ def gains(before: ClosedLoopFit, solution: Solution) -> np.ndarray:
 
     φ moves by one Newton step where a run is left out, and the errors with it to first order.
     """
-    after = stand(before.task.rows.records, solution.model, solution.values, before.task.prior, solution.theta)
+    after = evaluate(before.task.rows.records, solution.model, solution.values, before.task.prior, solution.theta)
     change = without_own_run(before.task, solution)
     rows = before.task.rows
     by_phi = linearise(replace(after.task, sigma=1.0), solution.model, after.theta, solution.values).by_phi
