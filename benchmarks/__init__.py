@@ -53,12 +53,12 @@ def command(work: Callable[..., None] | Mapping[str, Callable[..., None]]) -> No
     import tyro
 
     module: Any = inspect.getmodule(work if callable(work) else next(iter(work.values())))
-    said: dict[str, Any] = {
+    options: dict[str, Any] = {
         "prog": f"python -m {module.__spec__.name}",
         "description": module.__doc__,
         "config": (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     }
-    tyro.cli(work, **said) if callable(work) else tyro.extras.subcommand_cli_from_dict(dict(work), **said)
+    tyro.cli(work, **options) if callable(work) else tyro.extras.subcommand_cli_from_dict(dict(work), **options)
 
 
 def kept_rows(out: Path, column: str) -> dict[Any, dict[str, Any]]:

@@ -165,8 +165,8 @@ class Job:
         if module == MODULES["distil"] and not begun and (teacher.parents[1] / "result.json").exists():
             options["teacher"] = teacher
         if self.times > 1:
-            given = read_yaml(ROOT / "configs" / f"{self.config}.yaml")
-            options["updates"] = self.times * options.get("updates", given["updates"])
+            settings = read_yaml(ROOT / "configs" / f"{self.config}.yaml")
+            options["updates"] = self.times * options.get("updates", settings["updates"])
         for key, value in options.items():
             option = "--" + key.replace("_", "-")
             words += [option] if value is True else [option, str(value)]
@@ -279,9 +279,9 @@ def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
     The best has most seeds solved, then the highest mean score of the last evaluation.
     """
     jobs = trials(config)
-    found = [perform(job, out) for job in jobs]
-    done = [row for row in found if row is not None]
-    if len(done) < len(found):
+    results_of_jobs = [perform(job, out) for job in jobs]
+    done = [row for row in results_of_jobs if row is not None]
+    if len(done) < len(results_of_jobs):
         return -1, done
     ranks: list[tuple[int, float]] = []
     for trial in range(len(SEARCH[config])):
@@ -309,30 +309,30 @@ def run(
     searched = [job for config in only for job in trials(config)] if trial is None else []
     with place.opened() as executor:
         deque(executor.map(train, [Training(job, out) for job in searched]), 0)
-        wanted = []
+        jobs = []
         for config in only:
             best = chosen(config, out)[0] if trial is None else trial
             if best < 0:
                 print(f"{config}: another process is still searching.")
                 continue
-            wanted += [Job(config, best, SEARCH[config][best], s, times) for s in SEEDS[:seeds]]
-        deque(executor.map(train, [Training(job, out) for job in wanted]), 0)
+            jobs += [Job(config, best, SEARCH[config][best], s, times) for s in SEEDS[:seeds]]
+        deque(executor.map(train, [Training(job, out) for job in jobs]), 0)
 
 
 def results(out: Path, config: str) -> list[Row]:
     """Return every result of a configuration, by trial, length of training and seed."""
-    found = [json.loads(path.read_text()) for path in (out / config).glob("trial*/seed*/result.json")]
-    return sorted(found, key=lambda r: (r["trial"], r.get("times", 1), r["seed"]))
+    rows = [json.loads(path.read_text()) for path in (out / config).glob("trial*/seed*/result.json")]
+    return sorted(rows, key=lambda r: (r["trial"], r.get("times", 1), r["seed"]))
 
 
 def groups(out: Path, config: str, seeds: Sequence[int]) -> dict[str, list[Row]]:
     """Return the results of a configuration's seeds, by what was trained for how long."""
-    found: dict[str, list[Row]] = {}
+    by_name: dict[str, list[Row]] = {}
     for r in results(out, config):
         if r["seed"] in seeds:
             times = r.get("times", 1)
-            found.setdefault(f"{r['trial']}" + (f", {times} times" if times > 1 else ""), []).append(r)
-    return found
+            by_name.setdefault(f"{r['trial']}" + (f", {times} times" if times > 1 else ""), []).append(r)
+    return by_name
 
 
 def spread(values: Sequence[float], form: str) -> str:
@@ -352,9 +352,9 @@ def search_table(out: Path, configs: Sequence[str], seeds: Sequence[int]) -> Non
     """Print what the trials of each search came to."""
     rows = []
     for config in configs:
-        found = [r for r in results(out, config) if r["seed"] in seeds]
-        for trial in sorted({r["trial"] for r in found}):
-            part = [r for r in found if r["trial"] == trial]
+        results_of_seeds = [r for r in results(out, config) if r["seed"] in seeds]
+        for trial in sorted({r["trial"] for r in results_of_seeds}):
+            part = [r for r in results_of_seeds if r["trial"] == trial]
             ends = ["/".join(ring(r["last"])[:2]) for r in part if r["history"]]
             options = ", ".join(f"{k} {v}" for k, v in part[0]["options"].items())
             rows.append([config, str(trial), options, f"{solved(part)} of {len(part)}", ", ".join(ends)])
@@ -394,9 +394,9 @@ def median_ratio(theirs: Sequence[float], ours: Sequence[float], draws: int = 10
     Seeds that never solve are infinite: later than all others, whenever that would be.
     """
     generator = np.random.default_rng(0)
-    drawn = [np.median(generator.choice(x, (draws, len(x))), axis=1) for x in (theirs, ours)]
+    medians = [np.median(generator.choice(x, (draws, len(x))), axis=1) for x in (theirs, ours)]
     with np.errstate(invalid="ignore"):  # infinite over infinite says nothing
-        low, high = np.nanquantile(drawn[0] / drawn[1], (0.025, 0.975), method="nearest")
+        low, high = np.nanquantile(medians[0] / medians[1], (0.025, 0.975), method="nearest")
         return float(np.median(theirs) / np.median(ours)), float(low), float(high)
 
 
@@ -411,13 +411,13 @@ def ratio_line(out: Path, ours: str, theirs: str, seeds: Sequence[int]) -> None:
         other = [r["summary"] for r in part]
         for key, what in (("cpu_seconds", "CPU seconds"), ("steps", "environment steps")):
             a, b = ([float(s[key]) if s["solved"] else float("inf") for s in some] for some in (base, other))
-            told = f"\n{theirs} ({name}) / {ours}, {what} to solved: "
+            words = f"\n{theirs} ({name}) / {ours}, {what} to solved: "
             if a and np.isfinite([np.median(a), np.median(b)]).all():
-                told += "{:.2f} ({:.2f}–{:.2f})".format(*median_ratio(b, a))
+                words += "{:.2f} ({:.2f}–{:.2f})".format(*median_ratio(b, a))
             else:
-                told += "no ratio"
+                words += "no ratio"
             print(
-                f"{told}; {int(np.isfinite(b).sum())} of {len(b)} and {int(np.isfinite(a).sum())} of {len(a)} solved",
+                f"{words}; {int(np.isfinite(b).sum())} of {len(b)} and {int(np.isfinite(a).sum())} of {len(a)} solved",
                 end="",
             )
             spent = [s["spent"] for s in other if not s["solved"]]
@@ -474,9 +474,9 @@ def takeover(only: Sequence[str] = RINGS, out: Path = OUT, seeds: int = len(SEED
             own = {**environment, "failsafe": failsafe}
             figures = []
             for case, warmup in ((own, 750), (own, 1750), (own, 3000), (mixed(own), 3000)):
-                found = [evaluate_ring(make(), case, warmup=warmup, draws=draws) for make in makers]
-                touched, rings = sum(r["collisions"] for r in found), sum(len(r["ratios"]) for r in found)
-                ratio, std = (statistics.median(r[k] for r in found) for k in ("speed_ratio", "speed_std"))
+                judgements = [evaluate_ring(make(), case, warmup=warmup, draws=draws) for make in makers]
+                touched, rings = sum(r["collisions"] for r in judgements), sum(len(r["ratios"]) for r in judgements)
+                ratio, std = (statistics.median(r[k] for r in judgements) for k in ("speed_ratio", "speed_std"))
                 figures.append(f"{touched} of {rings} / {ratio:.3f} / {std:.2f}")
             rows.append([name, str(len(makers)), f"{failsafe:g} m/s²" if failsafe else "none", *figures])
     print("\n" + table(
@@ -492,8 +492,8 @@ def shocks(only: Sequence[str] = RINGS, out: Path = OUT, seeds: int = len(SEEDS)
         for path in checkpoints(out, config, seeds):
             policy, content = common.load(path)
             test = as_judged(content["environment"], content["training"]["arguments"]["judged_in"])
-            found = [evaluate(policy, {**test, **shock}, draws=FRESH) for shock in SHOCKS.values()]
-            figures = ["/".join(ring(x)) + (", passes" if x["passed"] else "") for x in found]
+            judgements = [evaluate(policy, {**test, **shock}, draws=FRESH) for shock in SHOCKS.values()]
+            figures = ["/".join(ring(x)) + (", passes" if x["passed"] else "") for x in judgements]
             rows.append([config, *path.parts[-4:-2], *figures])
     print("\n" + table(("agent", "trial", "seed", *(name or "no shock" for name in SHOCKS)), rows))
 
@@ -556,13 +556,13 @@ def environments() -> dict[str, Row]:
     guarded = environment_of("ring-apg")
     free = {**guarded, "failsafe": 0.0, "max_command": [-4.5, 2.6]}
     rings = {"failsafe": guarded, "brakes": free}
-    made = {ring + name: {**own, **shock} for ring, own in rings.items() for name, shock in SHOCKS.items()}
-    return {**made, "follow": environment_of("follow-apg")}
+    by_name = {ring + name: {**own, **shock} for ring, own in rings.items() for name, shock in SHOCKS.items()}
+    return {**by_name, "follow": environment_of("follow-apg")}
 
 
 def begun(environment: Row, folder: Path, updates: int) -> list[Policy]:
     """Return the policies of APG's configuration for this task before any update, or after one."""
-    made: list[Policy] = []
+    policies: list[Policy] = []
     for seed in UNTRAINED:
         arguments = common.load_agent(ROOT / "configs" / f"{environment['task']}-apg.yaml", apg.Arguments, "apg")
         arguments.environment, arguments.seed, arguments.updates = environment, seed, 1
@@ -571,10 +571,10 @@ def begun(environment: Row, folder: Path, updates: int) -> list[Policy]:
         if updates:
             if not (arguments.out / "last.pt").exists():
                 apg.train(arguments)
-            made.append(common.load(arguments.out / "last.pt")[0])
+            policies.append(common.load(arguments.out / "last.pt")[0])
         else:
-            made.append(common.begin(arguments, "apg")[0])
-    return made
+            policies.append(common.begin(arguments, "apg")[0])
+    return policies
 
 
 BEGUN = {"APG before any update": 0, "APG after one update": 1}
@@ -583,18 +583,18 @@ UNTRAINED_NAMES = [f"seed {seed}" for seed in UNTRAINED]
 
 def on_ring(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
     """Return what makes each row of a ring, by name."""
-    made: dict[str, Callable[[], Row]] = {
+    makers: dict[str, Callable[[], Row]] = {
         name: lambda make=make: alone(make, environment) for name, make in singles(environment).items()
     }
     for name, family in families(environment).items():
-        made[name] = lambda family=family: tried(family(), environment)
+        makers[name] = lambda family=family: tried(family(), environment)
     # Trained on the ring without a shock, as agents are.
     training = {k: v for k, v in environment.items() if not k.startswith("shock")}
     for name, updates in BEGUN.items():
-        made[name] = lambda updates=updates: tried(
+        makers[name] = lambda updates=updates: tried(
             networks(begun(training, folder, updates), UNTRAINED_NAMES), environment
         )
-    return made
+    return makers
 
 
 def behind_leader(environment: Row, folder: Path) -> dict[str, Callable[[], Row]]:
@@ -604,18 +604,18 @@ def behind_leader(environment: Row, folder: Path) -> dict[str, Callable[[], Row]
         names = names or [str(i) for i in range(len(acts))]
         return passing(names, lambda draws, some: [evaluate_follow(acts[i], environment, draws=draws) for i in some])
 
-    made: dict[str, Callable[[], Row]] = {"IDM (a human driver more)": lambda: judged([None], [""])}
+    makers: dict[str, Callable[[], Row]] = {"IDM (a human driver more)": lambda: judged([None], [""])}
     for name, hidden in zip(RANDOM, HIDDEN, strict=True):
-        made[name] = lambda hidden=hidden: judged(random_policies(environment, 200, hidden))
+        makers[name] = lambda hidden=hidden: judged(random_policies(environment, 200, hidden))
     for name, updates in BEGUN.items():
-        made[name] = lambda updates=updates: judged(begun(environment, folder, updates), UNTRAINED_NAMES)
+        makers[name] = lambda updates=updates: judged(begun(environment, folder, updates), UNTRAINED_NAMES)
 
     def always(action: float) -> Act:
         return lambda observation: observation.new_full((len(observation), 1), action)
 
     actions = [round(0.1 * i - 1.0, 1) for i in range(21)]
-    made["constants"] = lambda: judged([always(x) for x in actions], [f"{x:g} of the range" for x in actions])
-    return made
+    makers["constants"] = lambda: judged([always(x) for x in actions], [f"{x:g} of the range" for x in actions])
+    return makers
 
 
 def reference(tests: Sequence[Literal[TESTS]] = TESTS, out: Path = OUT) -> None:
@@ -646,9 +646,9 @@ def reference(tests: Sequence[Literal[TESTS]] = TESTS, out: Path = OUT) -> None:
         )
     )
     for name in tests:
-        found = [columns[name][row] for row in RANDOM]
-        done = [r for r in found if r is not None]
-        if len(done) == len(found):
+        cells = [columns[name][row] for row in RANDOM]
+        done = [r for r in cells if r is not None]
+        if len(done) == len(cells):
             passed, all_of = sum(len(r["passed"]) for r in done), sum(r["tried"] for r in done)
             verdict = "a test" if passed <= MOST * all_of else "no test"
             print(f"\n{name}: {passed} of {all_of} random policies pass, so it is {verdict}.")

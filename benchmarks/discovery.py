@@ -78,20 +78,22 @@ def jobs(sets: int, clean: int, first: int, few: int = 0) -> list[Job]:
     """
     from idm_env.data.synthetic import EFFECTS
 
-    made = []
+    result = []
     for number in range(sets):
         seed = first + 1000 * number
         for i, effect in enumerate(EFFECTS):
             for j, (strength, ou) in enumerate((("middle", 0.0), ("half", 0.0), ("middle", 0.1), ("half", 0.1))):
-                made.append(Job("one", effect, strength, ou, seed + 10 * i + j))
+                result.append(Job("one", effect, strength, ou, seed + 10 * i + j))
         for part in range(2):
             ou = (0.0, 0.1)[part]
-            made += [Job("outside", e, "", ou, seed + 400 + 10 * part + k) for k, e in enumerate(OUTSIDE)]
-        made += [Job("two", "+".join(e), "", 0.0, seed + 500 + k) for k, e in enumerate(TWO)]
+            result += [Job("outside", e, "", ou, seed + 400 + 10 * part + k) for k, e in enumerate(OUTSIDE)]
+        result += [Job("two", "+".join(e), "", 0.0, seed + 500 + k) for k, e in enumerate(TWO)]
     for j, ou in enumerate((0.0, 0.1, 0.2)):
-        made += [Job("none", "none", "", ou, first + 500_000 + 1000 * j + k) for k in range(clean)]
-    made += [Job("few", "none", "", (0.0, 0.1, 0.2)[k % 3], first + 600_000 + k, 4 + (k // 3) % 6) for k in range(few)]
-    return [made[i] for i in np.random.default_rng(first).permutation(len(made))]
+        result += [Job("none", "none", "", ou, first + 500_000 + 1000 * j + k) for k in range(clean)]
+    result += [
+        Job("few", "none", "", (0.0, 0.1, 0.2)[k % 3], first + 600_000 + k, 4 + (k // 3) % 6) for k in range(few)
+    ]
+    return [result[i] for i in np.random.default_rng(first).permutation(len(result))]
 
 
 def generated(job: Job) -> tuple[Any, Any]:
@@ -129,7 +131,7 @@ def outside(base: type, kind: str) -> type:
     """Return a platoon whose drivers have an effect that the catalogue has no name for."""
 
     class Outside(base):  # type: ignore[misc,valid-type]
-        def _rates(self, k: int, known: int, state: np.ndarray) -> np.ndarray:
+        def _rates(self, k: int, count: int, state: np.ndarray) -> np.ndarray:
             drivers, place, speed = self.drivers, state[0], state[1]
             time = (self.starts + k * self.step)[:, None]
             change = {}
@@ -149,7 +151,7 @@ def outside(base: type, kind: str) -> type:
                 change["time_gap"] = drivers.time_gap * (1 + longer(kind, self._view(k, state), drivers))
             self.drivers = dataclasses.replace(drivers, **change)
             try:
-                rates = super()._rates(k, known, state)
+                rates = super()._rates(k, count, state)
             finally:
                 self.drivers = drivers
             if kind == "period":
@@ -204,8 +206,8 @@ def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
 
     trajectories, truth = generated(job)
     begin = time.process_time()
-    found = discover(trajectories, seed=job.seed)
-    report = found.report
+    discovery = discover(trajectories, seed=job.seed)
+    report = discovery.report
     names = [f["effect"] or f["label"] for f in report["found"]]
     row: dict[str, Any] = dataclasses.asdict(job) | {
         "key": job.key,
@@ -217,7 +219,7 @@ def measure(job: Job, on_progress: object = None) -> dict[str, Any]:
         "before": report["error"]["before"]["gap_rmse_m"],
         "after": report["error"]["after"]["gap_rmse_m"],
         "floor": report["error"]["floor"]["gap_rmse_m"],
-        "oracle": oracle(found, truth) if truth.effects else None,
+        "oracle": oracle(discovery, truth) if truth.effects else None,
         "why": report["reason"],
         "best": next((c["effect"] for c in report["candidates"]), ""),
         "best_gain": next((c["held_out_gain"] for c in report["candidates"]), 0.0),
@@ -319,12 +321,12 @@ def draw(folder: Path) -> None:
     from idm_env.data import synthetic
     from idm_env.discovery import discover, pictures
 
-    found = discover(synthetic.generate(3, effect="brake_light", ou=0.05)[0])
-    drawn = {
-        "ranking": pictures.ranking(found.rounds[0]), "look_alikes": pictures.look_alikes(found),
-        "gaps": pictures.gaps(found),
+    discovery = discover(synthetic.generate(3, effect="brake_light", ou=0.05)[0])
+    figures = {
+        "ranking": pictures.ranking(discovery.rounds[0]), "look_alikes": pictures.look_alikes(discovery),
+        "gaps": pictures.gaps(discovery),
     }  # fmt: skip
-    for name, figure in drawn.items():
+    for name, figure in figures.items():
         assert figure is not None
         figure.savefig(folder / f"discovery_{name}.png", dpi=90, bbox_inches="tight")
 

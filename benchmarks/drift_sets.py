@@ -58,16 +58,16 @@ def leaders(random: np.random.Generator, steps: int, drivers: int) -> tuple[np.n
     fine, every = 0.025, round(DT / 0.025)
     speed = random.uniform(8.0, 16.0, drivers)
     position, accel, target = np.zeros(drivers), np.zeros(drivers), speed.copy()
-    kept = [(position, speed, accel)]
+    samples = [(position, speed, accel)]
     for k in range(steps * every):
         target = np.where(random.random(drivers) < fine / 12.0, random.uniform(3.0, 22.0, drivers), target)
         accel = accel + fine * (np.clip((target - speed) / 2.5, -2.5, 1.3) - accel)
         faster = np.maximum(speed + accel * fine, 0.0)
         position, speed = position + 0.5 * fine * (speed + faster), faster
         if (k + 1) % every == 0:
-            kept.append((position, speed, accel))
-    found = [np.array(x) for x in zip(*kept, strict=True)]
-    return found[0], found[1], found[2]
+            samples.append((position, speed, accel))
+    columns = [np.array(x) for x in zip(*samples, strict=True)]
+    return columns[0], columns[1], columns[2]
 
 
 def made(
@@ -87,16 +87,16 @@ def made(
     record = Record(*(y[1:] for y in both), torch.tensor([True, False]).expand(steps, drivers, 2))
     position = torch.tensor(np.stack((x[0], x[0] - 5.0 - gap), -1))
     start = simulator.state(position, torch.tensor(np.stack((v[0], v[0]), -1)), params, accel=both[2][0], seed=seed)
-    _, kept = simulator.rollout(start, {"replay": record}, params, steps, seed=seed + 1)
+    _, motion = simulator.rollout(start, {"replay": record}, params, steps, seed=seed + 1)
     tables = []
     for i in range(drivers):
         for vehicle in (0, 1):
             noise = vehicle * random.normal(size=(2, steps))
-            measured = kept.gap[:, i, 1].numpy() + GAP_NOISE * noise[0] if vehicle else np.full(steps, np.nan)
+            measured = motion.gap[:, i, 1].numpy() + GAP_NOISE * noise[0] if vehicle else np.full(steps, np.nan)
             tables.append(pl.DataFrame({
                 "run_id": f"{i:02d}", "vehicle_id": vehicle, "leader_id": [0 if vehicle else None] * steps,
-                "time_s": DT * np.arange(1, steps + 1), "position_m": kept.position[:, i, vehicle].numpy(),
-                "speed_mps": np.maximum(kept.speed[:, i, vehicle].numpy() + SPEED_NOISE * noise[1], 0.0),
+                "time_s": DT * np.arange(1, steps + 1), "position_m": motion.position[:, i, vehicle].numpy(),
+                "speed_mps": np.maximum(motion.speed[:, i, vehicle].numpy() + SPEED_NOISE * noise[1], 0.0),
                 "length_m": 5.0, "gap_m": measured,
             }, schema_overrides={"leader_id": pl.Int64}))  # fmt: skip
     table = pl.concat(tables).with_columns(pl.col("gap_m").fill_nan(None))
@@ -109,7 +109,7 @@ Part = tuple[int, bool, int, float]
 
 def scored(part: Part, on_progress: OnProgress = silent) -> dict[str, Any]:
     """Return what ``tell`` says of a set, beside what is hidden in it; alone: the estimate of what is hidden."""
-    seed, alone, drivers, seconds = part
+    seed, only_hidden, drivers, seconds = part
     drift, sigma, memory_time = HIDDEN[seed % len(HIDDEN)]
     sigma *= float(np.exp(np.random.default_rng(seed).uniform(-0.4, 0.4)))
     begin, trajectories = time.process_time(), made(seed, drift, sigma, memory_time, drivers, seconds)
@@ -118,22 +118,22 @@ def scored(part: Part, on_progress: OnProgress = silent) -> dict[str, Any]:
         "key": key(part), "seed": seed, "drivers": drivers, "hidden": drift.name if sigma else "none",
         "sigma": sigma, "memory_time": memory_time, "one_of": None, "gain": {},
     }  # fmt: skip
-    if alone:
+    if only_hidden:
         batch, raw = (Batch.of(x, substeps=1) for x in (smooth, measured))
-        found = estimate(behind_a_record(batch.dt, drift), batch, IDM_NAMES, usual(IDM_NAMES), measured=raw)
+        estimates = estimate(behind_a_record(batch.dt, drift), batch, IDM_NAMES, usual(IDM_NAMES), measured=raw)
     else:
-        told = tell(smooth, measured, DRIFTS)
-        found, row["one_of"], row["gain"] = told.found[drift.name], told.one_of, told.gain
-    rows = {str(r["name"]): r for r in found.table()}
+        drift_of_set = tell(smooth, measured, DRIFTS)
+        estimates, row["one_of"], row["gain"] = drift_of_set.found[drift.name], drift_of_set.one_of, drift_of_set.gain
+    rows = {str(r["name"]): r for r in estimates.table()}
     row["estimates"] = [rows[f"{drift.name}.{key}"] for key in ("sigma", "memory_time")]
     return row | {"cpu_s": time.process_time() - begin}
 
 
 def key(part: Part) -> str:
     """Return what a set is called in the file of results."""
-    seed, alone, drivers, seconds = part
+    seed, only_hidden, drivers, seconds = part
     size = "" if (drivers, seconds) == (DRIVERS, SECONDS) else f"|{drivers} drivers of {seconds:g} s"
-    return f"{seed}{size}|alone" if alone else f"{seed}{size}"
+    return f"{seed}{size}|alone" if only_hidden else f"{seed}{size}"
 
 
 def shown(sets: list[dict[str, Any]]) -> str:
@@ -144,9 +144,12 @@ def shown(sets: list[dict[str, Any]]) -> str:
     drifting = [s for s in sets if s["hidden"] != "none"]
     for name in dict.fromkeys([*(s["hidden"] for s in drifting), "all"]):
         rows = [s for s in drifting if name in (s["hidden"], "all")]
-        told = [s for s in rows if s["one_of"] is not None]
-        alone, among = sum(s["one_of"] == [s["hidden"]] for s in told), sum(s["hidden"] in s["one_of"] for s in told)
-        texts = [str(alone), str(among)] if told else ["–", "–"]
+        complete = [s for s in rows if s["one_of"] is not None]
+        single, among = (
+            sum(s["one_of"] == [s["hidden"]] for s in complete),
+            sum(s["hidden"] in s["one_of"] for s in complete),
+        )
+        texts = [str(single), str(among)] if complete else ["–", "–"]
         texts += [recovered(rows, i, number) for i, number in enumerate(("sigma", "memory_time"))]
         lines.append([name, str(len(rows)), *texts])
     steady = [not s["one_of"] for s in sets if s["hidden"] == "none"]

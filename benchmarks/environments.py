@@ -53,8 +53,12 @@ def vector(seconds: float, count: int) -> None:
             for policy in ("constant speed", "random"):
                 env = gym.make_vec("DiffIDM-v0", num_envs=count, dtype=dtype, autoreset_mode="SameStep", **keywords)
                 env.reset(seed=0)
-                at = iter(range(10**9))
-                actions = (lambda: zero) if policy == "constant speed" else (lambda at=at: random[next(at) % 64])
+                counter = iter(range(10**9))
+                actions = (
+                    (lambda: zero)
+                    if policy == "constant speed"
+                    else (lambda counter=counter: random[next(counter) % 64])
+                )
                 ended = [0]
 
                 def step(env=env, actions=actions, ended=ended) -> None:
@@ -68,7 +72,7 @@ def vector(seconds: float, count: int) -> None:
 def faces(seconds: float) -> None:
     """Print the rates of every task, effect and output with random actions; episodes that end begin anew within."""
     random = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 4096, 1)).astype(np.float32)
-    at = iter(range(10**9))
+    counter = iter(range(10**9))
     print("\nrandom actions, resets included: environments: env steps/s")
     rows: list[tuple[str, dict[str, object], tuple[int, ...]]] = [
         (task, {"task": task}, (1, 1024, 4096)) for task in ("ring", "follow", "platoon", "replay")
@@ -76,20 +80,20 @@ def faces(seconds: float) -> None:
     rows += [("ring, torch output", {"output": "torch"}, (256, 1024))]
     rows += [(f"ring, {name}", {"effects": [name]}, (1024,)) for name in CANDIDATES if rings(name)]
     for name, keywords, counts in rows:
-        found = []
+        cells = []
         for count in counts:
             if count == 1:
-                step = turning(gym.make("DiffIDM-v0", **keywords), lambda: random[next(at) % 64, 0])
+                step = turning(gym.make("DiffIDM-v0", **keywords), lambda: random[next(counter) % 64, 0])
             else:
                 env = gym.make_vec("DiffIDM-v0", num_envs=count, **keywords)
                 env.reset(seed=0)
 
                 def step(env=env, count=count) -> None:
-                    env.step(random[next(at) % 64, :count])
+                    env.step(random[next(counter) % 64, :count])
 
             step()
-            found.append(f"{count}: {rate(step, seconds) * count:12,.0f}")
-        print(f"  {name:32s} {'   '.join(found)}", flush=True)
+            cells.append(f"{count}: {rate(step, seconds) * count:12,.0f}")
+        print(f"  {name:32s} {'   '.join(cells)}", flush=True)
 
 
 def rings(effect: str) -> bool:
@@ -152,7 +156,7 @@ def write_returns(tasks: list[str], out: Path) -> None:
             return train_apg.returns(task, act, [*seeds] * len(rules)).view(len(rules), -1)
 
         best = searched(of)
-        found = {
+        by_policy = {
             "zero action": train_apg.returns(task, lambda seen, shape=shape: torch.zeros(len(seen), *shape), JUDGED_ON),
             "IDM": train_apg.returns(task, None, JUDGED_ON),
             "best rule": of(best.unsqueeze(0), JUDGED_ON)[0],
@@ -160,11 +164,11 @@ def write_returns(tasks: list[str], out: Path) -> None:
         print(f"{task}: v0, T, s0, a, b, share: {', '.join(f'{x:.3g}' for x in best)}")
         if task in train_apg.RECIPES:
             policy = train_apg.trained(task, shown=lambda words: None)
-            found["best agent"] = train_apg.returns(task, policy, JUDGED_ON)
+            by_policy["best agent"] = train_apg.returns(task, policy, JUDGED_ON)
         rows = [row for row in rows if row[0] != task]
-        for name, each in found.items():
+        for name, each in by_policy.items():
             rows.append([task, name, *(f"{x:.1f}" for x in (each.mean(), each.min(), each.max()))])
-        print(f"{task}: {time.process_time() - begin:.0f} CPU s", *rows[-len(found) :], sep="\n  ", flush=True)
+        print(f"{task}: {time.process_time() - begin:.0f} CPU s", *rows[-len(by_policy) :], sep="\n  ", flush=True)
         rows.sort(key=lambda row: list(TASKS).index(row[0]))  # stable: policies stay in their order
         out.write_text("\n".join(["task,policy,mean,lowest,highest", *(",".join(row) for row in rows)]) + "\n")
 

@@ -53,11 +53,11 @@ def benchmark(folder: Path) -> list[dict[str, Any]]:
     base = None
     for objective in ("spacing", "speed"):
         begin = time.process_time()
-        found = fit(training, by="all", objective=objective)  # type: ignore[arg-type]
+        result = fit(training, by="all", objective=objective)  # type: ignore[arg-type]
         rows.append(
-            {"model": f"IDM, fitted on {objective}", **judge(test, found), "cpu_s": time.process_time() - begin}
+            {"model": f"IDM, fitted on {objective}", **judge(test, result), "cpu_s": time.process_time() - begin}
         )
-        base = base or found
+        base = base or result
     assert base is not None
     for name in ("asymmetry", "delay", "leader_acceleration", "speed_dependent_gap"):
         begin = time.process_time()
@@ -66,11 +66,11 @@ def benchmark(folder: Path) -> list[dict[str, Any]]:
         simulator = Simulator(Lane(), (IDM(), Replay(), Brakes(), effect))
         first = torch.tensor([[(*effect.parameters[0].starts, 0.0)[0]]], dtype=torch.float64)
         start = (torch.cat((base.own, first), dim=-1), base.shared)
-        found = fit(
+        result = fit(
             training, by="all", simulator=simulator, free=(*IDM_NAMES, strength), start=start, substeps=1, iterations=15
         )
-        value = f"{strength} = {found.own[0, -1].item():.3f} {effect.parameters[0].unit}"
-        rows.append({"model": f"IDM + {value}", **judge(test, found), "cpu_s": time.process_time() - begin})
+        value = f"{strength} = {result.own[0, -1].item():.3f} {effect.parameters[0].unit}"
+        rows.append({"model": f"IDM + {value}", **judge(test, result), "cpu_s": time.process_time() - begin})
     return rows
 
 
@@ -78,20 +78,20 @@ def all_pairs(folder: Path) -> dict[str, Any]:
     """Fit every driver of all 228 pairs by Levenberg-Marquardt, from four starts each."""
     items = episodes(load(folder / "ngsim_i80_pairs.parquet"), max_gap=None)
     cpu, wall = time.process_time(), time.perf_counter()
-    found = fit(items, by="driver")
+    result = fit(items, by="driver")
     used = {"cpu_s": time.process_time() - cpu, "wall_s": time.perf_counter() - wall}
-    error, _ = errors(found.problem, found.own, found.shared)
-    return {"drivers": len(items), **used, **error.summary(), "converged": int(found.converged.sum())}
+    error, _ = errors(result.problem, result.own, result.shared)
+    return {"drivers": len(items), **used, **error.summary(), "converged": int(result.converged.sum())}
 
 
 def recovery() -> list[dict[str, Any]]:
     """Fifty generated drivers of 120 s with 5 cm of position noise: errors and coverage of the 95 % intervals."""
     trajectories, truth = synthetic.generate(17, runs=10, followers=5, seconds=120.0, noise=0.05)
-    found = fit(episodes(trajectories, max_gap=None, smooth=True), loss="mse")
+    result = fit(episodes(trajectories, max_gap=None, smooth=True), loss="mse")
     drivers = {f"{r['run_id']}/{r['vehicle_id']}": r for r in truth.drivers.to_dicts()}
-    values = np.array([[drivers[g][n] for n in NAMES] for g in found.problem.groups])
-    estimate, error = found.values().numpy(), found.uncertainty.standard_error.numpy()
-    identified = found.uncertainty.identified.numpy()
+    values = np.array([[drivers[g][n] for n in NAMES] for g in result.problem.groups])
+    estimate, error = result.values().numpy(), result.uncertainty.standard_error.numpy()
+    identified = result.uncertainty.identified.numpy()
     return [
         {
             "parameter": name,

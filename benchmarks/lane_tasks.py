@@ -77,13 +77,13 @@ class Seen:
 
     def idm(self, v0: Tensor, headway: Tensor, s0: Tensor, a: Tensor, b: Tensor) -> Tensor:
         """Return the action of IDM drivers with these numbers, behind whom they see ahead on their lane."""
-        there, ahead, left, faster = (torch.stack(each, -1) for each in self._nearby)
-        way = torch.where((there > 0.5) & (left.round() == 0) & (ahead > 0.0), ahead, torch.inf)
+        presence, ahead, left, faster = (torch.stack(each, -1) for each in self._nearby)
+        way = torch.where((presence > 0.5) & (left.round() == 0) & (ahead > 0.0), ahead, torch.inf)
         gap, first = way.min(-1)
         closing = torch.where(gap.isfinite(), -faster.gather(-1, first.unsqueeze(-1)).squeeze(-1), 0.0)
         driver = Driver(a, b, headway, s0, v0)
-        kept = interaction(driver, self.speed, gap - self._length, self.speed - closing)
-        return (a * (1.0 - (self.speed / v0) ** 4 - kept) / self.limit).clamp(-1.0, 1.0)
+        brake = interaction(driver, self.speed, gap - self._length, self.speed - closing)
+        return (a * (1.0 - (self.speed / v0) ** 4 - brake) / self.limit).clamp(-1.0, 1.0)
 
     def towards(self, target: Tensor) -> Tensor:
         """Return the action that reaches a speed (m/s) within 2 s."""
@@ -207,8 +207,8 @@ def rows_of(given: Mapping[str, Any], policies: Sequence[Path]) -> dict[str, Fou
         row("that advice, all vehicles", judged({**given, "controlled": "all"}, lambda task, n: glosa(task)))
     task = episodes_start(given, 1).task
     assert isinstance(task, OpenLanesTask)
-    drawn = torch.rand(DRAWS, task.road.count, 2, generator=generator)
-    places = torch.stack((4.0 + 24.0 * drawn[..., 0], 200.0 + 500.0 * drawn[..., 1]), -1)
+    numbers_of_rules = torch.rand(DRAWS, task.road.count, 2, generator=generator)
+    places = torch.stack((4.0 + 24.0 * numbers_of_rules[..., 0], 200.0 + 500.0 * numbers_of_rules[..., 1]), -1)
     place = searched(given, places, by_place)
     row("speed by lane and place", judged(given, lambda task, n: by_place(task, place, n)))
     everybody = {**given, "controlled": "all"}

@@ -104,12 +104,12 @@ def _net(ring: float) -> str:
         )
         parts.append(f'<edge id="{name}" from="{begin}" to="{end}" priority="1">{lanes}</edge>')
     none = "0" * LANES
-    asked = "".join(f'<request index="{k}" response="{none}" foes="{none}" cont="0"/>' for k in range(LANES))
+    requests = "".join(f'<request index="{k}" response="{none}" foes="{none}" cont="0"/>' for k in range(LANES))
     for name, edge in (("w", "a"), ("e", "b")):
         incoming = " ".join(f"{edge}_{k}" for k in range(LANES))
         parts.append(
             f'<junction id="{name}" type="priority" x="0" y="0" incLanes="{incoming}" intLanes="" '
-            f'shape="0,0 0,1 1,1">{asked}</junction>'
+            f'shape="0,0 0,1 1,1">{requests}</junction>'
         )
     for first, second in (("a", "b"), ("b", "a")):
         parts += [
@@ -134,11 +134,11 @@ def _routes(each: int, ring: float, pace: float, model: str) -> str:
     types, cars = [], []
     for i, top in enumerate(desired):
         place = (i // LANES) * ring * LANES / each
-        edge, at = ("a", place) if place < 0.5 * ring else ("b", place - 0.5 * ring)
+        edge, position = ("a", place) if place < 0.5 * ring else ("b", place - 0.5 * ring)
         types.append(vehicle_type(i, top, model=model))
         cars.append(
             f'<vehicle id="v{i}" type="t{i}" route="{edge}" depart="0" departLane="{i % LANES}" '
-            f'departPos="{at:.2f}" departSpeed="{pace:.2f}" insertionChecks="none"/>'
+            f'departPos="{position:.2f}" departSpeed="{pace:.2f}" insertionChecks="none"/>'
         )
     loops = f'<route id="a" edges="{"a b " * 300}"/><route id="b" edges="{"b a " * 300}"/>'
     return f"<routes>{loops}{''.join(types)}{''.join(cars)}</routes>"
@@ -212,26 +212,26 @@ def speed(part: tyro.conf.Positional[Literal["all", "rollouts", "highway"]] = "a
     console = Console()
     if part != "highway":
         peer = sumo(EACH, 15.0, 30.0)
-        beside = None if peer is None else peer[2]
-        told = Table("", "vehicles", "forward", "× SUMO", "forward + backward", "changes /vehicle/h",
+        peer_rate = None if peer is None else peer[2]
+        rows_of_table = Table("", "vehicles", "forward", "× SUMO", "forward + backward", "changes /vehicle/h",
                      title="Million updates per CPU second: 4 lanes, MOBIL at 1 Hz, Δt 0.1 s, 15 /km/lane")  # fmt: skip
         for dtype in (torch.float32, torch.float64):
             for size in SIZES:
                 forward, both, rate = rollouts(size, dtype)
-                ratio = "" if beside is None else f"{forward / beside:.0f}"
+                ratio = "" if peer_rate is None else f"{forward / peer_rate:.0f}"
                 name = str(dtype).removeprefix("torch.")
-                told.add_row(name, f"{size:,}", f"{forward:.1f}", ratio, f"{both:.1f}", f"{rate:.0f}")
-        told.add_row("SUMO", f"{EACH:,}", "not installed" if peer is None else f"{peer[2]:.2f}", "1", "", "")
-        console.print(told)
+                rows_of_table.add_row(name, f"{size:,}", f"{forward:.1f}", ratio, f"{both:.1f}", f"{rate:.0f}")
+        rows_of_table.add_row("SUMO", f"{EACH:,}", "not installed" if peer is None else f"{peer[2]:.2f}", "1", "", "")
+        console.print(rows_of_table)
     if part != "rollouts":
         single, peer_steps, vector = our_highway(1, 3.0), their_highway(8.0), our_highway(1024, 4.0)
         ratio = "" if peer_steps is None else f", {single / peer_steps:.0f} ×"
-        told = Table("", "env steps per CPU s", title="Task highway, 4 lanes")
-        told.add_row("vector of 1024, 50 vehicles", f"{vector:,.0f}")
-        told.add_row("single gym.make, 51 vehicles", f"{single:,.0f}{ratio}")
+        rows_of_table = Table("", "env steps per CPU s", title="Task highway, 4 lanes")
+        rows_of_table.add_row("vector of 1024, 50 vehicles", f"{vector:,.0f}")
+        rows_of_table.add_row("single gym.make, 51 vehicles", f"{single:,.0f}{ratio}")
         other = "not installed" if peer_steps is None else f"{peer_steps:.1f}"
-        told.add_row("HighwayEnv highway-fast-v0, 51 vehicles", other)
-        console.print(told)
+        rows_of_table.add_row("HighwayEnv highway-fast-v0, 51 vehicles", other)
+        console.print(rows_of_table)
 
 
 DENSITIES = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0)
@@ -301,8 +301,8 @@ def drive(part: Part, on_progress: OnProgress) -> tuple[float, float] | None:
         return our_flow(density)
     if who == "HighwayEnv":
         return their_flow(density)
-    found = sumo(200, density, SECONDS, who.removeprefix("SUMO "))
-    return None if found is None else found[:2]
+    result = sumo(200, density, SECONDS, who.removeprefix("SUMO "))
+    return None if result is None else result[:2]
 
 
 Rows = dict[str, dict[float, tuple[float, float] | None]]
@@ -312,11 +312,11 @@ def picture(found: Rows, path: Path) -> None:
     """Draw flow and change rate over density."""
     figure, axes = page.figure(1, 2, size=(9.0, 3.4))
     for name, colour in zip(WHO, ("#1e5adc", "#d1495b", "#e8a33d", "#6a6f78"), strict=True):
-        known = [(d, row) for d, row in found[name].items() if row is not None]
-        if known:
-            at = [d for d, _ in known]
-            axes[0, 0].plot(at, [v * d * 3.6 for d, (v, _) in known], "o-", ms=4, color=colour, label=name)
-            axes[0, 1].plot(at, [rate for _, (_, rate) in known], "o-", ms=4, color=colour, label=name)
+        points = [(d, row) for d, row in found[name].items() if row is not None]
+        if points:
+            densities = [d for d, _ in points]
+            axes[0, 0].plot(densities, [v * d * 3.6 for d, (v, _) in points], "o-", ms=4, color=colour, label=name)
+            axes[0, 1].plot(densities, [rate for _, (_, rate) in points], "o-", ms=4, color=colour, label=name)
     axes[0, 0].set(xlabel="density (vehicles/km/lane)", ylabel="flow (vehicles/h/lane)", ylim=(0, None))
     axes[0, 1].set(xlabel="density (vehicles/km/lane)", ylabel="changes per vehicle and hour", ylim=(0, None))
     axes[0, 0].legend(frameon=False, fontsize=8)
@@ -335,14 +335,14 @@ def flow(path: Path = Path("out/lanes-flow.png"), place: Place = HERE) -> None:
     """
     parts = {f"{name} at {density:g} /km/lane": Part(name, density) for name in WHO for density in DENSITIES}
     driven = named_rows(drive, parts, KEPT, place)
-    found: Rows = {name: {d: driven[f"{name} at {d:g} /km/lane"] for d in DENSITIES} for name in WHO}
+    rates: Rows = {name: {d: driven[f"{name} at {d:g} /km/lane"] for d in DENSITIES} for name in WHO}
     rows = []
     for density in DENSITIES:
-        cells = (found[name][density] for name in WHO)
+        cells = (rates[name][density] for name in WHO)
         texts = ("not installed" if x is None else f"{x[0] * density * 3.6:.0f}, {x[1]:.0f}" for x in cells)
         rows.append([f"{density:g}", *texts])
     print(table(("per km and lane", *(f"{name}: flow, changes" for name in WHO)), rows))
-    picture(found, path)
+    picture(rates, path)
     print(f"Picture: {path}; rows are kept in {KEPT}, remove it to drive them again.")
 
 
@@ -387,46 +387,46 @@ def world(kind: str, seed: int, rows: int, each: int, dtype: torch.dtype) -> tup
         pace = torch.full_like(place, 6.0)
         return simulator, simulator.state(place.to(dtype), pace, params, lane=index % count, length=4.0), params
     flows = {k: 300.0 + 2200.0 * float(torch.rand((), generator=draw)) for k in range(count - (kind == "ramps"))}
-    given = demand.trips(flows, 3600.0, speed=20.0, slots=each // 3, dtype=dtype)  # fewer find room there
-    n = len(given.departs)  # lanes share the slots, rounded down
+    trips = demand.trips(flows, 3600.0, speed=20.0, slots=each // 3, dtype=dtype)  # fewer find room there
+    n = len(trips.departs)  # lanes share the slots, rounded down
     params["idm"] = {name: x[..., :n] if x.dim() else x for name, x in params["idm"].items()}
-    return simulator, demand.waiting(simulator, demand.spread(given, (rows, n)), params), params
+    return simulator, demand.waiting(simulator, demand.spread(trips, (rows, n)), params), params
 
 
 def broken(simulator: Simulator, before: State, after: State, kept: Any, params: Params) -> Counts:
     """Return what happened between two decisions, and how often each law was broken."""
-    links, was, found = after.links, before.links, Counts()
+    links, was, counts = after.links, before.links, Counts()
     assert links is not None and was is not None
     own = torch.arange(after.speed.shape[-1])
-    there = torch.ones_like(after.speed, dtype=torch.bool) if after.present is None else after.present > 0
+    on_road = torch.ones_like(after.speed, dtype=torch.bool) if after.present is None else after.present > 0
     assert before.links is not None
     # Somebody alone on a ring follows himself, and has the ring as his gap.
-    found["overlaps"] = int(((kept.gap <= 0) & there).any(0).sum())
+    counts["overlaps"] = int(((kept.gap <= 0) & on_road).any(0).sum())
     inverse = (links.follower.gather(-1, links.leader) == own) | (links.leader == own)
-    found["links not inverse"] = int((~inverse & there).sum())
+    counts["links not inverse"] = int((~inverse & on_road).sum())
     lanes = links.lane.gather(-1, links.leader) == links.lane
-    found["leaders in another lane"] = int((~lanes & there).sum())
+    counts["leaders in another lane"] = int((~lanes & on_road).sum())
     fresh = simulator.road.view(after).gaps(after.position, after.length)
-    near = there & (after.gap < 5e3)
+    near = on_road & (after.gap < 5e3)
     slack = 1e-6 if after.gap.dtype == torch.float64 else 0.5
-    found["gaps that positions deny"] = int(((after.gap - fresh).abs() > slack)[near].sum())
-    stays = there if before.present is None else there & (before.present > 0)
+    counts["gaps that positions deny"] = int(((after.gap - fresh).abs() > slack)[near].sum())
+    stays = on_road if before.present is None else on_road & (before.present > 0)
     if after.trips is not None and before.trips is not None:
         stays = stays & (after.trips.entered == before.trips.entered)
         due, inside, left, queued = demand.counts(simulator, after)
         gone = (after.trips.entered - after.trips.left).sum(-1) != inside
-        found["vehicles lost"] = int(((due != inside + left + queued) | (queued < 0) | gone).sum())
-        found["entered"] = int((after.trips.entered - before.trips.entered).sum())
-        found["left"] = int((after.trips.left - before.trips.left).sum())
+        counts["vehicles lost"] = int(((due != inside + left + queued) | (queued < 0) | gone).sum())
+        counts["entered"] = int((after.trips.entered - before.trips.entered).sum())
+        counts["left"] = int((after.trips.left - before.trips.left).sum())
     moved = (after.position - before.position)[stays]
-    found["moved too far"] = int(((moved < -1e-3) | (moved > 60.0 * DT * EVERY)).sum())
+    counts["moved too far"] = int(((moved < -1e-3) | (moved > 60.0 * DT * EVERY)).sum())
     for name in ("changed", "refused", "blocked", "unjudged"):
-        found[name] = int((getattr(links, name) - getattr(was, name)).sum())
+        counts[name] = int((getattr(links, name) - getattr(was, name)).sum())
     unasked = ((links.unjudged - was.unjudged) > 0) & (links.follower != own)
     braking = kept.accel[0].gather(-1, links.follower)
-    found["unjudged who brake harder than is safe"] = int((unasked & (braking < -params["mobil"]["safe_decel"])).sum())
-    found["vehicle-steps"] = EVERY * int(there.sum())
-    return found
+    counts["unjudged who brake harder than is safe"] = int((unasked & (braking < -params["mobil"]["safe_decel"])).sum())
+    counts["vehicle-steps"] = EVERY * int(on_road.sum())
+    return counts
 
 
 def driven(kind: str, seed: int, rows: int, each: int, decisions: int) -> Iterator[Counts]:
@@ -439,8 +439,8 @@ def driven(kind: str, seed: int, rows: int, each: int, decisions: int) -> Iterat
         side = torch.randint(-1, 2, state.speed.shape, generator=draw)
         command = torch.where(some, side.to(dtype), torch.nan).expand(EVERY, *state.speed.shape)
         before = state
-        state, kept = simulator.rollout(state, {"lane_command": command}, params, EVERY)
-        yield broken(simulator, before, state, kept, params)
+        state, motion = simulator.rollout(state, {"lane_command": command}, params, EVERY)
+        yield broken(simulator, before, state, motion, params)
 
 
 LAWS = (
@@ -453,16 +453,18 @@ def check(
     steps: float, on_progress: OnProgress, *, rows: int = 32, each: int = 400, decisions: int = 300
 ) -> dict[str, Counts]:
     """Return what happened in at least so many vehicle-steps, a third of them on each kind of road."""
-    found, seed, share = {kind: Counts() for kind in ROADS}, 0, int(steps / len(ROADS))
+    by_road, seed, share = {kind: Counts() for kind in ROADS}, 0, int(steps / len(ROADS))
     for kind in ROADS:
-        while found[kind]["vehicle-steps"] < share:
+        while by_road[kind]["vehicle-steps"] < share:
             for counts in driven(kind, seed, rows, each, decisions):
-                found[kind].update(counts)
-                words = ", ".join(f"{found[kind][law]} {law}" for law in LAWS if found[kind][law]) or "no law broken"
-                on_progress(kind, min(found[kind]["vehicle-steps"], share), share, words)
+                by_road[kind].update(counts)
+                words = (
+                    ", ".join(f"{by_road[kind][law]} {law}" for law in LAWS if by_road[kind][law]) or "no law broken"
+                )
+                on_progress(kind, min(by_road[kind]["vehicle-steps"], share), share, words)
             seed += 1
-            found[kind]["worlds"] += rows
-    return found
+            by_road[kind]["worlds"] += rows
+    return by_road
 
 
 def counted(found: dict[str, Counts]) -> str:
@@ -503,13 +505,13 @@ def stood(task: OpenLanesTask, rows: int = 8, seconds: int = 600) -> Stood:
     longest, merged, hard, touched = now, 0, 0, 0
     for _ in range(seconds):
         before = state
-        state, kept = simulator.rollout(state, {}, params, round(1.0 / simulator.dt))
+        state, motion = simulator.rollout(state, {}, params, round(1.0 / simulator.dt))
         assert before.links and state.links and before.trips and state.trips and state.present is not None
         same = (state.present > 0) & (state.trips.entered == before.trips.entered)
         now = torch.where(same & (state.speed < 0.5), now + 1.0, 0.0)
         longest = torch.maximum(longest, now)
-        hard += int((same & (kept.accel < -6.0).any(0)).sum())
-        touched += int((same & (kept.gap <= 0.0).any(0)).sum())
+        hard += int((same & (motion.accel < -6.0).any(0)).sum())
+        touched += int((same & (motion.gap <= 0.0).any(0)).sum())
         merged += int((same & (before.links.lane == 0) & (state.links.lane != 0)).sum())
     assert state.trips is not None
     hourly = 3600.0 / seconds / rows
@@ -523,11 +525,11 @@ def standing() -> None:
     head = ("", "drivers", "longest stand in each of 8 × 600 s (s)", "from lane 0, vehicles/h", "out, vehicles/h",
             "hard brakings, s", "touched, s")  # fmt: skip
     rows = []
-    for name, (kind, given) in DEMANDS.items():
+    for name, (kind, keywords) in DEMANDS.items():
         for drivers, changed in zip(("without", "as they come"), BEFORE, strict=True):
-            found = stood(kind(parameters=changed, **given))
-            each = ", ".join(f"{x:.0f}" for x in found.longest)
-            rows.append([name, drivers, each, *(f"{x:.0f}" for x in found[1:])])
+            episodes = stood(kind(parameters=changed, **keywords))
+            each = ", ".join(f"{x:.0f}" for x in episodes.longest)
+            rows.append([name, drivers, each, *(f"{x:.0f}" for x in episodes[1:])])
     print(table(head, rows))
 
 
@@ -540,8 +542,8 @@ def laws(steps: tyro.conf.Positional[float] = 1e9) -> None:
     if not 1000.0 <= steps < math.inf:
         raise SystemExit(f"error: {steps:g} vehicle-steps are no number of 1000 or more. Usual is 1e9.")
     with progress.shown(Console(stderr=True)) as on_progress:
-        found = check(steps, on_progress)
-    print(counted(found))
+        by_road = check(steps, on_progress)
+    print(counted(by_road))
 
 
 main = {"speed": speed, "flow": flow, "standing": standing, "laws": laws}

@@ -39,8 +39,8 @@ class Found(NamedTuple):
 
 def drivers(flow: float) -> tuple[trip_table.TripTable, list[float]]:
     """Return departures and desired speeds (m/s)."""
-    made = trip_table.table(dict.fromkeys(range(LANES), flow), SECONDS, seed=1, speed=22.0, classes={"truck": 0.2})
-    table = trip_table.read(made)
+    columns = trip_table.table(dict.fromkeys(range(LANES), flow), SECONDS, seed=1, speed=22.0, classes={"truck": 0.2})
+    table = trip_table.read(columns)
     share = torch.rand(len(table.kind), generator=torch.Generator().manual_seed(2)).tolist()
     return table, [22.0 + 2.0 * x if kind else 27.0 + 9.0 * x for kind, x in zip(table.kind, share, strict=True)]
 
@@ -55,15 +55,15 @@ def ours(flow: float, keep_right: float) -> Found:
     params["mobil"]["keep_right"] = torch.tensor(keep_right)
     lengths = torch.tensor([TRUCK if kind else 5.0 for kind in table.kind])
     state = demand.waiting(simulator, table.trips(), params, length=lengths)
-    counted, there, way = 0, 0, 0.0
+    counted, count, way = 0, 0, 0.0
     for second in range(int(SECONDS)):
         before, (state, _) = state, simulator.rollout(state, {}, params, round(1.0 / DT), keep=None)
         assert state.links is not None and before.links is not None and state.present is not None
         inside = (state.present > 0) & (state.position > FIRST) & (state.position < LAST)
         if second >= SECONDS - COUNTED:
             counted += int((inside & (state.links.changed > before.links.changed)).sum())
-            there, way = there + int(inside.sum()), way + float(state.speed[inside].sum())
-    return found(counted, there, way)
+            count, way = count + int(inside.sum()), way + float(state.speed[inside].sum())
+    return found(counted, count, way)
 
 
 def found(counted: int, there: int, way: float) -> Found:
@@ -85,7 +85,7 @@ def sumo(flow: float) -> Found | None:
             f'departSpeed="{speed}"/>'
         )
     net = straight(LENGTH, 60.0, lanes=LANES)
-    counted, there, way, before = 0, 0, 0.0, dict[str, int]()
+    counted, count, way, before = 0, 0, 0.0, dict[str, int]()
     with started(net, f"<routes>{''.join(parts)}</routes>", "--step-method.ballistic") as libsumo:
         if libsumo is None:
             return None
@@ -98,9 +98,9 @@ def sumo(flow: float) -> Found | None:
                 inside = FIRST < libsumo.vehicle.getLanePosition(name) < LAST
                 if inside and second >= SECONDS - COUNTED:
                     counted += before.get(name, now[name]) != now[name]
-                    there, way = there + 1, way + libsumo.vehicle.getSpeed(name)
+                    count, way = count + 1, way + libsumo.vehicle.getSpeed(name)
             before = now
-    return found(counted, there, way)
+    return found(counted, count, way)
 
 
 def main() -> None:
@@ -111,8 +111,8 @@ def main() -> None:
         table.add_column(head)
     for flow in FLOWS:
         rows = ours(flow, 0.0), ours(flow, 0.2), sumo(flow)
-        told = ["not installed" if x is None else f"{x.changes:.0f}, {x.density:.1f}, {x.speed:.1f}" for x in rows]
-        table.add_row(f"{flow:.0f}", *told)
+        cells = ["not installed" if x is None else f"{x.changes:.0f}, {x.density:.1f}, {x.speed:.1f}" for x in rows]
+        table.add_row(f"{flow:.0f}", *cells)
     Console(width=140).print(table)
 
 

@@ -31,9 +31,9 @@ def make(folder: Path, drivers: int) -> int:
     for number in range(count):
         path = folder / f"{number:05d}.parquet"
         if not path.exists():
-            made, _ = synthetic.generate(number, runs=RUNS, followers=FOLLOWERS, seconds=SECONDS)
-            run = made.table["run_id"].cast(int) + number * RUNS
-            made.table.drop("gap_m", "gap_measured").with_columns(run.alias("run_id")).write_parquet(path)
+            trajectories, _ = synthetic.generate(number, runs=RUNS, followers=FOLLOWERS, seconds=SECONDS)
+            run = trajectories.table["run_id"].cast(int) + number * RUNS
+            trajectories.table.drop("gap_m", "gap_measured").with_columns(run.alias("run_id")).write_parquet(path)
     return count * FOLLOWERS * RUNS
 
 

@@ -35,20 +35,20 @@ def cases(folder: Path) -> dict[str, dict[str, Any]]:
     followers = table.filter(pl.col("leader_id").is_not_null())
     runs = followers.group_by("vehicle_name").agg(pl.col("run_id").n_unique()).sort("vehicle_name")
     models = [name for name, number in runs.rows() if number >= FEWEST_RUNS]
-    found: dict[str, dict[str, Any]] = {
+    by_name: dict[str, dict[str, Any]] = {
         "I-80 pairs": {"file": "ngsim_i80_pairs.parquet"},
         "ZalaZone, all": zalazone,
         "ZalaZone, all, grade known": {**zalazone, "known": ("grade",)},
     }
     for name in models:
         part = {**zalazone, "where": [*zalazone["where"], f"vehicle_name={name}"]}
-        found[f"ZalaZone, {name}"] = part
-        found[f"ZalaZone, {name}, grade known"] = {**part, "known": ("grade",)}
-    found["TGSIM"] = {"file": "tgsim_pairs.parquet"}
-    found["AstaZero, ACC"] = {"file": "openacc_astazero.parquet", "where": ["acc_run=ACC"]}
-    found["AstaZero, all"] = {"file": "openacc_astazero.parquet"}
-    found["I-80 lanes"] = {"file": "ngsim_i80_lanes.parquet"}
-    return found
+        by_name[f"ZalaZone, {name}"] = part
+        by_name[f"ZalaZone, {name}, grade known"] = {**part, "known": ("grade",)}
+    by_name["TGSIM"] = {"file": "tgsim_pairs.parquet"}
+    by_name["AstaZero, ACC"] = {"file": "openacc_astazero.parquet", "where": ["acc_run=ACC"]}
+    by_name["AstaZero, all"] = {"file": "openacc_astazero.parquet"}
+    by_name["I-80 lanes"] = {"file": "ngsim_i80_lanes.parquet"}
+    return by_name
 
 
 def run(folder: Path, case: dict[str, Any]) -> Discovery:
@@ -63,8 +63,8 @@ def timed(part: tuple[str, Path, dict[str, Any]], _: OnProgress = silent) -> dic
     """Return the row of a case (name, folder of the data, case)."""
     name, folder, case = part
     begin = time.process_time()
-    found = run(folder, case)
-    return row(name, found, time.process_time() - begin)
+    discovery = run(folder, case)
+    return row(name, discovery, time.process_time() - begin)
 
 
 def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
@@ -117,8 +117,8 @@ def said(r: dict[str, Any]) -> str:
     words += f": {', '.join(names)}" if names else f"; nearest {r['partial']['effect']}" if r["partial"] else ""
     for k in r["known"]:
         if k["effect"] == "grade":
-            at, low, high = (-9.81 * k[name] for name in ("estimate", "high", "low"))
-            words += f"; grade acts by {at:.1f} ({low:.1f} … {high:.1f}) m/s²"
+            gain, low, high = (-9.81 * k[name] for name in ("estimate", "high", "low"))
+            words += f"; grade acts by {gain:.1f} ({low:.1f} … {high:.1f}) m/s²"
     return words
 
 

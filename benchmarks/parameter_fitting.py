@@ -79,8 +79,8 @@ def cma(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) -> 
         np.zeros(len(problem.free)), 0.5, {"bounds": [-1.0, 1.0], "seed": seed + 1, "verbose": -9}
     )
     while True:
-        asked = search.ask()
-        search.tell(asked, [judge(x) for x in asked])
+        guesses_of_turn = search.ask()
+        search.tell(guesses_of_turn, [judge(x) for x in guesses_of_turn])
 
 
 def evolution(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) -> None:

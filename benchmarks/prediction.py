@@ -51,16 +51,16 @@ class Known:
 
 def known_agents(scenario: Scenario, _: OnProgress = silent) -> list[Known]:
     """Return the agents of a scene that are valid at the present and at ``LEAST_S``."""
-    scene, found = MapScene(scenario), []
+    scene, agents = MapScene(scenario), []
     for index, agent in enumerate(scenario.agents):
-        known = agent.valid[scenario.present] and agent.valid[scenario.present + 10 * LEAST_S]
-        if known:
+        is_valid = agent.valid[scenario.present] and agent.valid[scenario.present + 10 * LEAST_S]
+        if is_valid:
             one = mixture(scene, index)
             case = case_of(scenario, chosen(scene, one))
             hit = seen(case, one.futures, one.weights)
             assert hit is not None
-            found.append(Known(scene, one, hit))
-    return found
+            agents.append(Known(scene, one, hit))
+    return agents
 
 
 def held_out(scenes: Sequence[Sequence[Known]]) -> list[tuple[Known, Shares]]:
@@ -86,10 +86,10 @@ def show(title: str, rows: dict[str, list[Score]]) -> None:
 
 def compared(agents: Iterable[tuple[Known, Shares]], methods: Sequence[str]) -> dict[str, list[Score]]:
     """Return scores by method; ours with the shares that are held out."""
-    kept = list(agents)
+    pairs = list(agents)
     single: dict[str, Callable[[MapScene, int], Prediction]] = {n: m for n, m in METHODS.items() if n in methods}
-    return {OURS: [one.scored(chosen(one.scene, one.mixture, shares)) for one, shares in kept]} | {
-        name: [one.scored(method(one.scene, one.mixture.agent)) for one, _ in kept] for name, method in single.items()
+    return {OURS: [one.scored(chosen(one.scene, one.mixture, shares)) for one, shares in pairs]} | {
+        name: [one.scored(method(one.scene, one.mixture.agent)) for one, _ in pairs] for name, method in single.items()
     }
 
 
@@ -112,11 +112,11 @@ def main(files: tyro.conf.Positional[list[Path]], shares: bool = False, place: P
         return
     spent = (time.perf_counter() - begin) / max(sum(len(scene) for scene in scenes), 1)
     agents = held_out(scenes)
-    wanted = [item for item in agents if item[0].asked_for]
+    to_predict = [item for item in agents if item[0].asked_for]
     singles = [name for name in METHODS if name != OURS]
-    show("all scenes, tracks to predict", compared(wanted, singles))
-    for name in dict.fromkeys(one.scene.scenario.id for one, _ in wanted):
-        here = [item for item in wanted if item[0].scene.scenario.id == name]
+    show("all scenes, tracks to predict", compared(to_predict, singles))
+    for name in dict.fromkeys(one.scene.scenario.id for one, _ in to_predict):
+        here = [item for item in to_predict if item[0].scene.scenario.id == name]
         show(f"scene {name}, tracks to predict", compared(here, singles))
     for group in (None, *SHARES):
         here = [item for item in agents if group in (None, (item[0].seen.kind, item[0].seen.pace))]

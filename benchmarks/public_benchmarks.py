@@ -50,9 +50,9 @@ class RawIDM(IDM):
     def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
         """Return A (m/s²)."""
         brake = 2.0 * torch.sqrt(driver.max_accel * driver.comfort_decel)
-        wanted = driver.min_gap + scene.speed * (driver.time_gap + (scene.speed - scene.leader.speed) / brake)
+        gap = driver.min_gap + scene.speed * (driver.time_gap + (scene.speed - scene.leader.speed) / brake)
         free = (scene.speed / driver.desired_speed) ** p["exponent"]
-        term = (wanted / scene.leader.gap.clamp_min(0.1)) ** 2 * scene.leader.present
+        term = (gap / scene.leader.gap.clamp_min(0.1)) ** 2 * scene.leader.present
         return driver.max_accel * (1.0 - free - term)
 
 
@@ -90,12 +90,12 @@ class Event:
 
 def events(path: Path, order: str) -> list[Event]:
     """Return the events of a tidy file with vehicle 1 ahead of vehicle 2, sorted by the column ``order``."""
-    found = []
+    result = []
     for (name,), rows in pl.read_parquet(path).sort("run_id", order).group_by("run_id", maintain_order=True):
         parts = [rows.filter(pl.col("vehicle_id") == k) for k in (1, 2)]
         columns = [part[column].cast(pl.Float64).to_numpy() for part in parts for column in ("position_m", "speed_mps")]
-        found.append(Event(str(name), *columns))
-    return found
+        result.append(Event(str(name), *columns))
+    return result
 
 
 def follow(
@@ -117,13 +117,13 @@ def follow(
     state = sim.state(
         torch.stack([ahead[first], own], -1), torch.stack([pace[first], speed], -1), params, length=0.0
     )  # fmt: skip
-    active, nothing, kept = torch.tensor([True, False]), torch.zeros_like(own), []
+    active, nothing, steps = torch.tensor([True, False]), torch.zeros_like(own), []
     with torch.no_grad():
         for k in range(first + 1, most):
             place, speeds = torch.stack([ahead[k], nothing], -1), torch.stack([pace[k], nothing], -1)
             state = sim.step(state, {"replay": Record(place, speeds, torch.zeros_like(speeds), active)}, params)
-            kept.append(torch.stack([state.position[:, 1], state.speed[:, 1]]))
-    path = torch.stack(kept).numpy()
+            steps.append(torch.stack([state.position[:, 1], state.speed[:, 1]]))
+    path = torch.stack(steps).numpy()
     return [
         (path[: len(e.leader) - first - 1, 0, i], path[: len(e.leader) - first - 1, 1, i]) for i, e in enumerate(items)
     ]
@@ -134,12 +134,12 @@ def opencf(folder: Path) -> dict[str, float]:
     pairs = events(folder / "opencf_test_pairs.parquet", "step")
     values = json.loads((folder / "opencf_published.json").read_text())["parameters"]
     table = pl.read_parquet(folder / "opencf_published_outputs.parquet").sort("run_id", "step")
-    found = {}
+    largest = {}
     for name in BASELINES:
         ours = follow(pairs, values[name], (RawIDM(exponent=None), Clip(-10.0, 5.0)), FIRST)
         theirs = table[f"{name}_position_m"].to_numpy()
-        found[name] = float(np.abs(np.concatenate([position for position, _ in ours]) - theirs).max())
-    return found
+        largest[name] = float(np.abs(np.concatenate([position for position, _ in ours]) - theirs).max())
+    return largest
 
 
 @dataclass(frozen=True)
@@ -183,10 +183,10 @@ def main(data: Path = DATA) -> None:
     for name, apart in opencf(data).items():
         print(f"OpenCF {name}: at most {apart:.1e} m from what was submitted, 500 pairs")
     for title, most in (("whole events", None), (f"first {EVENT_STEPS} steps", EVENT_STEPS)):
-        found = transfollower(data, most=most)
+        error = transfollower(data, most=most)
         print(
-            f"TransFollower NGSIM, its IDM, {title}: {found.total:.2f} (spacing {found.spacing:.2f} m², "
-            f"speed {found.speed:.3f} m²/s²), {found.collisions} collisions"
+            f"TransFollower NGSIM, its IDM, {title}: {error.total:.2f} (spacing {error.spacing:.2f} m², "
+            f"speed {error.speed:.3f} m²/s²), {error.collisions} collisions"
         )
 
 

@@ -57,14 +57,14 @@ def truth_of(frame: pl.DataFrame, with_run: bool) -> Callable[[TrackPiece], Regu
     def motion(track: TrackPiece) -> RegularMotion:
         part = parts[(track.run_id, track.vehicle_id) if with_run else (track.vehicle_id,)]
         clock = clock_of(track, 0.1)
-        known = part["time_s"].to_numpy()
-        at = np.clip(np.searchsorted(known, clock - 0.05), 0, len(known) - 1)
-        there = np.abs(known[at] - clock) < 0.051
+        times = part["time_s"].to_numpy()
+        index = np.clip(np.searchsorted(times, clock - 0.05), 0, len(times) - 1)
+        near = np.abs(times[index] - clock) < 0.051
         position, speed, accel = (part[name].to_numpy() for name in ("position_m", "speed_mps", "accel_mps2"))
         if not np.isfinite(accel).any():
-            accel = np.gradient(speed, known)  # of Doppler speeds, in files without accelerations
-        columns = (column[at] for column in (position, speed, accel))
-        return RegularMotion(clock, *(np.where(there, column, np.nan) for column in columns))
+            accel = np.gradient(speed, times)  # of Doppler speeds, in files without accelerations
+        columns = (column[index] for column in (position, speed, accel))
+        return RegularMotion(clock, *(np.where(near, column, np.nan) for column in columns))
 
     return motion
 
@@ -109,12 +109,12 @@ def best_of(
     for choice in baselines.BASELINES[name][1]:
         whole = {**choice, **(given or {})}
         rows.append((whole, score(tuned, _motions(name, tuned, whole), truth, ends)))
-    found: dict[tuple, list[str]] = {}
+    by_choice: dict[tuple, list[str]] = {}
     for what in ("speed_rmse_mps", "accel_rmse_mps2"):
         choice, _ = min(rows, key=lambda row: row[1][what])
-        found.setdefault(tuple(choice.items()), []).append(what[:5])
+        by_choice.setdefault(tuple(choice.items()), []).append(what[:5])
     lines = []
-    for choice, what in found.items():
+    for choice, what in by_choice.items():
         note = ", ".join(f"{key} {value:g}" for key, value in choice)
         row = score(scored, _motions(name, scored, dict(choice)), truth, ends)
         lines.append(line(name, row, f"{note} for {' and '.join(what)}" if note else ""))
@@ -142,7 +142,7 @@ def filtering(part: tuple[Path, int], _: OnProgress = silent) -> str:
     tuned, scored = (first, second) if number == 1 else (second, first)
     noise = fit_noise([(t.time_s, t.position_m) for t in tuned], 0.1)
     ours = recipe(scored, 0.1, noise)
-    published = [found.motion for found in paper.imitate(scored)]
+    published = [result.motion for result in paper.imitate(scored)]
     lines = []
     for ends in ENDS_S:
         counts = f"half {number}: tuned on {len(tuned)} tracks, scored on the other {len(scored)}"
@@ -156,12 +156,12 @@ def filtering(part: tuple[Path, int], _: OnProgress = silent) -> str:
 
 
 def thinned(track: TrackPiece, seconds: float) -> TrackPiece:
-    kept, following = [], track.time_s[0]
+    indices, following = [], track.time_s[0]
     for i, now in enumerate(track.time_s):
         if now >= following - 1e-6:
-            kept.append(i)
+            indices.append(i)
             following = now + seconds
-    return track.part(np.array(kept))
+    return track.part(np.array(indices))
 
 
 def reconstruction(part: tuple[Path, str, float], _: OnProgress = silent) -> str:
@@ -182,21 +182,21 @@ def reconstruction(part: tuple[Path, str, float], _: OnProgress = silent) -> str
     ours = recipe(scored, 0.1, noise, SPARSE)
     lines.append(line("ours", score(scored, [f.motion for f in ours], truth)))
     for fixed in (False, True):
-        found = paper.imitate(scored, paper.RECONSTRUCT_STEP_S, fixed_parameters=fixed)
-        steps = [one.motion for one in found]
+        imitation = paper.imitate(scored, paper.RECONSTRUCT_STEP_S, fixed_parameters=fixed)
+        steps = [one.motion for one in imitation]
         dense = [_dense(m, clock_of(t, 0.1)) for m, t in zip(steps, scored, strict=True)]
         lines.append(line("  … parameters fixed" if fixed else "the paper's recipe", score(scored, dense, truth)))
     for name in baselines.available():
-        given = {"sigma": SPARSE_WHITE_M} if name == "Kalman/RTS" else None
-        lines += best_of(name, tuned, scored, truth, given=given)
+        fixed_choice = {"sigma": SPARSE_WHITE_M} if name == "Kalman/RTS" else None
+        lines += best_of(name, tuned, scored, truth, given=fixed_choice)
     return "\n".join(lines)
 
 
 def _dense(motion: RegularMotion, clock: np.ndarray) -> RegularMotion:
     """Return a coarse motion between its steps: positions and speeds by straight lines, accelerations held."""
-    at = np.clip(np.searchsorted(motion.time_s, clock + 1e-9) - 1, 0, len(motion.time_s) - 1)
+    index = np.clip(np.searchsorted(motion.time_s, clock + 1e-9) - 1, 0, len(motion.time_s) - 1)
     position, speed = (np.interp(clock, motion.time_s, x) for x in (motion.position_m, motion.speed_mps))
-    return RegularMotion(clock, position, speed, motion.accel_mps2[at])
+    return RegularMotion(clock, position, speed, motion.accel_mps2[index])
 
 
 def timing(count: int, seconds: float) -> None:
@@ -235,12 +235,12 @@ def timing(count: int, seconds: float) -> None:
 
 def noisy_tracks() -> list[TrackPiece]:
     """Return generated drivers whose positions carry noise correlated over 0.3 s, white noise, and jumps."""
-    made, _ = synthetic.generate(3, runs=2, followers=4, seconds=60.0)
+    trajectories, _ = synthetic.generate(3, runs=2, followers=4, seconds=60.0)
     rng = np.random.default_rng(0)
     tracks = []
     with TemporaryDirectory() as folder:
         path = Path(folder) / "made.parquet"
-        made.table.select("run_id", "vehicle_id", "leader_id", "time_s", "position_m").write_parquet(path)
+        trajectories.table.select("run_id", "vehicle_id", "leader_id", "time_s", "position_m").write_parquet(path)
         table = read_table(path)
     for track in Pieces(table):
         fade, noise = np.exp(-0.1 / 0.3), np.empty(len(track))

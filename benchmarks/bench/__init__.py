@@ -106,8 +106,8 @@ def _all_cores(threads: int, vehicles: int, rounds: int) -> dict[str, Any]:
 
 
 def _lanes(vehicles: int, rounds: int, compiled: bool, verbose: bool, say: Say) -> dict[str, Any]:
-    made = traffic.Traffic(vehicles)
-    why = dispatch.refusal(made.simulator, made.state, {}, made.params)
+    lanes = traffic.Traffic(vehicles)
+    why = dispatch.refusal(lanes.simulator, lanes.state, {}, lanes.params)
     if verbose:
         say(f"{vehicles} vehicles: kernels {'run' if why is None else 'do not run: ' + why}")
     layer = peers.diffidm_layer()
@@ -115,16 +115,16 @@ def _lanes(vehicles: int, rounds: int, compiled: bool, verbose: bool, say: Say) 
     for backward in (False, True):
         kind = "forward+backward" if backward else "forward"
         if layer is not None:
-            cases[f"diffidm {kind}"] = made.theirs(layer, backward)
-        cases[f"eager {kind}"] = made.ours(made.simulator, False, backward)
+            cases[f"diffidm {kind}"] = lanes.theirs(layer, backward)
+        cases[f"eager {kind}"] = lanes.ours(lanes.simulator, False, backward)
         if compiled and vehicles == 200_000:
-            cases[f"compiled {kind}"] = made.ours(made.simulator.compile(), False, backward)
+            cases[f"compiled {kind}"] = lanes.ours(lanes.simulator.compile(), False, backward)
         if why is None:
-            cases[f"kernel {kind}"] = made.ours(made.simulator, True, backward)
+            cases[f"kernel {kind}"] = lanes.ours(lanes.simulator, True, backward)
     if why is None:
-        cases["kernel forward, one step per call"] = made.calls()
+        cases["kernel forward, one step per call"] = lanes.calls()
         if torch.get_num_threads() == 1:
-            cases["reads and writes of one step alone"] = made.moves()
+            cases["reads and writes of one step alone"] = lanes.moves()
     cases["triad"], moved = traffic.triad()
     times = measure(cases, rounds)
     clock = "cpu" if torch.get_num_threads() == 1 else "wall"
@@ -134,11 +134,11 @@ def _lanes(vehicles: int, rounds: int, compiled: bool, verbose: bool, say: Say) 
 
 def _gpu(sizes: Sequence[int], rounds: int) -> dict[str, Any]:
     """Return milliseconds per step of the compiled step on the GPU, by CUDA events."""
-    found: dict[str, Any] = {}
+    fastest: dict[str, Any] = {}
     for vehicles in sizes:
-        made = traffic.Traffic(vehicles, "cuda")
+        lanes = traffic.Traffic(vehicles, "cuda")
         for backward in (False, True):
-            case = made.ours(made.simulator.compile(), False, backward)
+            case = lanes.ours(lanes.simulator.compile(), False, backward)
             case.run()
             times = []
             for _ in range(rounds):
@@ -148,8 +148,8 @@ def _gpu(sizes: Sequence[int], rounds: int) -> dict[str, Any]:
                 end.record()
                 torch.cuda.synchronize()
                 times.append(begin.elapsed_time(end) / case.units)
-            found[f"{vehicles} {'forward+backward' if backward else 'forward'}"] = min(times)
-    return found
+            fastest[f"{vehicles} {'forward+backward' if backward else 'forward'}"] = min(times)
+    return fastest
 
 
 def growth(one_core: dict[str, Any]) -> dict[str, float]:

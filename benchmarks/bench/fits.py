@@ -48,9 +48,9 @@ class Followers:
         self.start = (position[0], speed[0])
         self.inputs = {"replay": Record(position[1:], speed[1:], accel[1:], active)}
         state = self.simulator.state(*self.start, self.params(self.leaf))
-        found = kernels.prepared(self.simulator, state, records, self.inputs, 1)
-        assert not isinstance(found, str), found
-        self.behind = found
+        prepared = kernels.prepared(self.simulator, state, records, self.inputs, 1)
+        assert not isinstance(prepared, str), prepared
+        self.behind = prepared
         ones = torch.ones(steps, drivers)
         self._measured = torch.stack((20.0 * ones, 12.0 * ones)), torch.stack((ones, ones))
 
@@ -68,8 +68,8 @@ class Followers:
             gap, speed = self.behind.simulate(state, params)
         else:
             with dispatch.off("benchmark of the torch path"):
-                _, kept = self.simulator.rollout(state, self.inputs, params, self.steps)
-            gap, speed = kept.gap[..., 1], kept.speed[..., 1]
+                _, motion = self.simulator.rollout(state, self.inputs, params, self.steps)
+            gap, speed = motion.gap[..., 1], motion.speed[..., 1]
         ((gap - 20.0).square().mean() + (speed - 12.0).square().mean()).backward()  # type: ignore[no-untyped-call]
         assert leaf.grad is not None
         return leaf.grad
@@ -116,17 +116,19 @@ def recorded_leaders(rounds: int) -> dict[str, Any]:
 def corrected_models(rounds: int, drivers: int = 600, steps: int = 600) -> dict[str, dict[str, float]]:
     """Return, by added effect, ns per driver and step of normal equations and of a gradient, and times plain IDM."""
     models = {name or "plain": Followers(drivers, steps, *([name] if name else [])) for name in CORRECTIONS}
-    cases = {f"{name} equations": Case(made.equations, drivers * steps / 1e6) for name, made in models.items()}
+    cases = {
+        f"{name} equations": Case(followers.equations, drivers * steps / 1e6) for name, followers in models.items()
+    }
     cases |= {
-        f"{name} gradient": Case(lambda made=made: made.gradient(True), drivers * steps / 1e6)  # type: ignore[misc]
-        for name, made in models.items()
+        f"{name} gradient": Case(lambda followers=followers: followers.gradient(True), drivers * steps / 1e6)  # type: ignore[misc]
+        for name, followers in models.items()
     }
     times = {name: t["cpu_min_ms"] for name, t in measure(cases, rounds).items()}
     return {
         name: {
-            what: found
+            what: value
             for kind in ("equations", "gradient")
-            for what, found in (
+            for what, value in (
                 (f"{kind}_ns", times[f"{name} {kind}"]),
                 (f"{kind}_times_plain", times[f"{name} {kind}"] / times[f"plain {kind}"]),
             )
@@ -181,12 +183,12 @@ def rings(seconds: float = 0.5) -> dict[str, float]:
             count += steps
         return (time.process_time() - begin) / count
 
-    alone = Simulator(Lane(), simulator.effects)
-    line = alone.state(-30.0 * torch.arange(1000.0)[None], torch.full((1, 1000), 10.0), params)
-    line, _ = alone.rollout(line, {}, params, 10, keep=None)
+    lane_simulator = Simulator(Lane(), simulator.effects)
+    line = lane_simulator.state(-30.0 * torch.arange(1000.0)[None], torch.full((1, 1000), 10.0), params)
+    line, _ = lane_simulator.rollout(line, {}, params, 10, keep=None)
     begin = time.process_time()
     for _ in range(1000):
-        line, _ = alone.rollout(line, {}, params, 10, keep=None)
+        line, _ = lane_simulator.rollout(line, {}, params, 10, keep=None)
     lane = (time.process_time() - begin) / 10_000
     return {
         "env_steps_per_s_at_8192": 8192 / each(8192, 1),

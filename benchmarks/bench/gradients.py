@@ -71,24 +71,24 @@ def rows(rounds: int) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     idm_env.envs.batch.EAGER_STEPS = 0
     try:
-        made = [row for what, cases in workloads() for row in _told(what, measure(cases(), rounds))]
+        result = [row for what, cases in workloads() for row in _told(what, measure(cases(), rounds))]
     finally:
         torch.set_num_threads(threads)
         idm_env.envs.batch.EAGER_STEPS = eager
-    return made
+    return result
 
 
 def workloads() -> list[tuple[str, Callable[[], dict[str, Case]]]]:
     """Return what is measured: rings beside JAX, lanes, and a ring whose drivers are others."""
-    found: list[tuple[str, Callable[[], dict[str, Case]]]] = []
+    result: list[tuple[str, Callable[[], dict[str, Case]]]] = []
     for count, steps in COUNTS:
-        found.append((f"ring, {count} × {steps}", partial(_beside_jax, count, steps)))
+        result.append((f"ring, {count} × {steps}", partial(_beside_jax, count, steps)))
     for task in ("highway", "merge"):
         for count, steps in ((1, 100), (64, 50), (1024, 5)):
             lanes = {"task": task, "hold": 0.1}  # a step of Δt
-            found.append((f"{task}, {count} × {steps}", partial(of, lanes, count, steps, False)))
-    found.append(("ring of other drivers, 64 × 200", _others))
-    return found
+            result.append((f"{task}, {count} × {steps}", partial(of, lanes, count, steps, False)))
+    result.append(("ring of other drivers, 64 × 200", _others))
+    return result
 
 
 def _beside_jax(count: int, steps: int) -> dict[str, Case]:

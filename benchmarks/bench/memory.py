@@ -50,13 +50,13 @@ def peaks(sizes: Sequence[int], steps: int) -> dict[str, float]:
     sizes = sorted(n for n in sizes if n >= 200_000)
     if not sizes or not _STATUS.exists():
         return {}
-    found: dict[str, float] = {}
+    by_size: dict[str, float] = {}
     for n in sizes:
         done = subprocess.run(
             [sys.executable, "-c", _CHILD, str(n), str(steps)], check=True, capture_output=True, text=True, cwd=ROOT
         )
-        found[str(n)] = json.loads(done.stdout.splitlines()[-1])
+        by_size[str(n)] = json.loads(done.stdout.splitlines()[-1])
     low, high = sizes[0], sizes[-1]
     if high > low:
-        found["exponent"] = math.log(found[str(high)] / found[str(low)]) / math.log(high / low)
-    return found
+        by_size["exponent"] = math.log(by_size[str(high)] / by_size[str(low)]) / math.log(high / low)
+    return by_size

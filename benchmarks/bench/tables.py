@@ -23,28 +23,28 @@ PEERS = {
 
 def of(result: Mapping[str, Any]) -> list[tuple[str, Rows, str]]:
     """Return (title, rows, what it means) of everything that was measured."""
-    found: list[tuple[str, Rows, str]] = []
+    tables: list[tuple[str, Rows, str]] = []
     ratios = "× diffidm: how many times as fast as the published package, by the minimum."
     for size, part in sorted(result["one_core"].items(), key=lambda item: -int(item[0])):
         title = f"{int(size):,} vehicles, one core"
-        found.append((title, _paths(part, int(size), "cpu"), ratios + _triad(part)))
+        tables.append((title, _paths(part, int(size), "cpu"), ratios + _triad(part)))
     every = result["all_cores"]
     size = max(int(n) for n in result["one_core"])
     title = f"{size:,} vehicles, {every['threads']} thread{'s' if every['threads'] > 1 else ''} (wall time)"
-    found.append((title, _paths(every, size, "wall"), ratios + _triad(every)))
+    tables.append((title, _paths(every, size, "wall"), ratios + _triad(every)))
     others = [*_rings(result), *_peers(result)]
     if others:
-        found.append(("Environments and other simulators", others, "One core; higher is faster but for µs."))
+        tables.append(("Environments and other simulators", others, "One core; higher is faster but for µs."))
     if result.get("gradient_steps"):
         words = "A 32 × 32 policy in torch, torch output, one core, ms of CPU time; JAX where it is installed."
-        found.append(("A step of environments with its gradients", result["gradient_steps"], words))
-    found += _fits(result)
+        tables.append(("A step of environments with its gradients", result["gradient_steps"], words))
+    tables += _fits(result)
     if result.get("gradient_error"):
         rows = [{"path": name, "largest relative error": value} for name, value in result["gradient_error"].items()]
-        found.append(("Error of the gradient", rows, "Against float64 through torch."))
+        tables.append(("Error of the gradient", rows, "Against float64 through torch."))
     if result.get("growth"):
         rows = [{"path": name, "exponent": value} for name, value in result["growth"].items()]
-        found.append(("Growth of time with the number of vehicles", rows, "1 is linear."))
+        tables.append(("Growth of time with the number of vehicles", rows, "1 is linear."))
     if result.get("memory_mb_100_steps"):
         rows = [
             {"": f"{int(n):,} vehicles" if n.isdigit() else n, "peak (MB)" if n.isdigit() else "exponent": value}
@@ -52,11 +52,11 @@ def of(result: Mapping[str, Any]) -> list[tuple[str, Rows, str]]:
         ]
         names = list(dict.fromkeys(name for row in rows for name in row))
         rows = [{name: row.get(name, "") for name in names} for row in rows]
-        found.append(("Memory of 100 steps with their gradient", rows, "1 is linear."))
+        tables.append(("Memory of 100 steps with their gradient", rows, "1 is linear."))
     if result.get("gpu"):
         rows = [{"vehicles and pass": name, "ms per step": value} for name, value in result["gpu"].items()]
-        found.append(("GPU, the compiled step", rows, str(result["machine"].get("gpu"))))
-    return found
+        tables.append(("GPU, the compiled step", rows, str(result["machine"].get("gpu"))))
+    return tables
 
 
 def _triad(part: Mapping[str, Any]) -> str:
@@ -93,7 +93,7 @@ def _peers(result: Mapping[str, Any]) -> Rows:
 
 
 def _fits(result: Mapping[str, Any]) -> list[tuple[str, Rows, str]]:
-    found = []
+    tables = []
     fit = result.get("fit")
     if fit:
         rows = [{"what": n, "CPU ms, min": t["cpu_min_ms"], "median": t["cpu_median_ms"]} for n, t in fit["ms"].items()]
@@ -101,25 +101,25 @@ def _fits(result: Mapping[str, Any]) -> list[tuple[str, Rows, str]]:
             f"500 iterations of Adam: {fit['seconds_for_500_iterations']:.1f} s by the kernel, "
             f"{fit['times_eager']:.0f} times as fast as eager torch."
         )
-        found.append(("Fits of 6000 drivers over 600 steps", rows, words))
+        tables.append(("Fits of 6000 drivers over 600 steps", rows, words))
     discovery = result.get("discovery")
     if discovery:
         rows = [{"effect": n, "Jacobian, CPU ms": value} for n, value in discovery["jacobian_cpu_ms"].items()]
         words = f"{discovery['windows']} windows; a whole discovery takes {discovery['set_cpu_s']:.1f} CPU s."
-        found.append(("Discovery", rows, words))
-    return found
+        tables.append(("Discovery", rows, words))
+    return tables
 
 
 def absent(result: Mapping[str, Any]) -> str:
     """Return one line on what could not be measured here, and why."""
     one = next(iter(result["one_core"].values()))["times_ms_per_step"]
-    gone = [name for name, there in (
+    gone = [name for name, measured in (
         ("diffidm (not installed)", any(n.startswith("diffidm") for n in one)),
         ("kernels (see --verbose)", any(n.startswith("kernel") for n in one)),
         ("GPU (none)", bool(result.get("gpu"))),
         ("SUMO", "peers" not in result or bool(result["peers"].get("sumo"))),
         ("HighwayEnv", "peers" not in result or bool(result["peers"].get("highway"))),
-    ) if not there]  # fmt: skip
+    ) if not measured]  # fmt: skip
     if "peers" not in result:
         gone.append("other simulators (--no-peers)")
     return f"Not measured: {', '.join(gone)}." if gone else "Everything was measured."
@@ -143,10 +143,10 @@ def write(out: Path, result: Mapping[str, Any], drawn: page.Block | None) -> Non
 def _lead(result: Mapping[str, Any]) -> str:
     size, part = max(result["one_core"].items(), key=lambda item: int(item[0]))
     rows = {row["path"]: row for row in _paths(part, int(size), "cpu")}
-    told = []
+    parts = []
     for kind, words in (("forward", "a step"), ("forward+backward", "a step with its gradient")):
         row = min((r for n, r in rows.items() if n.split(" ", 1)[1] == kind), key=lambda r: r["ns per vehicle"])
         ratio = row["× diffidm"]
         more = f", {ratio:.3g} × diffidm" if ratio == ratio and not row["path"].startswith("diffidm") else ""
-        told.append(f"{words} takes {row['ns per vehicle']:.3g} ns per vehicle ({row['path'].split()[0]}{more})")
-    return f"With {int(size):,} vehicles on one core, " + ", ".join(told) + "."
+        parts.append(f"{words} takes {row['ns per vehicle']:.3g} ns per vehicle ({row['path'].split()[0]}{more})")
+    return f"With {int(size):,} vehicles on one core, " + ", ".join(parts) + "."

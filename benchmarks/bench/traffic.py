@@ -154,12 +154,12 @@ def accuracy(steps: int = 100) -> dict[str, float]:
 
     def double(traffic: Traffic) -> Traffic:
         """Return the same numbers in float64, so that only the arithmetic differs."""
-        made = Traffic(20 * LANE, dtype=torch.float64)
+        copy = Traffic(20 * LANE, dtype=torch.float64)
         columns = ("position", "speed", "accel", "gap", "length")
-        made.state = made.state._replace(**{name: getattr(traffic.state, name).double() for name in columns})
-        for leaf, same in zip(made.leaves, traffic.leaves, strict=True):
+        copy.state = copy.state._replace(**{name: getattr(traffic.state, name).double() for name in columns})
+        for leaf, same in zip(copy.leaves, traffic.leaves, strict=True):
             leaf.copy_(same)
-        return made
+        return copy
 
     true = gradients(double(Traffic(20 * LANE)), kernel=False)
 
