@@ -128,7 +128,7 @@ class Lag(Effect):
         "",
         "vehicles take longer than {law} to reach the acceleration that is wanted",
     )
-    looks_like: ClassVar[tuple[str, ...]] = ("delay", "leader_acceleration with the other sign")
+    looks_like: ClassVar[tuple[str, ...]] = ("delay", "leader_acceleration with the other sign", "action_point")
     told_by: ClassVar[str] = "sharp braking of leaders (jerk above 3 m/s³) at 10 Hz or more tells lag from delay"
     latency: ClassVar[bool] = True
     acts_on: ClassVar[str] = "response"
