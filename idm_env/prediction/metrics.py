@@ -20,7 +20,10 @@ MISS_M = {3: (1.0, 2.0), 5: (1.8, 3.6), 8: (3.0, 6.0)}
 """Horizon (s) → lateral and longitudinal bound (m) at 11 m/s and above."""
 SLOW, FAST = 1.4, 11.0
 """Speeds (m/s) between which the bounds grow from half to full."""
-PER_SECOND = 2
+RATE, PER_SECOND = 10, 2
+MEASURES = ("minADE", "minFDE", "miss_rate", "mAP")
+DRAWS = 200
+"""Of the bootstrap."""
 ENOUGH_SCENES = 10
 """From so many scenes on, intervals draw whole scenes."""
 SHAPES = (
@@ -50,9 +53,9 @@ def speed_scale(speed: float) -> float:
     return float(np.clip(0.5 + 0.5 * (speed - SLOW) / (FAST - SLOW), 0.5, 1.0))
 
 
-def at_two_hertz(seconds: int, rate: int = 10) -> np.ndarray:
+def at_two_hertz(seconds: int) -> np.ndarray:
     """Return the indices, at 10 Hz from the first future step on, of the samples up to ``seconds``."""
-    stride = rate // PER_SECOND
+    stride = RATE // PER_SECOND
     return np.arange(1, seconds * PER_SECOND + 1) * stride - 1
 
 
@@ -123,52 +126,16 @@ def score(case: Case) -> Score:
     return Score(case.kind, case.shape, [float(x) for x in case.confidence], best[0], best[1], by_horizon)
 
 
-def average_precision(scores: Sequence[Score], seconds: int) -> float:
-    """Return the area under the interpolated precision-recall curve of these agents; NaN without truth."""
-    confidence, correct, agents = [], [], 0
-    for item in scores:
-        hit = item.hit[HORIZONS.index(seconds)]
-        if hit is None:
-            continue
-        agents += 1
-        # of several futures that hit, only the most confident is a true positive
-        order = np.argsort(-np.array(item.confidence), kind="stable")
-        first = next((i for i in order if hit[i]), None)
-        for i in order:
-            confidence.append(item.confidence[i])
-            correct.append(i == first)
-    if agents == 0:
-        return float("nan")
-    order = np.lexsort((correct, -np.array(confidence)))
-    true = np.cumsum(np.array(correct)[order])
-    precision, recall = true / np.arange(1, len(true) + 1), true / agents
-    best = np.maximum.accumulate(precision[::-1])[::-1]
-    return float(np.sum(np.diff(np.concatenate([[0.0], recall])) * best))
-
-
 def summary(scores: Sequence[Score]) -> dict[str, float | int]:
     """Return agents and, per horizon, minADE and minFDE (m), miss rate and mAP; NaN where there is no truth."""
-    row: dict[str, float | int] = {"agents": len(scores)}
-    for i, seconds in enumerate(HORIZONS):
-        row[f"minADE_{seconds}s"] = _mean([item.ade[i] for item in scores])
-        row[f"minFDE_{seconds}s"] = _mean([item.fde[i] for item in scores])
-        row[f"miss_rate_{seconds}s"] = _mean(
-            [0.0 if any(h) else 1.0 for item in scores if (h := item.hit[i]) is not None]
-        )
-        binned = [item.shape.replace("right U-turn", "right") for item in scores]
-        precisions = [
-            average_precision([s for s, b in zip(scores, binned, strict=True) if b == shape], seconds)
-            for shape in sorted(set(binned))
-        ]
-        row[f"mAP_{seconds}s"] = _mean(precisions)
-    for name in ("minADE", "minFDE", "miss_rate", "mAP"):
-        row[name] = _mean([float(row[f"{name}_{seconds}s"]) for seconds in HORIZONS])
-    return row
+    measures = {name: float(values[0]) for name, values in _measures(scores, np.ones((1, len(scores)))).items()}
+    for name in MEASURES:
+        horizons = [measures[f"{name}_{seconds}s"] for seconds in HORIZONS]
+        measures[name] = float(_means(horizons, np.ones((1, len(HORIZONS))))[0])
+    return {"agents": len(scores), **measures}
 
 
-def intervals(
-    scores: Sequence[Score], scenes: Sequence[str], *, draws: int = 200, seed: int = 0
-) -> dict[str, tuple[float, float]]:
+def intervals(scores: Sequence[Score], scenes: Sequence[str]) -> dict[str, tuple[float, float]]:
     """Return 95 % bootstrap intervals of what ``summary`` returns at each horizon, by name such as ``minADE_8s``.
 
     Whole scenes are drawn where there are at least ``ENOUGH_SCENES``, since agents of a scene are alike, else agents.
@@ -177,60 +144,61 @@ def intervals(
     names = np.unique(np.asarray(scenes), return_inverse=True)[1] if len(scenes) else np.zeros(0, int)
     unit = names if len(np.unique(names)) >= ENOUGH_SCENES else np.arange(len(scores))
     count = len(np.unique(unit))
-    generator = np.random.default_rng(seed)
-    counts = [np.bincount(generator.integers(count, size=count), minlength=count) for _ in range(draws)]
+    generator = np.random.default_rng(0)
+    counts = [np.bincount(generator.integers(count, size=count), minlength=count) for _ in range(DRAWS)]
     weights = np.stack(counts)[:, unit].astype(float) if count > 1 else np.zeros((0, len(scores)))
-    bounds: dict[str, tuple[float, float]] = {}
+    return {name: _between(values) for name, values in _measures(scores, weights).items()}
+
+
+def _measures(scores: Sequence[Score], weights: np.ndarray) -> dict[str, np.ndarray]:
+    """Return every measure at every horizon under every row of weights [draws, agents]."""
+    shapes = [item.shape.replace("right U-turn", "right") for item in scores]
+    measures = {}
     for i, seconds in enumerate(HORIZONS):
         missed = [None if (h := item.hit[i]) is None else float(not any(h)) for item in scores]
-        for name, values in (
-            ("minADE", [item.ade[i] for item in scores]), ("minFDE", [item.fde[i] for item in scores]),
-            ("miss_rate", missed),
-        ):  # fmt: skip
-            bounds[f"{name}_{seconds}s"] = _between(_weighted_means(values, weights))
-        bounds[f"mAP_{seconds}s"] = _between(_weighted_map(scores, seconds, weights))
-    return bounds
+        columns = [item.ade[i] for item in scores], [item.fde[i] for item in scores], missed
+        by_shape = []
+        for shape in sorted(set(shapes)):
+            own = [n for n, other in enumerate(shapes) if other == shape]
+            by_shape.append(average_precision([scores[n] for n in own], seconds, weights[:, own]))
+        precisions = np.ma.masked_invalid(np.reshape(by_shape, (len(by_shape), len(weights))))
+        values = [*(_means(column, weights) for column in columns), precisions.mean(0).filled(np.nan)]
+        measures |= {f"{name}_{seconds}s": value for name, value in zip(MEASURES, values, strict=True)}
+    return measures
 
 
-def _weighted_means(values: Sequence[float | None], weights: np.ndarray) -> np.ndarray:
+def average_precision(scores: Sequence[Score], seconds: int, weights: np.ndarray) -> np.ndarray:
+    """Return the area under the interpolated precision-recall curve under every row of weights [draws, agents].
+
+    NaN where no agent with truth has a weight.
+    """
+    agents, confidence, correct = list[int](), list[float](), list[bool]()
+    for n, item in enumerate(scores):
+        hit = item.hit[HORIZONS.index(seconds)] or []
+        # of several futures that hit, only the most confident is a true positive
+        first = next((i for i in np.argsort(-np.array(item.confidence), kind="stable") if hit and hit[i]), None)
+        agents += [n] * len(hit)
+        confidence += item.confidence[: len(hit)]
+        correct += [i == first for i in range(len(hit))]
+    order = np.lexsort((correct, -np.array(confidence)))
+    index, true = np.array(agents, int)[order], np.array(correct, bool)[order]
+    areas = np.full(len(weights), np.nan)
+    for draw, weight in enumerate(weights):
+        every, total = weight[index], weight[np.unique(index)].sum()
+        if total > 0:
+            hits, futures = np.cumsum(every * true), np.cumsum(every)
+            precision = np.divide(hits, futures, out=np.zeros_like(hits), where=futures > 0)
+            best = np.maximum.accumulate(precision[::-1])[::-1]
+            areas[draw] = np.sum(np.diff(np.concatenate([[0.0], hits / total])) * best)
+    return areas
+
+
+def _means(values: Sequence[float | None], weights: np.ndarray) -> np.ndarray:
     """Return the mean of what is known under every row of weights [draws, agents]."""
     numbers = np.array([np.nan if v is None else v for v in values], float)
     finite = np.isfinite(numbers)
     total = weights[:, finite].sum(1)
-    sums = weights[:, finite] @ numbers[finite]
-    return np.divide(sums, total, out=np.full(len(weights), np.nan), where=total > 0)
-
-
-def _weighted_map(scores: Sequence[Score], seconds: int, weights: np.ndarray) -> np.ndarray:
-    """Return the mean average precision over shapes under every row of weights [draws, agents]."""
-    horizon = HORIZONS.index(seconds)
-    cases = [n for n, item in enumerate(scores) if item.hit[horizon] is not None]
-    shapes = sorted({scores[n].shape for n in cases})
-    each = np.full((len(shapes), len(weights)), np.nan)
-    for s, shape in enumerate(shapes):
-        agents, confidence, correct = [], [], []
-        for n in cases:
-            item, hit = scores[n], scores[n].hit[horizon] or []
-            if item.shape != shape:
-                continue
-            first = next((i for i in np.argsort(-np.array(item.confidence), kind="stable") if hit[i]), None)
-            agents += [n] * len(hit)
-            confidence += item.confidence
-            correct += [i == first for i in range(len(hit))]
-        order = np.argsort(-np.array(confidence), kind="stable")
-        index, true = np.array(agents)[order], np.array(correct)[order]
-        unique = np.unique(index)
-        for d, weight in enumerate(weights):
-            every = weight[index]
-            total = weight[unique].sum()
-            if total > 0:
-                hits, all_of = np.cumsum(every * true), np.cumsum(every)
-                precision = np.divide(hits, all_of, out=np.zeros_like(hits), where=all_of > 0)
-                best = np.maximum.accumulate(precision[::-1])[::-1]
-                each[s, d] = float(np.sum(np.diff(np.concatenate([[0.0], hits / total])) * best))
-    finite = np.isfinite(each)
-    total = finite.sum(0)
-    return np.divide(np.where(finite, each, 0.0).sum(0), total, out=np.full(len(weights), np.nan), where=total > 0)
+    return np.divide(weights[:, finite] @ numbers[finite], total, out=np.full(len(weights), np.nan), where=total > 0)
 
 
 def _between(values: np.ndarray) -> tuple[float, float]:
@@ -239,8 +207,3 @@ def _between(values: np.ndarray) -> tuple[float, float]:
         return float("nan"), float("nan")
     low, high = np.percentile(finite, [2.5, 97.5])
     return float(low), float(high)
-
-
-def _mean(values: Sequence[float | None]) -> float:
-    finite = [float(v) for v in values if v is not None and np.isfinite(v)]
-    return float(np.mean(finite)) if finite else float("nan")

@@ -11,7 +11,6 @@ from idm_env.prediction.metrics import (
     SHAPES,
     Case,
     Score,
-    _weighted_map,
     at_two_hertz,
     average_precision,
     displacement,
@@ -74,21 +73,25 @@ def test_what_has_no_truth_does_not_count() -> None:
     assert row["miss_rate_8s"] == 1.0 and row["miss_rate_3s"] == 0.5
 
 
+def precision_of(scores: list[Score]) -> float:
+    return float(average_precision(scores, 3, np.ones((1, len(scores))))[0])
+
+
 def test_average_precision_by_hand() -> None:
     good = case((0.0, 0.0), (50.0, 0.0), confidence=[0.9, 0.1])
     late = case((50.0, 0.0), (0.0, 0.0), confidence=[0.8, 0.2])
     # in order of confidence: hit, miss, hit, miss; recall ½ at precision 1, recall 1 at precision 2/3
-    assert average_precision([score(good), score(late)], 3) == pytest.approx(0.5 + 0.5 * 2 / 3)
+    assert precision_of([score(good), score(late)]) == pytest.approx(0.5 + 0.5 * 2 / 3)
     twice = case((0.0, 0.0), (0.1, 0.0), confidence=[0.6, 0.4])  # the second hit is a false positive
-    assert average_precision([score(twice)], 3) == 1.0
-    assert average_precision([score(case((50.0, 0.0)))], 3) == 0.0
+    assert precision_of([score(twice)]) == 1.0
+    assert precision_of([score(case((50.0, 0.0)))]) == 0.0
 
 
 def test_equal_confidences_do_not_depend_on_the_order_of_agents() -> None:
     """As in the benchmark's own code, false positives come first among equals."""
     hit, miss = score(case((0.0, 0.0))), score(case((50.0, 0.0)))
     for order in ([hit, miss, miss], [miss, miss, hit]):
-        assert average_precision(order, 3) == pytest.approx(1 / 3 * 1 / 3)
+        assert precision_of(order) == pytest.approx(1 / 3 * 1 / 3)
 
 
 def test_right_u_turns_count_with_right_turns() -> None:
@@ -145,14 +148,18 @@ def test_intervals_hold_the_figure_and_are_those_of_agents_or_scenes() -> None:
     assert np.isnan(intervals(scores[:1], ["one"])["minADE_3s"]).all()
 
 
-def test_a_resampled_map_with_everybody_once_is_the_map() -> None:
+def test_a_bootstrap_draws_the_measure_of_the_summary() -> None:
+    """Right U-turns are right turns there, too, and among equals false positives come first: all draws give it."""
+    hit, miss = score(case((0.0, 0.0))), score(case((50.0, 0.0)))
+    turns = [replace(hit, shape="right"), replace(miss, shape="right U-turn")]
+    alike = [each for _ in range(12) for each in turns]
+    low, high = intervals(alike, [str(i) for i in range(12) for _ in turns])["mAP_3s"]
+    assert (low, high, summary(alike)["mAP_3s"]) == pytest.approx((1 / 4,) * 3)
+
+
+def test_a_weight_counts_as_so_many_agents() -> None:
     rng = np.random.default_rng(1)
-    scores = []
-    for i in range(40):
-        confidence = rng.dirichlet(np.ones(4)).tolist()
-        hit = [bool(x) for x in rng.random(4) < 0.3]
-        scores.append(Score("vehicle", ("straight", "left")[i % 2], confidence, [1.0] * 3, [1.0] * 3, [hit] * 3))
-    once = _weighted_map(scores, 3, np.ones((1, 40)))
-    assert once[0] == pytest.approx(float(summary(scores)["mAP_3s"]), abs=1e-12)
-    twice = _weighted_map(scores, 3, np.repeat([[2.0, 0.0]], 20, axis=0).reshape(1, -1))
-    assert twice[0] == pytest.approx(float(summary(scores[::2])["mAP_3s"]), abs=1e-12)
+    confidence, hit = rng.dirichlet(np.ones(4), 40).tolist(), (rng.random((40, 4)) < 0.3).tolist()
+    scores = [Score("vehicle", "left", c, [1.0] * 3, [1.0] * 3, [h] * 3) for c, h in zip(confidence, hit, strict=True)]
+    weights = np.tile([2.0, 0.0], 20)[None]
+    assert average_precision(scores, 3, weights)[0] == pytest.approx(precision_of(scores[::2] * 2), abs=1e-12)
