@@ -102,10 +102,18 @@ def apart(function: Callable[..., Any]) -> Any:
 
         return returned(*kinds), generate
 
-    # numba counts the arguments of what it is given.
-    said, room = ", ".join(function.__code__.co_varnames[: function.__code__.co_argcount]), {"typed": typed}
-    exec(f"def {function.__name__}(typing_context, {said}):\n    return typed({said})", room)
-    return intrinsic(room[function.__name__])
+    names = ", ".join(function.__code__.co_varnames[: function.__code__.co_argcount])
+    return counted(function.__name__, names, typed)
+
+
+def counted(name: str, names: str, typed: Callable[..., Any]) -> Any:
+    """Return an intrinsic of that name whose arguments are ``names``: numba counts those of what it is given.
+
+    ``typed`` gets their types, and returns a signature and who generates code.
+    """
+    room: dict[str, Any] = {"typed": typed}
+    exec(f"def {name}(typing_context, {names}):\n    return typed({names})", room)
+    return intrinsic(room[name])
 
 
 def phase(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -336,10 +336,8 @@ def normal_equations(
     w = np.zeros(plan.size, k.dtype)
     h = np.zeros(((slots + BLOCK) * plan.n_signals + 1) * wide, k.dtype)
     th = np.zeros(plan.n_blocks * ((slots + BLOCK) * plan.n_moving_signals + 1) * wide, k.dtype)
-    target, weight, scaled, square, part, sums = (
-        np.zeros(ROW, k.dtype), np.zeros(ROW, k.dtype), np.zeros(ROW, k.dtype), np.zeros(ROW, k.dtype),
-        np.zeros(ROW, k.dtype), np.zeros(ROW, k.dtype),
-    )  # fmt: skip
+    x = np.zeros((6, ROW), k.dtype)
+    target, weight, scaled, square, part, sums = x[0], x[1], x[2], x[3], x[4], x[5]
     pairs = plan.n_blocks * (plan.n_blocks + 1) // 2
     gradients, normals = np.zeros((plan.n_blocks, ROW), k.dtype), np.zeros((pairs, ROW), k.dtype)
     for tile in range(begin, end):
@@ -435,25 +433,9 @@ def adjoint(
             last = min(first + BLOCK, steps)
             if signals:
                 past_again(
-                    w,
-                    h,
-                    plan,
-                    phases,
-                    past,
-                    tape,
-                    taped,
-                    record,
-                    reads,
-                    k,
-                    first,
-                    last,
-                    slots,
-                    flat,
-                    row,
-                    wide,
-                    n,
+                    w, h, plan, phases, past, tape, taped, record, reads, k, first, last, slots, flat, row, wide, n,
                     repeats,
-                )
+                )  # fmt: skip
             for t in range(last - 1, first - 1, -1):
                 now = slots + t - first
                 load_step(w, plan, tape, taped, record, reads, t, flat, row, n, repeats)

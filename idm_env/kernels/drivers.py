@@ -22,6 +22,7 @@ from idm_env.delay_buffer import PAST
 from idm_env.effects.base import Effect
 from idm_env.kernels import driver_loops as loops
 from idm_env.kernels import threads as pool
+from idm_env.kernels.lanes import part_of
 from idm_env.kernels.printed import HEADER
 from idm_env.kernels.tiles import Array
 from idm_env.kernels.workspace import take
@@ -135,7 +136,7 @@ def prepared(
     form = Form.of(state, inputs)
     fixed = {Leaf(n, s): _of(road_is, driver - s) for n, road_is in _topology(simulator, count) for s in range(-2, 4)}
     for name in form.flags:
-        active = _part(inputs, name)[..., driver]
+        active = part_of(inputs, name)[..., driver]
         if bool(active.any()) != bool(active.all()):
             return f"the input '{name}' of the driver changes under way"
         fixed[Leaf(name)] = float(active.any())
@@ -163,16 +164,6 @@ def _of(x: Tensor, vehicle: int) -> float:
     return float(x[min(max(vehicle, 0), len(x) - 1)])
 
 
-def _part(inputs: Inputs, name: str) -> Tensor:
-    """Return the input, or the part of one, that a slot stands for."""
-    for effect, value in inputs.items():
-        for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
-            if slot_name(effect, part) == name:
-                assert isinstance(x, Tensor)
-                return x
-    raise KeyError(name)
-
-
 # -- what is run -------------------------------------------------------------------------------------------------
 
 
@@ -196,7 +187,7 @@ class BehindRecord:
             at = min(max(driver - slot.shift, 0), vehicles - 1)
             if (name, at) not in series:
                 series[name, at] = len(columns)
-                source = records[name] if name in records else _part(inputs, name)
+                source = records[name] if name in records else part_of(inputs, name)
                 columns.append(self._column(source[..., at]))
             reads.append((series[name, at], int(slot.name.endswith(" after"))))
         self._record = np.stack(columns) if columns else np.zeros((1, self.steps + 1, self.rows), self.kind)

@@ -18,14 +18,13 @@ import numpy as np
 
 from idm_env import compat
 from idm_env.extras import needed
-from idm_env.kernels.compiler import STORE, module_text, name_of
+from idm_env.kernels.compiler import STORE, counted, module_text, name_of
 
 with needed("a compiled loop"):
     from llvmlite import ir
     from numba import carray, types  # type: ignore[attr-defined]
     from numba.core import cgutils
     from numba.core.typing.templates import signature
-    from numba.extending import intrinsic
     from numba.np.arrayobj import populate_array
     from numba.np.numpy_support import from_dtype
 
@@ -332,7 +331,7 @@ def emitted(kind: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     def compiled(function: Callable[..., Any]) -> Any:
         names = function.__code__.co_varnames[: function.__code__.co_argcount]
 
-        def typed(typing_context: Any, *given: Any) -> Any:
+        def typed(*given: Any) -> Any:
             def generate(context: Any, builder: Any, made: Any, arguments: Any) -> Any:
                 tree = ast.parse(module_text(function.__module__))
                 body = next(x for x in tree.body if isinstance(x, ast.FunctionDef) and x.name == function.__name__)
@@ -342,11 +341,8 @@ def emitted(kind: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
 
             return signature(types.void, *given), generate
 
-        # numba counts the arguments of what it is given.
-        room: dict[str, Any] = {"typed": typed, "__name__": function.__module__}
         said = ", ".join(names)
-        exec(f"def body(typing_context, {said}):\n    return typed(typing_context, {said})", room)
-        room["body"] = intrinsic(room["body"])
+        room: dict[str, Any] = {"body": counted("body", said, typed), "__name__": function.__module__}
         exec(f"def {function.__name__}({said}):\n    body({said})", room)
         chosen = {"error_model": "numpy"} | options
         return compat.compiled_callback(room[function.__name__], kind, chosen, name_of(function, chosen), STORE)

@@ -6,32 +6,9 @@ The states within a block live only in the workspace of a tile, so that the tape
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
+from idm_env.kernels import lane_loops as lane
 from idm_env.kernels.compiler import apart
 from idm_env.kernels.lane_loops import (
-    CLOSE,
-    FLAGS,
-    GRADIENT_ROWS,
-    HOIST,
-    HOISTS,
-    IS_RING,
-    MOVING,
-    N_ROWS,
-    NUMBERS,
-    ON_ACCEL,
-    ON_GAP,
-    ON_INPUT_ROWS,
-    ON_POSITION,
-    ON_ROWS,
-    ON_SIGNAL_ROWS,
-    ON_SPEED,
-    PARAMETERS,
-    RESPOND,
-    SCRATCH,
-    SEEDED,
-    SENSE,
-    SIGNALS,
-    STATE_ROWS,
-    STATICS,
     fetch_next,
     fetch_states,
     load_inputs,
@@ -41,33 +18,23 @@ from idm_env.kernels.lane_loops import (
     perceive,
     step,
     store_past,
-)  # fmt: skip
+)
 from idm_env.kernels.memory import add, copy, fill, number
 from idm_env.kernels.phases import call
-from idm_env.kernels.tiles import (
-    ROW,
-    exact,
-    load,
-    padded,
-    place,
-    send_ahead,
-    send_back,
-    uniform,
-    workspace,
-)  # fmt: skip
+from idm_env.kernels.tiles import ROW, exact, load, padded, place, send_ahead, send_back, uniform, workspace
 
 
 @apart
 def send(w, n, size, measures, sends, phase):
     """Add what fell on neighbours' numbers to their adjoints; further than one vehicle it is handed on."""
-    ring = measures[IS_RING]
+    ring = measures[lane.IS_RING]
     for i in range(sends.shape[0]):
         if sends[i, 0] != phase:
             continue
         shift, source = sends[i, 1], sends[i, 2]
         for hop in range(abs(shift)):
             last = hop == abs(shift) - 1
-            target = sends[i, 3] if last else measures[SCRATCH] + (hop % 2) * ROW
+            target = sends[i, 3] if last else measures[lane.SCRATCH] + (hop % 2) * ROW
             if not last:
                 fill(w, target, 0, padded(n))
             if shift > 0:
@@ -96,19 +63,19 @@ def step_back(w, h, pitch, ah, n, size, measures, phases, back, looks, recalls, 
 
     ``now`` is the place of the step in the past at address ``h`` (see ``step``), ``then`` in its adjoint ``ah``.
     """
-    m, signals = padded(n), measures[SIGNALS]
+    m, signals = padded(n), measures[lane.SIGNALS]
     perceive(w, h, pitch, n, size, measures, phases, looks, recalls, k, now)
-    if measures[NUMBERS] + measures[FLAGS]:
-        look(w, n, size, measures, looks, CLOSE)  # whose neighbour comes or goes is an input of this step
-    for phase in (CLOSE, RESPOND):
+    if measures[lane.NUMBERS] + measures[lane.FLAGS]:
+        look(w, n, size, measures, looks, lane.CLOSE)  # whose neighbour comes or goes is an input of this step
+    for phase in (lane.CLOSE, lane.RESPOND):
         call(back[phase], w, m, k)  # type: ignore[call-arg]
         send(w, n, size, measures, sends, phase)
-    if phases[SENSE]:
+    if phases[lane.SENSE]:
         give_back(w, ah, n, signals, recalls, then)
         for i in range(signals):
-            copy(w, measures[ON_SIGNAL_ROWS] + i * ROW, ah, (then * signals + i) * ROW, n)
-        call(back[SENSE], w, m, k)  # type: ignore[call-arg]
-        send(w, n, size, measures, sends, SENSE)
+            copy(w, measures[lane.ON_SIGNAL_ROWS] + i * ROW, ah, (then * signals + i) * ROW, n)
+        call(back[lane.SENSE], w, m, k)  # type: ignore[call-arg]
+        send(w, n, size, measures, sends, lane.SENSE)
 
 
 @exact
@@ -119,10 +86,10 @@ def recompute(
     """Run a block once more and put what the adjoint reads on the tape of the tile."""
     for t in range(steps):
         for i in range(len(taped)):
-            copy(tape, (t * len(taped) + i) * ROW, w, measures[STATE_ROWS] + taped[i] * ROW, n)
+            copy(tape, (t * len(taped) + i) * ROW, w, measures[lane.STATE_ROWS] + taped[i] * ROW, n)
         # The last step's result is not needed, but what it senses is.
-        if t + 1 < steps or phases[SENSE]:
-            if measures[NUMBERS] + measures[FLAGS]:
+        if t + 1 < steps or phases[lane.SENSE]:
+            if measures[lane.NUMBERS] + measures[lane.FLAGS]:
                 load_inputs(w, operands, strides, begin_step + t, row, first, n, size, measures)
             step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots + t)
 
@@ -130,10 +97,10 @@ def recompute(
 @exact
 def add_seeds(w, seeds, every, t, strides, row, first, n, size, measures, count):
     """Add the adjoints of what was kept of one step."""
-    for i, target in enumerate((ON_POSITION, ON_SPEED, ON_ACCEL, ON_GAP)):
+    for i, target in enumerate((lane.ON_POSITION, lane.ON_SPEED, lane.ON_ACCEL, lane.ON_GAP)):
         source = seeds + (i * every + t) * count * w.itemsize
-        load(w, measures[SEEDED], source, strides, len(strides) - 1, 0, row, first, n, size, False)
-        add(w, measures[target], w, measures[SEEDED], n)
+        load(w, measures[lane.SEEDED], source, strides, len(strides) - 1, 0, row, first, n, size, False)
+        add(w, measures[target], w, measures[lane.SEEDED], n)
 
 
 @exact
@@ -149,13 +116,16 @@ def backward(
     those of moving states, 0 for zeros and for what is not wanted; ``on_parameters`` (parameters, vehicles);
     ``on_inputs`` (inputs, ``over`` steps, vehicles).
     """
-    signals = measures[SIGNALS]
-    w = workspace(measures[N_ROWS] * ROW, k)
+    signals = measures[lane.SIGNALS]
+    w = workspace(measures[lane.N_ROWS] * ROW, k)
     h = workspace(((slots + steps) * signals + 1) * ROW, k)
     ah = workspace(((slots + steps) * signals + 1) * ROW, k)
     tape = workspace(len(taped) * steps * ROW, k)
-    dense, count, is_ring = len(strides) - 1, rows * size, measures[IS_RING] != 0
-    many, has_inputs = measures[STATICS] + measures[PARAMETERS], measures[NUMBERS] + measures[FLAGS] > 0
+    dense, count, is_ring = len(strides) - 1, rows * size, measures[lane.IS_RING] != 0
+    many, has_inputs = (
+        measures[lane.STATICS] + measures[lane.PARAMETERS],
+        measures[lane.NUMBERS] + measures[lane.FLAGS] > 0,
+    )
     filled = 0
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
@@ -166,7 +136,7 @@ def backward(
             fetch_next(operands, strides[:many], following, size, k)
             fetch_next(on_end, on_strides, following, size, k)
         for i in again:
-            load(w, measures[STATE_ROWS] + i * ROW, start[i], strides, dense, 0, row, first, n, size, False)
+            load(w, measures[lane.STATE_ROWS] + i * ROW, start[i], strides, dense, 0, row, first, n, size, False)
         load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
         filled = max(filled, n)
         load_past(h, past, alike, 0, slots, signals, strides, row, first, n, size, count)
@@ -177,33 +147,35 @@ def backward(
             w, h, tape, taped, operands, strides, k, begin_step, steps, slots, row, first, n, size, measures, phases,
             looks, recalls,
         )  # fmt: skip
-        for i in range(measures[MOVING]):
+        for i in range(measures[lane.MOVING]):
             if on_end[i]:
-                load(w, measures[ON_ROWS] + i * ROW, on_end[i], on_strides, i, 0, row, first, n, size, False)
+                load(w, measures[lane.ON_ROWS] + i * ROW, on_end[i], on_strides, i, 0, row, first, n, size, False)
             else:
-                fill(w, measures[ON_ROWS] + i * ROW, 0, n)
-        fill(w, measures[GRADIENT_ROWS], 0, (measures[PARAMETERS] + measures[HOISTS]) * ROW)
+                fill(w, measures[lane.ON_ROWS] + i * ROW, 0, n)
+        fill(w, measures[lane.GRADIENT_ROWS], 0, (measures[lane.PARAMETERS] + measures[lane.HOISTS]) * ROW)
         for t in range(steps - 1, -1, -1):
             now = begin_step + t
             if every:
                 add_seeds(w, seeds, every, now, strides, row, first, n, size, measures, count)
             for i in range(len(taped)):
-                copy(w, measures[STATE_ROWS] + taped[i] * ROW, tape, (t * len(taped) + i) * ROW, n)
+                copy(w, measures[lane.STATE_ROWS] + taped[i] * ROW, tape, (t * len(taped) + i) * ROW, n)
             if has_inputs:
                 load_inputs(w, operands, strides, now, row, first, n, size, measures)
             then = slots + t
             step_back(w, h.ctypes.data, ROW, ah, n, size, measures, phases, back, looks, recalls, sends, k, then, then)
             if over:
-                for i in range(measures[NUMBERS]):
-                    copy(on_inputs, (i * over + now) * count + at, w, measures[ON_INPUT_ROWS] + i * ROW + skip, own)
-        if back[HOIST]:
-            call(back[HOIST], w, padded(n), k)  # type: ignore[call-arg]
-        for i in range(measures[MOVING]):
+                for i in range(measures[lane.NUMBERS]):
+                    copy(
+                        on_inputs, (i * over + now) * count + at, w, measures[lane.ON_INPUT_ROWS] + i * ROW + skip, own
+                    )
+        if back[lane.HOIST]:
+            call(back[lane.HOIST], w, padded(n), k)  # type: ignore[call-arg]
+        for i in range(measures[lane.MOVING]):
             if on_begin[i]:
-                copy(on_begin[i], at, w, measures[ON_ROWS] + i * ROW + skip, own)
+                copy(on_begin[i], at, w, measures[lane.ON_ROWS] + i * ROW + skip, own)
         store_past(ah, on_past, slots - 1, slots, signals, at, skip, own, count)
-        for i in range(measures[PARAMETERS]):
+        for i in range(measures[lane.PARAMETERS]):
             if fresh:
-                copy(on_parameters, i * count + at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)
+                copy(on_parameters, i * count + at, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)
             else:
-                add(on_parameters, i * count + at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)
+                add(on_parameters, i * count + at, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)

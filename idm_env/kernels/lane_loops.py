@@ -13,18 +13,7 @@ import numpy as np
 from idm_env.kernels.compiler import apart
 from idm_env.kernels.memory import LINE, copy, number, prefetch, stream
 from idm_env.kernels.phases import call
-from idm_env.kernels.tiles import (
-    ROW,
-    exact,
-    load,
-    look_ahead,
-    look_back,
-    padded,
-    place,
-    repeats,
-    uniform,
-    workspace,
-)
+from idm_env.kernels.tiles import ROW, exact, load, look_ahead, look_back, padded, place, repeats, uniform, workspace
 
 (
     N_ROWS, IS_RING, STATES, MOVING, STATICS, PARAMETERS, HOISTS, NUMBERS, FLAGS, SIGNALS, STATE_ROWS, ON_ROWS,

@@ -342,16 +342,7 @@ _SHARED = re.compile(r"\b(?:in_\w+|t\d+)\[[^\[\]]*\]")
 
 _ALONG, _SPREAD = ("sum", "mean", "cat"), ("slice_backward", "select_backward")
 _EACH = {
-    *BINARY,
-    *COMPARE,
-    "where",
-    "clamp",
-    "clamp_min",
-    "clamp_max",
-    "clone",
-    "_to_copy",
-    "masked_fill",
-    "mm",
+    *BINARY, *COMPARE, "where", "clamp", "clamp_min", "clamp_max", "clone", "_to_copy", "masked_fill", "mm",
     "addmm",
-}
+}  # fmt: skip
 """Operations that are told a dimension by its number, and others that all agents may do at once."""

@@ -29,14 +29,9 @@ KINDS = {torch.float32: "f", torch.float64: "f", torch.int64: "i", torch.bool: "
 TYPES = {"d": np.dtype(np.float64), "i": np.dtype(np.int64), "b": np.dtype(np.bool_)}
 """Types of numbers beside those of the recording; ``d`` are doubles in a recording in single precision."""
 _BLANK = {
-    "new_zeros": 0.0,
-    "zeros_like": 0.0,
-    "zeros": 0.0,
-    "new_ones": 1.0,
-    "ones_like": 1.0,
-    "empty_like": 0.0,
+    "new_zeros": 0.0, "zeros_like": 0.0, "zeros": 0.0, "new_ones": 1.0, "ones_like": 1.0, "empty_like": 0.0,
     "new_empty_strided": 0.0,
-}
+}  # fmt: skip
 _FULL = {"new_full": 2, "full_like": 1, "full": 1, "fill_": 1}
 """Constants of one value, which backward passes write to: the value, or the place of the argument that it is."""
 

@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,8 +23,8 @@ with needed("a compiled loop"):
     from numba import types
     from numba.core import cgutils
     from numba.core.typing.templates import signature
-    from numba.extending import intrinsic
 
+from idm_env.kernels.compiler import counted
 from idm_env.kernels.functions import exp_float64, sigmoid_float64
 
 REAL, WHOLE = ir.DoubleType(), ir.IntType(64)
@@ -50,56 +51,11 @@ class Number:
         """The value in LLVM."""
         return self._value
 
-    def __add__(self, other: Any) -> Number:
-        return _made("fadd", self, other)
-
-    def __radd__(self, other: Any) -> Number:
-        return _made("fadd", other, self)
-
-    def __sub__(self, other: Any) -> Number:
-        return _made("fsub", self, other)
-
-    def __rsub__(self, other: Any) -> Number:
-        return _made("fsub", other, self)
-
-    def __mul__(self, other: Any) -> Number:
-        return _made("fmul", self, other)
-
-    def __rmul__(self, other: Any) -> Number:
-        return _made("fmul", other, self)
-
-    def __truediv__(self, other: Any) -> Number:
-        return _made("fdiv", self, other)
-
-    def __rtruediv__(self, other: Any) -> Number:
-        return _made("fdiv", other, self)
-
-    def __pow__(self, other: Any) -> Number:
-        return _called(lambda a, b: a**b, self, other)
-
-    def __rpow__(self, other: Any) -> Number:
-        return _called(lambda a, b: a**b, other, self)
-
     def __neg__(self) -> Number:
         return Number(_now.get().builder.fneg(self.value))
 
     def __abs__(self) -> Number:
         return _called(lambda x: abs(x), self)
-
-    def __lt__(self, other: Any) -> StagedBool:
-        return _compared("<", self, other)
-
-    def __le__(self, other: Any) -> StagedBool:
-        return _compared("<=", self, other)
-
-    def __gt__(self, other: Any) -> StagedBool:
-        return _compared(">", self, other)
-
-    def __ge__(self, other: Any) -> StagedBool:
-        return _compared(">=", self, other)
-
-    def __eq__(self, other: Any) -> StagedBool:  # type: ignore[override]
-        return _compared("==", self, other)
 
     def __ne__(self, other: Any) -> StagedBool:  # type: ignore[override]
         return StagedBool(_now.get().builder.fcmp_unordered("!=", self.value, _real(other)))
@@ -210,6 +166,20 @@ def _called(function: Callable[..., Any], *numbers: Any) -> Number:
     return Number(context.compile_internal(builder, function, kinds, [_real(x) for x in numbers]))
 
 
+def _operator(name: str, rule: Callable[[Any, Any], Any], *, both: bool) -> None:
+    """Give numbers an operator, and the one that Python asks for where a number stands on its right."""
+    setattr(Number, f"__{name}__", lambda self, other: rule(self, other))
+    if both:
+        setattr(Number, f"__r{name}__", lambda self, other: rule(other, self))
+
+
+for _name, _instruction in (("add", "fadd"), ("sub", "fsub"), ("mul", "fmul"), ("truediv", "fdiv")):
+    _operator(_name, partial(_made, _instruction), both=True)
+_operator("pow", partial(_called, lambda a, b: a**b), both=True)
+for _name, _sign in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">="), ("eq", "==")):
+    _operator(_name, partial(_compared, _sign), both=False)
+
+
 # -- what printed texts call -------------------------------------------------------------------------------------------
 
 
@@ -286,10 +256,7 @@ def staged(results: int = 0) -> Callable[[Callable[..., Any]], Any]:
 
             return kind(*given), generate
 
-        # numba counts the arguments of what it is given.
-        room: dict[str, Any] = {"typed": typed}
-        exec(f"def {function.__name__}(typing_context, {names}):\n    return typed({names})", room)
-        return intrinsic(room[function.__name__])
+        return counted(function.__name__, names, typed)
 
     return wrapped
 

@@ -12,32 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from idm_env.kernels import lane_loops as lane
 from idm_env.kernels.compiler import apart
 from idm_env.kernels.lane_adjoint import step_back
-from idm_env.kernels.lane_loops import (
-    FLAGS,
-    GRADIENT_ROWS,
-    HOIST,
-    HOISTS,
-    IS_RING,
-    MOVING,
-    N_ROWS,
-    NUMBERS,
-    ON_INPUT_ROWS,
-    ON_ROWS,
-    PARAMETERS,
-    SIGNALS,
-    STATE_ROWS,
-    STATES,
-    STATICS,
-    fetch_next,
-    fetch_states,
-    load_inputs,
-    load_past,
-    load_static,
-    step,
-    store_past,
-)
+from idm_env.kernels.lane_loops import fetch_next, fetch_states, load_inputs, load_past, load_static, step, store_past
 from idm_env.kernels.memory import add, copy, fill
 from idm_env.kernels.phases import call, call_rows
 from idm_env.kernels.printed import TileKernel
@@ -66,10 +44,10 @@ def advance(
     that the last call with this ``w`` was the same single tile with the same parameters.
     """
     slots, rows, size, wide, around = extent[0], extent[1], extent[2], extent[3], extent[4]
-    states, signals, is_ring = measures[STATES], measures[SIGNALS], measures[IS_RING] != 0
-    dense, many = len(strides) - 1, measures[STATICS] + measures[PARAMETERS]
+    states, signals, is_ring = measures[lane.STATES], measures[lane.SIGNALS], measures[lane.IS_RING] != 0
+    dense, many = len(strides) - 1, measures[lane.STATICS] + measures[lane.PARAMETERS]
     operands, count, filled = places[2 * states :], rows * size, 0
-    has_inputs, all_past = measures[NUMBERS] + measures[FLAGS] > 0, past.ctypes.data
+    has_inputs, all_past = measures[lane.NUMBERS] + measures[lane.FLAGS] > 0, past.ctypes.data
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
         if tile + 1 < end:
@@ -77,7 +55,7 @@ def advance(
             fetch_states(places, read, following, size, k)
             fetch_next(operands, strides[:many], following, size, k)
         for i in read:
-            load(w, measures[STATE_ROWS] + i * ROW, places[i], strides, dense, 0, row, first, n, size, False)
+            load(w, measures[lane.STATE_ROWS] + i * ROW, places[i], strides, dense, 0, row, first, n, size, False)
         if not kept:
             load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
             filled = max(filled, n)
@@ -93,7 +71,7 @@ def advance(
             for i in range(signals):
                 copy(all_past, ((newest + 1) * signals + i) * count + at, h, (slots * signals + i) * ROW + skip, own)
         for i in range(states):
-            copy(places[states + i], at, w, measures[STATE_ROWS] + i * ROW + skip, own)
+            copy(places[states + i], at, w, measures[lane.STATE_ROWS] + i * ROW + skip, own)
 
 
 @exact
@@ -137,23 +115,23 @@ def retreat(
     one will be that of the step before: what falls on parameters is added when all have been.
     """
     slots, rows, size, wide, around = extent
-    states, signals, is_ring = measures[STATES], measures[SIGNALS], measures[IS_RING] != 0
+    states, signals, is_ring = measures[lane.STATES], measures[lane.SIGNALS], measures[lane.IS_RING] != 0
     dense, count = len(strides) - 1, rows * size
     operands, filled = places[2 * states :], 0
-    has_inputs, all_past = measures[NUMBERS] + measures[FLAGS] > 0, past.ctypes.data
+    has_inputs, all_past = measures[lane.NUMBERS] + measures[lane.FLAGS] > 0, past.ctypes.data
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
         at = row * size + first + skip
         for i in again:
-            load(w, measures[STATE_ROWS] + i * ROW, places[i], strides, dense, 0, row, first, n, size, False)
+            load(w, measures[lane.STATE_ROWS] + i * ROW, places[i], strides, dense, 0, row, first, n, size, False)
         if not kept:
             load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
             filled = max(filled, n)
-            fill(w, measures[GRADIENT_ROWS], 0, (measures[PARAMETERS] + measures[HOISTS]) * ROW)
+            fill(w, measures[lane.GRADIENT_ROWS], 0, (measures[lane.PARAMETERS] + measures[lane.HOISTS]) * ROW)
         if has_inputs:
             load_inputs(w, operands, strides, t, row, first, n, size, measures)
-        for i in range(measures[MOVING]):
-            load(w, measures[ON_ROWS] + i * ROW, on_end[i], strides, dense, 0, row, first, n, size, False)
+        for i in range(measures[lane.MOVING]):
+            load(w, measures[lane.ON_ROWS] + i * ROW, on_end[i], strides, dense, 0, row, first, n, size, False)
         if signals:
             fill(ah, 0, 0, len(ah))
             load_past(ah, on_past_end, False, 1, slots, signals, strides, row, first, n, size, count)
@@ -163,15 +141,15 @@ def retreat(
             piece_of_past(h, all_past, newest, slots, signals, strides, row, first, n, size, count)
             source, pitch, now = np.int64(h.ctypes.data), ROW, slots
         step_back(w, source, pitch, ah, n, size, measures, phases, back, looks, recalls, sends, k, now, slots)
-        for i in range(measures[NUMBERS]):
-            copy(on_inputs, i * count + at, w, measures[ON_INPUT_ROWS] + i * ROW + skip, own)
-        if back[HOIST] and not more:
-            call(back[HOIST], w, padded(n), k)  # type: ignore[call-arg]
-        for i in range(measures[MOVING]):
-            copy(on_begin[i], at, w, measures[ON_ROWS] + i * ROW + skip, own)
+        for i in range(measures[lane.NUMBERS]):
+            copy(on_inputs, i * count + at, w, measures[lane.ON_INPUT_ROWS] + i * ROW + skip, own)
+        if back[lane.HOIST] and not more:
+            call(back[lane.HOIST], w, padded(n), k)  # type: ignore[call-arg]
+        for i in range(measures[lane.MOVING]):
+            copy(on_begin[i], at, w, measures[lane.ON_ROWS] + i * ROW + skip, own)
         store_past(ah, on_past, slots - 1, slots, signals, at, skip, own, count)
-        for i in range(0 if more else measures[PARAMETERS]):
-            add(on_parameters, i * count + at, w, measures[GRADIENT_ROWS] + i * ROW + skip, own)
+        for i in range(0 if more else measures[lane.PARAMETERS]):
+            add(on_parameters, i * count + at, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)
 
 
 @exact
@@ -192,6 +170,6 @@ def retreat_worlds(
 
 def workspaces(kernel: TileKernel, slots: int, real: np.dtype[Any]) -> tuple[Array, Array]:
     """Return a workspace and a past for a tile of a kernel's."""
-    rows, signals = kernel.measures[N_ROWS], kernel.measures[SIGNALS]
+    rows, signals = kernel.measures[lane.N_ROWS], kernel.measures[lane.SIGNALS]
     like = np.empty(0, real)
     return workspace(rows * ROW, like), workspace(((slots + 1) * signals + 1) * ROW, like)
