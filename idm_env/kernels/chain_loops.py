@@ -129,12 +129,14 @@ def put_in_lanes(low, high, said, before, links, position, was, present, coming,
             width = max(width, np.float64(position[base + i]) - np.float64(last))
         width += 1.0
         for i in range(n):
-            at = base + i
-            lane[at] = said[at] if said[at] >= 0 else before[0, at]
-            there = not coming or present[at] > 0
-            changed[at] = before[3, at] + (lane[at] != before[0, at] and there and (not coming or was[at] > 0))
-            key[i] = (lane[at] if there else count) * width + (np.float64(position[at]) - np.float64(last))
-            leader[at] = follower[at] = i
+            slot = base + i
+            lane[slot] = said[slot] if said[slot] >= 0 else before[0, slot]
+            on_road = not coming or present[slot] > 0
+            changed[slot] = before[3, slot] + (
+                lane[slot] != before[0, slot] and on_road and (not coming or was[slot] > 0)
+            )
+            key[i] = (lane[slot] if on_road else count) * width + (np.float64(position[slot]) - np.float64(last))
+            leader[slot] = follower[slot] = i
         order = np.argsort(key, kind="mergesort")
         for r in range(n - 1):
             i, j = base + order[r], base + order[r + 1]

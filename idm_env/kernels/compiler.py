@@ -46,11 +46,11 @@ def module_text(module: str) -> str:
 def name_of(function: Callable[..., Any], options: dict[str, Any]) -> Callable[[str], str]:
     """Return what names a version of a function: by its own file, all files here, and options, by content."""
     code = function.__code__
-    said = f"{function.__module__} {function.__qualname__} {code.co_firstlineno} {sorted(options.items(), key=str)}"
+    identity = f"{function.__module__} {function.__qualname__} {code.co_firstlineno} {sorted(options.items(), key=str)}"
     word = re.sub(r"\W", "_", function.__qualname__)[-60:]
 
     def name(version: str) -> str:
-        parts = "\0".join((said, module_text(function.__module__), _sources(), version))
+        parts = "\0".join((identity, module_text(function.__module__), _sources(), version))
         return f"{word}-{hashlib.sha256(parts.encode()).hexdigest()[:32]}"
 
     return name
@@ -73,9 +73,9 @@ class _Symbols:
         """Compile a loop for arguments of these types; return its symbol, and the type that it returns."""
         loop = self.loops[place]
         symbol = name_of(loop.py_func, loop.targetoptions)(str(kinds))
-        found, returned = compat.address_of(loop, kinds)
+        address, returned = compat.address_of(loop, kinds)
         if symbol not in self.known:
-            binding.add_symbol(symbol, found)
+            binding.add_symbol(symbol, address)
             self.known[symbol] = place, kinds
         return symbol, returned
 
@@ -97,8 +97,8 @@ def apart(function: Callable[..., Any]) -> Any:
 
         def generate(context: Any, builder: Any, made: Any, arguments: Any) -> Any:
             kind = ir.FunctionType(context.get_value_type(returned), [context.get_value_type(x) for x in kinds])
-            found = builder.call(cgutils.get_or_insert_function(builder.module, kind, symbol), arguments)
-            return context.get_dummy_value() if returned == types.none else found
+            result = builder.call(cgutils.get_or_insert_function(builder.module, kind, symbol), arguments)
+            return context.get_dummy_value() if returned == types.none else result
 
         return returned(*kinds), generate
 

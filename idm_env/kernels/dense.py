@@ -113,7 +113,7 @@ def _outer(tall: int, wide: int) -> Any:
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             v = _Vectors(context, builder, w)
-            made, data = v.data(sums, arguments[0]), v.data(w, arguments[4])
+            target, data = v.data(sums, arguments[0]), v.data(w, arguments[4])
             _, first, down, across, _, left, pitch_left, right, pitch_right, count = arguments
             zero = ir.Constant(v.vector, [v.number(0.0)] * v.lanes)
             totals = [[cgutils.alloca_once_value(builder, zero) for _ in range(wide)] for _ in range(tall)]
@@ -129,7 +129,7 @@ def _outer(tall: int, wide: int) -> Any:
                         builder.store(v.fma(a, b, builder.load(total)), total)
             for i, row in enumerate(totals):
                 for k, total in enumerate(row):
-                    spot = builder.gep(made, [v.step(v.step(first, i, down), k, across)])
+                    spot = builder.gep(target, [v.step(v.step(first, i, down), k, across)])
                     builder.store(builder.fadd(builder.load(spot), v.total(builder.load(total))), spot)
             return context.get_dummy_value()
 

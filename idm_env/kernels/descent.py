@@ -73,29 +73,29 @@ def descend(
     count = shape[0]
     values = np.array([dense(static_of(simulator, state, params, n).double(), shape) for n in program.parameters])
     parts = [dense(part_of(inputs, n)[:steps].double(), (steps, *shape)) for n in kernel.numbers]
-    given = np.array(parts).reshape(len(parts), steps * count)
+    series = np.array(parts).reshape(len(parts), steps * count)
     low, high = _limits(values, [bounds.get(n) for n in program.parameters])
-    given_low, given_high = _limits(given, [bounds.get(slots.get(n, "")) for n in kernel.numbers])
+    given_low, given_high = _limits(series, [bounds.get(slots.get(n, "")) for n in kernel.numbers])
     moves = any(n in slots for n in kernel.numbers)
-    made = [operand(static_of(simulator, state, params, n).double(), shape[:-1], 1) for n in program.statics]
-    made += [(x, (0, 1, 1)) for x in values] + [(x, (count, 1, 1)) for x in given]
-    made += [operand(part_of(inputs, n), shape[:-1], 1, steps) for n in kernel.flags]
+    operands = [operand(static_of(simulator, state, params, n).double(), shape[:-1], 1) for n in program.statics]
+    operands += [(x, (0, 1, 1)) for x in values] + [(x, (count, 1, 1)) for x in series]
+    operands += [operand(part_of(inputs, n), shape[:-1], 1, steps) for n in kernel.flags]
     blocks = -(-steps // BLOCK)
     tape = np.zeros((blocks + 1, len(program.states), count))
     tape[0] = [dense(x.double(), shape) for x in starts(state, program.states)]
-    kept, wide, kind = np.zeros((4, steps, count)), tiles.width(1, 0), "float64"
+    motion, wide, kind = np.zeros((4, steps, count)), tiles.width(1, 0), "float64"
     descent_loops.descend(
-        tape, BLOCK, kept.reshape(-1), *observed, values, np.zeros_like(values), low, high, given,
-        np.zeros_like(given if moves else given[:0]), given_low, given_high, kernel.measures, kernel.forward(kind),
+        tape, BLOCK, motion.reshape(-1), *observed, values, np.zeros_like(values), low, high, series,
+        np.zeros_like(series if moves else series[:0]), given_low, given_high, kernel.measures, kernel.forward(kind),
         kernel.backward(kind), kernel.looks, kernel.recalls, kernel.sends, kernel.read, kernel.taped, kernel.again,
-        addresses([x for x, _ in made]), table([*(s for _, s in made), (0, 1, 1)]), kernel.constants[kind], steps,
-        count, wide, tiles.tiles(count, 1, wide, 0), iterations, *rates,
+        addresses([x for x, _ in operands]), table([*(s for _, s in operands), (0, 1, 1)]), kernel.constants[kind],
+        steps, count, wide, tiles.tiles(count, 1, wide, 0), iterations, *rates,
     )  # fmt: skip
     first = [dense(x, shape)[None] for x in (state.position, state.speed, state.accel)]
     return DescentResult(
         dict(zip(program.parameters, values, strict=True)),
-        {slots[n]: x.reshape(steps, count) for n, x in zip(kernel.numbers, given, strict=True) if n in slots},
-        *(np.concatenate((x, y)) for x, y in zip(first, kept[:3], strict=True)),
+        {slots[n]: x.reshape(steps, count) for n, x in zip(kernel.numbers, series, strict=True) if n in slots},
+        *(np.concatenate((x, y)) for x, y in zip(first, motion[:3], strict=True)),
     )
 
 

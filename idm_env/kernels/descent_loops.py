@@ -18,8 +18,8 @@ def seed(seeds, position, step, vehicle, target, weight, count):
             seeds[(step[o] - 1) * count + vehicle[o]] = 0.0
     for o in range(len(step)):
         if step[o]:
-            at = (step[o] - 1) * count + vehicle[o]
-            seeds[at] += weight[o] * np.sign(position[at] - target[o])
+            cell = (step[o] - 1) * count + vehicle[o]
+            seeds[cell] += weight[o] * np.sign(position[cell] - target[o])
 
 
 @exact

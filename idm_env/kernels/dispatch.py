@@ -16,7 +16,6 @@ from idm_env import compat
 from idm_env.backends import off, switched_off
 from idm_env.delay_buffer import PAST
 from idm_env.kernels import available
-from idm_env.roads import Lanes
 from idm_env.scalar.record import Form
 from idm_env.simulator import Simulator
 from idm_env.step import CarFollowingStep
@@ -31,9 +30,7 @@ def found(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Par
     why = switched_off() or surroundings() or _unfit_tensors(state, inputs, params)
     if why is not None:
         return why
-    if isinstance(simulator.road, Lanes):
-        if simulator.lane_change_models and simulator.road.duration:
-            return "compiled changes take no time, and Lanes has a duration"
+    if state.links is not None:
         from idm_env.kernels.several import kernel_of
 
         return kernel_of(simulator, state, inputs)  # type: ignore[arg-type]
@@ -71,7 +68,7 @@ def rollout(
     kernel = found(simulator, state, inputs, params)
     if isinstance(kernel, str):
         return None
-    if isinstance(simulator.road, Lanes):
+    if state.links is not None:
         from idm_env.kernels import several
 
         return several.rollout(kernel, simulator, state, inputs, params, steps, keep)
@@ -130,11 +127,11 @@ def _within(shape: torch.Size, full: torch.Size) -> bool:
 
 
 def _tensors(inputs: Inputs) -> list[Tensor]:
-    found: list[Tensor] = []
+    leaves: list[Tensor] = []
     for value in inputs.values():
         parts: Any = (value,) if isinstance(value, Tensor) else value
-        found += [x for x in parts if x is not None]
-    return found
+        leaves += [x for x in parts if x is not None]
+    return leaves
 
 
 __all__ = ["found", "off", "refusal", "rollout", "surroundings"]

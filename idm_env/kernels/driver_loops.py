@@ -155,9 +155,9 @@ def uniform(w, plan, n):
 def look(target, to, h, w, plan, seen, same, signals, places, now, wide, n):
     """Fill rows with the past: ``places`` are (row, signal) of each, ``seen`` tells how long ago it was."""
     for i in range(places.shape[0]):
-        at, signal, ago = to + i * ROW, places[i, 1], seen[places[i, 0], 1]
+        begin, signal, ago = to + i * ROW, places[i, 1], seen[places[i, 0], 1]
         when = w[plan.agos + ago * ROW :]
-        row = target[at:]
+        row = target[begin:]
         if same[ago]:
             source = h[((now - int(when[0])) * signals + signal) * wide :]
             for j in range(n):

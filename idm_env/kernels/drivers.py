@@ -61,10 +61,10 @@ class _Printed:
         """Return the addresses of phases, 0 for what there is not, and the constants of a precision."""
         if (kind, names) not in self.known:
             head = HEADER.format(title=self.title, row=loops.ROW, kind=kind) + BESIDE
-            module, there = library.load("driver", head + self.text.text), self.text.phases
+            module, phases = library.load("driver", head + self.text.text), self.text.phases
             # Rounded as torch rounds a Python number that meets a tensor.
             constants = np.array([float(x) for x in self.text.constants.values] or [0.0], kind)
-            addresses = [getattr(module, n).address if n in there else 0 for n in names]
+            addresses = [getattr(module, n).address if n in phases else 0 for n in names]
             self.known[kind, names] = np.array(addresses, np.int64), constants
         return self.known[kind, names]
 
@@ -72,8 +72,8 @@ class _Printed:
     def places(self) -> Array:
         """Return what drivers see of the past: (place among what is seen, signal)."""
         signals = self.text.program.signals
-        found = [(i, signals.index(s)) for i, (s, _) in enumerate(self.text.program.seen)]
-        return np.array(found, np.int64).reshape(-1, 2)
+        pairs = [(i, signals.index(s)) for i, (s, _) in enumerate(self.text.program.seen)]
+        return np.array(pairs, np.int64).reshape(-1, 2)
 
     @cached_property
     def moving(self) -> Array:
@@ -184,12 +184,12 @@ class BehindRecord:
         reads: list[tuple[int, int]] = []
         for slot in kernel.program.records:
             name = slot.name.removesuffix(" after")
-            at = min(max(driver - slot.shift, 0), vehicles - 1)
-            if (name, at) not in series:
-                series[name, at] = len(columns)
+            column = min(max(driver - slot.shift, 0), vehicles - 1)
+            if (name, column) not in series:
+                series[name, column] = len(columns)
                 source = records[name] if name in records else part_of(inputs, name)
-                columns.append(self._column(source[..., at]))
-            reads.append((series[name, at], int(slot.name.endswith(" after"))))
+                columns.append(self._column(source[..., column]))
+            reads.append((series[name, column], int(slot.name.endswith(" after"))))
         self._record = np.stack(columns) if columns else np.zeros((1, self.steps + 1, self.rows), self.kind)
         self._reads = np.array(reads, np.int64).reshape(-1, 2)
 
@@ -205,17 +205,17 @@ class BehindRecord:
     def _start(self, state: State) -> Tensor:
         """Return the states at the start, (states, …, rows), differentiably."""
         shape = state.speed.shape[:-1]
-        found = []
+        parts = []
         for name in self.kernel.program.states:
             if name == "step":
-                found.append(state.step.to(state.speed.dtype).expand(shape))
+                parts.append(state.step.to(state.speed.dtype).expand(shape))
             elif name.startswith("memory of "):
-                found.append(state.memory[name.removeprefix("memory of ")].expand_as(state.speed)[..., self.driver])
+                parts.append(state.memory[name.removeprefix("memory of ")].expand_as(state.speed)[..., self.driver])
             elif name.startswith("gap"):
-                found.append(state.gap.expand_as(state.speed)[..., self.driver - shift_of(name)])
+                parts.append(state.gap.expand_as(state.speed)[..., self.driver - shift_of(name)])
             else:
-                found.append(getattr(state, name).expand_as(state.speed)[..., self.driver])
-        return torch.stack([x.expand(shape) for x in found])
+                parts.append(getattr(state, name).expand_as(state.speed)[..., self.driver])
+        return torch.stack([x.expand(shape) for x in parts])
 
     def _past(self, state: State) -> Tensor:
         """Return the past, (slots · signals, …, rows), newest slot first, differentiably."""
@@ -230,14 +230,14 @@ class BehindRecord:
     def _statics(self, state: State, params: Params) -> Tensor:
         """Return parameters and lengths, (…, …, rows), differentiably."""
         like, program = state.speed, self.kernel.program
-        found = []
+        values = []
         for name in program.parameters:
             effect, parameter = name.split(".", 1)
-            found.append(params[effect][parameter].to(like.dtype).expand_as(like)[..., self.driver])
+            values.append(params[effect][parameter].to(like.dtype).expand_as(like)[..., self.driver])
         for slot in program.constants:
-            at = min(max(self.driver - slot.shift, 0), like.shape[-1] - 1)
-            found.append(state.length.expand_as(like)[..., at])
-        return torch.stack(found) if found else like.new_zeros(1, *like.shape[:-1])
+            column = min(max(self.driver - slot.shift, 0), like.shape[-1] - 1)
+            values.append(state.length.expand_as(like)[..., column])
+        return torch.stack(values) if values else like.new_zeros(1, *like.shape[:-1])
 
     def _run(
         self, loop: Any, printed: _Printed, shape: Sequence[int], slots: int, *arguments: Any, threads: Any
@@ -305,8 +305,8 @@ class BehindRecord:
         )  # fmt: skip
         on_start = np.zeros_like(start)
         on_start[moving] = on_moving
-        found = [torch.from_numpy(x).view(-1, *shape) for x in (on_start, on_past, on_statics)]
-        return found[0], found[1], found[2]
+        gradients = [torch.from_numpy(x).view(-1, *shape) for x in (on_start, on_past, on_statics)]
+        return gradients[0], gradients[1], gradients[2]
 
     # -- tangents ------------------------------------------------------------------------------------------------
 
@@ -373,17 +373,18 @@ class BehindRecord:
         program = self.kernel.program
         moving = [n for n in program.states if n in program.moving]
         leaves = list(values.values())
-        made = None
+        derivative = None
         for i, name in enumerate(moving):
             memory = state.memory.get(name.removeprefix("memory of "))
             if memory is None or not memory.requires_grad:
                 continue
-            made = state.speed.new_zeros(len(leaves), len(moving), *state.speed.shape[:-1]) if made is None else made
+            if derivative is None:
+                derivative = state.speed.new_zeros(len(leaves), len(moving), *state.speed.shape[:-1])
             one = memory.expand_as(state.speed)[..., self.driver].sum()
             for j, slope in enumerate(torch.autograd.grad(one, leaves, retain_graph=True, allow_unused=True)):
                 if slope is not None:
-                    made[j, i] = slope
-        return made
+                    derivative[j, i] = slope
+        return derivative
 
 
 class _Rollout(torch.autograd.Function):
@@ -393,8 +394,8 @@ class _Rollout(torch.autograd.Function):
     def forward(
         ctx: Any, behind: BehindRecord, every: int, threads: int | None, *sources: Tensor
     ) -> tuple[Tensor, Tensor]:
-        wanted = any(ctx.needs_input_grad[3:])
-        taped = behind.kernel.taped if wanted else np.zeros(0, np.int64)
+        differentiable = any(ctx.needs_input_grad[3:])
+        taped = behind.kernel.taped if differentiable else np.zeros(0, np.int64)
         gap, speed, tape = behind._forward(sources, every, threads, taped)
         ctx.behind, ctx.every, ctx.threads, ctx.tape = behind, every, threads, tape
         ctx.save_for_backward(*sources)
@@ -405,8 +406,8 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     @once_differentiable  # second derivatives need the torch path: an error says so, not a silent zero
     def backward(ctx: Any, *seeds: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        found = ctx.behind._backward(ctx.saved_tensors, ctx.tape, seeds, ctx.every, ctx.threads)
-        return None, None, None, *found
+        gradients = ctx.behind._backward(ctx.saved_tensors, ctx.tape, seeds, ctx.every, ctx.threads)
+        return None, None, None, *gradients
 
 
 __all__ = ["BehindRecord", "DriverKernel", "prepared"]

@@ -84,9 +84,9 @@ class Walk:
 
     def run(self, function: ast.FunctionDef, arguments: Sequence[tuple[Any, Any]]) -> None:
         """Emit a function whose arguments have these types and values."""
-        for given, (kind, value) in zip(function.args.args, arguments, strict=True):
+        for parameter, (kind, value) in zip(function.args.args, arguments, strict=True):
             is_pointer = isinstance(kind, types.CPointer)
-            self._names[given.arg] = Pointer(kind.dtype, value) if is_pointer else Value(kind, value)
+            self._names[parameter.arg] = Pointer(kind.dtype, value) if is_pointer else Value(kind, value)
         self._block(function.body)
         for access, name in self._accesses:
             others = [x for n, x in self._scopes.items() if n != name]
@@ -124,13 +124,13 @@ class Walk:
     def _set(self, target: ast.expr, value: Any) -> None:
         if isinstance(target, ast.Subscript):
             to = self._place(target)
-            made = self._context.data_model_manager[to.kind].as_data(self._builder, self._cast(value, to.kind))
-            self._apart(self._builder.store(made, to.ir), to.name)
+            content = self._context.data_model_manager[to.kind].as_data(self._builder, self._cast(value, to.kind))
+            self._apart(self._builder.store(content, to.ir), to.name)
             return
         assert isinstance(target, ast.Name)
         if isinstance(value, Pointer):
-            known = value.name or _CONSTANT.fullmatch(target.id)
-            self._names[target.id] = value._replace(name=target.id if known else "given")
+            has_name = value.name or _CONSTANT.fullmatch(target.id)
+            self._names[target.id] = value._replace(name=target.id if has_name else "given")
             return
         value = self._number(value)
         slot = self._slots.get((target.id, value.kind))
@@ -150,12 +150,12 @@ class Walk:
         before = builder.block
         builder.branch(head)
         builder.position_at_end(head)
-        at = builder.phi(_WHOLE, node.target.id)
-        at.add_incoming(begin, before)
-        builder.cbranch(builder.icmp_signed("<", at, end), body, out)
+        index = builder.phi(_WHOLE, node.target.id)
+        index.add_incoming(begin, before)
+        builder.cbranch(builder.icmp_signed("<", index, end), body, out)
         builder.position_at_end(body)
-        self._again(node.body, {node.target.id: Value(types.int64, at)})
-        at.add_incoming(builder.add(at, by, flags=("nsw",)), builder.block)
+        self._again(node.body, {node.target.id: Value(types.int64, index)})
+        index.add_incoming(builder.add(index, by, flags=("nsw",)), builder.block)
         builder.branch(head)
         builder.position_at_end(out)
 
@@ -194,22 +194,22 @@ class Walk:
         return node.value
 
     def _name(self, node: ast.Name) -> Any:
-        found = self._names.get(node.id)
-        if isinstance(found, Variable):
-            self._read.append((node.id, found))
-            return Value(found.kind, self._builder.load(found.slot))
-        if found is not None:
-            return found
+        content = self._names.get(node.id)
+        if isinstance(content, Variable):
+            self._read.append((node.id, content))
+            return Value(content.kind, self._builder.load(content.slot))
+        if content is not None:
+            return content
         return self._room[node.id] if node.id in self._room else getattr(builtins, node.id)
 
     def _attribute(self, node: ast.Attribute) -> Any:
         return getattr(self._value(node.value), node.attr)
 
     def _subscript(self, node: ast.Subscript) -> Value:
-        at = self._place(node)
-        found = self._builder.load(at.ir)
-        self._apart(found, at.name)
-        return Value(at.kind, self._context.data_model_manager[at.kind].from_data(self._builder, found))
+        place = self._place(node)
+        content = self._builder.load(place.ir)
+        self._apart(content, place.name)
+        return Value(place.kind, self._context.data_model_manager[place.kind].from_data(self._builder, content))
 
     def _apart(self, access: Any, name: str) -> None:
         """Note where an access is to: own memory and constants lie apart from each other and from what is given.
@@ -217,9 +217,9 @@ class Walk:
         So LLVM need not test dozens of arrays for overlap, which it refuses to do, and then emits scalar code.
         """
         if name:
-            add, of = self._builder.module.add_metadata, self._scopes
-            of.setdefault(name, add([f"idm_env {name}", add(["idm_env"])]))
-            access.set_metadata("alias.scope", add([of[name]]))
+            add, scopes = self._builder.module.add_metadata, self._scopes
+            scopes.setdefault(name, add([f"idm_env {name}", add(["idm_env"])]))
+            access.set_metadata("alias.scope", add([scopes[name]]))
             self._accesses.append((access, name))
 
     def _place(self, node: ast.Subscript) -> Pointer:
@@ -236,10 +236,10 @@ class Walk:
         return self._called(_OPERATORS[type(node.ops[0])], [self._value(node.left), self._value(node.comparators[0])])
 
     def _boolop(self, node: ast.BoolOp) -> Any:
-        made = self._value(node.values[0])
+        result = self._value(node.values[0])
         for each in node.values[1:]:
-            made = self._called(_OPERATORS[type(node.op)], [made, self._value(each)])
-        return made
+            result = self._called(_OPERATORS[type(node.op)], [result, self._value(each)])
+        return result
 
     def _ifexp(self, node: ast.IfExp) -> Any:
         test = self._value(node.test)
@@ -252,49 +252,49 @@ class Walk:
 
     def _call(self, node: ast.Call) -> Any:
         if isinstance(node.func, ast.Name) and node.func.id in _IN_LINE:
-            kept = dict(self._names)
+            before = dict(self._names)
             self._names |= {n: self._value(x) for n, x in zip("xy", node.args, strict=True)}
-            made = self._value(_IN_LINE[node.func.id])
-            self._names = kept
-            return made
-        called, given = self._value(node.func), [self._value(x) for x in node.args]
+            result = self._value(_IN_LINE[node.func.id])
+            self._names = before
+            return result
+        called, arguments = self._value(node.func), [self._value(x) for x in node.args]
         if called is carray:
-            return given[0]
+            return arguments[0]
         if called is located:
-            kind = _type_of(given[1])
+            kind = _type_of(arguments[1])
             to = self._context.get_data_type(kind).as_pointer()
-            return Pointer(kind, self._builder.inttoptr(self._cast(given[0], types.int64), to))
+            return Pointer(kind, self._builder.inttoptr(self._cast(arguments[0], types.int64), to))
         if called is np.empty:
-            return self._room_for(given[0], _type_of(given[1] if len(given) > 1 else np.float64))
+            return self._room_for(arguments[0], _type_of(arguments[1] if len(arguments) > 1 else np.float64))
         if called is np.uint64:
-            return given[0]  # of an index: none is negative
+            return arguments[0]  # of an index: none is negative
         if isinstance(called, type) and issubclass(called, np.generic):
-            return Value(_type_of(called), self._cast(given[0], _type_of(called)))
-        return self._called(called, given)
+            return Value(_type_of(called), self._cast(arguments[0], _type_of(called)))
+        return self._called(called, arguments)
 
-    def _called(self, function: Any, given: Sequence[Any]) -> Any:
+    def _called(self, function: Any, arguments: Sequence[Any]) -> Any:
         """Return what a function makes of numbers: numba's instructions for their types."""
-        if not any(isinstance(x, (Value, Pointer)) for x in given):
-            return function(*given)
-        numbers = [self._array(x) if isinstance(x, Pointer) else self._number(x) for x in given]
+        if not any(isinstance(x, (Value, Pointer)) for x in arguments):
+            return function(*arguments)
+        numbers = [self._array(x) if isinstance(x, Pointer) else self._number(x) for x in arguments]
         kinds = tuple(x.kind for x in numbers)
         if (function, kinds) not in self._calls:
             kind = self._context.typing_context.resolve_value_type(function)
-            made = kind.get_call_type(self._context.typing_context, kinds, {})
-            self._calls[function, kinds] = made, self._context.get_function(kind, made)
-        made, implementation = self._calls[function, kinds]
-        values = [self._cast(x, kind) for x, kind in zip(numbers, made.args, strict=True)]
+            call = kind.get_call_type(self._context.typing_context, kinds, {})
+            self._calls[function, kinds] = call, self._context.get_function(kind, call)
+        call, implementation = self._calls[function, kinds]
+        values = [self._cast(x, kind) for x, kind in zip(numbers, call.args, strict=True)]
         for library in getattr(implementation, "libs", ()):
             self._context.active_code_library.add_linking_library(library)
-        return Value(made.return_type, implementation(self._builder, values))
+        return Value(call.return_type, implementation(self._builder, values))
 
-    def _array(self, at: Pointer) -> Value:
+    def _array(self, pointer: Pointer) -> Value:
         """Return an array, longer than any, of what lies at a pointer."""
-        kind = types.Array(at.kind, 1, "C")
-        made = self._context.make_array(kind)(self._context, self._builder)
-        item = self._context.get_abi_sizeof(at.ir.type.pointee)
-        populate_array(made, at.ir, [_WHOLE(1 << 40)], [_WHOLE(item)], _WHOLE(item), None)
-        return Value(kind, made._getvalue())
+        kind = types.Array(pointer.kind, 1, "C")
+        array = self._context.make_array(kind)(self._context, self._builder)
+        item = self._context.get_abi_sizeof(pointer.ir.type.pointee)
+        populate_array(array, pointer.ir, [_WHOLE(1 << 40)], [_WHOLE(item)], _WHOLE(item), None)
+        return Value(kind, array._getvalue())
 
     def _number(self, value: Any) -> Value:
         if isinstance(value, Value):
@@ -303,8 +303,8 @@ class Walk:
         return Value(kind, self._context.get_constant(kind, value))
 
     def _cast(self, value: Any, kind: Any) -> Any:
-        made = self._number(value)
-        return self._context.cast(self._builder, made.ir, made.kind, kind)
+        content = self._number(value)
+        return self._context.cast(self._builder, content.ir, content.kind, kind)
 
     def _condition(self, node: ast.expr) -> Any:
         return self._cast(self._value(node), types.boolean)
@@ -341,9 +341,9 @@ def emitted(kind: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
 
             return signature(types.void, *given), generate
 
-        said = ", ".join(names)
-        room: dict[str, Any] = {"body": counted("body", said, typed), "__name__": function.__module__}
-        exec(f"def {function.__name__}({said}):\n    body({said})", room)
+        parameters = ", ".join(names)
+        room: dict[str, Any] = {"body": counted("body", parameters, typed), "__name__": function.__module__}
+        exec(f"def {function.__name__}({parameters}):\n    body({parameters})", room)
         chosen = {"error_model": "numpy"} | options
         return compat.compiled_callback(room[function.__name__], kind, chosen, name_of(function, chosen), STORE)
 

@@ -3,6 +3,8 @@
 # mypy: disable-error-code="no-untyped-def"
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -66,6 +68,33 @@ _two_to = _exponent(ir.DoubleType(), ir.IntType(64), 1023, 52, types.float64)
 _two_to_single = _exponent(ir.FloatType(), ir.IntType(32), 127, 23, types.float32)
 
 
+def _polynomial(kind: types.Float, coefficients: Sequence[float]) -> Any:
+    """Return a polynomial of such a number, of coefficients from the highest power down, by Horner's rule."""
+    number = ir.FloatType() if kind == types.float32 else ir.DoubleType()
+    highest, *others = (ir.Constant(number, float(np.array(x, str(kind)))) for x in coefficients)
+
+    @intrinsic
+    def horner(typing_context: Any, x: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            value = highest
+            for constant in others:
+                value = builder.fadd(builder.fmul(value, arguments[0]), constant)
+            return value
+
+        return kind(kind), generate
+
+    return horner
+
+
+def _taylor(degree: int) -> list[float]:
+    """Return the coefficients of e^x, from the highest power down."""
+    return [1.0 / math.factorial(k) for k in range(degree, -1, -1)]
+
+
+# Taylor's series for |r| ≤ ln 2 / 2: the first term left out is below 5e-18, and below 6e-9 in single precision.
+_exp_of, _exp_of_single = _polynomial(types.float64, _taylor(13)), _polynomial(types.float32, _taylor(7))
+
+
 @compiler(forceinline=True)
 def exp_float64(x):
     """Return e^x of a double, within one unit in the last place; beyond ±708 as at ±708."""
@@ -74,30 +103,13 @@ def exp_float64(x):
     shifted = y * _LOG2_E + _MAGIC
     n = shifted - _MAGIC
     r = (y - n * _LN2_HIGH) - n * _LN2_LOW
-    # Taylor's series; |r| ≤ ln 2 / 2, so the first term left out is below 5e-18.
-    p = 1.0 / 6227020800.0
-    p = p * r + 1.0 / 479001600.0
-    p = p * r + 1.0 / 39916800.0
-    p = p * r + 1.0 / 3628800.0
-    p = p * r + 1.0 / 362880.0
-    p = p * r + 1.0 / 40320.0
-    p = p * r + 1.0 / 5040.0
-    p = p * r + 1.0 / 720.0
-    p = p * r + 1.0 / 120.0
-    p = p * r + 1.0 / 24.0
-    p = p * r + 1.0 / 6.0
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
-    return p * _two_to(shifted)  # type: ignore[call-arg]
+    return _exp_of(r) * _two_to(shifted)  # type: ignore[call-arg]
 
 
 # Constants of single precision: a Python literal would make doubles of what they meet.
-_LOW, _HIGH, _ONE, _HALF = np.float32(-87.0), np.float32(88.0), np.float32(1.0), np.float32(0.5)
+_LOW, _HIGH, _ONE = np.float32(-87.0), np.float32(88.0), np.float32(1.0)
 _MAGIC_32, _LOG2_E_32 = np.float32(12582912.0), np.float32(_LOG2_E)
 _LN2_HIGH_32, _LN2_LOW_32 = np.float32(0.693359375), np.float32(-2.12194440e-4)
-_C7, _C6, _C5 = np.float32(1 / 5040), np.float32(1 / 720), np.float32(1 / 120)
-_C4, _C3 = np.float32(1 / 24), np.float32(1 / 6)
 
 
 @compiler(forceinline=True)
@@ -108,15 +120,7 @@ def exp_float32(x):
     shifted = y * _LOG2_E_32 + _MAGIC_32
     n = shifted - _MAGIC_32
     r = (y - n * _LN2_HIGH_32) - n * _LN2_LOW_32
-    # Taylor's series; the first term left out is below 6e-9.
-    p = _C7 * r + _C6
-    p = p * r + _C5
-    p = p * r + _C4
-    p = p * r + _C3
-    p = p * r + _HALF
-    p = p * r + _ONE
-    p = p * r + _ONE
-    return p * _two_to_single(shifted)  # type: ignore[call-arg]
+    return _exp_of_single(r) * _two_to_single(shifted)  # type: ignore[call-arg]
 
 
 @compiler(forceinline=True)
@@ -134,6 +138,11 @@ def sigmoid_float32(x):
     return _ONE / (_ONE + exp_float32(-x if x > _FAR_32 else -_FAR_32))
 
 
+# log m = 2 artanh s as a series in s² ≤ 0.0295: the first term left out is below 1e-18 in double precision.
+_artanh_of = _polynomial(types.float64, [1.0 / k for k in range(21, 1, -2)])
+_artanh_of_single = _polynomial(types.float32, [1.0 / k for k in range(9, 1, -2)])
+
+
 @compiler(forceinline=True)
 def log1p_float64(x):
     """Return log(1 + x) of a double, within two units in the last place; −∞ at −1 and nan below."""
@@ -141,26 +150,15 @@ def log1p_float64(x):
     # What rounding took from 1 + x, relative to it.
     lost = ((1.0 - (u - x)) if x > 1.0 else (x - (u - 1.0))) / u
     n, m = _parts_of(u)  # type: ignore[call-arg]
-    # log m = 2 artanh s as a series; s² ≤ 0.0295, so the first term left out is below 1e-18.
     s = (m - 1.0) / (m + 1.0)
     z = s * s
-    p = 1.0 / 21.0
-    p = p * z + 1.0 / 19.0
-    p = p * z + 1.0 / 17.0
-    p = p * z + 1.0 / 15.0
-    p = p * z + 1.0 / 13.0
-    p = p * z + 1.0 / 11.0
-    p = p * z + 1.0 / 9.0
-    p = p * z + 1.0 / 7.0
-    p = p * z + 1.0 / 5.0
-    p = p * z + 1.0 / 3.0
-    y = n * _LN2_HIGH + (2.0 * s + (2.0 * s * z * p + (n * _LN2_LOW + lost)))
+    y = n * _LN2_HIGH + (2.0 * s + (2.0 * s * z * _artanh_of(z) + (n * _LN2_LOW + lost)))
     y = y if u > 0.0 else (-np.inf if u == 0.0 else np.nan)
     return x if x == np.inf else y
 
 
 _ZERO, _INFINITE, _NAN = np.float32(0.0), np.float32(np.inf), np.float32(np.nan)
-_TWO, _C9_LOG, _C7_LOG, _C5_LOG, _C3_LOG = (np.float32(x) for x in (2.0, 1 / 9, 1 / 7, 1 / 5, 1 / 3))
+_TWO = np.float32(2.0)
 
 
 @compiler(forceinline=True)
@@ -171,23 +169,17 @@ def log1p_float32(x):
     n, m = _parts_of_single(u)  # type: ignore[call-arg]
     s = (m - _ONE) / (m + _ONE)
     z = s * s
-    p = _C9_LOG * z + _C7_LOG
-    p = p * z + _C5_LOG
-    p = p * z + _C3_LOG
-    y = n * _LN2_HIGH_32 + (_TWO * s + (_TWO * s * z * p + (n * _LN2_LOW_32 + lost)))
+    y = n * _LN2_HIGH_32 + (_TWO * s + (_TWO * s * z * _artanh_of_single(z) + (n * _LN2_LOW_32 + lost)))
     y = y if u > _ZERO else (-_INFINITE if u == _ZERO else _NAN)
     return x if x == _INFINITE else y
 
 
-_UP = [np.float32(x) for x in (
+_UP = (
     -2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08, 1.48572235717979e-05,
     6.37261928875436e-04, 4.89352455891786e-03,
-)]  # fmt: skip
-_DOWN = [
-    np.float32(x) for x in (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)
-]
-_U6, _U5, _U4, _U3, _U2, _U1, _U0 = _UP
-_D3, _D2, _D1, _D0 = _DOWN
+)  # fmt: skip
+_DOWN = (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)
+_odd_of, _even_of = _polynomial(types.float32, _UP), _polynomial(types.float32, _DOWN)
 _MOST_32 = np.float32(7.90531110763549805)
 
 
@@ -197,16 +189,7 @@ def tanh_float32(x):
     y = -_MOST_32 if x < -_MOST_32 else x
     y = _MOST_32 if y > _MOST_32 else y
     z = y * y
-    p = z * _U6 + _U5
-    p = p * z + _U4
-    p = p * z + _U3
-    p = p * z + _U2
-    p = p * z + _U1
-    p = (p * z + _U0) * y
-    q = z * _D3 + _D2
-    q = q * z + _D1
-    q = q * z + _D0
-    return p / q
+    return _odd_of(z) * y / _even_of(z)
 
 
 @compiler(forceinline=True)

@@ -129,7 +129,7 @@ def backward(
     filled = 0
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
-        at = row * size + first + skip
+        cell = row * size + first + skip
         if tile + 1 < end:
             following = place(tile + 1, rows, size, wide, around, is_ring)
             fetch_states(start, again, following, size, k)
@@ -165,17 +165,16 @@ def backward(
             step_back(w, h.ctypes.data, ROW, ah, n, size, measures, phases, back, looks, recalls, sends, k, then, then)
             if over:
                 for i in range(measures[lane.NUMBERS]):
-                    copy(
-                        on_inputs, (i * over + now) * count + at, w, measures[lane.ON_INPUT_ROWS] + i * ROW + skip, own
-                    )
+                    to = (i * over + now) * count + cell
+                    copy(on_inputs, to, w, measures[lane.ON_INPUT_ROWS] + i * ROW + skip, own)
         if back[lane.HOIST]:
             call(back[lane.HOIST], w, padded(n), k)  # type: ignore[call-arg]
         for i in range(measures[lane.MOVING]):
             if on_begin[i]:
-                copy(on_begin[i], at, w, measures[lane.ON_ROWS] + i * ROW + skip, own)
-        store_past(ah, on_past, slots - 1, slots, signals, at, skip, own, count)
+                copy(on_begin[i], cell, w, measures[lane.ON_ROWS] + i * ROW + skip, own)
+        store_past(ah, on_past, slots - 1, slots, signals, cell, skip, own, count)
         for i in range(measures[lane.PARAMETERS]):
             if fresh:
-                copy(on_parameters, i * count + at, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)
+                copy(on_parameters, i * count + cell, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)
             else:
-                add(on_parameters, i * count + at, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)
+                add(on_parameters, i * count + cell, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)

@@ -106,14 +106,14 @@ def find(w, target, kind, at, m, exists, to, behind, begin, lap, ring, tables):
         for j in range(m):
             q = number(behind, at + j, w)
             over = q == first
-            there = number(lap, last - 1 if over else q - 1, w)
-            w[target + j] = ring * (number(lap, at + j, w) - there + over)
+            other_lap = number(lap, last - 1 if over else q - 1, w)
+            w[target + j] = ring * (number(lap, at + j, w) - other_lap + over)
     else:
         for j in range(m):
             q = number(behind, at + j, w)
             over = q == last
-            there = number(lap, first if over else q, w)
-            w[target + j] = -(ring * (number(lap, at + j, w) - there - over))
+            other_lap = number(lap, first if over else q, w)
+            w[target + j] = -(ring * (number(lap, at + j, w) - other_lap - over))
 
 
 @exact
@@ -172,9 +172,9 @@ def better(utility, by_hand, slot, other, other_by_hand, other_slot):
 @apart
 def reordered(order, begin, place, count, ring, winner, granted, fresh_order, fresh_begin):
     """Write the order after the granted changes."""
-    at = 0
+    rank = 0
     for k in range(count):
-        fresh_begin[k] = at
+        fresh_begin[k] = rank
         first, last = begin[k], begin[k + 1]
         late = np.int64(-1)
         for q in range(first, last + 1):
@@ -183,15 +183,15 @@ def reordered(order, begin, place, count, ring, winner, granted, fresh_order, fr
                 if ring > 0 and q == first and last > first and place[r] <= place[first]:
                     late = r  # the gap in front of the first is the one behind the last
                 else:
-                    fresh_order[at] = order[r]
-                    at += 1
+                    fresh_order[rank] = order[r]
+                    rank += 1
             if q < last and not granted[q]:
-                fresh_order[at] = order[q]
-                at += 1
+                fresh_order[rank] = order[q]
+                rank += 1
         if late >= 0:
-            fresh_order[at] = order[late]
-            at += 1
-    fresh_begin[count] = at
+            fresh_order[rank] = order[late]
+            rank += 1
+    fresh_begin[count] = rank
 
 
 @apart
@@ -321,22 +321,22 @@ def decide(
         winner[:] = -1
         some = 0
         for own in range(count):
-            for at in range(begin[own], begin[own + 1], CHUNK):
-                m = min(CHUNK, begin[own + 1] - at)
-                if len(turns) and not any_of(turns, stage, order, at, m):
+            for rank in range(begin[own], begin[own + 1], CHUNK):
+                m = min(CHUNK, begin[own + 1] - rank)
+                if len(turns) and not any_of(turns, stage, order, rank, m):
                     continue
                 fill_rows(
-                    w, slots, plan, places, which, at, m, own, begin, count, order, left, right, lap, base, row,
+                    w, slots, plan, places, which, rank, m, own, begin, count, order, left, right, lap, base, row,
                     ring, tables,
                 )  # fmt: skip
                 call(phase, w, padded(m), k)  # type: ignore[call-arg]
-                found = settle(
-                    w, slots * ROW, at, m, own, left, right, begin, ring, left_hand, base, order, winner, utility,
+                outcome = settle(
+                    w, slots * ROW, rank, m, own, left, right, begin, ring, left_hand, base, order, winner, utility,
                     to_left, len(merger) > 0, signals, refused, blocked, turns, stage,
                 )  # fmt: skip
-                if found < 0:
+                if outcome < 0:
                     return False
-                some |= found
+                some |= outcome
         granted[:] = False
         for r in winner:
             if r >= 0:

@@ -115,25 +115,25 @@ class Traffic:
         led, leads = (np.empty(self.rows * wide, dense(state.position, self.shape).dtype) for _ in range(2))
         if not self._lay(state, around, wide, slots, own, led, leads):
             return None
-        at, (there, first, last) = (*self.shape[:-1], wide), (torch.from_numpy(x) for x in (slots, led, leads))
-        there = there.view(at)
+        shape, (slot_of, first, last) = (*self.shape[:-1], wide), (torch.from_numpy(x) for x in (slots, led, leads))
+        slot_of = slot_of.view(shape)
         ends = None
         if self.road.closed:
-            lane = self.links.lane.expand(self.shape).gather(-1, there)
+            lane = self.links.lane.expand(self.shape).gather(-1, slot_of)
             ends = self.road.closed_at(lane, state.position)
-        return Places(there, torch.from_numpy(own).view(self.shape), first.view(at), last.view(at), ends)
+        return Places(slot_of, torch.from_numpy(own).view(self.shape), first.view(shape), last.view(shape), ends)
 
     def _lay(self, state: State, around: int, wide: int, *to: Array) -> bool:
         """Lay all rows out into four arrays; False where links are no order. Whoever has just decided knows it."""
-        count, known = self.road.count, self._order
+        count, order = self.road.count, self._order
         self._order = None
-        if known is not None:
-            order_loops.laid_by(*known, self.rows, self.n, count, around, wide, *to)
+        if order is not None:
+            order_loops.laid_by(*order, self.rows, self.n, count, around, wide, *to)
             return True
         lanes_of, leader, follower = (dense(x, self.shape) for x in self.links[:3])
-        position, there = dense(state.position, self.shape), self._present(state)
-        given = leader, follower, lanes_of, position, *there, np.arange(self.rows), self.n, count, self._ring
-        return bool(order_loops.laid(*given, around, wide, *to))
+        position, presence = dense(state.position, self.shape), self._present(state)
+        arguments = leader, follower, lanes_of, position, *presence, np.arange(self.rows), self.n, count, self._ring
+        return bool(order_loops.laid(*arguments, around, wide, *to))
 
     def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params, stage: int) -> State | None:
         """Return the state after those have decided whose turn it is at a stage, or None where links are no order."""
@@ -173,13 +173,13 @@ class Traffic:
         view = Linked(self.road, links, state.position)
         return seen_merging(view, state, torch.from_numpy(merger).view(self.shape), due)
 
-    def _plan(self, found: Decision, state: State, inputs: Inputs, params: Params) -> tuple[Array, Array, list[Array]]:
+    def _plan(self, kernel: Decision, state: State, inputs: Inputs, params: Params) -> tuple[Array, Array, list[Array]]:
         """Return what rows are filled with, whose numbers these are, and the arrays that the plan points to.
 
         What does not change in a rollout is looked up once.
         """
         if self._lasting is None:
-            self._lasting = self._begun(found, state, inputs, params)
+            self._lasting = self._begun(kernel, state, inputs, params)
         plan, places, moving, held = self._lasting
         more = []
         for i, name in moving:
@@ -188,7 +188,7 @@ class Traffic:
             more.append(array)
         return plan, places, [*held, *more]
 
-    def _begun(self, found: Decision, state: State, inputs: Inputs, params: Params) -> _Lasting:
+    def _begun(self, kernel: Decision, state: State, inputs: Inputs, params: Params) -> _Lasting:
         held, moving = [], []
 
         def find(i: int, name: str) -> tuple[int, int, int]:
@@ -198,7 +198,7 @@ class Traffic:
                 moving.append((i, name))
             return int(addresses([array])[0]), by_row, by_vehicle
 
-        return *rows_of(found.slots, find), moving, held
+        return *rows_of(kernel.slots, find), moving, held
 
     def _operand(self, name: str, state: State, inputs: Inputs, params: Params) -> tuple[Array, int, int]:
         """Return an array and its strides by row and vehicle."""
@@ -241,9 +241,9 @@ def rows_of(slots: Sequence[Leaf], find: Callable[[int, str], tuple[int, int, in
         if name in KINDS:
             rows.append((KINDS[name], side, 0, 0, 0, 0))
             continue
-        at, by_row, by_vehicle = find(i, name)
+        address, by_row, by_vehicle = find(i, name)
         place = places.setdefault((side, slot.shift), len(places)) if by_vehicle else 0
-        rows.append((lane_change_loops.ARRAY, side, place, at, by_row, by_vehicle))
+        rows.append((lane_change_loops.ARRAY, side, place, address, by_row, by_vehicle))
     return np.array(rows, np.int64), np.array(list(places), np.int64).reshape(-1, 2)
 
 

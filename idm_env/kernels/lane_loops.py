@@ -157,15 +157,15 @@ def respond_and_fetch(w, m, phases, k, sources, following, size):
 @apart
 def dense_arrays(start, read, operands, strides, many, size):
     """Return the addresses of what a tile is filled from and that has a number for every vehicle."""
-    found, count = np.empty(len(read) + many, np.int64), 0
+    sources, count = np.empty(len(read) + many, np.int64), 0
     for i in read:
-        found[count] = start[i]
+        sources[count] = start[i]
         count += 1
     for i in range(many):
         if strides[i, 2] == 1 and strides[i, 1] == size:
-            found[count] = operands[i]
+            sources[count] = operands[i]
             count += 1
-    return found[:count]
+    return sources[:count]
 
 
 @apart
@@ -231,7 +231,7 @@ def forward(
         load_past(h, past, alike, 0, slots, signals, strides, row, first, n, size, count)
         load_static(w, operands, strides, row, first, n, size, n <= filled, measures, phases, looks, k)
         filled = max(filled, n)
-        at = row * size + first + skip
+        cell = row * size + first + skip
         for t in range(begin_step, begin_step + steps):
             if has_inputs:
                 load_inputs(w, operands, strides, t, row, first, n, size, measures)
@@ -244,14 +244,14 @@ def forward(
                 respond_and_fetch(w, padded(n), phases, k, sources, following, size)
                 close(w, n, size, measures, phases, looks, k)
             if every:
-                copy(kept, t * count + at, w, measures[POSITION] + skip, own)
-                copy(kept, (every + t) * count + at, w, measures[SPEED] + skip, own)
-                copy(kept, (2 * every + t) * count + at, w, measures[ACCEL] + skip, own)
-                copy(kept, (3 * every + t) * count + at, w, measures[GAP] + skip, own)
+                copy(kept, t * count + cell, w, measures[POSITION] + skip, own)
+                copy(kept, (every + t) * count + cell, w, measures[SPEED] + skip, own)
+                copy(kept, (2 * every + t) * count + cell, w, measures[ACCEL] + skip, own)
+                copy(kept, (3 * every + t) * count + cell, w, measures[GAP] + skip, own)
         if past_caches:
-            store(ends, at, w, measures[STATE_ROWS] + skip, measures[STATES], own)
+            store(ends, cell, w, measures[STATE_ROWS] + skip, measures[STATES], own)
         else:
             for i in range(measures[STATES]):
                 if ends[i]:
-                    copy(ends[i], at, w, measures[STATE_ROWS] + i * ROW + skip, own)
-        store_past(h, past_end, slots + steps - 1, slots, signals, at, skip, own, count)
+                    copy(ends[i], cell, w, measures[STATE_ROWS] + i * ROW + skip, own)
+        store_past(h, past_end, slots + steps - 1, slots, signals, cell, skip, own, count)

@@ -94,12 +94,12 @@ class RolloutPlan:
         size = self.shape[-1]
         wide = tiles.width(size, self.slots)
         around = tiles.halo(steps, self.kernel.program.reach)
-        given = (
+        common = (
             *arguments, self.places, self.strides, self.kernel.constants[self.kind.name],
             first, steps, self.rows, size, wide, around,
         )  # fmt: skip
         pool.split(
-            lambda begin, end: loop(*given, begin, end),
+            lambda begin, end: loop(*common, begin, end),
             tiles.tiles(self.rows, size, wide, around), 1, pool.count(self.rows * size * steps, self.threads),
         )  # fmt: skip
 
@@ -152,15 +152,15 @@ def part_of(inputs: Inputs, name: str) -> Tensor:
 
 def starts(plan_state: State, names: tuple[str, ...]) -> list[Tensor]:
     """Return the tensors of the states, in the order of the program."""
-    found = []
+    parts = []
     for name in names:
         if name.startswith("memory of "):
-            found.append(plan_state.memory[name.removeprefix("memory of ")])
+            parts.append(plan_state.memory[name.removeprefix("memory of ")])
         elif name == "step":
-            found.append(plan_state.clock.to(plan_state.speed.dtype))
+            parts.append(plan_state.clock.to(plan_state.speed.dtype))
         else:
-            found.append(getattr(plan_state, name))
-    return found
+            parts.append(getattr(plan_state, name))
+    return parts
 
 
 def past_rows(past: Tensor, shape: tuple[int, ...], *, every: bool = False) -> Array:
@@ -186,19 +186,19 @@ def planned(
     """Return what ``run`` takes."""
     *batch, size = state.speed.shape
     program = kernel.program
-    given = [static_of(simulator, state, params, n) for n in (*program.statics, *program.parameters)]
+    values = [static_of(simulator, state, params, n) for n in (*program.statics, *program.parameters)]
     numbers = [part_of(inputs, n) for n in kernel.numbers]
     kind = state.speed.dtype
-    made = [operand(x.to(kind), batch, size) for x in given]
-    made += [operand(x, batch, size, steps) for x in (*numbers, *(part_of(inputs, n) for n in kernel.flags))]
-    strides = table([*(s for _, s in made), (0, size, 1)])
+    operands = [operand(x.to(kind), batch, size) for x in values]
+    operands += [operand(x, batch, size, steps) for x in (*numbers, *(part_of(inputs, n) for n in kernel.flags))]
+    strides = table([*(s for _, s in operands), (0, size, 1)])
     differentiated = list[Tensor]()
     if torch.is_grad_enabled():
-        differentiated = _differentiated(program.moving, state, given[len(program.statics) :], numbers, kernel.signals)
+        differentiated = _differentiated(program.moving, state, values[len(program.statics) :], numbers, kernel.signals)
     tape = any(x.requires_grad for x in differentiated)
     plan = RolloutPlan(
         kernel, simulator, state, inputs, params, steps, min(block, steps), keep, tape,
-        tuple(a for a, _ in made), strides, threads,
+        tuple(a for a, _ in operands), strides, threads,
     )  # fmt: skip
     return plan, differentiated
 
@@ -215,7 +215,7 @@ def _forward(
 ) -> tuple[list[Array | None], Array, Array, list[tuple[list[Array | None], Array]]]:
     """Return the last states, the last past, what is kept of every step, and the tape: states at every block."""
     states = range(len(plan.kernel.program.states))
-    kept = take((4, plan.steps if plan.keep else 0, plan.count), plan.kind)
+    motion = take((4, plan.steps if plan.keep else 0, plan.count), plan.kind)
     blocks = plan.blocks()
     tape: list[tuple[list[Array | None], Array]] = []
     again, read = set(plan.kernel.again), set(plan.kernel.read)
@@ -235,22 +235,22 @@ def _forward(
         alike = len(before) == plan.kernel.signals
         plan.forward(
             first, steps, addresses(now), addresses(ends), before.ctypes.data, alike, after.ctypes.data, plan.slots,
-            kept.ctypes.data, plan.steps if plan.keep else 0,
+            motion.ctypes.data, plan.steps if plan.keep else 0,
         )  # fmt: skip
         now, before = ends, after
-    return now, before, kept, tape
+    return now, before, motion, tape
 
 
 def _ran(plan: RolloutPlan) -> tuple[list[Tensor], list[tuple[list[Array | None], Array]]]:
     """Return the last states, the last past and what is kept, without a graph; and the tape."""
     start = [dense(x.to(plan.state.speed.dtype), plan.shape) for x in starts(plan.state, plan.kernel.program.states)]
     past = past_rows(plan.state.memory[PAST], plan.shape) if plan.slots else plan.past()
-    ends, after, kept, tape = _forward(plan, start, past)
+    ends, after, motion, tape = _forward(plan, start, past)
     out = [torch.from_numpy(x).view(plan.shape) for x in ends if x is not None]
     if plan.slots:
         out.append(past_tensor(after, plan.slots, plan.shape))
     if plan.keep:
-        out += [torch.from_numpy(x).view(plan.steps, *plan.shape) for x in kept]
+        out += [torch.from_numpy(x).view(plan.steps, *plan.shape) for x in motion]
     return out, tape
 
 
@@ -288,9 +288,9 @@ def _backward(
     begin_of = moving + bool(plan.slots)
     parameters = len(program.parameters)
     *batch, size = plan.shape
-    given = [(None, (0, 0, 0)) if s is None else operand(s, batch, size) for s in seeds[:moving]]
-    on: list[Array | None] = [array for array, _ in given]
-    strides = table([s for _, s in given])
+    seeded_operands = [(None, (0, 0, 0)) if s is None else operand(s, batch, size) for s in seeds[:moving]]
+    on: list[Array | None] = [array for array, _ in seeded_operands]
+    strides = table([s for _, s in seeded_operands])
     on_past = plan.past(filled=True)
     if plan.slots and seeds[states] is not None:
         on_past = past_rows(seeds[states], plan.shape, every=True)  # type: ignore[arg-type]
@@ -307,7 +307,7 @@ def _backward(
         first, steps = blocks[number]
         start, past = tape[number]
         # What nobody asks for is not written: half the time of a short rollout goes to memory.
-        begin = [take((plan.count,), plan.kind) if number or wanted else None for wanted in needed[:moving]]
+        begin = [take((plan.count,), plan.kind) if number or is_needed else None for is_needed in needed[:moving]]
         before = plan.past()
         plan.backward(
             first, steps, addresses(start), past.ctypes.data, len(past) == kernel.signals, plan.slots,
@@ -317,8 +317,8 @@ def _backward(
         on, on_past, strides = begin, before, table([(0, size, 1)] * moving)
     full = [*on, *([on_past] if plan.slots else []), *on_parameters, *on_inputs]
     return [
-        _gradient(plan, i, gradient, like, begin_of, parameters) if wanted and gradient is not None else None
-        for i, (gradient, like, wanted) in enumerate(zip(full, saved, needed, strict=True))
+        _gradient(plan, i, gradient, like, begin_of, parameters) if is_needed and gradient is not None else None
+        for i, (gradient, like, is_needed) in enumerate(zip(full, saved, needed, strict=True))
     ]
 
 
@@ -345,29 +345,29 @@ def _differentiable(
 ) -> list[Tensor | None]:
     """Return the gradients with a graph of their own, for second derivatives, from the torch path."""
     program = plan.kernel.program
-    given = dict(zip(program.moving, saved, strict=False))
+    values = dict(zip(program.moving, saved, strict=False))
     memory = dict(plan.state.memory)
-    memory.update({n.removeprefix("memory of "): x for n, x in given.items() if n in program.memories})
+    memory.update({n.removeprefix("memory of "): x for n, x in values.items() if n in program.memories})
     if plan.slots:
         memory[PAST] = saved[len(program.moving)]
-    plain: Any = {n: x for n, x in given.items() if n not in program.memories}
+    plain: Any = {n: x for n, x in values.items() if n not in program.memories}
     with off("second derivatives"):
-        last, kept = plan.simulator.rollout(  # type: ignore[attr-defined]
+        last, motion = plan.simulator.rollout(  # type: ignore[attr-defined]
             plan.state._replace(**plain, memory=memory), plan.inputs, plan.params, plan.steps
         )
     outputs = [
         *starts(last, program.states),
         *([last.memory[PAST]] if plan.slots else []),
-        *(kept if plan.keep else ()),
+        *(motion if plan.keep else ()),
     ]
     pairs = [(o, s) for o, s in zip(outputs, seeds, strict=True) if s is not None]
-    wanted = [x for x in saved if x.requires_grad]
-    found = iter(
+    leaves = [x for x in saved if x.requires_grad]
+    gradients = iter(
         torch.autograd.grad(
-            [o for o, _ in pairs], wanted, [s for _, s in pairs], create_graph=True, allow_unused=True
+            [o for o, _ in pairs], leaves, [s for _, s in pairs], create_graph=True, allow_unused=True
         )
     )  # fmt: skip
-    return [next(found) if x.requires_grad else None for x in saved]
+    return [next(gradients) if x.requires_grad else None for x in saved]
 
 
 def rollout(
@@ -385,18 +385,18 @@ def run(plan: RolloutPlan, sources: Sequence[Tensor]) -> tuple[State, tuple[Tens
     """Return what ``rollout`` does of a plan, differentiated by ``sources`` where it has a tape."""
     program = plan.kernel.program
     out = _Rollout.apply(plan, *sources) if plan.tape else tuple(_ran(plan)[0])
-    kept = out[len(program.states) + bool(plan.slots) :]
-    return state_after(program, plan.state, out, plan.steps), tuple(kept) if plan.keep else None
+    motion = out[len(program.states) + bool(plan.slots) :]
+    return state_after(program, plan.state, out, plan.steps), tuple(motion) if plan.keep else None
 
 
 def state_after(program: Program, state: State, out: Sequence[Tensor], steps: int) -> State:
     """Return the state after some steps from its parts, in the order of the program, with the past behind them."""
-    made = dict(zip(program.states, out, strict=False))
+    values = dict(zip(program.states, out, strict=False))
     memory = dict(state.memory)
-    memory.update({n.removeprefix("memory of "): made[n] for n in program.memories})
+    memory.update({n.removeprefix("memory of "): values[n] for n in program.memories})
     if PAST in memory and len(out) > len(program.states):
         memory[PAST] = out[len(program.states)]
     return state._replace(
-        gap=made["gap"], speed=made["speed"], position=made["position"], accel=made["accel"], step=state.step + steps,
-        present=made.get("present", state.present), memory=memory,
+        gap=values["gap"], speed=values["speed"], position=values["position"], accel=values["accel"],
+        step=state.step + steps, present=values.get("present", state.present), memory=memory,
     )  # fmt: skip

@@ -96,8 +96,8 @@ def stream(typing_context: Any, target: Any, to: Any, source: Any, at: Any) -> A
         first = _pointer(context, builder, target, arguments[0], arguments[1], source.dtype)
         second = _pointer(context, builder, source, arguments[2], arguments[3], source.dtype)
         line = ir.VectorType(ir.IntType(32), LINE // 4).as_pointer()
-        made = builder.load(builder.bitcast(second, line), align=4)
-        done = builder.store(made, builder.bitcast(first, line), align=LINE)
+        content = builder.load(builder.bitcast(second, line), align=4)
+        done = builder.store(content, builder.bitcast(first, line), align=LINE)
         done.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
         return context.get_dummy_value()
 
@@ -132,8 +132,8 @@ def gather(
         base = _pointer(context, builder, source, arguments[2], arguments[3], kind)
         which = _pointer(context, builder, index, arguments[4], arguments[5], index.dtype)
         with cgutils.for_range(builder, arguments[6]) as loop:
-            found = builder.gep(base, [builder.load(builder.gep(which, [loop.index]))])
-            builder.store(builder.load(found), builder.gep(into, [loop.index]))
+            cell = builder.gep(base, [builder.load(builder.gep(which, [loop.index]))])
+            builder.store(builder.load(cell), builder.gep(into, [loop.index]))
         return context.get_dummy_value()
 
     return types.void(target, types.int64, source, types.int64, index, types.int64, types.int64), generate

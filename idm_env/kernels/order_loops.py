@@ -21,11 +21,11 @@ def walk(leader, follower, lane, position, present, coming, n, count, ring, base
     """
     heads = np.full(count, -1, np.int64)
     furthest = np.full(count, -1.0)
-    there = 0
+    on_road = 0
     for i in range(n):
         if coming and present[base + i] <= 0:
             continue
-        there += 1
+        on_road += 1
         k = lane[base + i]
         if ring > 0:
             x = np.float64(position[base + i])
@@ -36,33 +36,33 @@ def walk(leader, follower, lane, position, present, coming, n, count, ring, base
             if heads[k] >= 0:
                 return False
             heads[k] = i
-    at = 0
+    rank = 0
     for k in range(count):
-        begin[k] = at
+        begin[k] = rank
         i = heads[k]
         if i < 0:
             continue
-        while at < there:
+        while rank < on_road:
             x = np.float64(position[base + i])
             if ring > 0:
                 x -= np.floor(x / ring) * ring
-            if at > begin[k] and x > place[at - 1]:
+            if rank > begin[k] and x > place[rank - 1]:
                 return False
-            order[at], place[at] = i, x
-            at += 1
+            order[rank], place[rank] = i, x
+            rank += 1
             following = follower[base + i]
             if following == i or following == heads[k]:
                 break
             i = following
-    begin[count] = at
-    if at < there:
+    begin[count] = rank
+    if rank < on_road:
         return False
     if coming:
         for i in range(n):
             if present[base + i] <= 0:
-                order[at] = i
-                at += 1
-    return at == n
+                order[rank] = i
+                rank += 1
+    return rank == n
 
 
 @apart
@@ -76,12 +76,12 @@ def lay(order, begin, n, count, halo, wide, base, to, slots, own, led, leads):
         first, size = begin[k], begin[k + 1] - begin[k]
         if size == 0:
             continue
-        for at in range(-halo, size + halo):
-            slots[p] = order[first + at % size] if halo else order[first + at]
-            led[p] = at > -halo
-            leads[p] = at < size + halo - 1
-            if 0 <= at < size:
-                own[base + order[first + at]] = p - to
+        for rank in range(-halo, size + halo):
+            slots[p] = order[first + rank % size] if halo else order[first + rank]
+            led[p] = rank > -halo
+            leads[p] = rank < size + halo - 1
+            if 0 <= rank < size:
+                own[base + order[first + rank]] = p - to
             p += 1
     for r in range(begin[count], n):
         slots[p], led[p], leads[p], own[base + order[r]] = order[r], 0, 0, p - to

@@ -50,13 +50,13 @@ def _layer_norm(
 
 def _layer_norm_back(
     g: Tensor, x: Tensor, shape: Sequence[int], mean: Tensor, scale: Tensor, weight: Tensor | None,
-    bias: Tensor | None, wanted: Sequence[bool],
+    bias: Tensor | None, needs: Sequence[bool],
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     normal = (x - mean) * scale
     own = g if weight is None else g * weight
     on_x = scale * (own - own.mean(-1, keepdim=True) - normal * (own * normal).mean(-1, keepdim=True))
     rows = list(range(g.dim() - 1))
-    return on_x, (g * normal).sum(rows) if wanted[1] else None, g.sum(rows) if wanted[2] else None
+    return on_x, (g * normal).sum(rows) if needs[1] else None, g.sum(rows) if needs[2] else None
 
 
 _ATEN = torch.ops.aten
@@ -123,28 +123,28 @@ class PolicyRows(RowFunction):
 
     def _first(self, lines: Sequence[str]) -> list[str]:
         """Print how blocks of inputs are read, rows last; what lies beyond the last row is 0."""
-        made: list[str] = []
+        loads: list[str] = []
         for name, (x, place) in self._read.items():
             if storage(x) in self._used:
                 to, width = f"{place.array}[U({place.start} + j * {PITCH})]", x.numel() // self._rows
-                made += [
+                loads += [
                     f"for j in range({width}):", "    for r in range(count):",
                     f"        {to} = in_{name}[U((first + r) * {width} + j)]",
                     "    for r in range(count, m):", f"        {to} = 0",
                 ]  # fmt: skip
-        return made
+        return loads
 
     def _tell(self, name: str, x: Tensor, kind: str) -> list[str]:
         strides = tuple(math.prod(x.shape[k + 1 :]) for k in range(1, x.dim()))
         to = Place(f"out_{name}", f"(first + r) * {math.prod(x.shape[1:])}", 0, strides, kind)
-        return self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at)}", "count")
+        return self._loops(x.shape[1:], lambda cell: f"{index(to, cell)} = {self._at(x, cell)}", "count")
 
     def _loops(self, shape: Sequence[int], line: Callable[[list[str]], str | list[str]], many: str = "m") -> list[str]:
         """Return loops over a shape and the rows of a block; what is the same for all rows is read before them."""
 
-        def inner(at: list[str]) -> list[str]:
-            made = line(at)
-            lines, held = [made] if isinstance(made, str) else made, dict[str, str]()
+        def inner(cell: list[str]) -> list[str]:
+            text = line(cell)
+            lines, held = [text] if isinstance(text, str) else text, dict[str, str]()
             for i, each in enumerate(lines):
                 for same in _SHARED.findall(each):
                     held.setdefault(same, f"h{len(held)}")
@@ -181,18 +181,18 @@ class PolicyRows(RowFunction):
         # As it stands: a table of constants would be read anew for every row.
         return f"F({float(value)!r})" if kind == "f" and math.isfinite(value) else super()._number(value, kind)
 
-    def _at(self, x: Any, at: Sequence[str], kind: str | None = None) -> str:
+    def _at(self, x: Any, cell: Sequence[str], kind: str | None = None) -> str:
         if not isinstance(x, Tensor):
-            return super()._at(x, at, kind)
+            return super()._at(x, cell, kind)
         self._used.add(storage(x))
         if storage(x) not in self._whole:
-            return super()._at(x, at, kind)
+            return super()._at(x, cell, kind)
         shape = tuple(x.shape)
-        while len(shape) > len(at) and shape[0] == 1:
+        while len(shape) > len(cell) and shape[0] == 1:
             x, shape = x[0], shape[1:]
-        if len(shape) > len(at):
+        if len(shape) > len(cell):
             raise Untraceable("an operation mixes rows")
-        lined = ["0" if n == 1 else i for n, i in zip(shape, at[len(at) - len(shape) :], strict=True)]
+        lined = ["0" if n == 1 else i for n, i in zip(shape, cell[len(cell) - len(shape) :], strict=True)]
         return index(self._place(x), lined)
 
     # -- operations ------------------------------------------------------------------------------------------------
@@ -245,12 +245,12 @@ class PolicyRows(RowFunction):
         shape = [source.shape[d] for d in left]
         to, inner = self._place(out.view(shape)), sorted(gone - {0})
 
-        def line(at: list[str]) -> list[str]:
-            own = dict(zip(left, at, strict=True))
+        def line(cell: list[str]) -> list[str]:
+            own = dict(zip(left, cell, strict=True))
             element = self._at(source, [own.get(d, f"k{d}") for d in range(1, source.dim())])
             heads = [*(f"for k{d} in range({source.shape[d]}):" for d in inner), "for r in range(m):"]
             lines = ["    " * i + head for i, head in enumerate(heads)]
-            return ["s = F(0.0)", *lines, "    " * len(heads) + f"s = s + {element}", f"{index(to, at)} += s"]
+            return ["s = F(0.0)", *lines, "    " * len(heads) + f"s = s + {element}", f"{index(to, cell)} += s"]
 
         self._parts.append(loops(shape, line))
 
@@ -260,17 +260,17 @@ class PolicyRows(RowFunction):
         dims = args[1] if len(args) > 1 else kwargs.get("dim")
         if name not in ("sum", "mean") or [d % source.dim() for d in dims or ()] != [source.dim() - 1]:
             return super()._reduce(name, args, kwargs, x, to)
-        kept = x.dim() == source.dim()
-        shape = x.shape[1:-1] if kept else x.shape[1:]
+        keeps_dim = x.dim() == source.dim()
+        shape = x.shape[1:-1] if keeps_dim else x.shape[1:]
         count = self._number(source.shape[-1] if name == "mean" else 1, "f")
-        own = to._replace(strides=to.strides[:-1]) if kept else to
+        own = to._replace(strides=to.strides[:-1]) if keeps_dim else to
 
-        def lines(at: list[str]) -> list[str]:
-            there = index(own, at)
+        def lines(cell: list[str]) -> list[str]:
+            target = index(own, cell)
             return [
-                "for r in range(m):", f"    {there} = F(0.0)", f"for k in range({source.shape[-1]}):",
-                "    for r in range(m):", f"        {there} = {there} + {self._at(source, [*at, 'k'])}",
-                "for r in range(m):", f"    {there} = {there} / {count}",
+                "for r in range(m):", f"    {target} = F(0.0)", f"for k in range({source.shape[-1]}):",
+                "    for r in range(m):", f"        {target} = {target} + {self._at(source, [*cell, 'k'])}",
+                "for r in range(m):", f"    {target} = {target} / {count}",
             ]  # fmt: skip
 
         return loops(shape, lines)
@@ -311,7 +311,7 @@ class PolicyRows(RowFunction):
         else:
             raise Untraceable(f"{name} of other things than rows and weights")
         first = args[0] if name == "addmm" else 0.0
-        self._parts.append(self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(first, at, 'f')}"))
+        self._parts.append(self._each(to, x.shape[1:], lambda cell: self._at(first, cell, "f")))
         for own, other in zip(self._columns(x), self._columns(a), strict=True):
             sides = f"{own}, {wide}, {other}, {deep}, {by.array}, {by.offset}"
             self._parts.append([f"dense(f, {sides}, {by.strides[1]}, {by.strides[0]}, m)"])
@@ -333,7 +333,7 @@ class PolicyRows(RowFunction):
         """Return a constant that is the same for all rows as numbers of theirs."""
         values, copied = self._table(x, self._plain(x)), x.contiguous().clone()
         to = self._fresh(copied)
-        self._parts.append(self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {index(values, at)}"))
+        self._parts.append(self._each(to, x.shape[1:], lambda cell: index(values, cell)))
         return copied
 
 

@@ -124,9 +124,9 @@ class TileKernel:
 
 @lru_cache(maxsize=512)
 def _compiled(title: str, kind: str, printed: tuple[str, tuple[str, ...]], names: tuple[str, ...]) -> Array:
-    text, there = printed
+    text, phases = printed
     module = library.load("phases", HEADER.format(title=title, row=ROW, kind=kind) + text)
-    return np.array([getattr(module, n).address if n in there else 0 for n in names], np.int64)
+    return np.array([getattr(module, n).address if n in phases else 0 for n in names], np.int64)
 
 
 def _measures(text: TileText) -> Array:
@@ -136,25 +136,25 @@ def _measures(text: TileText) -> Array:
         "statics": len(p.statics), "parameters": len(p.parameters), "hoists": len(p.hoist),
         "numbers": len(text.numbers), "flags": len(text.flags), "signals": text.signals,
     }  # fmt: skip
-    found = []
+    numbers = []
     for name in MEASURES:
         if name in counts:
-            found.append(int(counts[name]))
+            numbers.append(int(counts[name]))
         elif name.endswith("_rows"):
-            found.append(text.group(name.removesuffix("_rows").upper()) * ROW)
+            numbers.append(text.group(name.removesuffix("_rows").upper()) * ROW)
         else:
-            found.append(text.at(name.upper()) * ROW)
-    return np.array(found, np.int64)
+            numbers.append(text.at(name.upper()) * ROW)
+    return np.array(numbers, np.int64)
 
 
 def _flat(moves: dict[str, list[tuple[int, int, int]]], order: tuple[str, ...]) -> Array:
     """Return moves as rows (place of the phase in the order, direction, index, index)."""
-    found = [
+    rows = [
         (order.index(phase), step, to * ROW, source * ROW)
         for phase in order
         for step, to, source in moves.get(phase, ())
     ]
-    return np.array(found, np.int64).reshape(-1, 4)
+    return np.array(rows, np.int64).reshape(-1, 4)
 
 
 def printed(
@@ -193,8 +193,7 @@ def _tile_kernel(simulator: CarFollowingStep, form: Form) -> TileKernel:
     program = Program(record(simulator, form))
     road, names = type(simulator.road).__name__.lower(), ", ".join(e.name for e in simulator.effects)
     title = f"One step of {names} on a {road}, {simulator.integration}."
-    ring = isinstance(simulator.road, Ring)
-    return TileKernel(program, TileText(program, ring=ring, flags=form.flags), title)
+    return TileKernel(program, TileText(program, ring=simulator.road.around, flags=form.flags), title)
 
 
 __all__ = ["MEASURES", "TileKernel", "printed", "tile_kernel"]

@@ -62,16 +62,16 @@ class Repeated:
                 return None
             if graph and x.requires_grad:
                 return None
-        made = [torch.from_numpy(take(self.shape, self._kind)) for _ in values]
-        begin, end = (np.array([x.data_ptr() for x in each], np.int64) for each in (values, made))
+        results = [torch.from_numpy(take(self.shape, self._kind)) for _ in values]
+        begin, end = (np.array([x.data_ptr() for x in each], np.int64) for each in (values, results))
         lane_loops.forward(begin, end, *self._given)
-        return state_after(self.program, state, made, self.steps)
+        return state_after(self.program, state, results, self.steps)
 
 
 def again(simulator: CarFollowingStep, state: State, params: Params, steps: int) -> State | None:
     """Return the state after some steps where the simulator's last rollout was like this one; otherwise None."""
-    found = _kept[id(simulator)][1].get(steps) if id(simulator) in _kept else None
-    return found.after(state) if found is not None and found.fits(state, params) else None
+    earlier = _kept[id(simulator)][1].get(steps) if id(simulator) in _kept else None
+    return earlier.after(state) if earlier is not None and earlier.fits(state, params) else None
 
 
 def keep(plan: RolloutPlan) -> None:

@@ -68,13 +68,13 @@ class _Group:
         """Add a line, if that changes nothing."""
         to, value = line.split(" = ", 1)
         read, (target, store) = _elements(value), _elements(to)[0]
-        if any(self._written.get(at, text) != text for text, at in read):
+        if any(self._written.get(cell, text) != text for text, cell in read):
             return False
         if self._written.get(store, target) != target or self._read.get(store, {target}) != {target}:
             return False
         self._written[store] = target
-        for text, at in read:
-            self._read.setdefault(at, set()).add(text)
+        for text, cell in read:
+            self._read.setdefault(cell, set()).add(text)
         self.lines.append(line)
         return True
 
@@ -94,32 +94,32 @@ def _elements(text: str) -> list[tuple[str, str]]:
 
 def fused(parts: Sequence[list[str]]) -> list[str]:
     """Return loops behind one another; neighbours over one shape as one, where that changes nothing."""
-    made: list[str] = []
+    text: list[str] = []
     group: _Group | None = None
 
     def close() -> None:
         nonlocal group
         if group is not None:
-            made.extend(group.head)
-            made.extend("    " * len(group.head) + line for line in group.lines)
+            text.extend(group.head)
+            text.extend("    " * len(group.head) + line for line in group.lines)
             group = None
 
     for lines in parts:
         *head, last = lines
         line = last.strip()
         if group is not None and _NUMBER.match(line) and not head and group.lets_by(line):
-            made.append(line)
+            text.append(line)
             continue
-        alone = head and all(x.strip().startswith("for ") for x in head) and _elements(line.split(" = ")[0])
-        if not alone:
+        plain_loop = head and all(x.strip().startswith("for ") for x in head) and _elements(line.split(" = ")[0])
+        if not plain_loop:
             close()
-            made.extend(lines)
+            text.extend(lines)
         elif group is None or group.head != head or not group.takes(line):
             close()
             group = _Group(head)
             group.takes(line)
     close()
-    return made
+    return text
 
 
 def body(lines: Sequence[str]) -> str:

@@ -118,8 +118,8 @@ class RowFunction:
         self._table_of: dict[int, str] = {}
         self._parts: list[list[str]] = []
         with torch.no_grad(), _Recorder(self.simpler) as recorder:
-            found = dict(function(**inputs))
-        self._floats = next(x.dtype for x in (*inputs.values(), *found.values()) if x.is_floating_point())
+            results = dict(function(**inputs))
+        self._floats = next(x.dtype for x in (*inputs.values(), *results.values()) if x.is_floating_point())
         for name, x in inputs.items():
             self._given(name, x)
         self._blanks: dict[int, float] = {}
@@ -129,12 +129,12 @@ class RowFunction:
             elif called in _FULL:
                 self._blanks[storage(out)] = args[_FULL[called]]
         _refuse_forks(recorder.calls, list(inputs.values()))
-        calls = _needed(recorder.calls, list(found.values()))
+        calls = _needed(recorder.calls, list(results.values()))
         self._calls = calls
         for call in calls:
             self._print(*call)
-        self.constants = {name: self._plain(x) for name, x in found.items() if not (apart or self._known(x))}
-        moving = {name: x for name, x in found.items() if name not in self.constants}
+        self.constants = {name: self._plain(x) for name, x in results.items() if not (apart or self._known(x))}
+        moving = {name: x for name, x in results.items() if name not in self.constants}
         self.same = {} if apart else self._twice(moving)
         moving = {name: x for name, x in moving.items() if name not in self.same and self._by_row(name, x)}
         self.shapes = {name: tuple(x.shape[1:]) for name, x in moving.items()}
@@ -157,8 +157,8 @@ class RowFunction:
             f"    {n} = carray(located(at[{k}], {_TEXT[kind]}), SIZE)\n" for k, (n, kind) in enumerate(typed)
         )
         room = {kind: max(1, size) for kind, size in self._room.items()}
-        said = {"options": self.options, "imports": self.imports.format(kind=real.name), "around": self.around}
-        header = HEADER.format(kind=real.name, arguments=arguments, **said, **room)
+        parts = {"options": self.options, "imports": self.imports.format(kind=real.name), "around": self.around}
+        header = HEADER.format(kind=real.name, arguments=arguments, **parts, **room)
         self._held = [np.array(list(self._constants) or [0.0], real), *self._tables]
         self.fixed = addresses(self._held)
         self._noted.clear()
@@ -184,7 +184,7 @@ class RowFunction:
         """Print how an output is filled."""
         strides = tuple(math.prod(x.shape[k + 1 :]) for k in range(1, x.dim()))
         to = Place(f"out_{name}", f"r * {math.prod(x.shape[1:])}", 0, strides, kind)
-        return self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at)}")
+        return self._each(to, x.shape[1:], lambda cell: self._at(x, cell))
 
     def _first(self, lines: Sequence[str]) -> list[str]:
         """Return what comes before lines that were printed."""
@@ -192,6 +192,10 @@ class RowFunction:
 
     def _loops(self, shape: Sequence[int], line: Callable[[list[str]], str | list[str]]) -> list[str]:
         return loops(shape, line)
+
+    def _each(self, to: Place, shape: Sequence[int], value: Callable[[list[str]], str]) -> list[str]:
+        """Print what every element of a tensor becomes."""
+        return self._loops(shape, lambda cell: f"{index(to, cell)} = {value(cell)}")
 
     def _by_row(self, name: str, x: Tensor) -> bool:
         """Return whether an output has a value for every row."""
@@ -201,11 +205,11 @@ class RowFunction:
         """Return the names of arrays that are filled beside the outputs."""
         return []
 
-    def _twice(self, found: Mapping[str, Tensor]) -> dict[str, tuple[str, tuple[int, ...]]]:
+    def _twice(self, outputs: Mapping[str, Tensor]) -> dict[str, tuple[str, tuple[int, ...]]]:
         """Return outputs that are the numbers of another one, with its name and their own shape without rows."""
         first: dict[Any, str] = {}
         twice = {}
-        for name, x in found.items():
+        for name, x in outputs.items():
             strides = tuple(s for s, n in zip(x.stride()[1:], x.shape[1:], strict=True) if n > 1)
             other = first.setdefault((self._place(x)[:3], strides, x.numel()), name)
             if other != name:
@@ -273,7 +277,7 @@ class RowFunction:
             return f"np.float64({float(value)!r})" if math.isfinite(value) else f"np.float64(np.{float(value)!r})"
         return str(bool(value)) if kind == "b" else str(int(value))
 
-    def _at(self, x: Any, at: Sequence[str], kind: str | None = None) -> str:
+    def _at(self, x: Any, cell: Sequence[str], kind: str | None = None) -> str:
         """Return the text of one element; ``at`` are the indices behind the row, to which ``x`` broadcasts."""
         if not isinstance(x, Tensor):
             return self._number(x, kind or ("f" if isinstance(x, float) else "i"))
@@ -287,9 +291,9 @@ class RowFunction:
             shape, place = values.shape, self._table(x, values)
         else:
             shape = tuple(x.shape[1:])
-        if len(shape) > len(at):
+        if len(shape) > len(cell):
             raise Untraceable("an operation mixes rows")
-        lined = ["0" if n == 1 else i for n, i in zip(shape, at[len(at) - len(shape) :], strict=True)]
+        lined = ["0" if n == 1 else i for n, i in zip(shape, cell[len(cell) - len(shape) :], strict=True)]
         text = index(place, lined)
         return text if kind == own else f"{_TEXT[kind]}({text})"
 
@@ -333,7 +337,7 @@ class RowFunction:
         if value is None or x.dim() == 0 or x.shape[0] != self._rows:
             raise Untraceable("a constant is written to")
         to = self._fresh(x)
-        self._parts.append(self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._number(value, to.kind)}"))
+        self._parts.append(self._each(to, x.shape[1:], lambda cell: self._number(value, to.kind)))
 
     def _compute(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], x: Tensor, to: Place) -> list[str]:
         shape = tuple(x.shape[1:])
@@ -351,7 +355,7 @@ class RowFunction:
             name, args = "where", (args[1], args[2], args[0])
         if name in self.unary or name in ("_to_copy", "clone"):
             form = self.unary.get(name, "{0}")
-            return self._loops(shape, lambda at: f"{index(to, at)} = " + form.format(self._at(args[0], at, to.kind)))
+            return self._each(to, shape, lambda cell: form.format(self._at(args[0], cell, to.kind)))
         if name in BINARY or name in COMPARE:
             kind = to.kind if name in BINARY else self._common(args)
             form = BINARY.get(name) or COMPARE[name]
@@ -359,17 +363,13 @@ class RowFunction:
                 raise Untraceable(f"{name} with alpha")
             if name == "pow" and args[1] in (2, 3):
                 form = "({0} * {0})" if args[1] == 2 else "({0} * {0} * {0})"
-            return self._loops(
-                shape, lambda at: f"{index(to, at)} = " + form.format(*(self._at(a, at, kind) for a in args))
-            )
+            return self._each(to, shape, lambda cell: form.format(*(self._at(a, cell, kind) for a in args)))
         if name == "where":
             c, y, n = args
-            return self._loops(
-                shape,
-                lambda at: (
-                    f"{index(to, at)} = {self._at(y, at, to.kind)} if {self._at(c, at)} else {self._at(n, at, to.kind)}"
-                ),
-            )
+            return self._each(
+                to, shape,
+                lambda cell: f"{self._at(y, cell, to.kind)} if {self._at(c, cell)} else {self._at(n, cell, to.kind)}",
+            )  # fmt: skip
         if name in ("clamp", "clamp_min", "clamp_max"):
             return self._clamp(name, args, kwargs, shape, to)
         if name in REDUCE:
@@ -378,12 +378,9 @@ class RowFunction:
             return self._joined(name, args, kwargs, x, to)
         if name == "flip":
             turned = {d % x.dim() - 1 for d in args[1]}
-            return self._loops(
-                shape,
-                lambda at: (
-                    f"{index(to, at)} = "
-                    + self._at(args[0], [f"({shape[k] - 1} - {j})" if k in turned else j for k, j in enumerate(at)])
-                ),
+            mirrored = [f"({n - 1} - {{}})" if k in turned else "{}" for k, n in enumerate(shape)]
+            return self._each(
+                to, shape, lambda cell: self._at(args[0], [m.format(j) for m, j in zip(mirrored, cell, strict=True)])
             )
         if name == "cumsum":
             return self._cumsum(args, x, to)
@@ -403,30 +400,30 @@ class RowFunction:
         low = args[1] if name != "clamp_max" and len(args) > 1 else kwargs.get("min")
         high = args[1] if name == "clamp_max" else args[2] if len(args) > 2 else kwargs.get("max")
 
-        def line(at: list[str]) -> str:
-            text = self._at(args[0], at, to.kind)
+        def line(cell: list[str]) -> str:
+            text = self._at(args[0], cell, to.kind)
             if low is not None:
-                text = BINARY["maximum"].format(text, self._at(low, at, to.kind))
+                text = BINARY["maximum"].format(text, self._at(low, cell, to.kind))
             if high is not None:
-                text = BINARY["minimum"].format(text, self._at(high, at, to.kind))
-            return f"{index(to, at)} = {text}"
+                text = BINARY["minimum"].format(text, self._at(high, cell, to.kind))
+            return text
 
-        return self._loops(shape, line)
+        return self._each(to, shape, line)
 
     def _reduce(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any], x: Tensor, to: Place) -> list[str]:
         source = args[0]
-        given = args[1] if len(args) > 1 else kwargs.get("dim")
-        dims = range(source.dim()) if given is None else [given] if isinstance(given, int) else given
+        axis = args[1] if len(args) > 1 else kwargs.get("dim")
+        dims = range(source.dim()) if axis is None else [axis] if isinstance(axis, int) else axis
         gone = {d % source.dim() for d in dims or range(source.dim())}
         if 0 in gone:
             raise Untraceable(f"{name} mixes rows")
         first, update, last = REDUCE[name]
-        kept = len(x.shape) == source.dim()
+        keeps_dim = len(x.shape) == source.dim()
 
-        def line(at: list[str]) -> list[str]:
-            own = iter(at)
-            full = [f"k{d}" if d in gone else next(own) for d in range(1, source.dim())] if not kept else [
-                f"k{d}" if d in gone else at[d - 1] for d in range(1, source.dim())
+        def line(cell: list[str]) -> list[str]:
+            own = iter(cell)
+            full = [f"k{d}" if d in gone else next(own) for d in range(1, source.dim())] if not keeps_dim else [
+                f"k{d}" if d in gone else cell[d - 1] for d in range(1, source.dim())
             ]  # fmt: skip
             element = self._at(source, full, "b" if to.kind == "b" else to.kind)
             start = first or self._at(source, ["0" if i.startswith("k") else i for i in full])
@@ -435,7 +432,7 @@ class RowFunction:
                 lines.append("    " * depth + f"for k{d} in range({source.shape[d]}):")
             lines.append("    " * len(gone) + "s = " + update.format("s", element))
             count = self._number(math.prod(source.shape[d] for d in gone), "f")
-            return [*lines, f"{index(to, at)} = " + last.format("s", count)]
+            return [*lines, f"{index(to, cell)} = " + last.format("s", count)]
 
         return self._loops(x.shape[1:], line)
 
@@ -449,10 +446,10 @@ class RowFunction:
             shape = [*x.shape[1:]]
             shape[dim] = width
 
-            def line(at: list[str], part: Tensor = part, done: int = done) -> str:
-                there = [f"({done} + {j})" if k == dim else j for k, j in enumerate(at)]
-                own = [j for k, j in enumerate(at) if k != dim] if name == "stack" else at
-                return f"{index(to, there)} = {self._at(part, own, to.kind)}"
+            def line(cell: list[str], part: Tensor = part, done: int = done) -> str:
+                target = [f"({done} + {j})" if k == dim else j for k, j in enumerate(cell)]
+                own = [j for k, j in enumerate(cell) if k != dim] if name == "stack" else cell
+                return f"{index(to, target)} = {self._at(part, own, to.kind)}"
 
             lines += self._loops(shape, line)
             done += width
@@ -463,8 +460,8 @@ class RowFunction:
         if dim != x.dim() - 2:
             raise Untraceable("cumsum over another dimension than the last")
 
-        def line(at: list[str]) -> list[str]:
-            every = [*at, "k"]
+        def line(cell: list[str]) -> list[str]:
+            every = [*cell, "k"]
             return [
                 f"s = {self._number(0, to.kind)}", f"for k in range({x.shape[-1]}):",
                 f"    s = s + {self._at(args[0], every, to.kind)}", f"    {index(to, every)} = s",
@@ -483,18 +480,18 @@ class RowFunction:
         zero, many = self._number(0, to.kind), len(range(begin, end, step))
         if many == 1:
 
-            def chosen(at: list[str]) -> str:
-                own = [("0" if j == k else i) for j, i in enumerate(at) if j != k or name == "slice_backward"]
-                return f"{index(to, at)} = {self._at(source, own, to.kind)} if {at[k]} == {begin} else {zero}"
+            def chosen(cell: list[str]) -> str:
+                own = [("0" if j == k else i) for j, i in enumerate(cell) if j != k or name == "slice_backward"]
+                return f"{index(to, cell)} = {self._at(source, own, to.kind)} if {cell[k]} == {begin} else {zero}"
 
             return self._loops(shape, chosen)
-        lines = self._loops(shape, lambda at: f"{index(to, at)} = {zero}")
+        lines = self._each(to, shape, lambda cell: zero)
         part = [many if j == k else n for j, n in enumerate(shape)]
 
-        def line(at: list[str]) -> str:
-            there = [f"({begin} + {i} * {step})" if j == k else i for j, i in enumerate(at)]
-            own = [i for j, i in enumerate(at) if j != k] if name == "select_backward" else at
-            return f"{index(to, there)} = {self._at(source, own, to.kind)}"
+        def line(cell: list[str]) -> str:
+            target = [f"({begin} + {i} * {step})" if j == k else i for j, i in enumerate(cell)]
+            own = [i for j, i in enumerate(cell) if j != k] if name == "select_backward" else cell
+            return f"{index(to, target)} = {self._at(source, own, to.kind)}"
 
         return [*lines, *self._loops(part, line)]
 
@@ -505,11 +502,11 @@ class RowFunction:
         if k < 0 or self._known(which):
             raise Untraceable("index_add of rows")
 
-        def line(at: list[str]) -> str:
-            there = index(to, [self._at(which, [i]) if j == k else i for j, i in enumerate(at)])
-            return f"{there} = {there} + {self._at(source, at, to.kind)}"
+        def line(cell: list[str]) -> str:
+            target = index(to, [self._at(which, [i]) if j == k else i for j, i in enumerate(cell)])
+            return f"{target} = {target} + {self._at(source, cell, to.kind)}"
 
-        first = self._loops(x.shape[1:], lambda at: f"{index(to, at)} = {self._at(x, at, to.kind)}")
+        first = self._each(to, x.shape[1:], lambda cell: self._at(x, cell, to.kind))
         return [*first, *self._loops(source.shape[1:], line)]
 
     def _gathered(self, args: Sequence[Any], shape: tuple[int, ...], to: Place) -> list[str]:
@@ -519,10 +516,10 @@ class RowFunction:
         if along < 0:
             raise Untraceable("gather of rows")
 
-        def line(at: list[str]) -> list[str]:
+        def line(cell: list[str]) -> list[str]:
             # In two lines: loops that look elsewhere are not fused.
-            there = ["k" if d == along else i for d, i in enumerate(at)]
-            return [f"k = {self._at(which, at)}", f"{index(to, at)} = {self._at(source, there, to.kind)}"]
+            target = ["k" if d == along else i for d, i in enumerate(cell)]
+            return [f"k = {self._at(which, cell)}", f"{index(to, cell)} = {self._at(source, target, to.kind)}"]
 
         return self._loops(shape, line)
 
@@ -535,12 +532,15 @@ class RowFunction:
         if along < 0 or len(args) > 4 or kwargs:
             raise Untraceable(f"{name} of rows, or with a reduction")
 
-        def line(at: list[str]) -> list[str]:
-            there = index(to, ["k" if d == along else i for d, i in enumerate(at)])
-            value = self._at(source, at, to.kind)
-            return [f"k = {self._at(which, at)}", f"{there} = {value if name == 'scatter' else f'{there} + {value}'}"]
+        def line(cell: list[str]) -> list[str]:
+            target = index(to, ["k" if d == along else i for d, i in enumerate(cell)])
+            value = self._at(source, cell, to.kind)
+            return [
+                f"k = {self._at(which, cell)}",
+                f"{target} = {value if name == 'scatter' else f'{target} + {value}'}",
+            ]
 
-        first = self._loops(shape, lambda at: f"{index(to, at)} = {self._at(x, at, to.kind)}")
+        first = self._each(to, shape, lambda cell: self._at(x, cell, to.kind))
         return [*first, *self._loops(which.shape[1:], line)]
 
     def _sorted(self, args: Sequence[Any], kwargs: Mapping[str, Any], out: Sequence[Tensor]) -> list[str]:
@@ -551,13 +551,13 @@ class RowFunction:
         first, second, count = self._fresh(values), self._fresh(slots), x.shape[-1]
         most = min(count, self._read_of(slots))
 
-        def line(at: list[str]) -> list[str]:
+        def line(cell: list[str]) -> list[str]:
             def put(to: Place, k: str) -> str:
-                return index(to, [*at, k])
+                return index(to, [*cell, k])
 
             def insert(j: str, k: str) -> list[str]:
                 return [
-                    f"s = {self._at(x, [*at, j])}", f"k = {k}", f"while k > 0 and s < {put(first, '(k - 1)')}:",
+                    f"s = {self._at(x, [*cell, j])}", f"k = {k}", f"while k > 0 and s < {put(first, '(k - 1)')}:",
                     f"    {put(first, 'k')} = {put(first, '(k - 1)')}",
                     f"    {put(second, 'k')} = {put(second, '(k - 1)')}", "    k -= 1",
                     f"{put(first, 'k')} = s", f"{put(second, 'k')} = {j}",
@@ -567,7 +567,7 @@ class RowFunction:
                 return ["    " * by + x for x in lines]
 
             # Hardly any belongs to the first: many are compared at once, and looked at only where one does.
-            sooner = f"{self._at(x, [*at, 'j'])} < {put(first, str(most - 1))}"
+            sooner = f"{self._at(x, [*cell, 'j'])} < {put(first, str(most - 1))}"
             some = f"for j in range(h, min(h + {_AT_ONCE}, {count})):"
             return [
                 f"for j in range({most}):", *deeper(insert("j", "j"), 1),
@@ -594,21 +594,17 @@ class RowFunction:
             dim = args[1] % source.dim() - 1
             if dim < 0 or self._known(args[2]):
                 raise Untraceable("index_select of rows")
-            return self._loops(
-                x.shape[1:],
-                lambda at: (
-                    f"{index(to, at)} = "
-                    + self._at(source, [self._at(args[2], [j]) if k == dim else j for k, j in enumerate(at)])
-                ),
-            )
+            return self._each(
+                to, x.shape[1:],
+                lambda cell: self._at(source, [self._at(args[2], [j]) if k == dim else j for k, j in enumerate(cell)]),
+            )  # fmt: skip
         parts = args[1]
         if self._known(source) or any(p is None for p in parts) or len({p.dim() for p in parts}) > 1:
             raise Untraceable("an index into what changes")
         values, own = source.detach().cpu().numpy(), parts[0].dim() - 1
         table = self._table(source, values)
-        return self._loops(
-            x.shape[1:],
-            lambda at: f"{index(to, at)} = {index(table, [*(self._at(p, at[:own]) for p in parts), *at[own:]])}",
+        return self._each(
+            to, x.shape[1:], lambda cell: index(table, [*(self._at(p, cell[:own]) for p in parts), *cell[own:]])
         )
 
 
@@ -624,23 +620,23 @@ def tensors(args: Sequence[Any]) -> list[Tensor]:
 
 def _refuse_forks(calls: Sequence[Any], inputs: Sequence[Tensor]) -> None:
     """Raise Untraceable where Python has asked for a number that depends on inputs: it may have chosen by it."""
-    known = {storage(x) for x in inputs}
+    dependent = {storage(x) for x in inputs}
     for name, args, _, out in calls:
-        if any(storage(x) in known for x in tensors(args)):
+        if any(storage(x) in dependent for x in tensors(args)):
             if name == "_local_scalar_dense":
                 raise Untraceable("a fork on values")
-            known |= {storage(x) for x in tensors((out,))}
+            dependent |= {storage(x) for x in tensors((out,))}
 
 
-def _needed(calls: Sequence[Any], found: Sequence[Tensor]) -> list[Any]:
+def _needed(calls: Sequence[Any], results: Sequence[Tensor]) -> list[Any]:
     """Return the calls on which some results depend."""
-    wanted, kept = {storage(x) for x in found}, []
+    storages, needs = {storage(x) for x in results}, []
     for call in reversed(calls):
-        made = call[3] if isinstance(call[3], (list, tuple)) else (call[3],)
-        if any(storage(x) in wanted for x in made if isinstance(x, Tensor)):
-            wanted |= {storage(x) for x in tensors(call[1])}
-            kept.append(call)
-    return kept[::-1]
+        outputs = call[3] if isinstance(call[3], (list, tuple)) else (call[3],)
+        if any(storage(x) in storages for x in outputs if isinstance(x, Tensor)):
+            storages |= {storage(x) for x in tensors(call[1])}
+            needs.append(call)
+    return needs[::-1]
 
 
 def adjoint(
@@ -661,8 +657,8 @@ def adjoint(
                 return {}
             # With a graph of its own autograd writes nothing in place that is still read.
             end = _End.apply([leaves[f"on_{n}"] for n in names], *(out[n] for n in names))
-            found = torch.autograd.grad(end, [own[n] for n in by], create_graph=True, allow_unused=True)
-        return {n: g.detach() for n, g in zip(by, found, strict=True) if g is not None}
+            gradients = torch.autograd.grad(end, [own[n] for n in by], create_graph=True, allow_unused=True)
+        return {n: g.detach() for n, g in zip(by, gradients, strict=True) if g is not None}
 
     return back
 
@@ -680,10 +676,10 @@ class _End(torch.autograd.Function):
         return None, *ctx.seeds
 
 
-def index(place: Place, at: Sequence[str]) -> str:
+def index(place: Place, cell: Sequence[str]) -> str:
     """Return the text of an element: a local name, or an array with its index."""
     if place.start == "":
         return place.array
-    terms = [f"{i} * {s}" for i, s in zip(at, place.strides, strict=True) if i != "0" and s]
+    terms = [f"{i} * {s}" for i, s in zip(cell, place.strides, strict=True) if i != "0" and s]
     # Without a sign: numba would ask of every other index whether it counts from the end, and nothing would vectorise.
     return f"{place.array}[U({' + '.join([place.start, *([str(place.offset)] if place.offset else []), *terms])})]"

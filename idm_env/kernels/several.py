@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 def between(simulator: Simulator) -> Simulator:
     """Return the simulator of the steps between two decisions, made once."""
-    found: Simulator | None = simulator.__dict__.get("_between")
-    if found is None:
+    inner: Simulator | None = simulator.__dict__.get("_between")
+    if inner is None:
         assert isinstance(simulator.road, Lanes)
-        kept = (Remembering(e) if e.hook == "change" else e for e in simulator.effects)
-        still = tuple(e for e in kept if not isinstance(e, Remembering) or e.of.remembers)
-        found = dataclasses.replace(simulator, road=Chains(simulator.road.closed), effects=still)
-        simulator.__dict__["_between"] = found
-    return found
+        effects = (Remembering(e) if e.hook == "change" else e for e in simulator.effects)
+        still = tuple(e for e in effects if not isinstance(e, Remembering) or e.of.remembers)
+        inner = dataclasses.replace(simulator, road=Chains(simulator.road.closed), effects=still)
+        simulator.__dict__["_between"] = inner
+    return inner
 
 
 class _LaidOut:
@@ -59,12 +59,12 @@ class _LaidOut:
     def of(self, state: State, halo: int) -> Places | None:
         """Return the places of a state, or None where they are not known."""
         parts = self._parts(state)
-        kept = self._kept.get(id(parts[1]))
-        if kept is None or kept[2] != halo:
+        entry = self._kept.get(id(parts[1]))
+        if entry is None or entry[2] != halo:
             return None
         # What was kept is no inference tensor, so it has a version.
-        same = all((ref and ref()) is x for ref, x in zip(kept[0], parts, strict=True))
-        return kept[3] if same and kept[1] == _versions(parts) else None
+        same = all((ref and ref()) is x for ref, x in zip(entry[0], parts, strict=True))
+        return entry[3] if same and entry[1] == _versions(parts) else None
 
     def put(self, state: State, halo: int, places: Places) -> None:
         """Keep the places of a state; not in ``torch.inference_mode``, whose tensors do not tell when they change."""
@@ -88,9 +88,12 @@ def kernel_of(simulator: Simulator, state: State, inputs: Inputs) -> TileKernel 
     """Return the kernel of the steps between two decisions, or why there is none."""
     if state.step.numel() > 1 and state.step.shape != state.speed.shape[:-1]:
         return "steps are not counted by row"
+    assert isinstance(simulator.road, Lanes)
+    if simulator.lane_change_models and simulator.road.duration:
+        return "compiled changes take no time, and Lanes has a duration"
     inner = between(simulator)
-    kept = {name: x for name, x in inputs.items() if name in inner.by_name}
-    return tile_kernel(inner, Form.of(state._replace(links=None), kept))
+    own_inputs = {name: x for name, x in inputs.items() if name in inner.by_name}
+    return tile_kernel(inner, Form.of(state._replace(links=None), own_inputs))
 
 
 def rollout(
@@ -106,7 +109,7 @@ def rollout(
     stages = sorted({0, *simulator.turns(state.speed.shape[-1]).tolist()}) if blocks else [0]
     block = lanes.BLOCK if road.ring is not None else every
     traffic = Traffic(simulator, state)
-    kept: list[tuple[Tensor, ...]] = []
+    motions: list[tuple[Tensor, ...]] = []
     first, halo, places = state, 0, None
     done, clocks = 0, state.step.reshape(-1).numpy()
     if (clocks == clocks[0]).all():
@@ -139,18 +142,20 @@ def rollout(
         places = traffic.places(state, halo) if places is None else places
         if places is None:
             return None
-        given = {n: _placed(_cut(x, done, count), places, state, 1) for n, x in inputs.items() if n in inner.by_name}
+        own_inputs = {
+            n: _placed(_cut(x, done, count), places, state, 1) for n, x in inputs.items() if n in inner.by_name
+        }
         end, some = lanes.rollout(
-            kernel, inner, _row(state, places), given, _placed(own, places, state), count, keep=keep
+            kernel, inner, _row(state, places), own_inputs, _placed(own, places, state), count, keep=keep
         )
         state = _back(state, end, places)
         if some is not None:
-            kept.append(tuple(x.gather(-1, places.own.expand(count, *places.own.shape)) for x in some))
+            motions.append(tuple(x.gather(-1, places.own.expand(count, *places.own.shape)) for x in some))
         done += count
     state = state._replace(links=traffic.links)
     if places is not None:
         _LAID_OUT.put(state, halo, places)
-    return state, tuple(torch.cat(column) for column in zip(*kept, strict=True)) if keep else None
+    return state, tuple(torch.cat(column) for column in zip(*motions, strict=True)) if keep else None
 
 
 def _decided(traffic: Traffic, wishes: Any, state: State, inputs: Inputs, params: Params, stage: int) -> State | None:
@@ -173,9 +178,9 @@ def _some_decided(
     """
     rows = len(state.speed)
     part = _of_rows(state, which, rows)._replace(step=state.step[which])
-    own, given = (_of_rows(dict(x), which, rows) for x in (params, inputs))
+    own, own_inputs = (_of_rows(dict(x), which, rows) for x in (params, inputs))
     traffic = Traffic(simulator, part)
-    after = _decided(traffic, wishes, part, given, own, stage)
+    after = _decided(traffic, wishes, part, own_inputs, own, stage)
     if after is None:
         return None
     after = after._replace(links=traffic.links, step=state.step)
@@ -224,16 +229,16 @@ def _placed(tree: Tree, places: Places, state: State, leading: int = 0) -> Tree:
 
 def _moved(memory: Mapping[str, Tensor], index: Tensor, n: int) -> dict[str, Tensor]:
     """Return memories in another order; the past has vehicles before its slots and signals."""
-    found = {}
+    moved = {}
     for name, x in memory.items():
         if name == PAST:
             full = x.expand(*index.shape[:-1], *x.shape[-3:])
-            found[name] = full.gather(-3, index[..., None, None].expand(*index.shape, *x.shape[-2:]))
+            moved[name] = full.gather(-3, index[..., None, None].expand(*index.shape, *x.shape[-2:]))
         elif x.dim() and x.shape[-1] == n and n > 1:
-            found[name] = x.expand(*index.shape[:-1], n).gather(-1, index)
+            moved[name] = x.expand(*index.shape[:-1], n).gather(-1, index)
         else:
-            found[name] = x
-    return found
+            moved[name] = x
+    return moved
 
 
 def _row(state: State, places: Places) -> State:

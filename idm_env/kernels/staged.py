@@ -107,22 +107,22 @@ class Row:
         self.kind, self.value = kind, value
         self._array = emitter.context.make_array(kind)(emitter.context, emitter.builder, value)
 
-    def _place(self, at: Any) -> Any:
+    def _place(self, index: Any) -> Any:
         builder = _now.get().builder
-        if not isinstance(at, tuple):
-            return builder.gep(self._array.data, [_whole(at)])
+        if not isinstance(index, tuple):
+            return builder.gep(self._array.data, [_whole(index)])
         _, width = cgutils.unpack_tuple(builder, self._array.shape, 2)
-        row = builder.mul(_whole(at[0]), width)
-        return builder.gep(self._array.data, [builder.add(row, _whole(at[1]))])
+        row = builder.mul(_whole(index[0]), width)
+        return builder.gep(self._array.data, [builder.add(row, _whole(index[1]))])
 
-    def __getitem__(self, at: Any) -> Any:
-        found = _now.get().builder.load(self._place(at))
+    def __getitem__(self, index: Any) -> Any:
+        content = _now.get().builder.load(self._place(index))
         if self.kind.dtype == types.float64:
-            return Number(found)
-        return StagedBool(_now.get().builder.icmp_signed("!=", found, ir.Constant(found.type, 0)))
+            return Number(content)
+        return StagedBool(_now.get().builder.icmp_signed("!=", content, ir.Constant(content.type, 0)))
 
-    def __setitem__(self, at: Any, value: Any) -> None:
-        _now.get().builder.store(_real(value), self._place(at))
+    def __setitem__(self, index: Any, value: Any) -> None:
+        _now.get().builder.store(_real(value), self._place(index))
 
 
 class Index:
@@ -134,9 +134,9 @@ class Index:
     def before(self, steps: Any) -> Index:
         """Return this index less a number of steps, cut to whole ones; not below 0."""
         builder = _now.get().builder
-        found = builder.sub(self.value, builder.fptosi(_real(steps), WHOLE))
+        step = builder.sub(self.value, builder.fptosi(_real(steps), WHOLE))
         zero = ir.Constant(WHOLE, 0)
-        return Index(builder.select(builder.icmp_signed("<", found, zero), zero, found))
+        return Index(builder.select(builder.icmp_signed("<", step, zero), zero, step))
 
 
 def _real(x: Any) -> Any:
@@ -194,10 +194,10 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
     before = builder.block
     with builder.if_then(condition.value):
         inside = builder.block
-    found = builder.phi(REAL)
-    found.add_incoming(one, inside)
-    found.add_incoming(other, before)
-    return Number(found)
+    result = builder.phi(REAL)
+    result.add_incoming(one, inside)
+    result.add_incoming(other, before)
+    return Number(result)
 
 
 def negated(condition: Any) -> Any:
@@ -247,10 +247,10 @@ def staged(results: int = 0) -> Callable[[Callable[..., Any]], Any]:
             def generate(context: Any, builder: Any, made: Any, arguments: Any) -> Any:
                 token = _now.set(Emitter(context, builder))
                 try:
-                    found = function(*(_argument(k, x) for k, x in zip(made.args, arguments, strict=True)))
+                    outputs = function(*(_argument(k, x) for k, x in zip(made.args, arguments, strict=True)))
                     if not results:
                         return context.get_dummy_value()
-                    return context.make_tuple(builder, kind, [_real(x) for x in found])
+                    return context.make_tuple(builder, kind, [_real(x) for x in outputs])
                 finally:
                     _now.reset(token)
 

@@ -134,17 +134,17 @@ def padded(n):
 @exact
 def workspace(size, like):
     """Return zeros that begin on a cache line: a vector of 64 bytes that straddles two costs two accesses."""
-    made = np.zeros(size + LINE, like.dtype)
-    skip = -(made.ctypes.data // like.itemsize) % (LINE // like.itemsize)
-    return made[skip : skip + size]
+    buffer = np.zeros(size + LINE, like.dtype)
+    skip = -(buffer.ctypes.data // like.itemsize) % (LINE // like.itemsize)
+    return buffer[skip : skip + size]
 
 
 @exact
-def _fetch(w, to, source, at, n, truth):
+def _fetch(w, to, source, begin, n, truth):
     if truth:
-        copy_truth(w, to, source, at, n)
+        copy_truth(w, to, source, begin, n)
     else:
-        copy(w, to, source, at, n)
+        copy(w, to, source, begin, n)
 
 
 @apart

@@ -34,8 +34,8 @@ def _free(size: int, arrays: list[Array], unheld: int) -> Array | None:
 
 def _references_of_an_unheld_array() -> int:
     """Count as ``_free`` does: how many references its own bookkeeping makes differs between interpreters."""
-    alone = [np.empty(1, np.uint8)]
-    return next(count for count in range(1, 10) if _free(1, alone, count) is not None)
+    array = [np.empty(1, np.uint8)]
+    return next(count for count in range(1, 10) if _free(1, array, count) is not None)
 
 
 _UNHELD = _references_of_an_unheld_array()

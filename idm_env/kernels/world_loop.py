@@ -61,17 +61,17 @@ def advance(
             filled = max(filled, n)
         if has_inputs:
             load_inputs(w, operands, strides, t, row, first, n, size, measures)
-        at = row * size + first + skip
+        cell = row * size + first + skip
         if size <= wide:
             # Whole rows find their past where it lies: it is a hundred times as long as a state.
-            step(w, all_past + at * k.itemsize, count, n, size, measures, phases, looks, recalls, k, newest + 1)
+            step(w, all_past + cell * k.itemsize, count, n, size, measures, phases, looks, recalls, k, newest + 1)
         else:
             piece_of_past(h, all_past, newest, slots, signals, strides, row, first, n, size, count)
             step(w, h.ctypes.data, ROW, n, size, measures, phases, looks, recalls, k, slots)
             for i in range(signals):
-                copy(all_past, ((newest + 1) * signals + i) * count + at, h, (slots * signals + i) * ROW + skip, own)
+                copy(all_past, ((newest + 1) * signals + i) * count + cell, h, (slots * signals + i) * ROW + skip, own)
         for i in range(states):
-            copy(places[states + i], at, w, measures[lane.STATE_ROWS] + i * ROW + skip, own)
+            copy(places[states + i], cell, w, measures[lane.STATE_ROWS] + i * ROW + skip, own)
 
 
 @exact
@@ -121,7 +121,7 @@ def retreat(
     has_inputs, all_past = measures[lane.NUMBERS] + measures[lane.FLAGS] > 0, past.ctypes.data
     for tile in range(begin, end):
         row, first, n, skip, own = place(tile, rows, size, wide, around, is_ring)
-        at = row * size + first + skip
+        cell = row * size + first + skip
         for i in again:
             load(w, measures[lane.STATE_ROWS] + i * ROW, places[i], strides, dense, 0, row, first, n, size, False)
         if not kept:
@@ -136,20 +136,20 @@ def retreat(
             fill(ah, 0, 0, len(ah))
             load_past(ah, on_past_end, False, 1, slots, signals, strides, row, first, n, size, count)
         if size <= wide:
-            source, pitch, now = np.int64(all_past + at * k.itemsize), count, newest + 1
+            source, pitch, now = np.int64(all_past + cell * k.itemsize), count, newest + 1
         else:
             piece_of_past(h, all_past, newest, slots, signals, strides, row, first, n, size, count)
             source, pitch, now = np.int64(h.ctypes.data), ROW, slots
         step_back(w, source, pitch, ah, n, size, measures, phases, back, looks, recalls, sends, k, now, slots)
         for i in range(measures[lane.NUMBERS]):
-            copy(on_inputs, i * count + at, w, measures[lane.ON_INPUT_ROWS] + i * ROW + skip, own)
+            copy(on_inputs, i * count + cell, w, measures[lane.ON_INPUT_ROWS] + i * ROW + skip, own)
         if back[lane.HOIST] and not more:
             call(back[lane.HOIST], w, padded(n), k)  # type: ignore[call-arg]
         for i in range(measures[lane.MOVING]):
-            copy(on_begin[i], at, w, measures[lane.ON_ROWS] + i * ROW + skip, own)
-        store_past(ah, on_past, slots - 1, slots, signals, at, skip, own, count)
+            copy(on_begin[i], cell, w, measures[lane.ON_ROWS] + i * ROW + skip, own)
+        store_past(ah, on_past, slots - 1, slots, signals, cell, skip, own, count)
         for i in range(0 if more else measures[lane.PARAMETERS]):
-            add(on_parameters, i * count + at, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)
+            add(on_parameters, i * count + cell, w, measures[lane.GRADIENT_ROWS] + i * ROW + skip, own)
 
 
 @exact

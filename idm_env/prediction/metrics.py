@@ -153,7 +153,7 @@ def intervals(scores: Sequence[Score], scenes: Sequence[str]) -> dict[str, tuple
 def _measures(scores: Sequence[Score], weights: np.ndarray) -> dict[str, np.ndarray]:
     """Return every measure at every horizon under every row of weights [draws, agents]."""
     shapes = [item.shape.replace("right U-turn", "right") for item in scores]
-    measures = {}
+    measures = dict[str, np.ndarray]()
     for i, seconds in enumerate(HORIZONS):
         missed = [None if (h := item.hit[i]) is None else float(not any(h)) for item in scores]
         columns = [item.ade[i] for item in scores], [item.fde[i] for item in scores], missed
@@ -180,7 +180,7 @@ def average_precision(scores: Sequence[Score], seconds: int, weights: np.ndarray
         agents += [n] * len(hit)
         confidence += item.confidence[: len(hit)]
         correct += [i == first for i in range(len(hit))]
-    order = np.lexsort((correct, -np.array(confidence)))
+    order = np.lexsort((np.array(correct), -np.array(confidence)))
     index, true = np.array(agents, int)[order], np.array(correct, bool)[order]
     areas = np.full(len(weights), np.nan)
     for draw, weight in enumerate(weights):

@@ -37,6 +37,8 @@ class Road(abc.ABC):
 
     beside: ClassVar[bool] = False
     """Whether there may be a lane beside another; of ``Lanes`` the property says it."""
+    around: ClassVar[bool] = False
+    """Whether the first vehicle follows the last."""
 
     def view(self, state: State) -> Road:
         """Return this road as it is in a state: itself, where the order never changes."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from idm_env.roads.base import Road
 from idm_env.roads.ends import Ending
-from idm_env.types import FAR, State
+from idm_env.roads.lane import Lane
+from idm_env.types import State
 
 
 class Places(NamedTuple):
@@ -33,7 +33,7 @@ class Places(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Chains(Road):
+class Chains(Lane):
     """Lanes behind one another in one row, with standing leaders at their ends where ``closed``."""
 
     closed: bool = False
@@ -43,21 +43,9 @@ class Chains(Road):
         assert isinstance(state.links, Places)
         return _Chained(self, state.links, state.position)
 
-    def ahead(self, x: Tensor) -> Tensor:
-        """Return the x of the place before."""
-        return torch.cat((x[..., :1], x[..., :-1]), dim=-1)
-
-    def back(self, x: Tensor) -> Tensor:
-        """Return the x of the place behind."""
-        return torch.cat((x[..., 1:], x[..., -1:]), dim=-1)
-
     def led(self, x: Tensor) -> Tensor:
         """Raise TypeError: who is led is known in a state only."""
         raise TypeError("chains are seen through a state: road.view(state).")
-
-    def gaps(self, position: Tensor, length: Tensor, circumference: Tensor | float | None = None) -> Tensor:
-        """Return ``position[leader] − length[leader] − position`` (m), FAR at the front of a lane."""
-        return torch.where(self.led(position) > 0, self.ahead(position) - self.ahead(length) - position, FAR)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ class Ring(Road):
     """
 
     circumference: float | None = None
+    around: ClassVar[bool] = True
 
     def ahead(self, x: Tensor) -> Tensor:
         """Return the leader's x."""

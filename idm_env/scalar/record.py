@@ -17,7 +17,6 @@ from idm_env import delay_buffer
 from idm_env.roads.base import Road
 from idm_env.roads.chains import Chains
 from idm_env.roads.ends import Ending
-from idm_env.roads.ring import Ring
 from idm_env.scalar.graph import Graph, Node, TimeStep
 from idm_env.scalar.scalar import Scalar, Unordered, Untraceable, static, value_of
 from idm_env.step import CarFollowingStep
@@ -96,15 +95,14 @@ class SeenRoad(Ending):
 
     def led(self, x: Any) -> Any:
         """Return whether there is a leader."""
-        if isinstance(self.road, Ring):
-            return Scalar(self.graph, self.graph.constant(1.0))
-        return Scalar(self.graph, self.graph.input("led"))
+        return self._neighbour("led")
 
     def leads(self, x: Any) -> Any:
         """Return whether there is a follower."""
-        if isinstance(self.road, Ring):
-            return Scalar(self.graph, self.graph.constant(1.0))
-        return Scalar(self.graph, self.graph.input("leads"))
+        return self._neighbour("leads")
+
+    def _neighbour(self, name: str) -> Any:
+        return Scalar(self.graph, self.graph.constant(1.0) if self.road.around else self.graph.input(name))
 
     def room(self) -> Any:
         """Return how far the lane goes on, where lanes end."""
@@ -115,7 +113,7 @@ class SeenRoad(Ending):
 
     def gaps(self, position: Any, length: Any, circumference: Any = None) -> Any:
         """Return gaps from positions. Untraceable for vehicles that come and go on a ring."""
-        if isinstance(self.road, Ring):
+        if self.road.around:
             raise Untraceable("vehicles that come and go on a ring")
         return type(self.road).gaps(self, position, length)  # type: ignore[arg-type]
 
