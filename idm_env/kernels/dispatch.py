@@ -75,7 +75,7 @@ def rollout(
     from idm_env.kernels import lanes
 
     block = min(every or lanes.BLOCK, 4 * lanes.BLOCK)
-    plan, sources = lanes.planned(kernel, simulator, state, inputs, params, steps, block, keep, None)
+    plan, sources = lanes.planned(kernel, simulator, state, inputs, params, steps, block, keep)
     if short:
         repeated.keep(plan)
     return lanes.run(plan, sources)

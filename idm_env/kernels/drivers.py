@@ -239,54 +239,46 @@ class BehindRecord:
             values.append(state.length.expand_as(like)[..., column])
         return torch.stack(values) if values else like.new_zeros(1, *like.shape[:-1])
 
-    def _run(
-        self, loop: Any, printed: _Printed, shape: Sequence[int], slots: int, *arguments: Any, threads: Any
-    ) -> None:
+    def _run(self, loop: Any, shape: Sequence[int], slots: int, *arguments: Any) -> None:
         copies = math.prod(shape) // self.rows
         wide, work = loops.width(self.rows, copies), math.prod(shape) * self.steps
         pool.split(
             lambda begin, end: loop(*arguments, self.rows, copies, wide, self.steps, slots, begin, end),
-            loops.tiles(self.rows, copies), 1, pool.count(work, threads),
+            loops.tiles(self.rows, copies), 1, pool.count(work),
         )  # fmt: skip
 
-    def _given(
-        self, printed: _Printed, start: Tensor, past: Tensor, statics: Tensor
-    ) -> tuple[Array, Array, Array, int]:
+    def _given(self, start: Tensor, past: Tensor, statics: Tensor) -> tuple[Array, Array, Array, int]:
         flat = [x.detach().reshape(len(x), -1).contiguous().numpy() for x in (start, past, statics)]
         signals = len(self.kernel.program.signals)
         return flat[0], flat[1], flat[2], len(past) // signals if signals else 0
 
     # -- rollouts ------------------------------------------------------------------------------------------------
 
-    def simulate(
-        self, state: State, params: Params, every: int = 1, threads: int | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def simulate(self, state: State, params: Params, every: int = 1) -> tuple[Tensor, Tensor]:
         """Return gap (m) and speed (m/s) at every sample; differentiable in the start and in the parameters."""
         sources = (self._start(state), self._past(state), self._statics(state, params))
-        gap, speed = _Rollout.apply(self, every, threads, *sources)
+        gap, speed = _Rollout.apply(self, every, *sources)
         return gap, speed
 
-    def _forward(
-        self, sources: Sequence[Tensor], every: int, threads: int | None, taped: Array
-    ) -> tuple[Array, Array, Array]:
+    def _forward(self, sources: Sequence[Tensor], every: int, taped: Array) -> tuple[Array, Array, Array]:
         printed = self.kernel.printed()
-        start, past, statics, slots = self._given(printed, *sources)
+        start, past, statics, slots = self._given(*sources)
         shape, entries = sources[0].shape[1:], start.shape[1]
         kind = np.dtype(self.kind)
         gap, speed = (take((self.steps // every, entries), kind) for _ in range(2))
         tape = take((len(taped), self.steps if len(taped) else 0, entries), kind)
         self._run(
-            loops.forward, printed, shape, slots, start, past, statics, self._record, self._reads, self.kernel.seen,
+            loops.forward, shape, slots, start, past, statics, self._record, self._reads, self.kernel.seen,
             printed.places, printed.layout, *printed.compiled(self.kind, VALUES), every,
-            gap, speed, tape, taped, threads=threads,
+            gap, speed, tape, taped,
         )  # fmt: skip
         return gap, speed, tape
 
     def _backward(
-        self, sources: Sequence[Tensor], tape: Array, seeds: Sequence[Tensor | None], every: int, threads: int | None
+        self, sources: Sequence[Tensor], tape: Array, seeds: Sequence[Tensor | None], every: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         printed = self.kernel.printed(adjoint=True)
-        start, past, statics, slots = self._given(printed, *sources)
+        start, past, statics, slots = self._given(*sources)
         shape, kind = sources[0].shape[1:], np.dtype(self.kind)
         entries = start.shape[1]
         nothing = torch.zeros(0, entries, dtype=sources[0].dtype)
@@ -298,10 +290,10 @@ class BehindRecord:
         on_moving = np.zeros((len(moving), entries), kind)
         on_past, on_statics = np.zeros_like(past), np.zeros_like(statics)
         self._run(
-            loops.adjoint, printed, shape, slots, start, past, statics, self._record, self._reads, self.kernel.seen,
+            loops.adjoint, shape, slots, start, past, statics, self._record, self._reads, self.kernel.seen,
             printed.places, printed.layout, printed.compiled(self.kind, VALUES)[0],
             *printed.compiled(self.kind, ADJOINT), every, on_gap, on_speed, tape,
-            self.kernel.taped, on_moving, on_past, on_statics, threads=threads,
+            self.kernel.taped, on_moving, on_past, on_statics,
         )  # fmt: skip
         on_start = np.zeros_like(start)
         on_start[moving] = on_moving
@@ -312,33 +304,33 @@ class BehindRecord:
 
     def sensitivities(
         self, state: State, params: Params, names: tuple[str, ...], every: int = 1, *,
-        start_by: Tensor | None = None, threads: int | None = None,
+        start_by: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
         """Return gap and speed, and their derivatives by the named parameters, (samples, names, …, rows)."""
-        printed, arguments, slots, shape = self._linear(state, params, names, start_by, every)
+        arguments, slots, shape = self._linear(state, params, names, start_by, every)
         kind, entries = np.dtype(self.kind), math.prod(shape)
         samples, many = self.steps // every, len(names)
         out = [take((samples, entries), kind) for _ in range(2)]
         by = [take((samples, many, entries), kind) for _ in range(2)]
-        self._run(loops.sensitivities, printed, shape, slots, *arguments, *out, *by, threads=threads)
+        self._run(loops.sensitivities, shape, slots, *arguments, *out, *by)
         gap, speed = (torch.from_numpy(x).view(samples, *shape) for x in out)
         gap_by, speed_by = (torch.from_numpy(x).view(samples, many, *shape) for x in by)
         return gap, speed, gap_by, speed_by
 
     def normal_equations(
         self, state: State, params: Params, names: tuple[str, ...], targets: Tensor, weights: Tensor, every: int = 1, *,
-        start_by: Tensor | None = None, threads: int | None = None,
+        start_by: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         """Return ``Σ r²`` (…, rows), ``Jᵀ r`` (…, rows, names) and ``Jᵀ J`` (…, rows, names, names).
 
         ``r = weights · (gap or speed − targets)``; both are (2, samples, rows), gap first. No Jacobian is stored.
         """
-        printed, arguments, slots, shape = self._linear(state, params, names, start_by, every)
+        arguments, slots, shape = self._linear(state, params, names, start_by, every)
         kind, entries, many = np.dtype(self.kind), math.prod(shape), len(names)
         measured = [x.to(state.speed.dtype).contiguous().numpy() for x in (targets, weights)]
         counts = np.array([bool(x.any()) for x in weights])
         out = [np.empty((*size, entries), kind) for size in ((), (many,), (many * (many + 1) // 2,))]
-        self._run(loops.normal_equations, printed, shape, slots, *arguments, *measured, counts, *out, threads=threads)
+        self._run(loops.normal_equations, shape, slots, *arguments, *measured, counts, *out)
         cost, gradient, pairs = (torch.from_numpy(x) for x in out)
         first, second = torch.triu_indices(many, many)
         normal = pairs.new_empty(many, many, entries)
@@ -350,10 +342,10 @@ class BehindRecord:
 
     def _linear(
         self, state: State, params: Params, names: tuple[str, ...], start_by: Tensor | None, every: int
-    ) -> tuple[_Printed, tuple[Any, ...], int, Sequence[int]]:
+    ) -> tuple[tuple[Any, ...], int, Sequence[int]]:
         printed = self.kernel.printed(names)
         sources = (self._start(state), self._past(state), self._statics(state, params))
-        start, past, statics, slots = self._given(printed, *sources)
+        start, past, statics, slots = self._given(*sources)
         shape = sources[0].shape[1:]
         if start_by is None:
             along = np.zeros((0, 0, 0), self.kind)
@@ -363,7 +355,7 @@ class BehindRecord:
             start, along, past, statics, self._record, self._reads, self.kernel.seen, printed.places, printed.moving,
             printed.layout, *printed.compiled(self.kind, VALUES + TANGENTS), every,
         )  # fmt: skip
-        return printed, arguments, slots, shape
+        return arguments, slots, shape
 
     def start_by(self, state: State, values: Mapping[str, Tensor]) -> Tensor | None:
         """Return the derivative of the start by parameters, (names, moving states, …, rows); None where it is 0.
@@ -391,13 +383,11 @@ class _Rollout(torch.autograd.Function):
     """Keeps the states that the adjoint reads, where anybody will ask for it."""
 
     @staticmethod
-    def forward(
-        ctx: Any, behind: BehindRecord, every: int, threads: int | None, *sources: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        differentiable = any(ctx.needs_input_grad[3:])
+    def forward(ctx: Any, behind: BehindRecord, every: int, *sources: Tensor) -> tuple[Tensor, Tensor]:
+        differentiable = any(ctx.needs_input_grad[2:])
         taped = behind.kernel.taped if differentiable else np.zeros(0, np.int64)
-        gap, speed, tape = behind._forward(sources, every, threads, taped)
-        ctx.behind, ctx.every, ctx.threads, ctx.tape = behind, every, threads, tape
+        gap, speed, tape = behind._forward(sources, every, taped)
+        ctx.behind, ctx.every, ctx.tape = behind, every, tape
         ctx.save_for_backward(*sources)
         ctx.set_materialize_grads(False)
         shape = (len(gap), *sources[0].shape[1:])
@@ -406,8 +396,8 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     @once_differentiable  # second derivatives need the torch path: an error says so, not a silent zero
     def backward(ctx: Any, *seeds: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        gradients = ctx.behind._backward(ctx.saved_tensors, ctx.tape, seeds, ctx.every, ctx.threads)
-        return None, None, None, *gradients
+        gradients = ctx.behind._backward(ctx.saved_tensors, ctx.tape, seeds, ctx.every)
+        return None, None, *gradients
 
 
 __all__ = ["BehindRecord", "DriverKernel", "prepared"]

@@ -53,7 +53,6 @@ class RolloutPlan:
     tape: bool
     operands: tuple[Array, ...]
     strides: Array
-    threads: int | None
 
     @cached_property
     def shape(self) -> tuple[int, ...]:
@@ -100,7 +99,7 @@ class RolloutPlan:
         )  # fmt: skip
         pool.split(
             lambda begin, end: loop(*common, begin, end),
-            tiles.tiles(self.rows, size, wide, around), 1, pool.count(self.rows * size * steps, self.threads),
+            tiles.tiles(self.rows, size, wide, around), 1, pool.count(self.rows * size * steps),
         )  # fmt: skip
 
     def forward(self, first: int, steps: int, *arguments: Any) -> None:
@@ -181,7 +180,7 @@ def past_tensor(rows: Array, slots: int, shape: tuple[int, ...]) -> Tensor:
 
 def planned(
     kernel: TileKernel, simulator: CarFollowingStep, state: State, inputs: Inputs, params: Params, steps: int,
-    block: int, keep: bool, threads: int | None,
+    block: int, keep: bool,
 ) -> tuple[RolloutPlan, list[Tensor]]:  # fmt: skip
     """Return what ``run`` takes."""
     *batch, size = state.speed.shape
@@ -198,7 +197,7 @@ def planned(
     tape = any(x.requires_grad for x in differentiated)
     plan = RolloutPlan(
         kernel, simulator, state, inputs, params, steps, min(block, steps), keep, tape,
-        tuple(a for a, _ in operands), strides, threads,
+        tuple(a for a, _ in operands), strides,
     )  # fmt: skip
     return plan, differentiated
 
@@ -372,13 +371,13 @@ def _differentiable(
 
 def rollout(
     kernel: TileKernel, simulator: CarFollowingStep, state: State, inputs: Inputs, params: Params, steps: int, *,
-    block: int = BLOCK, keep: bool = True, threads: int | None = None,
+    block: int = BLOCK, keep: bool = True,
 ) -> tuple[State, tuple[Tensor, ...] | None]:  # fmt: skip
     """Do what ``simulator.rollout`` does, by the kernel that ``dispatch`` found for it.
 
     Returns the last state and, where ``keep`` is set, position, speed, acceleration and gap of every step.
     """
-    return run(*planned(kernel, simulator, state, inputs, params, steps, block, keep, threads))
+    return run(*planned(kernel, simulator, state, inputs, params, steps, block, keep))
 
 
 def run(plan: RolloutPlan, sources: Sequence[Tensor]) -> tuple[State, tuple[Tensor, ...] | None]:

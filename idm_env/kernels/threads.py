@@ -23,10 +23,9 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="idm_env")
 
 
-def count(work: int, threads: int | None = None) -> int:
-    """Return how many threads share ``work`` vehicle-steps; at most ``threads``, torch's number by default."""
-    most = torch.get_num_threads() if threads is None else threads
-    return max(1, min(most, work // GRAIN))
+def count(work: int) -> int:
+    """Return how many threads share ``work`` vehicle-steps; at most torch's number."""
+    return max(1, min(torch.get_num_threads(), work // GRAIN))
 
 
 def split(run: Callable[[int, int], None], total: int, align: int, threads: int) -> None:
