@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from idm_env.roads.base import if_present
 from idm_env.roads.ends import Ending, nearer
 from idm_env.types import FAR, Neighbour, State, Wish
 
@@ -126,19 +127,7 @@ class Sideways(Ending):
         """
         speed = state.speed
         present = present.to(speed.dtype)
-        some = present > 0
-        leader = Neighbour(
-            torch.where(some, gap, FAR),
-            torch.where(some, self.at(speed, slot), speed),
-            torch.where(some, self.at(state.accel, slot), 0.0),
-            present,
-        )
+        leader = if_present(Neighbour(gap, self.at(speed, slot), self.at(state.accel, slot), present), speed)
         its = Neighbour(*(self.at(x, slot) for x in leaders))
-        both = (its.present * present) > 0
-        second = Neighbour(
-            torch.where(both, gap + self.at(state.length, slot) + its.gap, FAR),
-            torch.where(both, its.speed, speed),
-            torch.where(both, its.accel, 0.0),
-            its.present * present,
-        )
-        return leader, second
+        second = its._replace(gap=gap + self.at(state.length, slot) + its.gap, present=its.present * present)
+        return leader, if_present(second, speed)

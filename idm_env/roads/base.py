@@ -26,6 +26,17 @@ class Outline(NamedTuple):
     ring: float | None
 
 
+def if_present(other: Neighbour, speed: Tensor) -> Neighbour:
+    """Return a neighbour, and where there is none nobody: FAR away, at one's own ``speed`` (m/s); elementwise."""
+    exists = other.present > 0
+    return Neighbour(
+        torch.where(exists, other.gap, FAR),
+        torch.where(exists, other.speed, speed),
+        torch.where(exists, other.accel, 0.0),
+        other.present,
+    )
+
+
 @dataclass(frozen=True)
 class Road(abc.ABC):
     """A topology over the last tensor dimension, vehicles sorted front first.
@@ -119,21 +130,10 @@ class Road(abc.ABC):
     def second_leader(self, leader: Neighbour, length: Tensor, speed: Tensor) -> Neighbour:
         """Return the leader's leader, with the gap between bumpers: ``s1 + length[leader] + s[leader]`` (m)."""
         present = leader.present * self.ahead(leader.present.expand_as(speed))
-        exists = present > 0
-        return Neighbour(
-            torch.where(exists, leader.gap + self.ahead(length) + self.ahead(leader.gap), FAR),
-            torch.where(exists, self.ahead(leader.speed), speed),
-            torch.where(exists, self.ahead(leader.accel), 0.0),
-            present,
-        )
+        gap = leader.gap + self.ahead(length) + self.ahead(leader.gap)
+        return if_present(Neighbour(gap, self.ahead(leader.speed), self.ahead(leader.accel), present), speed)
 
     def behind(self, leader: Neighbour, speed: Tensor, accel: Tensor) -> Neighbour:
         """Return the vehicle whose leader is this one, with *its* gap (m)."""
         present = self.leads(speed) * self.back(leader.present.expand_as(speed))
-        exists = present > 0
-        return Neighbour(
-            torch.where(exists, self.back(leader.gap), FAR),
-            torch.where(exists, self.back(speed), speed),
-            torch.where(exists, self.back(accel), 0.0),
-            present,
-        )
+        return if_present(Neighbour(self.back(leader.gap), self.back(speed), self.back(accel), present), speed)

@@ -6,6 +6,7 @@ Shapes: what belongs to vehicles is ``[..., n]``, in SI units.
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -18,13 +19,12 @@ def nearer(leader: Neighbour, room: Tensor | None) -> Neighbour:
     """Return the leader, or whoever stands where the lane ends (``room`` metres ahead) if that is nearer."""
     if room is None:
         return leader
-    first = room < leader.gap
-    return Neighbour(
-        torch.where(first, room, leader.gap),
-        torch.where(first, 0.0, leader.speed),
-        torch.where(first, 0.0, leader.accel),
-        torch.where(first, 1.0, leader.present),
-    )
+    return either(room < leader.gap, (room, 0.0, 0.0, 1.0), leader)
+
+
+def either(condition: Tensor, one: Sequence[Tensor | float], other: Neighbour) -> Neighbour:
+    """Return gap, speed, acceleration and presence of ``one`` where a condition holds, elsewhere those of ``other``."""
+    return Neighbour(*(torch.where(condition, x, y) for x, y in zip(one, other, strict=True)))
 
 
 class Ending(Road):
@@ -43,10 +43,4 @@ class Ending(Road):
         second, room = super().second_leader(leader, length, speed), self.room()
         if room is None:
             return second
-        at_end = room <= leader.gap
-        return Neighbour(
-            torch.where(at_end, FAR, second.gap),
-            torch.where(at_end, speed, second.speed),
-            torch.where(at_end, 0.0, second.accel),
-            torch.where(at_end, 0.0, second.present),
-        )
+        return either(room <= leader.gap, (FAR, speed, 0.0, 0.0), second)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from idm_env.roads.adjacent import Preference, Side, Sideways
+from idm_env.roads.ends import either
 from idm_env.roads.layout import LaneLayout
 from idm_env.roads.order import Order, laps
 from idm_env.types import FAR, Links, Motion, Moving, Neighbour, State
@@ -183,26 +184,15 @@ class Linked(Sideways):
         if self.shadow is None:
             return nearest
         way = self._to_shadow()
-        first = way < nearest.gap
-        return Neighbour(
-            torch.where(first, way, nearest.gap),
-            torch.where(first, self.at(speed, self.shadow), nearest.speed),
-            torch.where(first, self.at(accel, self.shadow), nearest.accel),
-            torch.where(first, 1.0, nearest.present),
-        )
+        ahead = way, self.at(speed, self.shadow), self.at(accel, self.shadow), 1.0
+        return either(way < nearest.gap, ahead, nearest)
 
     def second_leader(self, leader: Neighbour, length: Tensor, speed: Tensor) -> Neighbour:
         """Return the leader's leader; beyond somebody who is leaving nobody is seen."""
         second = super().second_leader(leader, length, speed)
         if self.shadow is None:
             return second
-        beyond = self._to_shadow() <= leader.gap
-        return Neighbour(
-            torch.where(beyond, FAR, second.gap),
-            torch.where(beyond, speed, second.speed),
-            torch.where(beyond, 0.0, second.accel),
-            torch.where(beyond, 0.0, second.present),
-        )
+        return either(self._to_shadow() <= leader.gap, (FAR, speed, 0.0, 0.0), second)
 
     def _to_shadow(self) -> Tensor:
         assert self.shadow is not None and self.length is not None
