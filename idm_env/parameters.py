@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from idm_env.validation import nearest as nearest
 from idm_env.validation import shown
 
 Role = Literal["strength", "shape", "threshold", "place"]
+V = TypeVar("V")
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,15 @@ def check(effects: Iterable[HasParameters], params: Params) -> None:
             worst = float(value[bad].reshape(-1)[0])
             unit = "" if p.unit == "1" else f" {p.unit}"
             raise ValueError(f"{full} = {worst:g}{unit} is outside [{p.low:g}, {p.high:g}]{unit}.")
+
+
+def replaced(params: Mapping[str, Mapping[str, V]], values: Mapping[str, V]) -> dict[str, dict[str, V]]:
+    """Return parameters with some of them, by full names such as ``idm.time_gap``, replaced."""
+    changed = {effect: dict(own) for effect, own in params.items()}
+    for full, value in values.items():
+        effect, name = full.split(".")
+        changed.setdefault(effect, {})[name] = value
+    return changed
 
 
 def table(effects: Iterable[HasParameters]) -> list[dict[str, object]]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from idm_env.fitting.batch import Batch
-from idm_env.parameters import catalogue
+from idm_env.parameters import catalogue, replaced
 from idm_env.simulator import Simulator
 from idm_env.types import Record
 
@@ -86,9 +86,8 @@ class MeasuredDrivers:
     def params(self, theta: Tensor) -> dict[str, dict[str, Tensor]]:
         """Return parameters of drivers with log θ [..., p], and drift in units of its level: σ = 1, standing still."""
         params = self.simulator.defaults(dtype=torch.float64)
-        for i, name in enumerate(self.free):
-            effect, parameter = name.split(".")
-            params[effect][parameter] = theta[..., i].exp().unsqueeze(-1)
+        own = {name: theta[..., i].exp().unsqueeze(-1) for i, name in enumerate(self.free)}
+        params = replaced(params, own)
         for name in self.drifts:
             one = torch.ones((), dtype=torch.float64)
             params[name] = {**params[name], "sigma": one, "memory_time": STILL * one}

@@ -19,7 +19,7 @@ import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +28,9 @@ from torch import Tensor
 
 from idm_env.data import DataError
 from idm_env.fitting.lane_decisions import Decisions
+from idm_env.fitting.uncertainty import estimate_row
 from idm_env.multilane.incentives import wished
-from idm_env.parameters import Parameter
+from idm_env.parameters import Parameter, replaced
 from idm_env.simulator import Simulator
 
 TEMPERATURE = Parameter("temperature", "τ", "m/s²", 0.5, 0.01, 20.0, role="shape")
@@ -113,10 +114,7 @@ class UtilityLogit(Choice):
 
     def values(self, theta: Tensor, decisions: Decisions) -> Tensor:
         """Return ``h/τ + ln σ(m/τ)``."""
-        params = {effect: dict(values) for effect, values in decisions.params.items()}
-        for name, value in zip(self.free, theta, strict=False):
-            effect, parameter = name.split(".")
-            params[effect][parameter] = value
+        params = replaced(decisions.params, dict(zip(self.free, theta, strict=False)))
         wish = wished(self.simulator, decisions.scene, params)
         utility, margin = torch.stack(wish[:2], -1), torch.stack(wish[2:4], -1)
         return utility / theta[-3] + torch.nn.functional.logsigmoid(margin / theta[-3])
@@ -198,17 +196,10 @@ class Chosen(NamedTuple):
     at_bound: Tensor
     identified: Tensor
 
-    def table(self) -> list[dict[str, object]]:
+    def table(self) -> list[dict[str, Any]]:
         """Return one row per parameter: estimate, standard error, 95 % interval, and what is doubtful."""
-        rows: list[dict[str, object]] = []
-        for i, p in enumerate(self.model.parameters):
-            estimate, error = float(self.theta[i]), float(self.standard_error[i])
-            rows.append({
-                "parameter": p.name, "symbol": p.symbol, "unit": p.unit, "estimate": estimate, "standard_error": error,
-                "low": max(estimate - 1.96 * error, p.low), "high": min(estimate + 1.96 * error, p.high),
-                "at_bound": bool(self.at_bound[i]), "identified": bool(self.identified[i]),
-            })  # fmt: skip
-        return rows
+        columns = zip(self.theta, self.standard_error, self.at_bound, self.identified, strict=True)
+        return [estimate_row(p.name, p, *column) for p, column in zip(self.model.parameters, columns, strict=True)]
 
 
 def fit_choice(

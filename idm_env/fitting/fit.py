@@ -19,7 +19,7 @@ from idm_env.fitting.batch import Batch
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.problem import Loss, Objective, Problem, group_of
 from idm_env.fitting.solver import Normal, Progress, minimise, normal
-from idm_env.fitting.uncertainty import Uncertainty, uncertainty
+from idm_env.fitting.uncertainty import Uncertainty, estimate_row, uncertainty
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress
 from idm_env.roads import Lane
@@ -51,26 +51,11 @@ class Fit:
 
     def table(self) -> list[dict[str, Any]]:
         """Return one row per group and parameter: estimate, standard error, 95 % interval, and what is doubtful."""
-        rows = []
+        values, columns, rows = self.values(), self.uncertainty, []
         for g, group in enumerate(self.problem.groups):
             for i, (name, p) in enumerate(zip(self.names, self.problem.parameters, strict=True)):
-                estimate = float(self.values()[g, i])
-                error = float(self.uncertainty.standard_error[g, i])
-                rows.append(
-                    {
-                        "group": group,
-                        "parameter": name,
-                        "symbol": p.symbol,
-                        "unit": p.unit,
-                        "estimate": estimate,
-                        "standard_error": error,
-                        "low": max(estimate - 1.96 * error, p.low),
-                        "high": min(estimate + 1.96 * error, p.high),
-                        "at_bound": bool(self.uncertainty.at_bound[g, i]),
-                        "identified": bool(self.uncertainty.identified[g, i]),
-                        "converged": bool(self.converged[g]),
-                    }
-                )
+                own = (x[g, i] for x in (values, columns.standard_error, columns.at_bound, columns.identified))
+                rows.append({"group": group, **estimate_row(name, p, *own), "converged": bool(self.converged[g])})
         return rows
 
 

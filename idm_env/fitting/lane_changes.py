@@ -29,6 +29,7 @@ from idm_env.fitting.options import Source
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.model_file import Model, load_model, save_model
+from idm_env.parameters import replaced
 from idm_env.reports import page
 from idm_env.roads import Lanes
 from idm_env.types import Command, Params, Record
@@ -129,10 +130,7 @@ def lane_changes(
     if int(torch.unique(fold[decisions.vehicle[decisions.chosen > 0]]).numel()) < 2:
         raise DataError(f"{trajectories.source}: only one driver changes lanes. Nobody could be held out; take more.")
     seen = held_out(fitted, decisions, fold)
-    numbers = {effect: dict(values) for effect, values in model.parameters.items()}
-    for name, value in zip(free, fitted[0].theta.tolist(), strict=False):
-        effect, parameter = name.split(".")
-        numbers.setdefault(effect, {})[parameter] = float(value)
+    numbers = replaced(model.parameters, dict(zip(free, fitted[0].theta.tolist(), strict=False)))
     return LaneChanges(decisions, tuple(fitted), tuple(seen), replace(model, parameters=numbers, fitted_on={}))
 
 

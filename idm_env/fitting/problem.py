@@ -20,7 +20,7 @@ from idm_env.fitting.prior import Prior
 from idm_env.fitting.solver import Box, Normal
 from idm_env.fitting.tangent import TangentStep, linearised_rollout
 from idm_env.kernels import dispatch
-from idm_env.parameters import Parameter, catalogue, nearest
+from idm_env.parameters import Parameter, catalogue, nearest, replaced
 from idm_env.simulator import Simulator
 from idm_env.types import Inputs, State
 
@@ -134,10 +134,7 @@ class Problem:
         """Return defaults with some parameters replaced, each by a tensor that broadcasts against rows × vehicles."""
         params = self.simulator.defaults(dtype=self.batch.gap.dtype)
         fixed = {name: torch.tensor(value, dtype=self.batch.gap.dtype) for name, value in self.fixed.items()}
-        for name, value in {**fixed, **values}.items():
-            effect, parameter = name.split(".")
-            params[effect][parameter] = value
-        return params
+        return replaced(params, {**fixed, **values})
 
     def simulate(self, values: dict[str, Tensor]) -> Simulated:
         """Roll the drivers out behind their measured leaders; ``values`` are [..., rows] by parameter name."""

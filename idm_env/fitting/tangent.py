@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils import _pytree as pytree
 
+from idm_env.parameters import replaced
 from idm_env.simulator import Simulator
 from idm_env.types import Params, State
 
@@ -63,10 +64,7 @@ class TangentStep:
                 filled = list(state_leaves)
                 for i, x in zip(moving, floats, strict=True):
                     filled[i] = x
-                changed = {effect: dict(p) for effect, p in params.items()}
-                for name, value in zip(names, values, strict=True):
-                    effect, parameter = name.split(".")
-                    changed[effect][parameter] = value
+                changed = replaced(params, dict(zip(names, values, strict=True)))
                 after = pytree.tree_flatten(step(pytree.tree_unflatten(filled, state_spec), inputs, changed))[0]
                 return [after[i] for i in moving], [after[i] for i in fixed]
 
@@ -104,9 +102,7 @@ def linearised_rollout(
     along = list(directions.values())
 
     def begin(values: list[Tensor]) -> list[Tensor]:
-        changed = {effect: dict(p) for effect, p in params.items()}
-        for name, value in zip(names, values, strict=True):
-            changed[name.split(".")[0]][name.split(".")[1]] = value
+        changed = replaced(params, dict(zip(names, values, strict=True)))
         return [x for x in pytree.tree_flatten(start(changed))[0] if _is_float(x)]
 
     values = [params[name.split(".")[0]][name.split(".")[1]].contiguous() for name in names]

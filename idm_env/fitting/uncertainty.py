@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torch import Tensor
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.problem import Problem
 from idm_env.fitting.solver import normal
+from idm_env.parameters import Parameter
 
 ENOUGH_ROWS = 10
 """From this many episodes in a group on, their spread itself gives the variance of the group's gradient."""
@@ -24,6 +25,18 @@ class Uncertainty(NamedTuple):
     effective_samples: Tensor
     at_bound: Tensor
     identified: Tensor
+
+
+def estimate_row(
+    name: str, p: Parameter, estimate: Tensor, error: Tensor, at_bound: Tensor, identified: Tensor
+) -> dict[str, Any]:  # fmt: skip
+    """Return one parameter's row of a table: estimate [], standard error [], 95 % interval, and what is doubtful."""
+    middle, half = float(estimate), 1.96 * float(error)
+    return {
+        "parameter": name, "symbol": p.symbol, "unit": p.unit, "estimate": middle, "standard_error": float(error),
+        "low": max(middle - half, p.low), "high": min(middle + half, p.high),
+        "at_bound": bool(at_bound), "identified": bool(identified),
+    }  # fmt: skip
 
 
 def effective_samples(residual: Tensor, weight: Tensor) -> Tensor:
