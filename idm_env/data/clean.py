@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import polars as pl
 
 from idm_env.data.errors import DataError, Repair, listed
-from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TRACK
+from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TRACK, taken_as_missing
 
 LARGEST_ID = 2.0**53
 """Floats tell whole numbers apart below this only."""
@@ -80,11 +80,9 @@ def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair
         if not frame[name].dtype.is_float():
             continue
         finite = (frame[name].is_finite() & (frame[name].abs() <= LARGEST.get(name, float("inf")))).fill_null(True)
-        bad = frame.height - int(finite.sum())
-        if bad:
-            frame = frame.with_columns(pl.when(finite).then(pl.col(name)).alias(name))
-            text = f"{bad} values of {name} were NaN, infinite or beyond all measure and are taken as missing."
-            repairs.append(Repair("not finite", bad, text))
+        words = "were NaN, infinite or beyond all measure and are"
+        frame, done = taken_as_missing(frame, name, finite, "not finite", words)
+        repairs += done
     return frame, repairs
 
 

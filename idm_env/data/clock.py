@@ -9,7 +9,7 @@ import polars as pl
 
 from idm_env.data.clean import natural
 from idm_env.data.errors import DataError, Repair
-from idm_env.data.schema import TRACK
+from idm_env.data.schema import TRACK, of_run, track_numbers
 
 LONGEST_BRIDGE = 2.5
 """Two samples at most this many steps apart are joined: jitter and one missing row, never more."""
@@ -60,31 +60,29 @@ def regularise(
     Position, speed, gap and length are interpolated linearly in time; all other columns are taken from the sample
     nearest in time, as a place on a lap must not be averaged over its wrap.
     """
-    step = frame["run_id"].replace_strict(steps, return_dtype=pl.Float64).to_numpy()
-    if starts is None:
-        start = frame.select(pl.col("time_s").min().over("run_id"))["time_s"].to_numpy()
-    else:
-        start = frame["run_id"].replace_strict(starts, return_dtype=pl.Float64).to_numpy()
+    first = pl.col("time_s").min().over("run_id") if starts is None else of_run(starts)
+    columns = frame.select(of_run(steps).alias("step"), first.alias("start"))
+    step, start = columns["step"].to_numpy(), columns["start"].to_numpy()
     exact = (frame["time_s"].to_numpy() - start) / step
     whole = np.round(exact)
     on_clock = np.abs(exact - whole) * step <= np.minimum(CLOCK_ROUNDING_S, 0.05 * step)
     exact = np.where(on_clock, whole, exact)
-    track = frame.select(pl.struct(TRACK).rle_id())[TRACK[0]].to_numpy()
+    track = track_numbers(frame)
     left, weight, ticks = _grid(exact, track, np.maximum(LONGEST_BRIDGE, bridge / step))
     times = start[left] + ticks * step[left]
     changed = weight > 0
     if changed.any() or len(left) != frame.height:
         same_leader = _same_leader(frame)[left]
-        columns = {
+        values = {
             name: _interpolated(frame[name], left, weight, same_leader if name == "gap_m" else None)
             for name in frame.columns
         }
-        result = pl.DataFrame(columns)
+        result = pl.DataFrame(values)
     else:
         result = frame
     result = result.with_columns(pl.Series("time_s", times), pl.Series("step", ticks.astype(np.int64)))
     result = result.filter((pl.col("step").diff() != 0).fill_null(True) | (pl.struct(TRACK).rle_id().diff() != 0))
-    return result, _repairs(frame, on_clock, track[left[changed]])
+    return result, _repairs(track, on_clock, track[left[changed]])
 
 
 def _grid(exact: np.ndarray, track: np.ndarray, bridge: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -120,8 +118,7 @@ def _interpolated(column: pl.Series, left: np.ndarray, weight: np.ndarray, same:
     return column.gather(np.where(weight > 0.5, right, left))
 
 
-def _repairs(frame: pl.DataFrame, on_clock: np.ndarray, changed_tracks: np.ndarray) -> list[Repair]:
-    track = frame.select(pl.struct(TRACK).rle_id())[TRACK[0]].to_numpy()
+def _repairs(track: np.ndarray, on_clock: np.ndarray, changed_tracks: np.ndarray) -> list[Repair]:
     jittered = np.unique(track[~on_clock])
     filled = int((~np.isin(changed_tracks, jittered)).sum())
     repairs = []

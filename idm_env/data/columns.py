@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from idm_env.data.schema import TIDY
+from idm_env.data.schema import TIDY, of_run
 from idm_env.data.trajectories import Trajectories
 
 _KNOWN = {*TIDY, "gap_measured", "step"}
@@ -16,9 +16,8 @@ _KNOWN = {*TIDY, "gap_measured", "step"}
 
 def with_step(trajectories: Trajectories) -> pl.DataFrame:
     """Return the table with the integer column ``step``: equal for all vehicles of a run at the same time."""
-    step = pl.col("run_id").replace_strict(trajectories.steps, return_dtype=pl.Float64)
     since = pl.col("time_s") - pl.col("time_s").min().over("run_id")
-    return trajectories.table.with_columns((since / step).round().cast(pl.Int64).alias("step"))
+    return trajectories.table.with_columns((since / of_run(trajectories.steps)).round().cast(pl.Int64).alias("step"))
 
 
 def extra(table: pl.DataFrame) -> tuple[dict[str, np.ndarray], list[str]]:

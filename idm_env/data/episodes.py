@@ -9,7 +9,7 @@ from idm_env.data import columns, records
 from idm_env.data.episode import Episode, Episodes
 from idm_env.data.errors import DataError, Repair
 from idm_env.data.neighbours import Neighbours, find
-from idm_env.data.schema import LEADER_LOST_GAP_M, SHORTEST_TRACK_S
+from idm_env.data.schema import LEADER_LOST_GAP_M, SHORTEST_TRACK_S, spans, track_numbers
 from idm_env.data.trajectories import Trajectories
 
 
@@ -41,7 +41,7 @@ def episodes(
     around = find(table)
     gap = table["gap_m"].to_numpy()
     valid, left_out = _valid(trajectories, table, around, gap, max_gap)
-    spans, changes, too_short = _spans(trajectories, table, valid, min_seconds)
+    stretches, changes, too_short = _spans(trajectories, table, valid, min_seconds)
     if changes:
         text = f"The leader changes at {changes} rows; the stretch was split there."
         left_out.append(Repair("leader changes", changes, text))
@@ -49,7 +49,7 @@ def episodes(
         rows = sum(end - begin for begin, end in too_short)
         text = f"{len(too_short)} stretches ({rows} rows) shorter than {min_seconds:g} s were left out."
         left_out.append(Repair("too short", len(too_short), text))
-    if not spans:
+    if not stretches:
         reasons = " ".join(repair.text for repair in left_out)
         if too_short:
             reasons += " Where samples are missing, idm-env reconstruct fills the holes."
@@ -58,7 +58,7 @@ def episodes(
     numbers, texts = columns.extra(table)
     items = []
     count: dict[tuple[str, str], int] = {}
-    for begin, end in spans:
+    for begin, end in stretches:
         run, vehicle = table["run_id"][begin], table["vehicle_id"][begin]
         count[run, vehicle] = count.get((run, vehicle), -1) + 1
         span = slice(begin, end, _stride(trajectories, run, dt))
@@ -116,19 +116,16 @@ def _spans(
     trajectories: Trajectories, table: pl.DataFrame, valid: np.ndarray, min_seconds: float
 ) -> tuple[list[tuple[int, int]], int, list[tuple[int, int]]]:
     """Return [begin, end) of the stretches, the number of changes of leader, and the stretches that are too short."""
-    track = table.select(pl.struct("run_id", "vehicle_id").rle_id())["run_id"].to_numpy()
-    leader = table.select(pl.struct("run_id", "leader_id").rle_id())["run_id"].to_numpy()
+    track, leader = track_numbers(table), track_numbers(table, ("run_id", "leader_id"))
     both = valid[1:] & valid[:-1] & (track[1:] == track[:-1]) & (np.diff(table["step"].to_numpy()) == 1)
     joined = both & (leader[1:] == leader[:-1])
-    begins = np.flatnonzero(valid & ~np.append(False, joined))
-    ends = np.flatnonzero(valid & ~np.append(joined, False)) + 1
-    spans: list[tuple[int, int]] = []
+    long: list[tuple[int, int]] = []
     short: list[tuple[int, int]] = []
-    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
+    for begin, end in spans(joined, valid):
         step = trajectories.steps[table["run_id"][begin]]
         enough = (end - begin) * step >= min_seconds - 1e-9 and end - begin > 3
-        (spans if enough else short).append((begin, end))
-    return spans, int((both & ~joined).sum()), short
+        (long if enough else short).append((begin, end))
+    return long, int((both & ~joined).sum()), short
 
 
 def _place(trajectories: Trajectories, values: np.ndarray, run: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import polars as pl
 
 from idm_env.data import speeds
 from idm_env.data.neighbours import Neighbours
-from idm_env.data.schema import DEFAULT_LENGTH_M
+from idm_env.data.schema import DEFAULT_LENGTH_M, of_run, spans
 from idm_env.data.smooth import fuse
 from idm_env.data.trajectories import Trajectories
 
@@ -56,7 +56,7 @@ class RecordColumns:
     def of(cls, trajectories: Trajectories, table: pl.DataFrame, around: Neighbours) -> RecordColumns:
         """Return the arrays of a table with ``step``, smoothing every track once for its acceleration."""
         position, speed = table["position_m"].to_numpy(), table["speed_mps"].to_numpy()
-        step = table["run_id"].replace_strict(trajectories.steps, return_dtype=pl.Float64).to_numpy()
+        step = table.select(of_run(trajectories.steps))["run_id"].to_numpy()
         accel = np.zeros(table.height)
         for begin, end in speeds.stretches(table):
             accel[begin:end] = fuse(position[begin:end], speed[begin:end], float(step[begin])).accel
@@ -141,7 +141,4 @@ class RecordColumns:
 
 def _stretches(rows: np.ndarray, present: np.ndarray, stride: int) -> list[tuple[int, int]]:
     """Return [begin, end) of stretches in which one vehicle is present without a break, at least 4 samples long."""
-    joined = present[1:] & present[:-1] & (np.diff(rows) == stride)
-    begins = np.flatnonzero(present & ~np.append(False, joined))
-    ends = np.flatnonzero(present & ~np.append(joined, False)) + 1
-    return [(b, e) for b, e in zip(begins.tolist(), ends.tolist(), strict=True) if e - b >= 4]
+    return [(begin, end) for begin, end in spans(np.diff(rows) == stride, present) if end - begin >= 4]

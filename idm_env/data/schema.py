@@ -5,11 +5,13 @@ One row per vehicle and time. Positions are front bumpers along the lane, gaps a
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import polars as pl
 
-from idm_env.data.errors import DataError
+from idm_env.data.errors import DataError, Repair
 
 REQUIRED = ("vehicle_id", "time_s", "position_m")
 TIDY = (
@@ -63,6 +65,35 @@ COLUMNS: dict[str, tuple[Any, bool, pl.Expr, str]] = {
     "gap_measured": (pl.Boolean, True, *_ANY),
 }  # fmt: skip
 """Columns of the tidy table: type, whether every row has a value, what holds of every value, and how that is said."""
+
+
+def of_run(values: Mapping[str, float]) -> pl.Expr:
+    """Return the number that every row's run has."""
+    return pl.col("run_id").replace_strict(values, return_dtype=pl.Float64)
+
+
+def track_numbers(frame: pl.DataFrame, names: Sequence[str] = TRACK) -> np.ndarray:
+    """Return the number of every row's track [rows], from 0; consecutive rows of the same ``names`` are one."""
+    return frame.select(pl.struct(names).rle_id())[names[0]].to_numpy()
+
+
+def spans(joined: np.ndarray, usable: np.ndarray) -> list[tuple[int, int]]:
+    """Return begin and end of every stretch of usable rows [rows], each of them joined to the one before [rows − 1]."""
+    joined = joined & usable[1:] & usable[:-1]
+    begins = np.flatnonzero(usable & ~np.append(False, joined))
+    ends = np.flatnonzero(usable & ~np.append(joined, False)) + 1
+    return list(zip(begins.tolist(), ends.tolist(), strict=True))
+
+
+def taken_as_missing(
+    frame: pl.DataFrame, name: str, good: pl.Series, kind: str, words: str
+) -> tuple[pl.DataFrame, list[Repair]]:  # fmt: skip
+    """Return a table without the values of a column that are not good [rows], and how many these were."""
+    count = frame.height - int(good.sum())
+    if not count:
+        return frame, []
+    repair = Repair(kind, count, f"{count} values of {name} {words} taken as missing.")
+    return frame.with_columns(pl.when(good).then(pl.col(name)).alias(name)), [repair]
 
 
 def check(table: pl.DataFrame, source: str) -> pl.DataFrame:

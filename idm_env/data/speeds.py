@@ -6,7 +6,15 @@ import numpy as np
 import polars as pl
 
 from idm_env.data.errors import Repair
-from idm_env.data.schema import DEFAULT_LENGTH_M, HIGHEST_SPEED_MPS, LOWEST_SPEED_MPS, TRACK
+from idm_env.data.schema import (
+    DEFAULT_LENGTH_M,
+    HIGHEST_SPEED_MPS,
+    LOWEST_SPEED_MPS,
+    TRACK,
+    of_run,
+    spans,
+    track_numbers,
+)
 from idm_env.data.smooth import noise_sigma, smooth
 
 
@@ -62,7 +70,7 @@ def complete(frame: pl.DataFrame, steps: dict[str, float]) -> tuple[pl.DataFrame
     if not count:
         return frame, []
     position, speed = frame["position_m"].to_numpy(), frame["speed_mps"].to_numpy().copy()
-    step = frame["run_id"].replace_strict(steps, return_dtype=pl.Float64).to_numpy()
+    step = frame.select(of_run(steps))["run_id"].to_numpy()
     for begin, end in stretches(frame):
         hole = np.isnan(speed[begin:end])
         if hole.any():
@@ -78,10 +86,8 @@ def complete(frame: pl.DataFrame, steps: dict[str, float]) -> tuple[pl.DataFrame
 
 def stretches(frame: pl.DataFrame) -> list[tuple[int, int]]:
     """Return [begin, end) of every unbroken stretch of one vehicle; the frame is sorted and has ``step``."""
-    track = frame.select(pl.struct(TRACK).rle_id())[TRACK[0]].to_numpy()
-    new = (np.diff(track) != 0) | (np.diff(frame["step"].to_numpy()) != 1)
-    edges = np.concatenate([[0], np.flatnonzero(new) + 1, [frame.height]])
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+    joined = (np.diff(track_numbers(frame)) == 0) & (np.diff(frame["step"].to_numpy()) == 1)
+    return spans(joined, np.ones(frame.height, bool))
 
 
 def _estimated(position: np.ndarray, step: float) -> np.ndarray:

@@ -7,7 +7,7 @@ import math
 import polars as pl
 
 from idm_env.data.errors import DataError, Repair
-from idm_env.data.schema import HIGHEST_SPEED_MPS, LONGEST_LENGTH_M, LOWEST_SPEED_MPS, TRACK
+from idm_env.data.schema import HIGHEST_SPEED_MPS, LONGEST_LENGTH_M, LOWEST_SPEED_MPS, TRACK, taken_as_missing
 
 LONGEST_MEDIAN_LENGTH_M = 12.0
 LONGEST_STEP_S = 2.0
@@ -107,15 +107,12 @@ def check_gaps(joined: pl.DataFrame, source: str) -> None:
 
 def implausible(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     """Empty single speeds and lengths that no vehicle has (the unit itself having been checked), counted."""
-    repairs = []
+    repairs: list[Repair] = []
     bounds = {"speed_mps": (LOWEST_SPEED_MPS, HIGHEST_SPEED_MPS, "m/s"), "length_m": (0.1, LONGEST_LENGTH_M, "m")}
     for name, (low, high, unit) in bounds.items():
         if name not in frame.columns:
             continue
-        good = frame[name].is_between(low, high).fill_null(True)
-        count = frame.height - int(good.sum())
-        if count:
-            frame = frame.with_columns(pl.when(good).then(pl.col(name)).alias(name))
-            text = f"{count} values of {name} outside [{low:g}, {high:g}] {unit} are taken as missing."
-            repairs.append(Repair("implausible value", count, text))
+        good, words = frame[name].is_between(low, high).fill_null(True), f"outside [{low:g}, {high:g}] {unit} are"
+        frame, done = taken_as_missing(frame, name, good, "implausible value", words)
+        repairs += done
     return frame, repairs

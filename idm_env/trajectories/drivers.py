@@ -9,6 +9,7 @@ import numpy as np
 
 from idm_env.data import Episode, VehicleRecord
 from idm_env.data.records import FAR_M
+from idm_env.data.schema import spans
 from idm_env.effects import IDM
 from idm_env.fitting.fit import Fit, fit
 from idm_env.fitting.options import Options
@@ -58,9 +59,7 @@ def episode_of(filtered: Filtered, leaders: dict[tuple[str, str], list[Filtered]
 
 def _stretches(leader: np.ndarray, usable: np.ndarray) -> list[tuple[int, int]]:
     """Return [begin, end) of stretches of usable steps behind one leader."""
-    change = (leader[1:] != leader[:-1]) | (usable[1:] != usable[:-1])
-    edges = np.concatenate([[0], np.flatnonzero(change) + 1, [len(leader)]])
-    return [(b, e) for b, e in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True) if usable[b] and leader[b]]
+    return spans(leader[1:] == leader[:-1], usable & (leader != ""))
 
 
 def fit_drivers(

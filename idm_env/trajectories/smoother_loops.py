@@ -9,7 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from idm_env.trajectories.compiled import compiled
+from idm_env.extras import needed
+
+with needed("filtering or reconstruction"):
+    from idm_env.kernels.compiler import compiler
+
+compiled = compiler(fastmath={"contract"})
 
 N = 4
 LOG_TWO_PI = float(np.log(2.0 * np.pi))

@@ -19,6 +19,7 @@ from idm_env.data import Repair, clean, clock, directions, leaders, prepare, uni
 from idm_env.data.errors import Counted
 from idm_env.data.load import batches
 from idm_env.data.names import Columns
+from idm_env.data.schema import TRACK, of_run
 from idm_env.jobs import storage
 from idm_env.trajectories.tracks import Table
 
@@ -26,7 +27,6 @@ KEPT = ("run_id", "vehicle_id", "time_s", "position_m", "leader_id", "lane", "le
 MOST_BUCKETS = 64
 BUCKET_ROWS = 400_000
 """Rows of a bucket of times."""
-KEY = ["run_id", "vehicle_id"]
 BRIDGED_S = 2.0
 """Holes up to this are filled before leaders are looked for (s)."""
 LONGEST_STEP_S = 60.0
@@ -86,7 +86,7 @@ class Spool:
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
         files, index = self._read(path, layout, ring_length, columns)
-        self.vehicles: list[tuple[str, str]] = index.select(KEY).rows()
+        self.vehicles: list[tuple[str, str]] = index.select(TRACK).rows()
         self.shelf = Shelf(self.source, folder, _borders([run for run, _ in self.vehicles], chunk))
         chunks = pl.Series(self.shelf.borders[1:-1], dtype=pl.UInt32)
         index = index.with_columns(pl.lit(chunks).search_sorted(pl.col("number"), "right").alias("chunk"))
@@ -147,7 +147,7 @@ class Spool:
     def _shelve(self, files: list[Path], index: pl.DataFrame) -> dict[str, float]:
         """Write the chunks, by the rules for whole vehicles, and return the time step of each run (s)."""
         per_bucket = max(1, -(-self.chunks // MOST_BUCKETS))
-        number = index.select(*KEY, "number", "chunk")
+        number = index.select(*TRACK, "number", "chunk")
         buckets = self._partition(files, "vehicles", pl.col("chunk") // per_bucket, number)
         paces, twice, unsorted = [], [], int(index["backward"].sum())
         for chunk in range(self.chunks):
@@ -199,7 +199,7 @@ class Spool:
             if not files:
                 leaders.headways(frame, self.source)  # refuses what is the wrong way round
             files.append(self.folder / f"led-{bucket:05d}.parquet")
-            storage.write(files[-1], frame.select(*KEY, "chunk", "step", "leader_id").write_parquet)
+            storage.write(files[-1], frame.select(*TRACK, "chunk", "step", "leader_id").write_parquet)
             _remove(parts)
         by_chunk = self._partition(files, "led", pl.col("chunk"))
         followers = 0
@@ -207,7 +207,7 @@ class Spool:
             ticks = pl.read_parquet(parts, glob=False).sort(*clean.NAMES, "step")
             ticks, repairs = leaders.steady(ticks)
             self._counted.add(repairs)
-            followers += ticks.filter(pl.col("leader_id").is_not_null()).select(KEY).n_unique()
+            followers += ticks.filter(pl.col("leader_id").is_not_null()).select(TRACK).n_unique()
             frame = pl.read_parquet(self.shelf.path(chunk), glob=False).drop("leader_id", "gap_m", strict=False)
             storage.write(self.shelf.path(chunk), _joined(frame, ticks, steps, starts).write_parquet)
             _remove(parts)
@@ -222,7 +222,7 @@ class Spool:
         for n, path in enumerate(files):
             frame = pl.read_parquet(path, glob=False)
             if index is not None:
-                frame = frame.join(index, on=KEY, how="left", maintain_order="left")
+                frame = frame.join(index, on=TRACK, how="left", maintain_order="left")
             frame = frame.with_columns(bucket.cast(pl.Int64).alias("bucket"))
             for (key,), part in frame.partition_by("bucket", as_dict=True, include_key=False).items():
                 target = self.folder / f"{name}-{key:05d}-{n:05d}.parquet"
@@ -243,15 +243,11 @@ def _joined(
     frame: pl.DataFrame, ticks: pl.DataFrame, steps: dict[str, float], starts: dict[str, float]
 ) -> pl.DataFrame:
     """Return the rows of a chunk with the leaders at the nearest tick of the clock, "" for none."""
-
-    def of_run(values: dict[str, float]) -> pl.Expr:
-        return pl.col("run_id").replace_strict(values, return_dtype=pl.Float64)
-
     tick = ((pl.col("time_s") - of_run(starts)) / of_run(steps)).alias("tick")
     frame = frame.with_row_index("row").with_columns(tick).sort("tick")
-    ticks = ticks.select(*KEY, pl.col("leader_id").fill_null(""), pl.col("step").cast(pl.Float64).alias("tick"))
+    ticks = ticks.select(*TRACK, pl.col("leader_id").fill_null(""), pl.col("step").cast(pl.Float64).alias("tick"))
     joined = frame.join_asof(
-        ticks.sort("tick"), on="tick", by=KEY, strategy="nearest", tolerance=1.0, check_sortedness=False
+        ticks.sort("tick"), on="tick", by=TRACK, strategy="nearest", tolerance=1.0, check_sortedness=False
     )
     return joined.sort("row").drop("row", "tick").with_columns(pl.col("leader_id").fill_null(""))
 
@@ -278,7 +274,7 @@ def _indexed(piece: pl.DataFrame) -> pl.DataFrame:
     """
     time = pl.col("time_s")
     ring = pl.col("ring_length_m").is_not_null().any() if "ring_length_m" in piece.columns else pl.lit(False)
-    return piece.group_by(KEY, maintain_order=True).agg(
+    return piece.group_by(TRACK, maintain_order=True).agg(
         *directions.END, directions.lane_of(piece), pl.len().cast(pl.Int64).alias("rows"), time.first().alias("first"),
         time.last().alias("last"), (time.diff() < 0).sum().cast(pl.Int64).alias("backward"), ring.alias("ring"),
     )  # fmt: skip
@@ -286,7 +282,7 @@ def _indexed(piece: pl.DataFrame) -> pl.DataFrame:
 
 def _merged(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
     """Return what is known per vehicle of the file."""
-    return pl.concat(parts).group_by(KEY, maintain_order=True).agg(
+    return pl.concat(parts).group_by(TRACK, maintain_order=True).agg(
         pl.col("begin").min(), pl.col("end").max(), pl.col("from").sort_by("begin").first(),
         pl.col("to").sort_by("end").last(), pl.col("rises").sum(), pl.col("lane").drop_nulls().first(),
         pl.col("rows").sum(),

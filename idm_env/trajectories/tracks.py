@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 
 from idm_env.data import Repair
-from idm_env.data.schema import HIGHEST_SPEED_MPS
+from idm_env.data.schema import HIGHEST_SPEED_MPS, spans
 
 SMALLEST_JUMP_M = 8.0
 """A change of position is a jump only above this, whatever the time step (m)."""
@@ -134,8 +134,7 @@ class Pieces:
         usual = float(np.median(steps))
         cut = np.zeros(len(steps), bool) if self.bridge is None else steps > max(self.bridge, 2.5 * usual)
         cut |= jumps(whole.time_s, whole.position_m)
-        edges = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(whole)]])
-        return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+        return spans(~cut, np.ones(len(whole), bool))
 
 
 def jumps(time: np.ndarray, position: np.ndarray) -> np.ndarray:
