@@ -294,12 +294,12 @@ class Adjacent(NamedTuple):
 
 
 def mapped(function: Callable[..., Tensor], first: Tree, *rest: Any) -> Tree:
-    """Apply a function to every tensor of like-shaped tuples and mappings; None stays None."""
-    if first is None:
-        return first
-    if isinstance(first, Tensor):
+    """Apply a function to every tensor of like-shaped tuples and mappings; what is no tensor stays as it is."""
+    if hasattr(first, "dim"):  # a tensor, or what stands for one while a step is recorded
         return function(first, *rest)  # type: ignore[return-value]
     if isinstance(first, Mapping):
         return {k: mapped(function, v, *(r[k] for r in rest)) for k, v in first.items()}  # type: ignore[return-value]
-    assert isinstance(first, tuple)
-    return type(first)(*(mapped(function, *parts) for parts in zip(first, *rest, strict=True)))  # type: ignore[return-value]
+    if not isinstance(first, tuple):
+        return first
+    parts = (mapped(function, *each) for each in zip(first, *rest, strict=True))
+    return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)  # type: ignore[return-value]

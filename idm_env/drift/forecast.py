@@ -6,7 +6,6 @@ Shapes: levels are ``[T, rows, p + k]``, drawn futures ``[steps, draws, starts]`
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ import torch
 from idm_env.drift.estimate import DriftSettings, Likelihood, predicted
 from idm_env.drift.linear import MeasuredDrivers, Path
 from idm_env.fitting.batch import Batch
+from idm_env.types import mapped
 
 
 def followed(
@@ -81,17 +81,12 @@ def _chunk(
         for j, name in enumerate(drivers.drifts)
     }
     state = state._replace(memory={**state.memory, **memory}, step=state.step.expand(state.speed.shape[:-1]))
-    inputs = {n: _wider(x) for n, x in batch.inputs(simulator.without(*simulator.draws)).items()}
+    inputs = mapped(lambda x: x.unsqueeze(1), dict(batch.inputs(simulator.without(*simulator.draws))))
     inputs = simulator.drawn(state.speed, inputs, batch.steps, seed)
     _, trajectory = simulator.rollout(state, inputs, params, batch.steps)
     parts = (x[..., d].numpy() for x in (trajectory.gap, trajectory.speed))
     gap, speed = (np.pad(x, [(0, steps - len(x)), (0, 0), (0, 0)], constant_values=np.nan) for x in parts)
     return gap, speed
-
-
-def _wider(value: Any) -> Any:
-    """Return an input with a dimension for draws after time."""
-    return type(value)(*(None if x is None else x.unsqueeze(1) for x in value))
 
 
 def crps(drawn: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from idm_env.multilane.incentives import lane_scene
 from idm_env.roads import End, Lanes
 from idm_env.roads.linked import Linked
 from idm_env.simulator import Simulator
-from idm_env.types import Params, Scene
+from idm_env.types import Params, Scene, mapped
 
 LEFT, RIGHT = 1, 2
 """What a driver chose, beside 0: to stay."""
@@ -120,7 +120,7 @@ def recorded_decisions(
     if not any(len(part[-1]) for part in parts):
         raise DataError(f"{trajectories.source}: no driver has a lane beside his own. Lane changes need several lanes.")
     left_out = [Repair(kind, n, _WORDS[kind].format(n=n)) for kind, n in lost.items() if n]
-    scene, params, possible, chosen, vehicle = _joined(parts)
+    scene, params, possible, chosen, vehicle = mapped(lambda *columns: torch.cat(columns), *parts)
     return Decisions(scene, params, possible, chosen, vehicle, tuple(names), every, tuple(left_out))
 
 
@@ -233,27 +233,8 @@ def _of_slots(params: list[Params], slot: Tensor) -> dict[str, dict[str, Tensor]
 
 
 def _picked(tree: Any, mask: Tensor) -> Any:
-    """Return what belongs to the vehicles of a mask; what is the same for all of them is repeated."""
-    if isinstance(tree, Tensor):
-        return tree.expand(mask.shape)[mask]
-    if isinstance(tree, dict):
-        return {name: _picked(x, mask) for name, x in tree.items()}
-    if isinstance(tree, tuple) and hasattr(tree, "_fields"):
-        return type(tree)(*(_picked(x, mask) for x in tree))  # type: ignore[call-arg]
-    return tree
-
-
-def _joined(parts: list[Any]) -> Any:
-    """Return the parts of all runs one after the other."""
-    first = parts[0]
-    if isinstance(first, Tensor):
-        return torch.cat(parts)
-    if isinstance(first, dict):
-        return {name: _joined([part[name] for part in parts]) for name in first}
-    if isinstance(first, tuple):
-        fields = [_joined([part[i] for part in parts]) for i in range(len(first))]
-        return type(first)(*fields) if hasattr(first, "_fields") else tuple(fields)
-    return first
+    """Return the marked elements of every tensor."""
+    return mapped(lambda x: x.expand(mask.shape)[mask], tree)
 
 
 __all__ = ["LEFT", "RIGHT", "Decisions", "recorded_decisions"]

@@ -7,9 +7,6 @@ limits the vehicle: it is the driver who decides. He judges by what he sees now,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -17,7 +14,7 @@ from idm_env.roads.adjacent import Side, Sideways
 from idm_env.roads.linked import Linked
 from idm_env.roads.merging import LANE, MERGER_GAP, MERGER_SPEED, merger
 from idm_env.step import CarFollowingStep
-from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish
+from idm_env.types import FAR, Beside, Inputs, Neighbour, Params, Scene, State, Wish, mapped
 
 
 class _Now:
@@ -150,13 +147,11 @@ def _one_side(
     # What is nearer: the leader there or the end of that lane; behind an end there is nobody.
     nearest = view.before_end(leader, side.ends)
     second = second._replace(present=second.present * (nearest.gap == leader.gap).to(led.dtype))
-    n = side.follower
-    behind = Neighbour(
-        side.back_gap,
-        view.at(scene.speed, n),
-        view.at(scene.accel, n),
-        side.followed.to(scene.speed.dtype),
-    )
+
+    def his(x: Tensor) -> Tensor:
+        return view.at(x, side.follower)
+
+    behind = Neighbour(side.back_gap, his(scene.speed), his(scene.accel), side.followed.to(scene.speed.dtype))
     own = scene._replace(leader=nearest, second_leader=scene.second_leader and second, behind=scene.behind and behind)
     accel = stepping.wanted(own, params)[0]
     exists, ends = side.exists.to(scene.speed.dtype), _room(stepping, own, side.ends, params)
@@ -169,30 +164,19 @@ def _one_side(
         nearest.accel,
         nearest.present,
     )
-    follower = _gather(view, scene, n)._replace(leader=me, second_leader=scene.second_leader and mine)
+    follower = mapped(his, scene)._replace(leader=me, second_leader=scene.second_leader and mine)
     if scene.lane is not None:  # he is on it already
-        follower = follower._replace(lane=view.at(state.memory[LANE], n))
-    with_me = stepping.wanted(follower, _gather(view, dict(params), n))[0]
+        follower = follower._replace(lane=his(state.memory[LANE]))
+    with_me = stepping.wanted(follower, mapped(his, dict(params)))[0]
     return Beside(
         exists=exists,
         leader=nearest,
         follower=behind,
         wanted=accel,
         with_me=with_me * behind.present,
-        without_me=view.at(now, n) * behind.present,
+        without_me=his(now) * behind.present,
         ends=ends,
     )
-
-
-def _gather(view: Sideways, tree: Any, slots: Any) -> Any:
-    """Return, in every slot, what belongs to another slot."""
-    if hasattr(tree, "dim"):
-        return view.at(tree, slots)
-    if isinstance(tree, Mapping):
-        return {name: _gather(view, x, slots) for name, x in tree.items()}
-    if isinstance(tree, tuple) and hasattr(tree, "_fields"):
-        return type(tree)(*(_gather(view, x, slots) for x in tree))  # type: ignore[call-arg]
-    return tree
 
 
 __all__ = ["NOW", "lane_scene", "on_lanes", "seen_merging", "wished"]
