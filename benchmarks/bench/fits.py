@@ -147,16 +147,16 @@ def discovery() -> dict[str, Any]:
     from idm_env.discovery import discover, model, records, search
     from idm_env.discovery.calibrate import first_prior
     from idm_env.discovery.discover import prepare
-    from idm_env.discovery.solve import Task, linearise
+    from idm_env.discovery.solve import Problem, linearise
 
     trajectories, _ = synthetic.generate(0)
     rows = records.windows(prepare(trajectories, "driver"))
-    task = Task(rows, search.first_noise(rows), first_prior())
-    theta = np.tile(task.prior.centre, (task.groups, 1))
+    problem = Problem(rows, search.first_noise(rows), first_prior())
+    theta = np.tile(problem.prior.centre, (problem.groups, 1))
 
     def jacobian(name: str) -> Case:
         term = model.simple(name)
-        return Case(lambda: linearise(task, model.Hypothesis((term,)), theta, np.array(term.starts[0])))
+        return Case(lambda: linearise(problem, model.Hypothesis((term,)), theta, np.array(term.starts[0])))
 
     times = measure({n: jacobian(n) for n in CANDIDATES if ALL[n].sought == "anywhere"}, 3)
     begin = time.process_time()

@@ -46,9 +46,9 @@ def calibrate(records: Records, model: Hypothesis, values: np.ndarray, start: np
     3. Its weight is the one that predicts best what a driver's parameters have not seen (``closed_loop.evaluate``).
     """
     own = model.catalogue.own
-    task, theta = judge.unweighed(records, model, values, first_prior(own), start=start)
-    fit = evaluate(records, model, values, population(theta, task.rows, own), theta)
-    return Calibrated(model, values, fit.theta, fit.task.prior, fit)
+    problem, theta = judge.unweighed(records, model, values, first_prior(own), start=start)
+    fit = evaluate(records, model, values, population(theta, problem.rows, own), theta)
+    return Calibrated(model, values, fit.theta, fit.problem.prior, fit)
 
 
 def judged(

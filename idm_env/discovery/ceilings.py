@@ -20,7 +20,7 @@ from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.model import Frozen
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.result import Ceilings
-from idm_env.discovery.solve import Solution, Task, solve
+from idm_env.discovery.solve import Problem, Solution, solve
 
 NEIGHBOURS = 10
 EVERY = 4
@@ -51,7 +51,7 @@ def repeats(at: ClosedLoopFit) -> float:
     A situation is speed, time gap, closing speed and the leader's acceleration; the covariance of an error with the
     mean error of the nearest ones in other runs, over the variance.
     """
-    rows, records = at.task.rows, at.task.rows.records
+    rows, records = at.problem.rows, at.problem.rows.records
     valid = at.scored.copy()
     valid[:, np.arange(valid.shape[1]) % EVERY != 0] = False
     i, j = np.nonzero(valid)
@@ -74,11 +74,11 @@ def repeats(at: ClosedLoopFit) -> float:
 
 def between_halves(at: ClosedLoopFit) -> float:
     """Return the correlation, over drivers, of the logarithms of time gaps of both halves of their time."""
-    seen = np.unique(at.task.rows.group)
+    seen = np.unique(at.problem.rows.group)
     if len(seen) < FEWEST:
         return float("nan")
-    rows = at.task.rows
-    other = replace(at.task, rows=replace(rows, valid=at.scored))
+    rows = at.problem.rows
+    other = replace(at.problem, rows=replace(rows, valid=at.scored))
     theta = solve(other, Frozen(at.model, at.values), at.theta, np.zeros(0), iterations=10, tolerance=1e-4).theta
     names = [p.name for p in at.model.catalogue.own]
     if "time_gap" not in names:
@@ -93,8 +93,8 @@ def refitted(records: Records, null: Solution) -> float:
     second = judge.halves(rows)
     for half in (second, rows.valid & ~second):
         own = replace(rows, valid=half)
-        task, theta = judge.unweighed(records, null.model, null.values, null.prior, own, null.theta)
-        errors = Task(own, None, task.prior).errors(theta[None], Frozen(null.model, null.values), empty)[0]
+        problem, theta = judge.unweighed(records, null.model, null.values, null.prior, own, null.theta)
+        errors = Problem(own, None, problem.prior).errors(theta[None], Frozen(null.model, null.values), empty)[0]
         square += float((errors**2).sum())
     return float(np.sqrt(square / rows.valid.sum()))
 

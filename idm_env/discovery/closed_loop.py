@@ -16,7 +16,7 @@ from idm_env.discovery import judge
 from idm_env.discovery.model import Frozen, Hypothesis, Term
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.score import interval_of, log_gain, without_own_run
-from idm_env.discovery.solve import Linear, Prior, Solution, Task, finish, linearise, solve
+from idm_env.discovery.solve import Linear, Prior, Problem, Solution, finish, linearise, solve
 from idm_env.discovery.units import MANY_RUNS, Units, units
 
 GRID_S = (5.0, 15.0, 50.0, 150.0, 500.0)
@@ -29,14 +29,14 @@ ENDS_S = (0.5, 5e5)
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoopFit:
-    """A model in free simulation: ``task`` over all time, θ from the part that is not ``scored``, and errors (m) there.
+    """A model in closed loop: ``problem`` over all time, θ from the part that is not ``scored``, and errors (m) there.
 
-    ``rmse_m`` are the gap's errors on the scored time by weight (s); ``task.prior.error_correlation_s`` is the best.
+    ``rmse_m`` are the gap's errors on the scored time by weight (s); ``problem.prior.error_correlation_s`` is the best.
     ``absorb`` [G, P, P] is the inverse curvature of that calibration, ``weight`` [R] what a row's squares count: one
     over its own mean square plus the usual one, so that a few hopeless followers do not decide.
     """
 
-    task: Task
+    problem: Problem
     scored: np.ndarray
     model: Hypothesis
     values: np.ndarray
@@ -49,17 +49,17 @@ class ClosedLoopFit:
 
     def across(self, response: np.ndarray) -> np.ndarray:
         """Return a response [R, m, Q] on the scored time, after θ has followed it on the rest."""
-        rows = self.task.rows
+        rows = self.problem.rows
         part = (rows.valid & ~self.scored)[..., None]
-        pull = self.task.per_group(np.einsum("rmi,rmq->riq", self.linear.by_theta * part, response))
-        follow = np.einsum("gij,gjq->giq", self.absorb, pull / self.task.sigma**2)
+        pull = self.problem.per_group(np.einsum("rmi,rmq->riq", self.linear.by_theta * part, response))
+        follow = np.einsum("gij,gjq->giq", self.absorb, pull / self.problem.sigma**2)
         moved = response - np.einsum("rmi,riq->rmq", self.linear.by_theta, follow[rows.group])
         result: np.ndarray = moved * self.scored[..., None]
         return result
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted sums over units of values [R, ...]."""
-        rows = self.task.rows
+        rows = self.problem.rows
         return self.units.sums(rows.record, values * self.weight.reshape(-1, *[1] * (values.ndim - 1)))
 
     @property
@@ -79,16 +79,16 @@ def evaluate(records: Records, model: Hypothesis, values: np.ndarray, prior: Pri
     rows, frozen = whole(records).settled(), Frozen(model, values)
     scored = judge.halves(rows)
     part = replace(rows, valid=rows.valid & ~scored)
-    task = Task(part, None, replace(prior, free=False))
-    near = solve(task, frozen, theta, np.zeros(0), iterations=15, tolerance=1e-4).theta
-    heard = replace(task, rows=replace(rows, valid=scored))
-    fits: dict[float, tuple[Task, Solution]] = {}
+    problem = Problem(part, None, replace(prior, free=False))
+    near = solve(problem, frozen, theta, np.zeros(0), iterations=15, tolerance=1e-4).theta
+    heard = replace(problem, rows=replace(rows, valid=scored))
+    fits: dict[float, tuple[Problem, Solution]] = {}
     square: dict[float, float] = {}
     grid: Sequence[float] = GRID_S
     while grid:
         for seconds in grid:
             heavier = judge.scaled(
-                replace(task, prior=replace(task.prior, error_correlation_s=seconds)), model, values, near
+                replace(problem, prior=replace(problem.prior, error_correlation_s=seconds)), model, values, near
             )
             start = min(fits.items(), key=lambda fit: abs(np.log(fit[0] / seconds)))[1][1].theta if fits else near
             fits[seconds] = heavier, solve(heavier, frozen, start, np.zeros(0), iterations=10, tolerance=1e-4)
@@ -96,14 +96,14 @@ def evaluate(records: Records, model: Hypothesis, values: np.ndarray, prior: Pri
             square[seconds] = float((errors**2).sum()) / max(int(scored.sum()), 1)
         grid = further(square)
     error_correlation_s = min(square, key=lambda seconds: square[seconds])
-    task, fitted = fits[error_correlation_s]
-    matrix = task.per_group(np.einsum("rmi,rmj->rij", fitted.linear.by_theta, fitted.linear.by_theta))
+    problem, fitted = fits[error_correlation_s]
+    matrix = problem.per_group(np.einsum("rmi,rmj->rij", fitted.linear.by_theta, fitted.linear.by_theta))
     matrix += np.diag(prior.width**-2.0)
-    meters = linearise(replace(task, rows=rows, sigma=1.0), frozen, fitted.theta, np.zeros(0))
+    meters = linearise(replace(problem, rows=rows, sigma=1.0), frozen, fitted.theta, np.zeros(0))
     of_row = (meters.residual**2 * scored).sum(1) / np.maximum(scored.sum(1), 1)
     usual = max(float(np.median(of_row)), 1e-6)
     return ClosedLoopFit(
-        replace(task, rows=rows), scored, model, values, fitted.theta, meters,
+        replace(problem, rows=rows), scored, model, values, fitted.theta, meters,
         np.linalg.inv(matrix + 1e-9 * np.eye(matrix.shape[-1])), 1.0 / (of_row + usual), units(records, MANY_RUNS),
         {seconds: float(np.sqrt(square[seconds])) for seconds in sorted(square)},
     )  # fmt: skip
@@ -134,7 +134,7 @@ def linear_screen(at: ClosedLoopFit, term: Term) -> Line:
 
     Finite responses rather than derivatives at the null: what acts beyond a threshold shows, too.
     """
-    model, meters = at.model.adding(term), replace(at.task, sigma=1.0)
+    model, meters = at.model.adding(term), replace(at.problem, sigma=1.0)
     starts = np.array(term.starts)
     null = np.array([p.default if p.null is None else p.null for p in term.parameters])
     strengths = np.array([p.role == "strength" or p.null is not None for p in term.parameters])
@@ -168,14 +168,14 @@ def nested(at: ClosedLoopFit, term: Term, start: np.ndarray) -> Solution:
 
 def joint(at: ClosedLoopFit, model: Hypothesis, values: np.ndarray) -> Solution:
     """Fit all terms of a model at once in free simulation over all time, from φ ``values`` [Q]."""
-    return solve(at.task, model, at.theta, values, iterations=8, tolerance=1e-3)
+    return solve(at.problem, model, at.theta, values, iterations=8, tolerance=1e-3)
 
 
 def refitted(records: Records, solution: Solution) -> tuple[Solution, np.ndarray]:
     """Fit φ of a model of windows once more, in free simulation over all time; also return intervals [Q, 3]."""
     fit = evaluate(records, solution.model, solution.values, solution.prior, solution.theta)
     again = joint(fit, solution.model, solution.values)
-    return again, interval_of(again, fit.task)
+    return again, interval_of(again, fit.problem)
 
 
 def gains(before: ClosedLoopFit, solution: Solution) -> np.ndarray:
@@ -183,18 +183,18 @@ def gains(before: ClosedLoopFit, solution: Solution) -> np.ndarray:
 
     φ moves by one Newton step where a run is left out, and the errors with it to first order.
     """
-    after = evaluate(before.task.rows.records, solution.model, solution.values, before.task.prior, solution.theta)
-    change = without_own_run(before.task, solution)
-    rows = before.task.rows
-    by_phi = linearise(replace(after.task, sigma=1.0), solution.model, after.theta, solution.values).by_phi
+    after = evaluate(before.problem.rows.records, solution.model, solution.values, before.problem.prior, solution.theta)
+    change = without_own_run(before.problem, solution)
+    rows = before.problem.rows
+    by_phi = linearise(replace(after.problem, sigma=1.0), solution.model, after.theta, solution.values).by_phi
     moved = after.errors + np.einsum("rmq,rq->rm", after.across(by_phi), change[rows.run])
     squares = [before.sums((e**2).sum(1)) for e in (before.errors, moved)]
     return log_gain(*squares)
 
 
-def in_windows(task: Task, solution: Solution) -> Solution:
+def in_windows(problem: Problem, solution: Solution) -> Solution:
     """Return a model that was fitted in free simulation as one of windows: φ stands, θ follows."""
     frozen = Frozen(solution.model, solution.values)
-    theta = solve(task, frozen, solution.theta, np.zeros(0)).theta
-    linear = linearise(task, solution.model, theta, solution.values)
-    return finish(task, solution.model, theta, solution.values, linear, solution.cost)
+    theta = solve(problem, frozen, solution.theta, np.zeros(0)).theta
+    linear = linearise(problem, solution.model, theta, solution.values)
+    return finish(problem, solution.model, theta, solution.values, linear, solution.cost)

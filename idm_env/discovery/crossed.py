@@ -18,7 +18,7 @@ from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.score import without
-from idm_env.discovery.solve import Prior, Solution, Task, solve
+from idm_env.discovery.solve import Prior, Problem, Solution, solve
 
 FOLDS = 4
 POOLED_S = closed_loop.ENDS_S[1]
@@ -39,10 +39,10 @@ def folds_of(runs: Sequence[str], kept: Sequence[str], seed: int) -> np.ndarray:
     return fold
 
 
-def values_of(task: Task, solution: Solution, runs: Sequence[str], fold: np.ndarray) -> np.ndarray:
-    """Return φ [folds, Q] without the runs of each fold; ``task`` is what φ was fitted to, ``runs`` are all."""
-    of_run = fold[[runs.index(run) for run in task.rows.records.runs]]
-    moved = without(task, solution, of_run, int(fold.max()) + 1)
+def values_of(problem: Problem, solution: Solution, runs: Sequence[str], fold: np.ndarray) -> np.ndarray:
+    """Return φ [folds, Q] without the runs of each fold; ``problem`` is what φ was fitted to, ``runs`` are all."""
+    of_run = fold[[runs.index(run) for run in problem.rows.records.runs]]
+    moved = without(problem, solution, of_run, int(fold.max()) + 1)
     result: np.ndarray = solution.values + moved
     return result
 
@@ -93,7 +93,7 @@ def crossed(
     """
     rows, own = whole(records), model.catalogue.own
     is_calibrated = start is not None
-    task, theta = judge.unweighed(
+    problem, theta = judge.unweighed(
         records, model, values.mean(0), first_prior(own), start=start, calibrated=is_calibrated
     )
     second = judge.halves(rows)
@@ -101,7 +101,7 @@ def crossed(
     middle = Frozen(model, values.mean(0))
     # Where every driver is the population's middle, no driver needs to be fitted to half of his time.
     near = np.stack([theta, theta]) if pooled else np.stack([
-        solve(replace(task, rows=half), middle, theta, EMPTY, iterations=10, tolerance=1e-4).theta for half in halves
+        solve(replace(problem, rows=half), middle, theta, EMPTY, iterations=10, tolerance=1e-4).theta for half in halves
     ])  # fmt: skip
     of_row = fold[rows.run]
     parts: dict[int, _Fold] = {}
@@ -116,16 +116,16 @@ def crossed(
             parts[int(k)] = _weighed(mine, prior, frozen, near)
     gap, speed, thetas = _simulated(rows, second, fold, parts)
     short = windows(records)
-    task = Task(short, noise.alike(len(short)), first_prior(own))
-    ahead = _predicted(task, model, values, fold, thetas)
+    problem = Problem(short, noise.alike(len(short)), first_prior(own))
+    ahead = _predicted(problem, model, values, fold, thetas)
     if whitened is not False and not pooled:
-        others = _whitened(task, model, values, fold, theta)
-        other = _predicted(task, model, values, fold, others)
+        others = _whitened(problem, model, values, fold, theta)
+        other = _predicted(problem, model, values, fold, others)
         left = [_loss(np.bincount(short.group, x**2)[np.unique(short.group)]) ** 0.25 for x in (ahead, other)]
         whitened = bool(whitened or left[1] < CLEARLY * left[0])
         ahead, thetas = (other, others) if whitened else (ahead, thetas)
     longer = _in_blocks(records)
-    further = EMPTY if longer is None else _predicted(Task(longer, None, task.prior), model, values, fold, thetas)
+    further = EMPTY if longer is None else _predicted(Problem(longer, None, problem.prior), model, values, fold, thetas)
     return judge.Judged(rows, gap, speed, ahead, short.record, bool(whitened), further)
 
 
@@ -160,17 +160,17 @@ def _weighed(mine: list[Rows], prior: Prior, frozen: Frozen, near: np.ndarray) -
     thetas: dict[float, np.ndarray] = {}
     left: dict[float, np.ndarray] = {}
     seen = np.unique(mine[0].group)
-    count = np.sum([Task(half, None, prior).per_group(half.valid.sum(1)) for half in mine], axis=0)
+    count = np.sum([Problem(half, None, prior).per_group(half.valid.sum(1)) for half in mine], axis=0)
     grid: Sequence[float] = GRID_S[::2]
     while grid:
         for seconds in grid:
             begin = thetas[min(thetas, key=lambda s: abs(np.log(s / seconds)))] if thetas else near
             fitted, square = [], np.zeros(near.shape[1])
             for i, half in enumerate(mine):
-                task = Task(half, None, replace(prior, free=False, error_correlation_s=seconds))
-                task = judge.scaled(task, frozen, EMPTY, near[i])
-                fitted.append(solve(task, frozen, begin[i], EMPTY, iterations=10, tolerance=1e-4).theta)
-                other_half = replace(task, rows=mine[1 - i])
+                problem = Problem(half, None, replace(prior, free=False, error_correlation_s=seconds))
+                problem = judge.scaled(problem, frozen, EMPTY, near[i])
+                fitted.append(solve(problem, frozen, begin[i], EMPTY, iterations=10, tolerance=1e-4).theta)
+                other_half = replace(problem, rows=mine[1 - i])
                 errors = other_half.errors(fitted[i][None], frozen, EMPTY[None])[0]
                 square += other_half.per_group((errors**2).sum(1))
             thetas[seconds], left[seconds] = np.stack(fitted), square[seen] / np.maximum(count[seen], 1)
@@ -189,18 +189,18 @@ def _simulated(
         others = [p.left for j, p in parts.items() if j != k or len(parts) == 1]
         best = min(sorted(weights), key=lambda s: _loss(np.concatenate([left[s] for left in others])))
         chosen[k], in_fold = part.thetas[best], fold[rows.run] == k
-        one = Task(rows.some(in_fold), None, part.prior).predict(chosen[k], part.frozen, np.zeros((2, 0)))
+        one = Problem(rows.some(in_fold), None, part.prior).predict(chosen[k], part.frozen, np.zeros((2, 0)))
         gap[in_fold], speed[in_fold] = (np.take_along_axis(x, copy[in_fold][None], 0)[0] for x in one)
     return gap, speed, chosen
 
 
 def _whitened(
-    task: Task, model: Hypothesis, values: np.ndarray, fold: np.ndarray, theta: np.ndarray
+    problem: Problem, model: Hypothesis, values: np.ndarray, fold: np.ndarray, theta: np.ndarray
 ) -> dict[int, np.ndarray]:
     """Return log θ [2, G, P] of every fold, from whitened predictions 5 s ahead of each half of the drivers' blocks."""
     # The window before the first of a block is in the other half.
-    rows = replace(task.rows, joined=task.rows.joined & (task.rows.block == np.roll(task.rows.block, 1)))
-    free, second = replace(task, rows=rows, prior=replace(task.prior, free=False)), rows.block % 2 == 1
+    rows = replace(problem.rows, joined=problem.rows.joined & (problem.rows.block == np.roll(problem.rows.block, 1)))
+    free, second = replace(problem, rows=rows, prior=replace(problem.prior, free=False)), rows.block % 2 == 1
     all_time = solve(free, Frozen(model, values.mean(0)), theta, EMPTY, iterations=15, tolerance=1e-3).theta
     thetas = {}
     for k in np.unique(fold[rows.run]):
@@ -215,14 +215,16 @@ def _whitened(
 
 
 def _predicted(
-    task: Task, model: Hypothesis, values: np.ndarray, fold: np.ndarray, thetas: dict[int, np.ndarray]
+    problem: Problem, model: Hypothesis, values: np.ndarray, fold: np.ndarray, thetas: dict[int, np.ndarray]
 ) -> np.ndarray:
     """Return errors of the gap 5 s ahead [windows] with log θ [2, G, P] of every fold, from the half not scored."""
-    rows, ahead = task.rows, np.zeros(len(task.rows))
+    rows, ahead = problem.rows, np.zeros(len(problem.rows))
     copy = (rows.block % 2 == 0).astype(int)
     for k, theta in thetas.items():
         mine = fold[rows.run] == k
         if mine.any():
-            both = Task(rows.some(mine), None, task.prior).errors(theta, Frozen(model, values[k]), np.zeros((2, 0)))
+            both = Problem(rows.some(mine), None, problem.prior).errors(
+                theta, Frozen(model, values[k]), np.zeros((2, 0))
+            )
             ahead[mine] = np.take_along_axis(both[..., -1], copy[mine][None], 0)[0]
     return ahead

@@ -35,7 +35,7 @@ from idm_env.discovery.records import Records
 from idm_env.discovery.result import Result
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, Round, decide
-from idm_env.discovery.solve import Solution, Task
+from idm_env.discovery.solve import Problem, Solution
 from idm_env.discovery.verdict import Verdict
 from idm_env.effects import (
     ALL,
@@ -68,7 +68,7 @@ class Discovery:
     records: Records
     null: Solution
     final: Solution
-    task: Task
+    problem: Problem
     rounds: list[Round]
     judgement: Judgement
     responses: places.Responses
@@ -148,15 +148,15 @@ def discover(
     options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
     mark = storage.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
     saved = storage.Store(None if out is None else out / storage.UNFINISHED / "explain", mark, resume)
-    task = Task(rows, search.first_noise(rows), calibrate.first_prior(law.declared))
+    problem = Problem(rows, search.first_noise(rows), calibrate.first_prior(law.declared))
     known_terms = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
     extra = [*own, *(terms.known_effect(term) for term in known_terms)]
     bare = Hypothesis(known_terms, march.Catalogue.of(extra, prepared.period, law))
-    searching = Search(task, names, located and effects is None, saved, progress, bare)
+    searching = Search(problem, names, located and effects is None, saved, progress, bare)
     progress("null", 0, 0, law.name)
     values = search.starting_values(bare)
-    null = searching.null(bare, judge.unweighed(rows.records, bare, values, task.prior)[1], values)
+    null = searching.null(bare, judge.unweighed(rows.records, bare, values, problem.prior)[1], values)
     decided = decide(searching, null, seed)
     saved.remove()
     progress("final check", 0, 0, "test set")
@@ -275,7 +275,7 @@ def _finish(
     trajectories: Trajectories, evaluation: Evaluation, decided: Decided, refused: dict[str, str], by: str,
     on_law: Callable[[int, int, str], None],
 ) -> Discovery:  # fmt: skip
-    null, prepared, task = decided.null, evaluation.records, evaluation.searching.task
+    null, prepared, problem = decided.null, evaluation.records, evaluation.searching.problem
     judgement, last = judgement_of(evaluation, decided)
     first, before = evaluation.of_null
     laws: list[bases.Law] = []
@@ -283,7 +283,7 @@ def _finish(
         laws = bases.compared(null.model, before, evaluation.against_null, evaluation.seed, on_law)
         judgement = judgement.beside(bases.best_of(laws))
     final = judgement.compared if judgement.added and judgement.compared is not None else null
-    everywhere = judge.windowed(prepared, task, final)
+    everywhere = judge.windowed(prepared, problem, final)
     judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
     scored = prepared if evaluation.test is None else evaluation.test
     floor = ceilings.floor(scored, ceilings.drift(trajectories))
@@ -300,7 +300,7 @@ def _finish(
         ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain),
     )  # fmt: skip
     # Drivers who adapt are calibrated on parts of the held-out runs too.
-    fit = prepared if evaluation.adapt else task.rows.records
+    fit = prepared if evaluation.adapt else problem.rows.records
     seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fit.episodes])
     shown = null if judgement.compared is None else judgement.compared
     pairs = [(null, first), (shown, last)][: len(judgement.titles)]
@@ -309,7 +309,7 @@ def _finish(
     saved = [replace(corrected(prepared, s, theta.theta, by), fitted_on=seen) for s, theta in pairs]
     models = dict(zip(judgement.names(), saved, strict=True))
     return Discovery(
-        result, models, prepared, null, shown, task, decided.rounds, judgement, places.respond(task, shown)
+        result, models, prepared, null, shown, problem, decided.rounds, judgement, places.respond(problem, shown)
     )
 
 

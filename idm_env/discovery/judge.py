@@ -12,7 +12,7 @@ from idm_env.discovery import march, places
 from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.noise import HEAVY
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
-from idm_env.discovery.solve import Prior, Solution, Task, cost_of, solve
+from idm_env.discovery.solve import Prior, Problem, Solution, cost_of, solve
 from idm_env.discovery.units import units
 
 
@@ -95,47 +95,47 @@ def calibrate(
     of ``prior.error_correlation_s`` seconds count as one, so that the population, as prior, speaks for a driver whose
     record is short or noisy.
     """
-    task, theta = unweighed(records, model, values, prior, rows, start)
-    return weighed(task, model, values, theta)
+    problem, theta = unweighed(records, model, values, prior, rows, start)
+    return weighed(problem, model, values, theta)
 
 
 def unweighed(
     records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, rows: Rows | None = None,
     start: np.ndarray | None = None, calibrated: bool = False,
-) -> tuple[Task, np.ndarray]:  # fmt: skip
-    """Return the task of a calibration and its first fit: log θ [G, P] with a prior that hardly weighs anything.
+) -> tuple[Problem, np.ndarray]:  # fmt: skip
+    """Return the problem of a calibration and its first fit: log θ [G, P] with a prior that hardly weighs anything.
 
     From two starts, the prior's centre and ``start`` [G, P]; every group keeps the better one. From ``start`` alone
     where that is of a model already ``calibrated`` on these records.
     """
     rows = (whole(records) if rows is None else rows).settled()
     frozen, empty = Frozen(model, values), np.zeros(0)
-    task = Task(rows, None, replace(prior, free=False))
-    centre = np.tile(prior.centre, (task.groups, 1))
+    problem = Problem(rows, None, replace(prior, free=False))
+    centre = np.tile(prior.centre, (problem.groups, 1))
     fits = [
-        solve(task, frozen, x, empty, iterations=25, tolerance=1e-5)
+        solve(problem, frozen, x, empty, iterations=25, tolerance=1e-5)
         for x in ([] if calibrated else [centre]) + ([] if start is None else [start])
     ]
-    costs = np.stack([cost_of(task, f.theta[None], f.linear.residual[None])[0] for f in fits])
-    return task, np.where((costs.argmin(0) == 0)[:, None], fits[0].theta, fits[-1].theta)
+    costs = np.stack([cost_of(problem, f.theta[None], f.linear.residual[None])[0] for f in fits])
+    return problem, np.where((costs.argmin(0) == 0)[:, None], fits[0].theta, fits[-1].theta)
 
 
-def weighed(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Solution:
+def weighed(problem: Problem, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Solution:
     """Return the calibration in which errors of ``error_correlation_s`` count as one, from a first fit [G, P]."""
-    task = scaled(task, model, values, theta)
-    return solve(task, Frozen(model, values), theta, np.zeros(0), iterations=25, tolerance=1e-5)
+    problem = scaled(problem, model, values, theta)
+    return solve(problem, Frozen(model, values), theta, np.zeros(0), iterations=25, tolerance=1e-5)
 
 
-def scaled(task: Task, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Task:
+def scaled(problem: Problem, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Problem:
     """Return a problem of closed-loop simulation in whose cost errors of ``error_correlation_s`` count as one.
 
     They are as large as at log θ [G, P] and φ [Q].
     """
-    rows = task.rows
-    errors = task.errors(theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
+    rows = problem.rows
+    errors = problem.errors(theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
     square = (errors**2).sum(1) / np.maximum(rows.valid.sum(1), 1)
-    correlated = task.prior.error_correlation_s / (rows.every * rows.records.dt)
-    return replace(task, sigma=float(np.sqrt(max(np.median(square), 1e-4) * correlated)))
+    correlated = problem.prior.error_correlation_s / (rows.every * rows.records.dt)
+    return replace(problem, sigma=float(np.sqrt(max(np.median(square), 1e-4) * correlated)))
 
 
 def closed_loop_squares(records: Records, s: Solution) -> np.ndarray:
@@ -143,20 +143,20 @@ def closed_loop_squares(records: Records, s: Solution) -> np.ndarray:
     model, values, prior = s.model, s.values, s.prior
     fitted = calibrate(records, model, values, prior, start=s.theta)
     rows = whole(records)
-    task = Task(rows, None, prior)
-    errors = task.errors(fitted.theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
+    problem = Problem(rows, None, prior)
+    errors = problem.errors(fitted.theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
     return units(records).sums(rows.record, (np.clip(errors, -30.0, 30.0) ** 2).sum(1))
 
 
-def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> float:
+def confirmed(records: Records, problem: Problem, null: Solution, final: Solution) -> float:
     """Return the gain in log RMSE of predictions on runs never used: φ as found, θ of their drivers fitted in both.
 
-    Judged by the noise of ``task``, as the choice was. (Errors of free simulation are dominated by drivers' own noise:
+    Judged by the noise of ``problem``, as the choice was. (Errors of closed loops are dominated by drivers' own noise:
     with 0.1 m/s² of it they refused every second right finding of half strength.)
     """
     rows = windows(records)
-    assert task.noise is not None
-    on_test = Task(rows, task.noise.alike(len(rows)), task.prior)
+    assert problem.noise is not None
+    on_test = Problem(rows, problem.noise.alike(len(rows)), problem.prior)
     squares = []
     for s in (null, final):
         start = np.tile(s.prior.centre, (on_test.groups, 1))
@@ -165,12 +165,12 @@ def confirmed(records: Records, task: Task, null: Solution, final: Solution) -> 
     return float(0.5 * np.log(squares[0] / squares[1]))
 
 
-def windowed(records: Records, task: Task, solution: Solution) -> tuple[Task, Solution]:
-    """Return a model in windows of all records, and its task: φ as it stands, θ fitted, the noise of ``task``."""
-    assert task.noise is not None
+def windowed(records: Records, problem: Problem, solution: Solution) -> tuple[Problem, Solution]:
+    """Return a model in windows of all records, and its problem: φ as it stands, θ fitted, the noise of ``problem``."""
+    assert problem.noise is not None
     rows = windows(records)
-    in_windows = Task(rows, task.noise.alike(len(rows)), replace(task.prior, free=False))
-    start = np.tile(task.prior.centre, (in_windows.groups, 1))
+    in_windows = Problem(rows, problem.noise.alike(len(rows)), replace(problem.prior, free=False))
+    start = np.tile(problem.prior.centre, (in_windows.groups, 1))
     return in_windows, solve(in_windows, Frozen(solution.model, solution.values), start, np.zeros(0))
 
 
@@ -190,8 +190,8 @@ def judge(records: Records, model: Hypothesis, values: np.ndarray, theta: np.nda
     """Return the errors of a model with log θ [G, P] and values [Q] on all of the records."""
     rows, short, frozen, empty = whole(records), windows(records), Frozen(model, values), np.zeros((1, 0))
     prior = Prior(theta.mean(0), np.ones(theta.shape[-1]))
-    gap, speed = (x[0] for x in Task(rows, None, prior).predict(theta[None], frozen, empty))
-    ahead = Task(short, None, prior).errors(theta[None], frozen, empty)[0][:, -1]
+    gap, speed = (x[0] for x in Problem(rows, None, prior).predict(theta[None], frozen, empty))
+    ahead = Problem(short, None, prior).errors(theta[None], frozen, empty)[0][:, -1]
     return Judged(rows, gap, speed, ahead, short.record)
 
 

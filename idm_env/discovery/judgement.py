@@ -16,7 +16,7 @@ from idm_env.discovery.records import Records
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided
 from idm_env.discovery.shared import Shared
-from idm_env.discovery.solve import Solution, Task
+from idm_env.discovery.solve import Problem, Solution
 from idm_env.discovery.verdict import Reason, Refusal, improves, mean_ratio
 
 Calibration = tuple[Solution, judge.Judged | None]
@@ -148,7 +148,7 @@ class Evaluation:
     @cached_property
     def of_null(self) -> Calibration:
         """Calibration of the null, which says how predictions 5 s ahead of every other model are calibrated."""
-        return self._judged(self.null, self.searching.task, None)
+        return self._judged(self.null, self.searching.problem, None)
 
     @cached_property
     def _null_at_best(self) -> judge.Judged:
@@ -158,29 +158,29 @@ class Evaluation:
         """Return a model with values [Q], calibrated from log θ [G, P]; errors only where drivers do not adapt."""
         fit = self.searching.calibrated(model, values, start)
         test = None if self.adapt else self.test
-        return calibrate.judged(fit, self.searching.task.rows.records, test, self.records, self.adapt)
+        return calibrate.judged(fit, self.searching.problem.rows.records, test, self.records, self.adapt)
 
-    def _judged(self, s: Solution, task: Task, whitened: bool | None, pooled: bool = False) -> Calibration:
+    def _judged(self, s: Solution, problem: Problem, whitened: bool | None, pooled: bool = False) -> Calibration:
         theta, errors = self.calibrated(s.model, s.values, s.theta)
         if self.adapt and self.test is not None:
-            values = crossed.values_of(task, s, self.records.runs, self._fold)
+            values = crossed.values_of(problem, s, self.records.runs, self._fold)
             errors = self._crossed(s.model, values, theta.theta, whitened, pooled)
         return theta, errors
 
     def _crossed(
         self, model: Hypothesis, values: np.ndarray, theta: np.ndarray, whitened: bool | None, pooled: bool = False
     ) -> judge.Judged:
-        noise = self.searching.task.noise
+        noise = self.searching.problem.noise
         assert noise is not None
         return crossed.crossed(self.records, model, values, self._fold, noise, theta, pooled, whitened)
 
-    def judged(self, s: Solution, task: Task | None = None, pooled: bool = False) -> Calibration:
-        """Return the calibration of a model; ``task`` is what φ was fitted to, if not predictions in windows.
+    def judged(self, s: Solution, problem: Problem | None = None, pooled: bool = False) -> Calibration:
+        """Return the calibration of a model; ``problem`` is what φ was fitted to, if not predictions in windows.
 
         With ``pooled`` all drivers have one set of parameters.
         """
         before = self.of_null[1]
-        return self._judged(s, task or self.searching.task, None if before is None else before.whitened, pooled)
+        return self._judged(s, problem or self.searching.problem, None if before is None else before.whitened, pooled)
 
     def against_null(self, model: Hypothesis) -> tuple[judge.Judged, judge.Judged]:
         """Return the errors of another law, and those of the null that they are compared with (see ``bases``)."""
@@ -193,7 +193,7 @@ class Evaluation:
         at_best, theta = crossed.at_best(self.records, model, self.null.values)
         if bases.is_far(at_best, self._null_at_best, bool(model.catalogue.personal)):
             return at_best, self._null_at_best
-        values = crossed.values_of(self.searching.task, self.null, self.records.runs, self._fold)
+        values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
         return self._crossed(model, values, theta, before.whitened), before
 
 
@@ -219,15 +219,15 @@ def judgement_of(evaluation: Evaluation, decided: Decided) -> tuple[Judgement, S
                 break
         if not judgement.added and compared is not None:
             # The right effect with a strength fitted in windows may be off over minutes: these fit it once more.
-            again, intervals = closed_loop.refitted(evaluation.searching.task.rows.records, compared)
-            theta, after = evaluation.judged(again, decided.null_in_closed_loop.task)
+            again, intervals = closed_loop.refitted(evaluation.searching.problem.rows.records, compared)
+            theta, after = evaluation.judged(again, decided.null_in_closed_loop.problem)
             other = _in_closed_loop(judgement, evaluation, again, intervals, after)
             if other.improves:
                 judgement, last = other, theta
     if decided.joined is not None and before is not None:
         # What was found in closed loop takes the place of what windows found where it does better there.
         joined = decided.joined
-        theta, after = evaluation.judged(joined.solution, decided.null_in_closed_loop.task)
+        theta, after = evaluation.judged(joined.solution, decided.null_in_closed_loop.problem)
         now = judgement.after if judgement.added and judgement.after is not None else before
         assert after is not None
         if after.summary()["gap_rmse_m"] < now.summary()["gap_rmse_m"]:
@@ -248,7 +248,7 @@ def _confirmed(evaluation: Evaluation, decided: Decided) -> tuple[list[Solution]
         return confirmed, decided.rounds[0].refusal
     for s in decided.steps:
         final = confirmed[-1] if confirmed else decided.null
-        if judge.confirmed(test, evaluation.searching.task, final, s) <= 0:
+        if judge.confirmed(test, evaluation.searching.problem, final, s) <= 0:
             return confirmed, Refusal(Reason.TEST_SET)
         confirmed.append(s)
     return confirmed, decided.rounds[0].refusal
@@ -258,5 +258,5 @@ def _in_closed_loop(
     judgement: Judgement, evaluation: Evaluation, s: Solution, intervals: np.ndarray, after: judge.Judged | None
 ) -> Judgement:
     """Return the judgement of what was fitted in closed loop, with its intervals [Q, 3] and errors."""
-    compared = closed_loop.in_windows(evaluation.searching.task, s)
+    compared = closed_loop.in_windows(evaluation.searching.problem, s)
     return replace(judgement, compared=compared, added=True, refusal=None, after=after, intervals=intervals)

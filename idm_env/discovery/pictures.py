@@ -75,8 +75,8 @@ def _projected(d: Discovery, scored: Any) -> np.ndarray | None:
 
 
 def _off(d: Discovery, by_theta: np.ndarray, column: np.ndarray) -> np.ndarray:
-    group = d.task.rows.group
-    groups = d.task.groups
+    group = d.problem.rows.group
+    groups = d.problem.groups
     own = by_theta.shape[-1]
     matrix, cross = np.zeros((groups, own, own)), np.zeros((groups, own))
     np.add.at(matrix, group, np.einsum("rmi,rmj->rij", by_theta, by_theta))
@@ -117,8 +117,8 @@ def added_variable(d: Discovery) -> Figure | None:
     column = _projected(d, scored)
     if column is None:
         return None
-    residual = _off(d, d.null.linear.by_theta, d.task.residual(
-        d.task.errors(d.null.theta[None], d.null.model, d.null.values[None])
+    residual = _off(d, d.null.linear.by_theta, d.problem.residual(
+        d.problem.errors(d.null.theta[None], d.null.model, d.null.values[None])
     )[0])  # fmt: skip
     x, y = (column**2).sum(1) ** 0.5 * np.sign(column[:, -1]), -(residual * column).sum(1)
     y = y / np.maximum((column**2).sum(1) ** 0.5, 1e-9) * np.sign(column[:, -1])
@@ -155,10 +155,10 @@ def curves(d: Discovery) -> Figure | None:
 
 def _residual(d: Discovery) -> list[np.ndarray]:
     """Return the residual acceleration before and after [R, J]: how much more the driver gains in speed each second."""
-    task = d.task
+    problem = d.problem
     shown = []
     for s in (d.null, d.final)[: len(d.judgement.titles)]:
-        errors = task.errors(s.theta[None], s.model, s.values[None])[0]
+        errors = problem.errors(s.theta[None], s.model, s.values[None])[0]
         seconds = errors[:, 1:-2:2]
         shown.append(-np.diff(seconds, axis=1, prepend=0.0))
     return shown

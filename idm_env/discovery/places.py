@@ -14,7 +14,7 @@ import torch
 
 from idm_env.discovery.march import PULSED
 from idm_env.discovery.records import Rows
-from idm_env.discovery.solve import Solution, Task, equations
+from idm_env.discovery.solve import Problem, Solution, equations
 from idm_env.discovery.units import Units, units
 from idm_env.effects.free import FREE
 
@@ -59,9 +59,9 @@ class Responses:
         return matrix, vector
 
 
-def respond(task: Task, solution: Solution) -> Responses:
+def respond(problem: Problem, solution: Solution) -> Responses:
     """Return the responses at a solution."""
-    rows, records = task.rows, task.rows.records
+    rows, records = problem.rows, problem.rows.records
     seconds = max(1, round(1.0 / records.dt))
     pieces = max(rows.steps // seconds, 1)
     pulses = np.zeros((1 + len(WHATS) * pieces, 4))
@@ -71,7 +71,7 @@ def respond(task: Task, solution: Solution) -> Responses:
     copies = len(pulses)
     theta = np.repeat(solution.theta[None], copies, axis=0)
     values = np.repeat(solution.values[None], copies, axis=0)
-    residual = task.residual(task.errors(theta, solution.model, values, pulses))
+    residual = problem.residual(problem.errors(theta, solution.model, values, pulses))
     change = (residual[1:] - residual[0]).reshape(len(WHATS), pieces, len(rows), -1) / PULSE
     middle = rows.start[:, None] + seconds * np.arange(pieces) + seconds // 2
     signals = records.signals
@@ -86,7 +86,7 @@ def respond(task: Task, solution: Solution) -> Responses:
         "relative_gap": relative_gap(solution, rows, middle),
     }
     linear = solution.linear
-    matrix = equations(task, solution.theta, linear)[1][:, : linear.own, : linear.own]
+    matrix = equations(problem, solution.theta, linear)[1][:, : linear.own, : linear.own]
     counted = units(records)
     square = counted.sums(rows.record, (linear.residual**2).sum(-1))
     return Responses(

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import norm as normal
 
 from idm_env.discovery.score import ALPHA, FAINT, Tested, half_width
-from idm_env.discovery.solve import Solution, Task, prior_of, projected
+from idm_env.discovery.solve import Problem, Solution, prior_of, projected
 from idm_env.discovery.units import units
 from idm_env.effects import ALL
 from idm_env.parameters import Parameter
@@ -67,9 +67,9 @@ class Planted:
     bar: Bar
 
     @classmethod
-    def of(cls, solution: Solution, task: Task, which: np.ndarray, shape: np.ndarray, bar: Bar) -> Planted:
+    def of(cls, solution: Solution, problem: Problem, which: np.ndarray, shape: np.ndarray, bar: Bar) -> Planted:
         """Return what a candidate fitted in windows does, ``shape`` [B] of its strengths ``which`` [B] in φ."""
-        rows, counted = task.rows, units(task.rows.records)
+        rows, counted = problem.rows, units(problem.rows.records)
         across, residual = projected(solution)[..., which], solution.linear.residual
         matrix = counted.sums(rows.record, np.einsum("rmi,rmj->rij", across, across))
         pull = -counted.sums(rows.record, np.einsum("rmi,rm->ri", across, residual))
@@ -172,7 +172,7 @@ class Strength:
         return self.seen / AGREED <= self.beyond <= self.seen * AGREED
 
 
-def strength_of(solution: Solution, task: Task, label: str, bar: Bar) -> Strength | None:
+def strength_of(solution: Solution, problem: Problem, label: str, bar: Bar) -> Strength | None:
     """Return the strength of a term that has one, or only such, else None; ``bar`` is what it had to reach."""
     where = solution.model.where(label)
     parameters = solution.model.parameters[where]
@@ -180,7 +180,7 @@ def strength_of(solution: Solution, task: Task, label: str, bar: Bar) -> Strengt
     if not strengths or 1 < len(strengths) < len(parameters):
         return None
     entries = where.start + np.array(strengths)
-    width, estimate = half_width(solution, task)[entries], solution.values[entries]
+    width, estimate = half_width(solution, problem)[entries], solution.values[entries]
     p = parameters[strengths[0]]
     assert p.null is not None
     furthest = float(estimate[np.abs(estimate - p.null).argmax()])
@@ -188,10 +188,10 @@ def strength_of(solution: Solution, task: Task, label: str, bar: Bar) -> Strengt
     term = next(t for t in solution.model.terms if t.label == label)
     typical = abs(p.default - p.null) if len(strengths) == 1 else term.smoothness
     shape = np.ones(1) if len(strengths) == 1 else np.sin(2.0 * np.pi * np.arange(len(strengths)) / WAVE_KNOTS)
-    seen = BEYOND_LINES * Planted.of(solution, task, entries, shape, bar).smallest(typical)
+    seen = BEYOND_LINES * Planted.of(solution, problem, entries, shape, bar).smallest(typical)
     if term.effect is not None and ALL[term.effect].latency:
         # A latency that comes out below one step of the data becomes part of the null.
-        seen = max(seen, task.rows.records.dt + float(normal.ppf(POWER) / 1.96 * np.median(width)))
+        seen = max(seen, problem.rows.records.dt + float(normal.ppf(POWER) / 1.96 * np.median(width)))
     if seen > reach(p, len(strengths) > 1):
         seen = float("inf")
     return Strength(p, furthest, low, high, seen, typical, len(strengths))

@@ -16,7 +16,7 @@ from idm_env.discovery import ladder
 from idm_env.discovery.march import COLUMNS
 from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.records import Records, Rows, whole, windows
-from idm_env.discovery.solve import Prior, Solution, Task, solve
+from idm_env.discovery.solve import Prior, Problem, Solution, solve
 
 LAGS_S = (0.5, 1.5)
 """Lags at which increments of the speed's error are compared: at these, white noise of sensors is gone."""
@@ -48,8 +48,8 @@ class NoisyDrivers:
             signals[first:end, column["pushed"]] = self.sigma[records.group[r]] * noise
         rows = whole(replace(records, signals=signals), longest_s=np.inf, every_s=0.0)
         pulse = np.array([[1.0, 0.0, rows.steps, 1.0]])
-        task = Task(rows, None, _no_prior(self.theta))
-        gap, speed = (x[0][rows.valid] for x in task.predict(self.theta[None], self.model, EMPTY, pulse))
+        problem = Problem(rows, None, _no_prior(self.theta))
+        gap, speed = (x[0][rows.valid] for x in problem.predict(self.theta[None], self.model, EMPTY, pulse))
         samples = rows.samples[rows.valid]
         moved = signals[samples, column["lead_rear"]] - gap - signals[samples, column["position"]]
         signals[samples, column["position"]] += moved
@@ -61,38 +61,38 @@ class NoisyDrivers:
         return replace(records, signals=signals)
 
 
-def drivers_of(task: Task, solution: Solution) -> NoisyDrivers:
+def drivers_of(problem: Problem, solution: Solution) -> NoisyDrivers:
     """Return a calibrated model of windows with its drivers' noise: as records driven with it look most alike."""
-    records, model = task.rows.records, Frozen(solution.model, solution.values)
-    near, far, of_group = _increments(task.rows, model, solution.theta)
-    none = NoisyDrivers(model, solution.theta, np.zeros(task.groups), MEMORIES_S[0])
+    records, model = problem.rows.records, Frozen(solution.model, solution.values)
+    near, far, of_group = _increments(problem.rows, model, solution.theta)
+    none = NoisyDrivers(model, solution.theta, np.zeros(problem.groups), MEMORIES_S[0])
     if near <= 0.0:
         return none
     tried: list[tuple[float, NoisyDrivers]] = []
     for memory in MEMORIES_S:
         first = replace(none, sigma=np.sqrt(near * of_group) / LAGS_S[0], memory_s=memory)
         driven = first.drive(records, np.random.default_rng(0))
-        sooner, later, _ = _increments(replace(task.rows, records=driven), model, solution.theta)
+        sooner, later, _ = _increments(replace(problem.rows, records=driven), model, solution.theta)
         if sooner > 0.0:
             tried.append((abs(later / sooner - far / near), replace(first, sigma=first.sigma * np.sqrt(near / sooner))))
     if not tried:
         return none
     best = min(tried, key=lambda one: one[0])[1]
     # Increments tell what is drift and its memory; how large it is shows better in what it comes to.
-    replica, theta = _fitted(task, best, np.random.default_rng(0))
-    sizes = [float(np.median(_ahead(t, x, model) ** 2)) for t, x in ((task, solution.theta), (replica, theta))]
+    replica, theta = _fitted(problem, best, np.random.default_rng(0))
+    sizes = [float(np.median(_ahead(t, x, model) ** 2)) for t, x in ((problem, solution.theta), (replica, theta))]
     return replace(best, sigma=best.sigma * np.sqrt(sizes[0] / sizes[1]))
 
 
-def _fitted(task: Task, drivers: NoisyDrivers, random: np.random.Generator) -> tuple[Task, np.ndarray]:
+def _fitted(problem: Problem, drivers: NoisyDrivers, random: np.random.Generator) -> tuple[Problem, np.ndarray]:
     """Return the windows of a replica, and log θ [G, P] of drivers fitted to it in them."""
-    replica = replace(task, rows=windows(drivers.drive(task.rows.records, random)))
+    replica = replace(problem, rows=windows(drivers.drive(problem.rows.records, random)))
     return replica, solve(replica, drivers.model, drivers.theta, EMPTY[0], iterations=3).theta
 
 
-def _ahead(task: Task, theta: np.ndarray, model: Hypothesis) -> np.ndarray:
+def _ahead(problem: Problem, theta: np.ndarray, model: Hypothesis) -> np.ndarray:
     """Return errors of the gap 5 s ahead [W]."""
-    errors: np.ndarray = Task(task.rows, None, task.prior).errors(theta[None], model, EMPTY)[0][:, -1]
+    errors: np.ndarray = Problem(problem.rows, None, problem.prior).errors(theta[None], model, EMPTY)[0][:, -1]
     return errors
 
 
@@ -101,7 +101,7 @@ def _increments(rows: Rows, model: Hypothesis, theta: np.ndarray) -> tuple[float
 
     A driver counts by one over his own mean square plus the usual one.
     """
-    speed = Task(rows, None, _no_prior(theta)).predict(theta[None], model, EMPTY)[1][0]
+    speed = Problem(rows, None, _no_prior(theta)).predict(theta[None], model, EMPTY)[1][0]
     step = np.diff(speed - rows.records.speed[rows.samples], axis=1, prepend=0.0)
     own = np.mean(step**2, axis=1)
     square = np.bincount(rows.group, own, len(theta)) / np.maximum(np.bincount(rows.group, minlength=len(theta)), 1)
@@ -113,21 +113,21 @@ def _increments(rows: Rows, model: Hypothesis, theta: np.ndarray) -> tuple[float
     return near / total * usual, far / total * usual, square / usual
 
 
-def agreement(task: Task, solution: Solution, floor_m: float, seed: int) -> ladder.Agreement:
+def agreement(problem: Problem, solution: Solution, floor_m: float, seed: int) -> ladder.Agreement:
     """Return whether a model's errors 5 s ahead agree with noise, by a posterior predictive p-value.
 
     The statistic is the share of the squared error that a smooth function of the scene takes beside drift, as on the
     ladder with fewer features. Every replica has drivers' noise, that of sensors (``floor_m``), and drivers fitted to
     it in windows of 5 s, as those of ``solution`` are to the data.
     """
-    drivers, random, above = drivers_of(task, solution), np.random.default_rng(seed), 0
+    drivers, random, above = drivers_of(problem, solution), np.random.default_rng(seed), 0
 
     def share(rows: Rows, error: np.ndarray) -> float:
         return ladder.structure(rows, error, seed, FEATURES)[0]
 
-    mine = share(task.rows, _ahead(task, solution.theta, drivers.model))
+    mine = share(problem.rows, _ahead(problem, solution.theta, drivers.model))
     for draw in range(1, DRAWS + 1):
-        replica, theta = _fitted(task, drivers, random)
+        replica, theta = _fitted(problem, drivers, random)
         noise = floor_m * random.standard_normal(len(replica.rows))
         above += share(replica.rows, _ahead(replica, theta, drivers.model) + noise) >= mine
         if above == ENOUGH:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import t as student
 
-from idm_env.discovery.solve import Linear, Solution, Task, cost_of, equations, prior_of, projected
+from idm_env.discovery.solve import Linear, Problem, Solution, cost_of, equations, prior_of, projected
 from idm_env.discovery.units import rho, signs, units
 
 ALPHA = 0.05
@@ -24,7 +24,7 @@ noise than that of these sets, 0.2 m/s² at most, has not been held against a tr
 """
 
 
-def held_out(task: Task, solution: Solution) -> np.ndarray:
+def held_out(problem: Problem, solution: Solution) -> np.ndarray:
     """Return the held-out squared residual of every unit of the test [units], in units of noise.
 
     φ for a run comes from all other runs (one Newton step from the common optimum, on the normal equations without
@@ -33,41 +33,41 @@ def held_out(task: Task, solution: Solution) -> np.ndarray:
     time that θ has not seen either is fair too, but drivers' noise makes a θ from 90 s so uncertain that most of the
     power is lost: an effect that lowered the error of every run by 4 % was missed.)
     """
-    rows = task.rows
+    rows = problem.rows
     model = solution.model
     linear = solution.linear
-    change = without_own_run(task, solution)
+    change = without_own_run(problem, solution)
     shifted = linear.residual + np.einsum("rmq,rq->rm", linear.by_phi, change[rows.run])
     counted = units(rows.records)
-    if _spans_runs(task):
+    if _spans_runs(problem):
         # Drivers of several runs share θ, which then stays that of all runs: to first order.
         moved = linear.residual + np.einsum("rmq,rq->rm", projected(solution), change[rows.run])
         return counted.sums(rows.record, (moved**2).sum(-1))
     own = linear.own
-    part = replace(task, prior=solution.prior)
+    part = replace(problem, prior=solution.prior)
     gradient, matrix = equations(part, solution.theta, Linear(shifted, linear.jacobian[:own], own))
     step = -np.linalg.solve(matrix + 1e-9 * np.eye(own), gradient[..., None])[..., 0]
     low, high = solution.model.catalogue.bounds.T
     theta = np.clip(solution.theta + np.clip(step, -0.5, 0.5), low, high)
-    by_group = np.zeros((task.groups, len(solution.values)))
+    by_group = np.zeros((problem.groups, len(solution.values)))
     by_group[rows.group] = change[rows.run]
     values = np.repeat((solution.values + by_group)[None], 2, axis=0)
     both = np.stack([theta, solution.theta])
-    residual = task.residual(task.errors(both, model, values))
+    residual = problem.residual(problem.errors(both, model, values))
     better = cost_of(part, both, residual).argmin(0)[rows.group]
     square = (residual**2).sum(-1)
     return counted.sums(rows.record, np.where(better == 0, square[0], square[1]))
 
 
-def _spans_runs(task: Task) -> bool:
+def _spans_runs(problem: Problem) -> bool:
     """Tell whether any group has rows in more than one run."""
-    pairs = np.unique(np.stack([task.rows.group, task.rows.run]), axis=1)
+    pairs = np.unique(np.stack([problem.rows.group, problem.rows.run]), axis=1)
     return len(np.unique(pairs[0])) < pairs.shape[1]
 
 
-def per_run(task: Task, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+def per_run(problem: Problem, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     """Return φ's gradient [runs, Q] and matrix [runs, Q, Q] of every run, the drivers' own parameters eliminated."""
-    rows = task.rows
+    rows = problem.rows
     across = projected(solution)
     runs, count = len(rows.records.runs), len(solution.values)
     gradient, matrix = np.zeros((runs, count)), np.zeros((runs, count, count))
@@ -76,7 +76,7 @@ def per_run(task: Task, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     return gradient, matrix
 
 
-def without(task: Task, solution: Solution, part: np.ndarray, parts: int) -> np.ndarray:
+def without(problem: Problem, solution: Solution, part: np.ndarray, parts: int) -> np.ndarray:
     """Return by how much φ changes [parts, Q] when the runs of a part are left out; ``part`` is that of every run."""
     count = len(solution.values)
     change = np.zeros((parts, count))
@@ -84,7 +84,7 @@ def without(task: Task, solution: Solution, part: np.ndarray, parts: int) -> np.
         return change
     low, high = (np.array([getattr(p, side) for p in solution.model.parameters]) for side in ("low", "high"))
     ridge = prior_of(solution.model)
-    s, big = per_run(task, solution)
+    s, big = per_run(problem, solution)
     for one in np.unique(part):
         mine = part == one
         rest = big[~mine].sum(0) + np.diag(ridge)
@@ -95,10 +95,10 @@ def without(task: Task, solution: Solution, part: np.ndarray, parts: int) -> np.
     return change
 
 
-def without_own_run(task: Task, solution: Solution) -> np.ndarray:
+def without_own_run(problem: Problem, solution: Solution) -> np.ndarray:
     """Return by how much φ changes for every run [runs, Q] when that run is left out."""
-    runs = len(task.rows.records.runs)
-    return without(task, solution, np.arange(runs), runs)
+    runs = len(problem.rows.records.runs)
+    return without(problem, solution, np.arange(runs), runs)
 
 
 def log_gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -171,11 +171,11 @@ def level(gains: np.ndarray, seed: int, run: np.ndarray, share: float) -> float:
     return float(highest[above]) + 1e-9 if above >= 0 else float(highest[0]) + 1e-9
 
 
-def interval_of(solution: Solution, task: Task) -> np.ndarray:
+def interval_of(solution: Solution, problem: Problem) -> np.ndarray:
     """Return estimate, low and high [Q, 3] of φ, within its bounds; see ``half_width``."""
     if not len(solution.values):
         return np.zeros((0, 3))
-    width = half_width(solution, task)
+    width = half_width(solution, problem)
     low, high = (np.array([getattr(p, side) for p in solution.model.parameters]) for side in ("low", "high"))
     return np.stack(
         [solution.values, np.maximum(solution.values - width, low), np.minimum(solution.values + width, high)], axis=1
@@ -187,7 +187,7 @@ def at_level(tested: Tested, share: float) -> Tested:
     return replace(tested, p_value=np.minimum(tested.p_value / share, 1.0))
 
 
-def half_width(solution: Solution, task: Task) -> np.ndarray:
+def half_width(solution: Solution, problem: Problem) -> np.ndarray:
     """Return half the 95 % interval [Q] of φ: jackknife over runs, t with runs − 1 degrees of freedom.
 
     A run that says much of φ pulls it towards itself, which a spread of gradients at the common φ does not show. Where
@@ -195,23 +195,23 @@ def half_width(solution: Solution, task: Task) -> np.ndarray:
     in squares, and ``NOISY`` of it: what smoothing, steps of 0.1 s, and the noise of drivers, which changes what they
     see, do alike in every run, so that no spread shows it.
     """
-    spread, noise, times = _variances(solution, task)
+    spread, noise, times = _variances(solution, problem)
     width = np.maximum(
         times * np.sqrt(np.maximum(np.diag(spread), 0.0)), 1.96 * np.sqrt(np.maximum(np.diag(noise), 0.0))
     )
     null = np.array([p.null or 0.0 if p.role == "strength" else 0.0 for p in solution.model.parameters])
     own = np.array([p.role != "place" for p in solution.model.parameters])
-    share = SYSTEMATIC + min(NOISY * (0.0 if task.noise is None else task.noise.wander), MOST_NOISY)
+    share = SYSTEMATIC + min(NOISY * (0.0 if problem.noise is None else problem.noise.wander), MOST_NOISY)
     result: np.ndarray = np.sqrt(width**2 + (1.96 * share * own * (solution.values - null)) ** 2)
     return result
 
 
-def _variances(solution: Solution, task: Task) -> tuple[np.ndarray, np.ndarray, float]:
+def _variances(solution: Solution, problem: Problem) -> tuple[np.ndarray, np.ndarray, float]:
     """Return φ's covariance [Q, Q] by the spread of runs, and by the noise, and Student's t of the former."""
-    runs = len(task.rows.records.runs)
-    big = per_run(task, solution)[1].sum(0) + np.diag(prior_of(solution.model))
+    runs = len(problem.rows.records.runs)
+    big = per_run(problem, solution)[1].sum(0) + np.diag(prior_of(solution.model))
     big = big + np.diag(1e-9 * np.diag(big) + 1e-12)
-    off = without_own_run(task, solution)
+    off = without_own_run(problem, solution)
     off = off - off.mean(0)
     jackknife = off.T @ off * (runs - 1) / max(runs, 1)
     variance = float((solution.linear.residual**2).mean())
@@ -229,13 +229,13 @@ class Contrast:
     high: float
 
 
-def contrast_of(solution: Solution, task: Task, label: str) -> Contrast:
+def contrast_of(solution: Solution, problem: Problem, label: str) -> Contrast:
     """Return which two knots of the curve ``label`` differ most, by the near end of the difference's 95 % interval.
 
     Single knots say less: drivers' own parameters move a curve up and down as a whole, and its contrasts stay.
     """
     entries = solution.model.where(label)
-    values, (spread, noise, times) = solution.values[entries], _variances(solution, task)
+    values, (spread, noise, times) = solution.values[entries], _variances(solution, problem)
     wide = np.zeros((len(values), len(values)))
     for matrix, factor in ((spread[entries, entries], times), (noise[entries, entries], 1.96)):
         own = np.diag(matrix)

@@ -17,7 +17,7 @@ from idm_env.discovery.closed_loop import ClosedLoopFit
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Rows
 from idm_env.discovery.score import held_out, log_gain
-from idm_env.discovery.solve import Linear, Solution, Task, finish, linearise, projected, solve
+from idm_env.discovery.solve import Linear, Problem, Solution, finish, linearise, projected, solve
 from idm_env.discovery.units import Units, units
 from idm_env.effects import Effect
 from idm_env.effects.base import Sought
@@ -47,7 +47,7 @@ class Scored:
 class Search:
     """The state of a search on the validation runs."""
 
-    task: Task
+    problem: Problem
     names: Sequence[str]
     located: bool
     saved: Store
@@ -65,26 +65,26 @@ class Search:
     @property
     def units(self) -> Units:
         """What a test counts."""
-        return units(self.task.rows.records)
+        return units(self.problem.rows.records)
 
     def null(self, model: Hypothesis, theta: np.ndarray, values: np.ndarray | None = None) -> Solution:
-        """Fit a null and its noise in turn until both stand, from log θ [G, P] and φ [Q]; updates ``task``."""
+        """Fit a null and its noise in turn until both stand, from log θ [G, P] and φ [Q]; updates ``problem``."""
         values = starting_values(model) if values is None else values
-        solution = solve(self.task, model, theta, values)
+        solution = solve(self.problem, model, theta, values)
         for _ in range(3):
-            self.task = self._renoised(solution)
-            solution = solve(self.task, model, solution.theta, solution.values, iterations=6)
+            self.problem = self._renoised(solution)
+            solution = solve(self.problem, model, solution.theta, solution.values, iterations=6)
         return solution
 
     def weighed(self, now: Solution) -> tuple[ClosedLoopFit, Solution]:
         """Evaluate a model of windows in free simulation of the validation runs; return that, and it with that prior.
 
-        In windows its drivers stay as they are. The weight of the prior becomes that of the task.
+        In windows its drivers stay as they are. The weight of the prior becomes that of the problem.
         """
         if self.last_weighed is None or self.last_weighed[1] is not now:
             fit = self.calibrated(now.model, now.values, now.theta)
-            self.task = replace(
-                self.task, prior=replace(self.task.prior, error_correlation_s=fit.prior.error_correlation_s)
+            self.problem = replace(
+                self.problem, prior=replace(self.problem.prior, error_correlation_s=fit.prior.error_correlation_s)
             )
             self.last_weighed = fit.fit, replace(now, prior=fit.prior)
         return self.last_weighed
@@ -93,21 +93,21 @@ class Search:
         """Return a model with values [Q] calibrated on the validation runs, done once for one ``start`` [G, P]."""
         key = (id(model), values.tobytes(), None if start is None else start.tobytes())
         if key not in self.calibrations:
-            self.calibrations[key] = calibrate.calibrate(self.task.rows.records, model, values, start)
+            self.calibrations[key] = calibrate.calibrate(self.problem.rows.records, model, values, start)
         return self.calibrations[key]
 
     def closed_loop_squares(self, now: Solution) -> np.ndarray:
         """Return squared gap errors (m²) of closed-loop simulation of the validation runs [units]."""
         if now not in self.squares:
-            self.squares[now] = judge.closed_loop_squares(self.task.rows.records, now)
+            self.squares[now] = judge.closed_loop_squares(self.problem.rows.records, now)
         return self.squares[now]
 
-    def _renoised(self, solution: Solution) -> Task:
-        errors = self.task.errors(solution.theta[None], solution.model, solution.values[None])[0]
-        noise = noises.estimate(errors, self.task.rows.joined)
-        prior = population(solution.theta, self.task.rows, solution.model.catalogue.own)
+    def _renoised(self, solution: Solution) -> Problem:
+        errors = self.problem.errors(solution.theta[None], solution.model, solution.values[None])[0]
+        noise = noises.estimate(errors, self.problem.rows.joined)
+        prior = population(solution.theta, self.problem.rows, solution.model.catalogue.own)
         return replace(
-            self.task, noise=noise, prior=replace(prior, error_correlation_s=self.task.prior.error_correlation_s)
+            self.problem, noise=noise, prior=replace(prior, error_correlation_s=self.problem.prior.error_correlation_s)
         )
 
     def round(self, solution: Solution, number: int, first: bool = True) -> tuple[list[Scored], np.ndarray]:
@@ -118,14 +118,16 @@ class Search:
         """
         if not first and (shape := solution.model.terms[-1]).fades:
             self.on_progress(f"round {number}", 0, 1, f"{shape.label} by another state")
-            before = held_out(self.task, solution)
-            return self._curves(solution, places.respond(self.task, solution), before, number, _surfaces(shape)), before
+            before = held_out(self.problem, solution)
+            return self._curves(
+                solution, places.respond(self.problem, solution), before, number, _surfaces(shape)
+            ), before
         have = {t.label for t in solution.model.terms}
-        before = held_out(self.task, solution)
+        before = held_out(self.problem, solution)
         untried = [terms.simple(e) for e in self._sought("anywhere") if e.name not in have]
         untried += [terms.given_profile(e) for e in self._sought("given") if e.name not in have]
         scored: list[Scored] = []
-        responses = places.respond(self.task, solution)
+        responses = places.respond(self.problem, solution)
         promised = {t.label: self._promise(solution, t)[0].max() for t in untried}
         # What promises most comes first: all others need not be fitted to the end where they stay far behind it.
         for i, term in enumerate(sorted(untried, key=lambda t: -promised[t.label])):
@@ -138,17 +140,17 @@ class Search:
     def again(self, solution: Solution, best: Scored, scored: list[Scored]) -> tuple[Solution, list[Scored]]:
         """Judge the leading candidates once more, all by the noise that the best one leaves."""
         assert best.solution is not None
-        self.task = self._renoised(best.solution)
-        null = solve(self.task, solution.model, solution.theta, solution.values, iterations=8)
-        before = held_out(self.task, null)
+        self.problem = self._renoised(best.solution)
+        null = solve(self.problem, solution.model, solution.theta, solution.values, iterations=8)
+        before = held_out(self.problem, null)
         highest = best.gains.mean()
         result = []
         for s in scored:
             if s.solution is None or s.gains.mean() < 0.3 * highest:
                 result.append(s)
                 continue
-            fresh = solve(self.task, s.solution.model, s.solution.theta, s.solution.values, iterations=10)
-            gains = log_gain(before, held_out(self.task, fresh))
+            fresh = solve(self.problem, s.solution.model, s.solution.theta, s.solution.values, iterations=10)
+            gains = log_gain(before, held_out(self.problem, fresh))
             result.append(Scored(s.term, fresh, gains if s.honest is None else np.where(s.honest, gains, s.gains)))
         return null, result
 
@@ -176,23 +178,23 @@ class Search:
         stored = self.saved.get(key)
         if stored is not None:
             theta, values = stored["theta"].numpy(), stored["values"].numpy()
-            linear = linearise(self.task, model, theta, values)
-            best = finish(self.task, model, theta, values, linear, stored["cost"])
+            linear = linearise(self.problem, model, theta, values)
+            best = finish(self.problem, model, theta, values, linear, stored["cost"])
         else:
             starts = starts or [np.append(solution.values, s) for s in term.starts]
             share, scaled = self._promise(solution, term, starts)
             # Chance alone lowers the error by the number of parameters over that of the errors.
             if share.max() < FAINT + term.size / solution.linear.residual.size:
-                best = solve(self.task, model, solution.theta, scaled[share.argmax()], iterations=1)
+                best = solve(self.problem, model, solution.theta, scaled[share.argmax()], iterations=1)
             else:
                 promising = [starts[i] for i in np.argsort(-share)[:RACED] if share[i] >= NEAR * share.max()]
-                first = [solve(self.task, model, solution.theta, s, iterations=5) for s in promising]
+                first = [solve(self.problem, model, solution.theta, s, iterations=5) for s in promising]
                 best = min(first, key=lambda s: s.cost)
                 if 0.5 * np.log(solution.cost / best.cost) >= worth:
-                    best = solve(self.task, model, best.theta, best.values, iterations=iterations)
+                    best = solve(self.problem, model, best.theta, best.values, iterations=iterations)
             arrays = {"theta": torch.from_numpy(best.theta), "values": torch.from_numpy(best.values)}
             self.saved.put(key, {**arrays, "cost": float(best.cost)})
-        gains = log_gain(before, held_out(self.task, best))
+        gains = log_gain(before, held_out(self.problem, best))
         return Scored(term, best, gains)
 
     def _promise(
@@ -202,12 +204,12 @@ class Search:
 
         A start's response, after θ has followed it, is scaled by one number, which scales strengths.
         """
-        task, linear, model = self.task, solution.linear, solution.model.adding(term)
+        problem, linear, model = self.problem, solution.linear, solution.model.adding(term)
         starts = np.array(begin or [np.append(solution.values, s) for s in term.starts])
-        residual = task.residual(task.errors(np.repeat(solution.theta[None], len(starts), axis=0), model, starts))
+        residual = problem.residual(problem.errors(np.repeat(solution.theta[None], len(starts), axis=0), model, starts))
         responses = np.concatenate([linear.jacobian[: linear.own], residual - linear.residual])
         tried = Linear(linear.residual, responses, linear.own)
-        moved = projected(finish(task, model, solution.theta, starts[0], tried, 0.0))
+        moved = projected(finish(problem, model, solution.theta, starts[0], tried, 0.0))
         square = np.einsum("rms,rms->s", moved, moved) + 1e-9
         push = np.einsum("rms,rm->s", moved, linear.residual)
         strengths = [p for p in term.parameters if p.role == "strength"]
@@ -251,7 +253,7 @@ class Search:
         worth: float,
     ) -> list[Scored]:  # fmt: skip
         have = {t.label for t in solution.model.terms}
-        period = self.task.rows.records.period
+        period = self.problem.rows.records.period
         result: list[Scored] = []
 
         def interval_of(what: str, coordinate: str, open_end: bool = False, named: Effect | None = None) -> None:

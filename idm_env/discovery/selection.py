@@ -148,7 +148,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
         if fitted and tested.gain[fitted[0]] > 0.3 * LEAST_GAIN:
             now, scored = searching.again(now, scored[fitted[0]], scored)
             tested = _tested(searching, scored, seed)
-        left = judge.ceiling(places.respond(searching.task, now))
+        left = judge.ceiling(places.respond(searching.problem, now))
         this = Round(scored, tested, before, left, None)
         rounds.append(this)
         _choose(searching, now, this)
@@ -157,7 +157,7 @@ def _rounds(searching: Search, null: Solution, seed: int) -> tuple[Solution, lis
         chosen = scored[this.winner].solution
         assert chosen is not None
         now = searching.weighed(searching.null(chosen.model, chosen.theta, chosen.values))[1]
-        if not steps and _is_a_step(now, searching.task.rows.records.dt):
+        if not steps and _is_a_step(now, searching.problem.rows.records.dt):
             null = now
             rounds.pop()
         else:
@@ -189,7 +189,7 @@ def _is_a_step(now: Solution, dt: float) -> bool:
 
 def _at_floor(searching: Search, now: Solution) -> bool:
     """Tell whether only the noise of measurement is left; what smoothing does at sharp bends would be named next."""
-    records = searching.task.rows.records
+    records = searching.problem.rows.records
     square = searching.closed_loop_squares(now).sum() / len(whole(records).valid.nonzero()[0])
     return bool(square <= (AT_FLOOR * judge.floor(records)["gap_rmse_m"]) ** 2)
 
@@ -209,7 +209,7 @@ def _pairs(searching: Search, now: Solution, last: Round, seed: int) -> Round | 
     if not pairs or (last.refusal is not None and last.refusal.reason is Reason.FEW_RUNS):
         return None
     number = len(have) + 1
-    before = held_out(searching.task, now)
+    before = held_out(searching.problem, now)
     scored = [searching.pair(now, pair, before, number) for pair in pairs]
     tested = _tested(searching, (*last.scored, *scored), seed)
     mine = Tested(*(x[len(last.scored) :] for x in (tested.p_value, tested.gain, tested.interval)))
@@ -267,7 +267,7 @@ def _choose(searching: Search, now: Solution, this: Round) -> None:
     winner = max(named, key=lambda i: tested.gain[i]) if named else best
     chosen = scored[winner].solution
     assert chosen is not None
-    after = judge.ceiling(places.respond(searching.task, chosen))
+    after = judge.ceiling(places.respond(searching.problem, chosen))
     gained, rest = float(tested.gain[winner]), max(float(after.mean()), 0.0)
     explained = 1.0 - np.exp(-2 * gained)
     this.share = float(explained / max(explained + np.exp(-2 * gained) * (1.0 - np.exp(-2 * rest)), 1e-12))
@@ -299,13 +299,13 @@ def _delete(searching: Search, final: Solution, base: int) -> Solution:
     As long as another is left: one alone was tested against none, and stays.
     """
     while len(final.model.terms) > base + 1:
-        now, intervals = held_out(searching.task, final), interval_of(final, searching.task)
+        now, intervals = held_out(searching.problem, final), interval_of(final, searching.problem)
         losses = []
         for index in range(base, len(final.model.terms)):
             begin = sum(t.size for t in final.model.terms[:index])
             keep = np.delete(final.values, np.arange(begin, begin + final.model.terms[index].size))
-            less = solve(searching.task, final.model.without(index), final.theta, keep)
-            loss = float(log_gain(held_out(searching.task, less), now).mean())
+            less = solve(searching.problem, final.model.without(index), final.theta, keep)
+            loss = float(log_gain(held_out(searching.problem, less), now).mean())
             losses.append((min(loss, 0.0) if together.contains_null(final, intervals, index) else loss, index, less))
         loss, _, less = min(losses, key=lambda x: x[0])
         if loss >= LEAST_GAIN:

@@ -55,7 +55,7 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class Problem:
     """Rows, how their errors are judged, and the prior: everything that is common to the null and all candidates.
 
     ``noise`` None means free simulation: plain gap errors in units of ``sigma`` (m).
@@ -138,7 +138,7 @@ class Task:
         total[[g for g, _ in self.of_group]] = np.add.reduceat(x[self.order], [r.start for _, r in self.of_group])
         return total
 
-    def of_rows(self, mask: np.ndarray) -> Task:
+    def of_rows(self, mask: np.ndarray) -> Problem:
         """Return the problem of some rows ``mask`` [R], all those of their groups."""
         noise = self.noise and replace(self.noise, weight=self.noise.weight[mask])
         return replace(self, rows=self.rows.some(mask), noise=noise)
@@ -193,7 +193,7 @@ def differences(parameters: tuple[Parameter, ...], values: np.ndarray) -> np.nda
     return size
 
 
-def linearise(task: Task, model: Hypothesis, theta: np.ndarray, values: np.ndarray) -> Linear:
+def linearise(problem: Problem, model: Hypothesis, theta: np.ndarray, values: np.ndarray) -> Linear:
     """Return the residual at log θ [G, P] and φ [Q], and its derivatives by forward differences."""
     count, own = model.entries.size, theta.shape[-1]
     step = np.append(np.full(own, STEP), differences(model.parameters, values))
@@ -203,7 +203,7 @@ def linearise(task: Task, model: Hypothesis, theta: np.ndarray, values: np.ndarr
         many[1 + i, :, i] += STEP
     for i in range(count):
         shared[1 + own + i, i] += step[own + i]
-    residual = task.residual(task.errors(many, model, shared))
+    residual = problem.residual(problem.errors(many, model, shared))
     return Linear(residual[0], (residual[1:] - residual[0]) / step[:, None, None], own)
 
 
@@ -217,31 +217,31 @@ def prior_of(model: Hypothesis) -> np.ndarray:
     ])  # fmt: skip
 
 
-def equations(task: Task, theta: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
+def equations(problem: Problem, theta: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
     """Return every group's gradient [G, P + Q] and matrix [G, P + Q, P + Q], with the prior of θ in them."""
-    gradient, matrix = _sums(task, linear)
-    weight = task.prior.width**-2.0
+    gradient, matrix = _sums(problem, linear)
+    weight = problem.prior.width**-2.0
     own = linear.own
-    gradient[:, :own] += weight * (theta - task.prior.centre)
+    gradient[:, :own] += weight * (theta - problem.prior.centre)
     matrix[:, :own, :own] += np.diag(weight)
     return gradient, matrix
 
 
-def _sums(task: Task, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
+def _sums(problem: Problem, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
     """Return Jᵀr [G, N] and JᵀJ [G, N, N] over the rows of every group."""
     count = len(linear.jacobian)
-    gradient, matrix = np.zeros((task.groups, count)), np.zeros((task.groups, count, count))
-    jacobian, residual = linear.jacobian[:, task.order], linear.residual[task.order]
-    for group, rows in task.of_group:
+    gradient, matrix = np.zeros((problem.groups, count)), np.zeros((problem.groups, count, count))
+    jacobian, residual = linear.jacobian[:, problem.order], linear.residual[problem.order]
+    for group, rows in problem.of_group:
         j = jacobian[:, rows].reshape(count, -1)
         gradient[group], matrix[group] = j @ residual[rows].reshape(-1), j @ j.T
     return gradient, matrix
 
 
-def cost_of(task: Task, theta: np.ndarray, residual: np.ndarray) -> np.ndarray:
+def cost_of(problem: Problem, theta: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return the cost of every copy and group [C, G]: squared residuals and the prior."""
-    pull = (((theta - task.prior.centre) / task.prior.width) ** 2).sum(-1)
-    return np.asarray(task.per_group(_squares(residual).T).T + pull)
+    pull = (((theta - problem.prior.centre) / problem.prior.width) ** 2).sum(-1)
+    return np.asarray(problem.per_group(_squares(residual).T).T + pull)
 
 
 def _squares(residual: np.ndarray) -> np.ndarray:
@@ -250,11 +250,11 @@ def _squares(residual: np.ndarray) -> np.ndarray:
 
 
 class _Nested:
-    """A task and a model as the solver sees them: log θ of every group is its own, φ is shared."""
+    """A problem and a model as the solver sees them: log θ of every group is its own, φ is shared."""
 
-    def __init__(self, task: Task, model: Hypothesis) -> None:
-        self.task, self.model = task, model
-        self.prior = task.known
+    def __init__(self, problem: Problem, model: Hypothesis) -> None:
+        self.problem, self.model = problem, model
+        self.prior = problem.known
         self.stiffness = torch.from_numpy(prior_of(model))
         of_phi = np.array([(p.low, p.high, _longest(p)) for p in model.parameters]).reshape(-1, 3)
         bounds = model.catalogue.bounds
@@ -264,24 +264,24 @@ class _Nested:
 
     def costs(self, own: Tensor, shared: Tensor) -> Tensor:
         """Return the sums of squared residuals [C, G]."""
-        residual = self.task.residual(self.task.errors(own.numpy(), self.model, shared.numpy()))
-        return torch.from_numpy(self.task.per_group(_squares(residual).T)).T
+        residual = self.problem.residual(self.problem.errors(own.numpy(), self.model, shared.numpy()))
+        return torch.from_numpy(self.problem.per_group(_squares(residual).T)).T
 
     def normal(self, own: Tensor, shared: Tensor) -> Normal:
         """Return the normal equations of one copy."""
         linear = self.linear(own, shared)
-        gradient, matrix = _sums(self.task, linear)
-        cost = self.task.per_group(_squares(linear.residual))
+        gradient, matrix = _sums(self.problem, linear)
+        cost = self.problem.per_group(_squares(linear.residual))
         return Normal(*(torch.from_numpy(x[None]) for x in (cost, gradient, matrix)))
 
     def linear(self, own: Tensor, shared: Tensor) -> Linear:
         """Return the linearisation of one copy; of groups at which nothing has changed the last one is kept."""
         theta, values = own[0].numpy(), shared[0].numpy()
         if self.at is None or not torch.equal(self.at[1], shared):
-            self.at = own, shared, linearise(self.task, self.model, theta, values)
-        moved = (theta != self.at[0][0].numpy()).any(-1)[self.task.rows.group]
+            self.at = own, shared, linearise(self.problem, self.model, theta, values)
+        moved = (theta != self.at[0][0].numpy()).any(-1)[self.problem.rows.group]
         if moved.any():
-            part = linearise(self.task.of_rows(moved), self.model, theta, values)
+            part = linearise(self.problem.of_rows(moved), self.model, theta, values)
             residual, jacobian = self.at[2].residual.copy(), self.at[2].jacobian.copy()
             residual[moved], jacobian[:, moved] = part.residual, part.jacobian
             self.at = own, shared, Linear(residual, jacobian, part.own)
@@ -296,7 +296,7 @@ def _longest(p: Parameter) -> float:
 
 
 def solve(
-    task: Task,
+    problem: Problem,
     model: Hypothesis,
     theta: np.ndarray,
     values: np.ndarray,
@@ -305,26 +305,26 @@ def solve(
     tolerance: float = 2e-4,
 ) -> Solution:
     """Minimise over θ of every group and φ, from log θ [G, P] and values [Q]."""
-    nested = _Nested(task, model)
+    nested = _Nested(problem, model)
     begin = Progress.begin(torch.tensor(theta[None]), torch.tensor(values[None]), damping=1e-3)
     optimum, now = minimise(nested, begin, iterations, tolerance=tolerance)
     linear = nested.linear(optimum.own, optimum.shared)
     own, shared = optimum.own[0].numpy(), optimum.shared[0].numpy()
     cost = float(now.cost.sum()) + float((prior_of(model) * shared**2).sum())
-    return finish(task, model, own, shared, linear, cost)
+    return finish(problem, model, own, shared, linear, cost)
 
 
 def finish(
-    task: Task, model: Hypothesis, theta: np.ndarray, values: np.ndarray, linear: Linear, cost: float
+    problem: Problem, model: Hypothesis, theta: np.ndarray, values: np.ndarray, linear: Linear, cost: float
 ) -> Solution:
     """Return the solution at log θ [G, P] and φ [Q]: φ's matrix per group without θ, and the prior centred there."""
-    prior = task.known.following(torch.from_numpy(theta[None]))
-    _, matrix = equations(replace(task, prior=prior), theta, linear)
+    prior = problem.known.following(torch.from_numpy(theta[None]))
+    _, matrix = equations(replace(problem, prior=prior), theta, linear)
     own = linear.own
     cross = matrix[:, :own, own:]
     follow = np.linalg.solve(matrix[:, :own, :own] + 1e-9 * np.eye(own), cross)
     big = matrix[:, own:, own:] - np.einsum("giq,gis->gqs", cross, follow)
-    return Solution(model, theta, values, cost, linear, big, prior, task.rows.group, follow)
+    return Solution(model, theta, values, cost, linear, big, prior, problem.rows.group, follow)
 
 
 def projected(solution: Solution) -> np.ndarray:

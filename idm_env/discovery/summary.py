@@ -16,7 +16,7 @@ from idm_env.discovery.model import STATES, Term
 from idm_env.discovery.power import Bar, Strength, powerful, strength_of
 from idm_env.discovery.score import CLOSED_LOOP_SHARE, contrast_of, interval_of, level, rivals
 from idm_env.discovery.selection import LEAST_GAIN, Decided, Round
-from idm_env.discovery.solve import Solution, Task
+from idm_env.discovery.solve import Problem, Solution
 from idm_env.discovery.units import MANY_RUNS, smallest_p, units
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude
 from idm_env.effects import ALL
@@ -42,17 +42,17 @@ def summarise(
         by: Who shares parameters.
         ceilings: How much could be explained at all.
     """
-    task, rounds = evaluation.searching.task, decided.rounds
+    problem, rounds = evaluation.searching.problem, decided.rounds
     compared, before, first, errors = judged.compared, judged.before, rounds[0], judged.errors
     law, base = judged.null.model.catalogue.base.title, len(judged.null.model.terms)
     final = compared if compared is not None and judged.added else judged.null
-    terms = [] if compared is None else _findings(compared, rounds, judged.intervals, base, task, law)
+    terms = [] if compared is None else _findings(compared, rounds, judged.intervals, base, problem, law)
     added, nearest = (terms, []) if judged.added else ([], terms)
     test_runs = [] if evaluation.test is None else list(evaluation.test.runs)
-    run = units(task.rows.records).run
-    strengths = _strengths(first, task, bar(first, run, judged.seed, len(test_runs)))
+    run = units(problem.rows.records).run
+    strengths = _strengths(first, problem, bar(first, run, judged.seed, len(test_runs)))
     others = [name for f in added if f.effect for name in f.equivalent if name in ALL]
-    verdict, refusal = _verdict(judged, rounds, added, others, strengths, task)
+    verdict, refusal = _verdict(judged, rounds, added, others, strengths, problem)
     data = _data(trajectories, evaluation, rounds, judged.null, by)
     sentence = words.headline(
         verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, strengths, law
@@ -73,7 +73,7 @@ def summarise(
             *words.cautions(data.at_bounds, data.drivers),
         ],
         found=added,
-        known=_known(final, interval_of(final, task), base),
+        known=_known(final, interval_of(final, problem), base),
         helps={
             key: result.Change(
                 c.outcome.value, c.ratio, c.low, c.high, c.before, c.after, words.ERRORS[key][1], *c.driver, c.improved
@@ -98,7 +98,9 @@ def summarise(
         data=data,
         seed=judged.seed,
         versions=versions(),
-        prior=result.Weight(weight.task.prior.error_correlation_s, list(weight.rmse_m), list(weight.rmse_m.values())),
+        prior=result.Weight(
+            weight.problem.prior.error_correlation_s, list(weight.rmse_m), list(weight.rmse_m.values())
+        ),
         ceilings=ceilings,
         bases=bases.rows(laws),
     )  # fmt: skip
@@ -106,12 +108,12 @@ def summarise(
 
 def _verdict(
     judged: Judgement, rounds: Sequence[Round], added: Sequence[result.TermFinding], others: Sequence[str],
-    strengths: dict[str, Strength], task: Task,
+    strengths: dict[str, Strength], problem: Problem,
 ) -> tuple[Verdict, Refusal | None]:  # fmt: skip
     """Return what is concluded, and why nothing (more) was added."""
     first, refusal, ladder = rounds[0], judged.refusal, judged.ladder
-    counted = units(task.rows.records)
-    power = len(task.rows.records.runs) >= MANY_RUNS or powerful(
+    counted = units(problem.rows.records)
+    power = len(problem.rows.records.runs) >= MANY_RUNS or powerful(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest_p(counted.run)
     )
     structured = any(r.significant for r in (first, *(r for r in rounds if r.in_closed_loop)))
@@ -126,7 +128,7 @@ def _verdict(
     if verdict is Verdict.UNEXPLAINED and unnamed and refusal is not None:
         refusal = Refusal(Reason.STRUCTURE, unnamed)
     if verdict is Verdict.CANNOT_TELL and not power:
-        refusal = Refusal(Reason.NO_POWER, len(task.rows.records.runs))
+        refusal = Refusal(Reason.NO_POWER, len(problem.rows.records.runs))
     return verdict, refusal
 
 
@@ -138,12 +140,12 @@ def bar(first: Round, run: np.ndarray, seed: int, kept: int) -> Bar:
     return Bar(level(gains, seed, run, 1.0 - CLOSED_LOOP_SHARE), max(LEAST_GAIN, float(rest)), kept)
 
 
-def _strengths(first: Round, task: Task, reached: Bar) -> dict[str, Strength]:
+def _strengths(first: Round, problem: Problem, reached: Bar) -> dict[str, Strength]:
     """Return by name what the first round says of the strengths of effects that have one."""
     strengths = {}
     for s in first.scored:
         if s.solution is not None and s.term.effect is not None and s.term.effect in ALL:
-            strength = strength_of(s.solution, task, s.term.label, reached)
+            strength = strength_of(s.solution, problem, s.term.label, reached)
             if strength is not None:
                 strengths[s.term.effect] = strength
     return strengths
@@ -205,19 +207,19 @@ def _where(term: Term, values: dict[str, float]) -> result.Location:
 
 
 def _findings(
-    compared: Solution, rounds: Sequence[Round], intervals: np.ndarray | None, base: int, task: Task, law: str
+    compared: Solution, rounds: Sequence[Round], intervals: np.ndarray | None, base: int, problem: Problem, law: str
 ) -> list[result.TermFinding]:
     """Return the terms of a model after the first ``base``; ``intervals`` [Q, 3] where they are not its own."""
-    intervals = interval_of(compared, task) if intervals is None else intervals
+    intervals = interval_of(compared, problem) if intervals is None else intervals
     findings, begin = [], sum(t.size for t in compared.model.terms[:base])
     for term in compared.model.terms[base:]:
-        findings.append(_finding(term, compared, rounds, intervals[begin : begin + term.size], task, law))
+        findings.append(_finding(term, compared, rounds, intervals[begin : begin + term.size], problem, law))
         begin += term.size
     return findings
 
 
 def _finding(
-    term: Term, compared: Solution, rounds: Sequence[Round], intervals: np.ndarray, task: Task, law: str
+    term: Term, compared: Solution, rounds: Sequence[Round], intervals: np.ndarray, problem: Problem, law: str
 ) -> result.TermFinding:
     this, winner = next(
         (r, i)
@@ -228,9 +230,9 @@ def _finding(
         p.name: result.ParameterEstimate(p.symbol, float(x[0]), float(x[1]), float(x[2]), p.unit)
         for p, x in zip(term.parameters, intervals, strict=True)
     }
-    contrast = contrast_of(compared, task, term.label) if term.located and term.form == CURVE else None
+    contrast = contrast_of(compared, problem, term.label) if term.located and term.form == CURVE else None
     gains = np.array([s.gains for s in this.scored])
-    close = [] if this.in_closed_loop else rivals(gains, winner, units(task.rows.records).run)
+    close = [] if this.in_closed_loop else rivals(gains, winner, units(problem.rows.records).run)
     equivalent, near = (
         [this.scored[i].term.effect or this.scored[i].term.label for i in which] for which in (this.equivalent, close)
     )
@@ -336,7 +338,7 @@ def standard_errors(solution: Solution) -> np.ndarray:
 def _data(
     trajectories: Trajectories, evaluation: Evaluation, rounds: Sequence[Round], null: Solution, by: str
 ) -> result.DataCard:
-    prepared, rows = evaluation.records, evaluation.searching.task.rows
+    prepared, rows = evaluation.records, evaluation.searching.problem.rows
     inside = np.concatenate([np.arange(a, b) for a, b in zip(prepared.first, prepared.bounds[1:], strict=True)])
     speed, gap = prepared.speed[inside], prepared.gap[inside]
     closing, free, standing = (

@@ -67,13 +67,13 @@ def grow(searching: Search, start: ClosedLoopFit, base: int, seed: int) -> tuple
         if grown is None:
             break
         solution = grown
-        fit = closed_loop.evaluate(fit.task.rows.records, grown.model, grown.values, fit.task.prior, grown.theta)
+        fit = closed_loop.evaluate(fit.problem.rows.records, grown.model, grown.values, fit.problem.prior, grown.theta)
     if solution is None:
         return None, steps
     solution = _backward(start, solution, base)
     if len(solution.model.terms) == base:
         return None, steps
-    return Joined(solution, interval_of(solution, start.task), closed_loop.gains(start, solution)), steps
+    return Joined(solution, interval_of(solution, start.problem), closed_loop.gains(start, solution)), steps
 
 
 def _forward(searching: Search, fit: ClosedLoopFit, seed: int) -> tuple[Step, Solution | None]:
@@ -104,7 +104,7 @@ def _forward(searching: Search, fit: ClosedLoopFit, seed: int) -> tuple[Step, So
 def _backward(start: ClosedLoopFit, solution: Solution, base: int) -> Solution:
     """Take back terms whose interval contains their null once all are in, or that the held-out score does not miss."""
     while len(solution.model.terms) > base:
-        intervals, gain = interval_of(solution, start.task), float(closed_loop.gains(start, solution).mean())
+        intervals, gain = interval_of(solution, start.problem), float(closed_loop.gains(start, solution).mean())
         added = range(base, len(solution.model.terms))
         losses = {index: 0.0 for index in added if contains_null(solution, intervals, index)}
         if not losses:

@@ -19,10 +19,10 @@ from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, whole
-from idm_env.discovery.solve import Task
+from idm_env.discovery.solve import Problem
 from idm_env.effects import BASES, Brakes, Replay, base_named
 from idm_env.fitting.batch import Batch
-from idm_env.fitting.problem import Problem
+from idm_env.fitting.problem import Problem as FitProblem
 from idm_env.model_file import load_model
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
@@ -33,16 +33,16 @@ def test_the_loop_of_a_law_is_the_simulator(platoon: Records, name: str) -> None
     """Within 1e-9 m, at the population's parameters."""
     law = base_named(name)
     rows, prior = whole(platoon), first_prior(law.declared)
-    task = Task(rows, None, prior)
+    problem = Problem(rows, None, prior)
     model = Hypothesis((), Catalogue((), law, located=False))
-    mine = task.predict(np.tile(prior.centre, (1, task.groups, 1)), model, np.zeros((1, 0)))[0][0]
+    mine = problem.predict(np.tile(prior.centre, (1, problem.groups, 1)), model, np.zeros((1, 0)))[0][0]
     simulator = Simulator(Lane(), (law, Replay(), Brakes()), dt=platoon.dt, integration="midpoint")
     batch = Batch.of(platoon.episodes, substeps=1)
-    problem = Problem(simulator, batch, (), (), torch.zeros(len(batch), dtype=torch.long), ("all",), kernels=False)
+    measured = FitProblem(simulator, batch, (), (), torch.zeros(len(batch), dtype=torch.long), ("all",), kernels=False)
     given = zip(law.declared, np.exp(prior.centre), strict=True)
     values = {f"{name}.{p.name}": torch.full((len(batch),), float(x), dtype=torch.float64) for p, x in given}
     with torch.no_grad():
-        reference = problem.simulate(values).gap.numpy()[4::5].T
+        reference = measured.simulate(values).gap.numpy()[4::5].T
     count = min(mine.shape[1], reference.shape[1])
     assert float(np.abs(mine[:, :count] - reference[:, :count])[rows.valid[:, :count]].max()) < 1e-9
 

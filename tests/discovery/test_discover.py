@@ -36,7 +36,7 @@ def test_the_hidden_effect_is_named(drag: Discovery) -> None:
     assert gain["low"] < 0.4 < gain["high"]
     error = drag.report["error"]
     assert error["after"]["gap_rmse_m"] < 0.5 * error["before"]["gap_rmse_m"]
-    fitted_on = set(drag.task.rows.records.runs)
+    fitted_on = set(drag.problem.rows.records.runs)
     assert error["held_out_runs"] and not fitted_on & set(error["held_out_runs"])
 
 

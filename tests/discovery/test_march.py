@@ -19,10 +19,10 @@ from idm_env.discovery.judge import Frozen
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, Rows, whole, windows
-from idm_env.discovery.solve import Task
+from idm_env.discovery.solve import Problem
 from idm_env.effects import CANDIDATES, IDM, Brakes, Replay
 from idm_env.fitting.batch import Batch
-from idm_env.fitting.problem import Problem
+from idm_env.fitting.problem import Problem as FitProblem
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
@@ -73,7 +73,7 @@ def simulated(records: Records, model: Hypothesis, values: np.ndarray) -> np.nda
     effects, numbers = terms.effects_of(model, values)
     simulator = Simulator(Lane(), (IDM(), Replay(), *effects, Brakes()), dt=records.dt, integration="midpoint")
     batch = Batch.of(records.episodes, substeps=1)
-    problem = Problem(
+    problem = FitProblem(
         simulator, batch, (), (), torch.zeros(len(batch), dtype=torch.long), ("all",), kernels=False
     )  # fmt: skip
     given = dict(zip((f"idm.{p.name}" for p in IDM.declared), np.exp(THETA), strict=True))
@@ -85,9 +85,9 @@ def simulated(records: Records, model: Hypothesis, values: np.ndarray) -> np.nda
 
 def twin(records: Records, model: Hypothesis, values: np.ndarray) -> np.ndarray:
     rows = whole(records)
-    task = Task(rows, None, first_prior())
-    theta = np.tile(THETA, (1, task.groups, 1))
-    return task.predict(theta, Frozen(model, values), np.zeros((1, 0)))[0][0]
+    problem = Problem(rows, None, first_prior())
+    theta = np.tile(THETA, (1, problem.groups, 1))
+    return problem.predict(theta, Frozen(model, values), np.zeros((1, 0)))[0][0]
 
 
 def modelled(term: Term | None) -> Hypothesis:
@@ -144,8 +144,8 @@ def test_windows_share_their_winding_up(platoon: Records) -> None:
     model, values = Hypothesis((terms.simple("memory"), terms.simple("delay"))), np.array([[0.7, 40.0, 0.46]])
 
     def ends(some: Rows) -> np.ndarray:
-        task = Task(some, None, first_prior())
-        return task.predict(np.tile(THETA, (1, task.groups, 1)), model, values)[0][0]
+        problem = Problem(some, None, first_prior())
+        return problem.predict(np.tile(THETA, (1, problem.groups, 1)), model, values)[0][0]
 
     together = ends(rows)
     for i in (1, 5, len(rows) - 1):

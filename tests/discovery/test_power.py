@@ -62,19 +62,19 @@ def test_a_latency_below_one_step_is_nobody_s() -> None:
     found = discover(synthetic.generate(6, runs=4, followers=2, seconds=60.0)[0], effects=["lag", "drag"])
     at = next(s for s in found.rounds[0].scored if s.term.label == "lag")
     assert at.solution is not None
-    strength = strength_of(at.solution, found.task, "lag", Bar(-np.inf, 0.0, 0))
+    strength = strength_of(at.solution, found.problem, "lag", Bar(-np.inf, 0.0, 0))
     assert strength is not None and found.records.dt < strength.seen < 2.0 * found.records.dt
     assert strength.seen > found.records.dt + 0.4 * (strength.high - strength.estimate)
     # Where the search goes to half of what a higher bar asks for, no strength would have been found.
     bar = Bar(-np.inf, 1.0, 0)
-    strength = strength_of(at.solution, found.task, "lag", bar)
+    strength = strength_of(at.solution, found.problem, "lag", bar)
     assert strength is not None and 3.0 * found.records.dt < strength.seen < strength.parameter.high
     model = at.solution.model
     for share, seen in ((1.2, strength.seen), (0.5, np.inf)):
         shorter = replace(strength.parameter, default=0.1, high=share * strength.seen)
         lag = replace(model.terms[-1], parameters=(shorter,))
         within = replace(at.solution, model=replace(model, terms=(*model.terms[:-1], lag)))
-        told = strength_of(within, found.task, "lag", bar)
+        told = strength_of(within, found.problem, "lag", bar)
         assert told is not None and told.seen == pytest.approx(seen, rel=CLOSE - 1.0)
 
 

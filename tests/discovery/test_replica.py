@@ -11,29 +11,29 @@ from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import gather, windows
 from idm_env.discovery.search import Search
-from idm_env.discovery.solve import Solution, Task
+from idm_env.discovery.solve import Problem, Solution
 from idm_env.jobs.storage import Store
 
 
-def fitted(ou: float) -> tuple[Task, Solution]:
+def fitted(ou: float) -> tuple[Problem, Solution]:
     """Return the windows of 24 drivers with noise, and drivers of IDM fitted to them."""
     made, _ = synthetic.generate(4, runs=8, followers=3, seconds=120.0, ou=ou)
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
-    task = Task(rows, search.first_noise(rows), first_prior())
-    searching = Search(task, ("drag",), False, Store(None, "", False), lambda *_: None)
-    null = searching.null(Hypothesis(), np.tile(task.prior.centre, (task.groups, 1)))
-    return judge.windowed(records, searching.task, null)
+    problem = Problem(rows, search.first_noise(rows), first_prior())
+    searching = Search(problem, ("drag",), False, Store(None, "", False), lambda *_: None)
+    null = searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)))
+    return judge.windowed(records, searching.problem, null)
 
 
 @pytest.mark.parametrize("ou", [0.0, 0.1])
 def test_noise_of_drivers_is_that_of_the_data_and_what_it_leaves_agrees(ou: float) -> None:
     """An Ornstein–Uhlenbeck acceleration of 0.1 m/s² whose memory is 5 s."""
-    task, found = fitted(ou)
-    drivers = replica.drivers_of(task, found)
+    problem, found = fitted(ou)
+    drivers = replica.drivers_of(problem, found)
     assert np.median(drivers.sigma) == pytest.approx(ou, abs=0.03)
     assert not ou or 2.0 <= drivers.memory_s <= 8.0
-    agreement = replica.agreement(task, found, judge.floor(task.rows.records)["horizon_rmse_m"], 0)
+    agreement = replica.agreement(problem, found, judge.floor(problem.rows.records)["horizon_rmse_m"], 0)
     assert not agreement.is_refused and agreement.p_value >= 0.05 and agreement.replicas >= replica.ENOUGH
 
 

@@ -18,16 +18,16 @@ from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.score import SYSTEMATIC, half_width, held_out
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import _same_class
-from idm_env.discovery.solve import Solution, Task, _Nested, linearise, solve
+from idm_env.discovery.solve import Problem, Solution, _Nested, linearise, solve
 from idm_env.jobs.storage import Store
 
 
 def begun(records: Records, *names: str) -> tuple[Search, Solution]:
     """Return a search with its null."""
     rows = windows(records)
-    task = Task(rows, search.first_noise(rows), first_prior())
-    searching = Search(task, names, False, Store(None, "", False), lambda *_: None)
-    return searching, searching.null(Hypothesis(), np.tile(task.prior.centre, (task.groups, 1)))
+    problem = Problem(rows, search.first_noise(rows), first_prior())
+    searching = Search(problem, names, False, Store(None, "", False), lambda *_: None)
+    return searching, searching.null(Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)))
 
 
 def made(seed: int, **choices: object) -> Records:
@@ -48,15 +48,15 @@ def test_a_time_is_found_although_its_scan_ends_a_bin_off() -> None:
 def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("leader_acceleration", "memory", "drag", "dead_zone", "speed_time_gap")
     copies: list[int] = []
-    predict = Task.predict
+    predict = Problem.predict
 
-    def counted(self: Task, theta: np.ndarray, *rest: object) -> tuple[np.ndarray, np.ndarray]:
+    def counted(self: Problem, theta: np.ndarray, *rest: object) -> tuple[np.ndarray, np.ndarray]:
         copies.append(len(theta))
         return predict(self, theta, *rest)  # type: ignore[arg-type]
 
     for hidden in (None, "speed_time_gap"):
         searching, null = begun(made(31, runs=6, followers=2, seconds=120.0, effect=hidden), *names)
-        monkeypatch.setattr(Task, "predict", counted)
+        monkeypatch.setattr(Problem, "predict", counted)
         for term in map(terms.simple, names):
             copies.clear()
             share, scaled = searching._promise(null, term)
@@ -73,41 +73,41 @@ def test_what_promises_nothing_costs_little_and_what_is_there_is_fitted(monkeypa
 
 def test_an_interval_is_as_wide_as_fits_without_a_run_differ() -> None:
     searching, null = begun(made(31, runs=8, followers=2, seconds=150.0, effect="memory", ou=0.05), "memory")
-    model, task = Hypothesis((terms.simple("memory"),)), searching.task
-    found = solve(task, model, null.theta, np.array(model.terms[0].starts[-1]), iterations=30, tolerance=1e-8)
-    runs = np.unique(task.rows.run)
-    without = [task.of_rows(task.rows.run != run) for run in runs]
+    model, problem = Hypothesis((terms.simple("memory"),)), searching.problem
+    found = solve(problem, model, null.theta, np.array(model.terms[0].starts[-1]), iterations=30, tolerance=1e-8)
+    runs = np.unique(problem.rows.run)
+    without = [problem.of_rows(problem.rows.run != run) for run in runs]
     left = [solve(t, model, found.theta, found.values, iterations=20, tolerance=1e-7).values[0] for t in without]
     jackknife = np.std(left) * np.sqrt(len(runs) - 1)
-    quiet = replace(task, noise=None)
+    quiet = replace(problem, noise=None)
     share = half_width(found, quiet)[0] ** 2 - (1.96 * SYSTEMATIC * found.values[0]) ** 2
     assert np.sqrt(share) / student.ppf(0.975, len(runs) - 1) == pytest.approx(jackknife, rel=0.12)
     # Drivers' noise, alike in all runs, does not show in how these differ.
-    assert task.noise is not None and 0.03 < task.noise.wander < 0.08
-    assert half_width(found, task)[0] > half_width(found, quiet)[0]
+    assert problem.noise is not None and 0.03 < problem.noise.wander < 0.08
+    assert half_width(found, problem)[0] > half_width(found, quiet)[0]
 
 
 def test_a_law_alone_has_a_loop_of_its_own(platoon: Records) -> None:
     """It rolls out as the whole catalogue's does with an effect at its null."""
     rows = whole(platoon)
-    task, theta = Task(rows, None, first_prior()), np.tile(first_prior().centre, (1, len(platoon.groups), 1))
+    problem, theta = Problem(rows, None, first_prior()), np.tile(first_prior().centre, (1, len(platoon.groups), 1))
     absent = Hypothesis((terms.simple("drag"),))
     assert not Hypothesis().bare.catalogue.effects and absent.catalogue.effects
-    alone = task.predict(theta, Hypothesis(), np.zeros((1, 0)))
-    beside = task.predict(theta, absent, np.zeros((1, 1)))
+    alone = problem.predict(theta, Hypothesis(), np.zeros((1, 0)))
+    beside = problem.predict(theta, absent, np.zeros((1, 1)))
     np.testing.assert_allclose(alone, beside, rtol=0, atol=1e-9)
 
 
 def test_candidates_far_behind_the_best_are_not_fitted_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("memory", "leader_acceleration", "drag", "power_limit", "speed_time_gap")
     searching, null = begun(made(31, runs=6, followers=2, seconds=120.0, effect="speed_time_gap"), *names)
-    before = held_out(searching.task, null)
+    before = held_out(searching.problem, null)
     to_the_end: list[str] = []
 
-    def noted(task: Task, model: Hypothesis, *rest: np.ndarray, iterations: int = 12) -> Solution:
+    def noted(problem: Problem, model: Hypothesis, *rest: np.ndarray, iterations: int = 12) -> Solution:
         if model.terms and iterations > 5:
             to_the_end.append(model.terms[-1].label)
-        return solve(task, model, *rest, iterations=iterations)
+        return solve(problem, model, *rest, iterations=iterations)
 
     monkeypatch.setattr(search, "solve", noted)
     alone = {n: searching._nested(null, terms.simple(n), before, f"alone/{n}") for n in names}
@@ -124,16 +124,16 @@ def test_candidates_far_behind_the_best_are_not_fitted_to_the_end(monkeypatch: p
 def test_only_groups_that_moved_are_rolled_out_again(platoon: Records) -> None:
     """Free simulation, and windows, whose errors depend on those before: the same bits as everything anew."""
     searching, null = begun(platoon, "drag")
-    for task in (searching.task, Task(whole(platoon), None, searching.task.prior)):
+    for problem in (searching.problem, Problem(whole(platoon), None, searching.problem.prior)):
         model, values = Hypothesis((terms.simple("drag"),)), np.array([1e-4])
-        nested = _Nested(task, model)
+        nested = _Nested(problem, model)
         shared, first = torch.tensor(values[None]), torch.tensor(null.theta[None])
         nested.linear(first, shared)
         other = first.clone()
         other[:, [1, 4]] += 0.05
-        got, anew = nested.linear(other, shared), linearise(task, model, other[0].numpy(), values)
+        got, anew = nested.linear(other, shared), linearise(problem, model, other[0].numpy(), values)
         assert (got.residual == anew.residual).all() and (got.jacobian == anew.jacobian).all()
-        assert (got.residual != nested.task.residual(task.errors(first.numpy(), model, values[None]))[0]).any()
+        assert (got.residual != nested.problem.residual(problem.errors(first.numpy(), model, values[None]))[0]).any()
 
 
 def test_a_curve_has_intervals_over_its_coordinate_in_it() -> None:

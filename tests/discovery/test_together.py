@@ -15,7 +15,7 @@ from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import gather, windows
 from idm_env.discovery.score import interval_of
 from idm_env.discovery.search import Search
-from idm_env.discovery.solve import Task, solve
+from idm_env.discovery.solve import Problem, solve
 from idm_env.jobs.storage import Store
 
 
@@ -24,15 +24,15 @@ def searching() -> Search:
     made, _ = synthetic.generate(31, runs=6, followers=3, seconds=120.0, effect="speed_time_gap")
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
-    task = Task(rows, search.first_noise(rows), first_prior(), np.ones(len(rows)))
-    return Search(task, ("speed_time_gap", "drag"), False, Store(None, "", False), lambda *_: None)
+    problem = Problem(rows, search.first_noise(rows), first_prior(), np.ones(len(rows)))
+    return Search(problem, ("speed_time_gap", "drag"), False, Store(None, "", False), lambda *_: None)
 
 
 @pytest.fixture(scope="module")
 def start(searching: Search) -> closed_loop.ClosedLoopFit:
-    task = searching.task
-    null = solve(task, Hypothesis(), np.tile(task.prior.centre, (task.groups, 1)), np.zeros(0))
-    return closed_loop.evaluate(task.rows.records, null.model, null.values, null.prior, null.theta)
+    problem = searching.problem
+    null = solve(problem, Hypothesis(), np.tile(problem.prior.centre, (problem.groups, 1)), np.zeros(0))
+    return closed_loop.evaluate(problem.rows.records, null.model, null.values, null.prior, null.theta)
 
 
 def test_what_is_there_is_added_in_free_simulation_and_nothing_else(
@@ -58,9 +58,9 @@ def test_a_term_of_windows_whose_interval_contains_its_null_is_taken_back_whatev
     searching: Search, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = Hypothesis((terms.simple("speed_time_gap"), terms.simple("drag")))
-    task = searching.task
-    both = solve(task, model, np.tile(task.prior.centre, (task.groups, 1)), np.array([-0.3, 1e-4]))
-    intervals = interval_of(both, task)
+    problem = searching.problem
+    both = solve(problem, model, np.tile(problem.prior.centre, (problem.groups, 1)), np.array([-0.3, 1e-4]))
+    intervals = interval_of(both, problem)
     assert intervals[0, 2] < 0.0 and intervals[1, 1] < 0.0 < intervals[1, 2]
     monkeypatch.setattr(selection, "log_gain", lambda *_: np.ones(1))  # the loss of no term is small
     assert [t.label for t in selection._delete(searching, both, 0).model.terms] == ["speed_time_gap"]
@@ -72,9 +72,9 @@ def test_what_windows_found_is_fitted_in_free_simulation_once_more(
     """A strength that is a quarter of the true one comes back."""
     model = Hypothesis((terms.simple("speed_time_gap"),))
     off = closed_loop.in_windows(
-        searching.task, replace(closed_loop.joint(start, model, np.array([-0.3])), values=np.array([-0.1]))
+        searching.problem, replace(closed_loop.joint(start, model, np.array([-0.3])), values=np.array([-0.1]))
     )
-    again, intervals = closed_loop.refitted(start.task.rows.records, off)
+    again, intervals = closed_loop.refitted(start.problem.rows.records, off)
     assert again.values[0] == pytest.approx(-0.4, rel=0.3)
     assert intervals[0, 1] < again.values[0] < intervals[0, 2]
 

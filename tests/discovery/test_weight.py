@@ -13,15 +13,15 @@ from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.result import Weight
 from idm_env.discovery.search import first_noise
-from idm_env.discovery.solve import Solution, Task, solve
+from idm_env.discovery.solve import Problem, Solution, solve
 
 
 def fitted(seconds: float, ou: float, spread: float, seed: int = 5) -> tuple[Records, Solution]:
     made, _ = synthetic.generate(seed, runs=10, followers=2, seconds=seconds, ou=ou, spread=spread)
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
-    task = Task(rows, first_noise(rows), first_prior())
-    null = solve(task, Hypothesis(), np.tile(first_prior().centre, (task.groups, 1)), np.zeros(0))
+    problem = Problem(rows, first_noise(rows), first_prior())
+    null = solve(problem, Hypothesis(), np.tile(first_prior().centre, (problem.groups, 1)), np.zeros(0))
     seen = null.theta[np.unique(records.group)]
     return records, replace(null, prior=replace(first_prior(), centre=np.median(seen, axis=0), width=np.full(5, 0.3)))
 
@@ -29,7 +29,7 @@ def fitted(seconds: float, ou: float, spread: float, seed: int = 5) -> tuple[Rec
 def weight(records: Records, null: Solution) -> tuple[float, dict[float, float]]:
     """Return the weight that was chosen and the errors of all; the best is no end of what was tried."""
     at = closed_loop.evaluate(records, null.model, null.values, null.prior, null.theta)
-    tried, best = sorted(at.rmse_m), at.task.prior.error_correlation_s
+    tried, best = sorted(at.rmse_m), at.problem.prior.error_correlation_s
     for end, beside in ((0, 1), (-1, -2)):
         if best == tried[end] and best not in closed_loop.ENDS_S:
             assert at.rmse_m[best] > 0.9994 * at.rmse_m[tried[beside]]
@@ -49,7 +49,7 @@ def test_short_noisy_records_of_like_drivers_lean_on_the_population() -> None:
     for seconds in (5.0, error_correlation_s):
         prior = replace(null.prior, error_correlation_s=seconds)
         theta = judge.calibrate(others, Hypothesis(), empty, prior, replace(rows, valid=rows.valid & ~second)).theta
-        scored = Task(replace(rows, valid=second), None, prior)
+        scored = Problem(replace(rows, valid=second), None, prior)
         errors.append(np.linalg.norm(scored.errors(theta[None], Hypothesis(), empty[None])))
     assert errors[1] < 0.95 * errors[0]
 
