@@ -190,9 +190,10 @@ class Evaluation:
             errors = self.calibrated(model, self.null.values)[1]
             assert errors is not None
             return errors, before
+        of_null = self._null_at_best
         at_best, theta = crossed.at_best(self.records, model, self.null.values)
-        if bases.is_far(at_best, self._null_at_best, bool(model.catalogue.personal)):
-            return at_best, self._null_at_best
+        if bases.is_far(at_best, of_null, bool(model.catalogue.personal)):
+            return at_best, of_null
         values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
         return self._crossed(model, values, theta, before.whitened), before
 
