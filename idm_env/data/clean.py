@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import polars as pl
 
-from idm_env.data.errors import DataError, Repair, listed
+from idm_env.data.errors import DataError, Repair, listed, repaired
 from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TRACK, taken_as_missing
 
 LARGEST_ID = 2.0**53
@@ -135,9 +135,7 @@ def without_empty(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[
     """
     rows = frame.filter(pl.all_horizontal(pl.col("vehicle_id", "time_s").is_not_null()))
     check_runs(rows.filter(pl.col("run_id").is_null()), source)
-    count = frame.height - rows.height
-    text = f"{count} rows without a vehicle or a time were left out."
-    return rows, [Repair("no time", count, text)] if count else []
+    return rows, repaired("no time", frame.height - rows.height, "rows without a vehicle or a time were left out.")
 
 
 def check_runs(nowhere: pl.DataFrame, source: str) -> None:
@@ -194,10 +192,8 @@ def ordered(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair], pl.DataFra
     repeated = (pl.col("time_s").diff() == 0) & same
     moved = frame.filter(repeated & ((pl.col("position_m") - pl.col("position_m").shift(1)).abs() > 1e-6))
     rows = frame.filter(~repeated.fill_null(False))
-    count = frame.height - rows.height
-    if count:
-        text = f"{count} rows repeat a time of their vehicle and were left out; the first of each was kept."
-        repairs.append(Repair("duplicated time", count, text))
+    words = "rows repeat a time of their vehicle and were left out; the first of each was kept."
+    repairs += repaired("duplicated time", frame.height - rows.height, words)
     twice = moved.group_by(TRACK, maintain_order=True).agg(pl.col("time_s").first(), pl.len().alias("moved"))
     return rows, repairs, twice
 
@@ -237,11 +233,9 @@ def single_holes(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
             leader = pl.col("leader_id")
             between = pl.when(leader.shift(1).eq_missing(leader.shift(-1)).over(TRACK)).then(between)
         filled = frame.select(pl.coalesce(column, between).alias(name))[name]
-        count = frame[name].null_count() - filled.null_count()
-        if count:
-            text = f"{count} single missing values of {name} were interpolated between their neighbours in time."
-            repairs.append(Repair("interpolated", count, text))
-            frame = frame.with_columns(filled)
+        words = f"single missing values of {name} were interpolated between their neighbours in time."
+        repairs += repaired("interpolated", frame[name].null_count() - filled.null_count(), words)
+        frame = frame.with_columns(filled)
     return frame, repairs
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from idm_env.data.clean import natural
-from idm_env.data.errors import DataError, Repair
+from idm_env.data.errors import DataError, Repair, repaired
 from idm_env.data.schema import TRACK, of_run, track_numbers
 
 LONGEST_BRIDGE = 2.5
@@ -121,12 +121,10 @@ def _interpolated(column: pl.Series, left: np.ndarray, weight: np.ndarray, same:
 def _repairs(track: np.ndarray, on_clock: np.ndarray, changed_tracks: np.ndarray) -> list[Repair]:
     jittered = np.unique(track[~on_clock])
     filled = int((~np.isin(changed_tracks, jittered)).sum())
-    repairs = []
-    if len(jittered):
-        rows = int((~on_clock).sum())
-        text = f"{len(jittered)} tracks had irregular times ({rows} rows) and were resampled onto a regular clock."
-        repairs.append(Repair("irregular time", len(jittered), text))
-    if filled:
-        text = f"{filled} single missing rows were filled by interpolation; longer holes split the track."
-        repairs.append(Repair("missing row", filled, text))
-    return repairs
+    words = f"tracks had irregular times ({(~on_clock).sum()} rows) and were resampled onto a regular clock."
+    return [
+        *repaired("irregular time", len(jittered), words),
+        *repaired(
+            "missing row", filled, "single missing rows were filled by interpolation; longer holes split the track."
+        ),
+    ]

@@ -39,11 +39,14 @@ def filled(values: np.ndarray) -> np.ndarray | None:
     good = np.flatnonzero(np.isfinite(values))
     if len(good) == 0:
         return None
-    ticks = np.arange(len(values))
-    after = np.clip(np.searchsorted(good, ticks), 0, len(good) - 1)
+    return values[good[nearest_of(good, np.arange(len(values)))]]
+
+
+def nearest_of(times: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Return the index in rising ``times`` [samples] of the one nearest to every tick [ticks], the earlier of two."""
+    after = np.clip(np.searchsorted(times, ticks), min(1, len(times) - 1), len(times) - 1)
     before = np.maximum(after - 1, 0)
-    nearer = np.where(np.abs(good[before] - ticks) <= np.abs(good[after] - ticks), before, after)
-    return values[good[nearer]]
+    return np.where(ticks - times[before] <= times[after] - ticks, before, after)
 
 
 def labels(table: pl.DataFrame, names: list[str], begin: int, end: int) -> dict[str, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import polars as pl
 
 from idm_env.data.clean import NAMES
-from idm_env.data.errors import DataError, Repair
+from idm_env.data.errors import DataError, Repair, repaired
 from idm_env.data.schema import TRACK
 
 DECIDED_M = 20.0
@@ -94,13 +94,11 @@ def renamed(frame: pl.DataFrame, vehicles: pl.DataFrame) -> pl.DataFrame:
 
 def repairs(vehicles: pl.DataFrame) -> list[Repair]:
     """Return what is to be said of mirrored vehicles."""
-    if vehicles.height == 0:
-        return []
-    text = (
-        f"{vehicles.height} vehicles drive against the others (their position_m falls): they were mirrored, with "
+    words = (
+        f"vehicles drive against the others (their position_m falls): they were mirrored, with "
         f"−position_m for position_m, and are in runs of their own, whose names end with '{SUFFIX}'."
     )
-    return [Repair("direction mirrored", vehicles.height, text)]
+    return repaired("direction mirrored", vehicles.height, words)
 
 
 def one_way(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:

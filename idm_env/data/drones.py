@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from idm_env.data.errors import DataError, Repair, missing_column
+from idm_env.data.errors import DataError, Repair, missing_column, repaired
 
 FRAME_S = 0.04
 FOOT_M = 0.3048
@@ -93,14 +93,13 @@ def pneuma(path: Path) -> Read:
 
     DataError where no line holds a track.
     """
-    parts, broken, assumed = [], 0, 0
+    parts, broken = [], 0
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
         cells = [cell.strip() for cell in line.strip().rstrip(";").split(";")]
         try:
             numbers = np.array([float(cell) for cell in cells[4:]]).reshape(-1, 6)
         except ValueError:
-            broken += bool(line.strip())
-            continue
+            numbers = np.empty((0, 6))
         if len(numbers) < 2:
             broken += bool(line.strip())
             continue
@@ -108,16 +107,14 @@ def pneuma(path: Path) -> Read:
         north = np.radians(np.diff(latitude)) * EARTH_M
         east = np.radians(np.diff(longitude)) * EARTH_M * np.cos(np.radians(latitude[0]))
         kind = cells[1].lower()
-        assumed += 1
         parts.append(pl.DataFrame({
             "vehicle_id": cells[0], "time_s": time, "speed_mps": speed / 3.6, "length_m": LENGTHS_M.get(kind, 5.0),
             "position_m": np.concatenate([[0.0], np.cumsum(np.hypot(north, east))]), "vehicle_class": cells[1],
         }))  # fmt: skip
     if not parts:
         raise DataError(f"{path.name}: no line holds a track of pNEUMA's layout; is it the unzipped csv?")
-    repairs = [Repair("length assumed", assumed, f"{assumed} vehicles have the nominal length of their type.")]
-    if broken:
-        repairs.append(Repair("broken line", broken, f"{broken} lines that hold no whole track were left out."))
+    repairs = repaired("length assumed", len(parts), "vehicles have the nominal length of their type.")
+    repairs += repaired("broken line", broken, "lines that hold no whole track were left out.")
     return pl.concat(parts).with_columns(pl.lit(None, pl.String).alias("leader_id")), repairs
 
 
@@ -149,8 +146,7 @@ def i24(path: Path) -> Read:
     table = pl.concat(parts)
     # Vehicles are sampled by their own clocks: one clock for all, so that leaders are measured at the same times.
     table = _on_one_clock(table.with_columns(pl.col("time_s") - pl.col("time_s").min()))
-    repairs = [Repair("broken document", broken, f"{broken} documents without a whole track were left out.")]
-    return table, repairs if broken else []
+    return table, repaired("broken document", broken, "documents without a whole track were left out.")
 
 
 def _on_one_clock(table: pl.DataFrame) -> pl.DataFrame:

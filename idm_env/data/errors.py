@@ -32,6 +32,11 @@ class Repair:
         return self.text
 
 
+def repaired(kind: str, count: int, words: str) -> list[Repair]:
+    """Return the repair of so many, told by their number and ``words``; nothing where there are none."""
+    return [Repair(kind, count, f"{count} {words}")] if count else []
+
+
 def by_kind(repairs: Iterable[Repair]) -> list[tuple[str, int]]:
     """Return the kind and the number of each, as ``reports.page.account`` takes them."""
     return [(repair.kind, repair.count) for repair in repairs]

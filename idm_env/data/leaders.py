@@ -6,7 +6,7 @@ import polars as pl
 
 from idm_env.data import units
 from idm_env.data.clean import NAMES, NO_LEADER, natural
-from idm_env.data.errors import DataError, Repair, listed
+from idm_env.data.errors import DataError, Repair, listed, repaired
 from idm_env.data.schema import TRACK
 
 SHARE_BEHIND = 0.5
@@ -81,10 +81,8 @@ def named(counts: pl.DataFrame, source: str) -> list[Repair]:
         names = wrong.filter(pl.col("state") == "lost")["leader_id"].unique(maintain_order=True)
         text = f"{lost} rows name a leader that the run does not hold ({listed(names, 5)}); they are without leader."
         repairs.append(Repair("leader does not exist", lost, text))
-    if own := total.get("own", 0):
-        text = f"{own} rows name the vehicle itself as leader and are taken as without leader."
-        repairs.append(Repair("own leader", own, text))
-    return repairs
+    words = "rows name the vehicle itself as leader and are taken as without leader."
+    return repairs + repaired("own leader", total.get("own", 0), words)
 
 
 def steady(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
@@ -109,8 +107,8 @@ def steady(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     if "gap_m" in frame.columns:
         mean = (shifted(1, "gap_m") + shifted(-1, "gap_m")) / 2
         changes.append(pl.when(flicker).then(mean).otherwise("gap_m").alias("gap_m"))
-    text = f"{count} single samples of another leader were taken as of the one before and after."
-    return frame.with_columns(changes), [Repair("leader flickers", count, text)]
+    words = "single samples of another leader were taken as of the one before and after."
+    return frame.with_columns(changes), repaired("leader flickers", count, words)
 
 
 def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
@@ -127,8 +125,8 @@ def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     gap = pl.when(pl.col("leader_id").is_not_null()).then(gap)
     joined = joined.with_columns(gap.alias("gap_m")).drop("lead_position", "lead_length", "headway")
     count = joined.filter(~pl.col("gap_measured") & pl.col("gap_m").is_not_null()).height
-    text = f"{count} gaps were taken from the positions and lengths of the two vehicles, as gap_m is absent."
-    return joined, [Repair("gap from positions", count, text)] if count else []
+    words = "gaps were taken from the positions and lengths of the two vehicles, as gap_m is absent."
+    return joined, repaired("gap from positions", count, words)
 
 
 def headways(frame: pl.DataFrame, source: str) -> pl.DataFrame:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import polars as pl
 
 from idm_env.data.clean import exact
-from idm_env.data.errors import DataError, Repair, missing_column
+from idm_env.data.errors import DataError, Repair, missing_column, repaired
 
 FOOT_M = 0.3048
 FRAME_S = 0.1
@@ -115,5 +115,5 @@ def _told_apart(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
         # a leader outside the file keeps its number, so that it is counted as one that does not exist
         frame = frame.with_columns(pl.coalesce("leader_id", pl.col("preceding").cast(pl.String)))
     frame = frame.drop("vehicle_id").rename({"name": "vehicle_id"})
-    text_repair = f"{count} vehicles had the identifier of an earlier one and were told apart by their times."
-    return frame, [Repair("identifier used again", count, text_repair)] if count else []
+    words = "vehicles had the identifier of an earlier one and were told apart by their times."
+    return frame, repaired("identifier used again", count, words)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from idm_env.data.errors import DataError, Repair
+from idm_env.data.errors import DataError, Repair, repaired
 
 REQUIRED = ("vehicle_id", "time_s", "position_m")
 TIDY = (
@@ -90,10 +90,8 @@ def taken_as_missing(
 ) -> tuple[pl.DataFrame, list[Repair]]:  # fmt: skip
     """Return a table without the values of a column that are not good [rows], and how many these were."""
     count = frame.height - int(good.sum())
-    if not count:
-        return frame, []
-    repair = Repair(kind, count, f"{count} values of {name} {words} taken as missing.")
-    return frame.with_columns(pl.when(good).then(pl.col(name)).alias(name)), [repair]
+    done = repaired(kind, count, f"values of {name} {words} taken as missing.")
+    return frame.with_columns(pl.when(good).then(pl.col(name)).alias(name)) if count else frame, done
 
 
 def check(table: pl.DataFrame, source: str) -> pl.DataFrame:

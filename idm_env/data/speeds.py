@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from idm_env.data.errors import Repair
+from idm_env.data.errors import Repair, repaired
 from idm_env.data.schema import (
     DEFAULT_LENGTH_M,
     HIGHEST_SPEED_MPS,
@@ -36,8 +36,7 @@ def unwrapped(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     frame = frame.with_columns(
         (pl.col("position_m") + pl.coalesce(laps * pl.col("ring_length_m"), pl.lit(0.0))).alias("position_m")
     )
-    text = f"{count} jumps of position at the start of the ring were unwrapped."
-    return frame, [Repair("unwrapped", count, text)] if count else []
+    return frame, repaired("unwrapped", count, "jumps of position at the start of the ring were unwrapped.")
 
 
 def lengths(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
@@ -47,18 +46,14 @@ def lengths(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     frame = frame.with_columns(median.alias("length_m"))
     without = frame.filter(pl.col("length_m").is_null()).select(TRACK).n_unique()
     filled = empty - frame["length_m"].null_count()
-    repairs = []
-    if filled:
-        text = f"{filled} missing values of length_m were taken from other rows of the same vehicle."
-        repairs.append(Repair("length filled", filled, text))
-    repairs += length_assumed(without)
+    words = "missing values of length_m were taken from other rows of the same vehicle."
+    repairs = repaired("length filled", filled, words) + length_assumed(without)
     return frame.with_columns(pl.col("length_m").fill_null(DEFAULT_LENGTH_M)), repairs
 
 
 def length_assumed(without: int) -> list[Repair]:
     """Return what is to be said of so many vehicles without a length."""
-    text = f"{without} vehicles have no length_m; {DEFAULT_LENGTH_M} m is assumed."
-    return [Repair("length assumed", without, text)] if without else []
+    return repaired("length assumed", without, f"vehicles have no length_m; {DEFAULT_LENGTH_M} m is assumed.")
 
 
 def complete(frame: pl.DataFrame, steps: dict[str, float]) -> tuple[pl.DataFrame, list[Repair]]:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from scipy.stats import qmc
@@ -24,6 +24,7 @@ from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
+from idm_env.validation import one_of
 
 Method = Literal["lm", "adam"]
 
@@ -115,8 +116,7 @@ def fit(
     ``checkpoint`` names the folder that makes an interrupted fit resumable with the same result. ValueError and
     DataError for what cannot be fitted.
     """
-    if method not in ("lm", "adam"):
-        raise ValueError(f"method = '{method}' is unknown. Use 'lm' or 'adam'.")
+    one_of("method", method, get_args(Method))
     if prior is not None and method != "lm":
         raise ValueError(f"method = '{method}' knows no prior. Use 'lm'.")
     if prior is not None and start is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter, catalogue, nearest, replaced
 from idm_env.simulator import Simulator
 from idm_env.types import Inputs, State
+from idm_env.validation import one_of
 
 if TYPE_CHECKING:
     from idm_env.kernels.drivers import BehindRecord
@@ -79,12 +80,8 @@ class Problem:
             raise ValueError(
                 f"the simulator steps by {self.simulator.dt:g} s, the batch by {self.batch.step:g} s. Give both one dt."
             )
-        for what, value, known_values in (
-            ("objective", self.objective, ("spacing", "speed", "both")),
-            ("loss", self.loss, ("mse", "rmse")),
-        ):
-            if value not in known_values:
-                raise ValueError(f"{what} '{value}' is unknown.{nearest(value, known_values)}")
+        one_of("objective", self.objective, get_args(Objective))
+        one_of("loss", self.loss, get_args(Loss))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -113,15 +113,6 @@ class _Job(NamedTuple):
         return self.path.name
 
 
-def _predict_file(job: _Job, progress: OnProgress) -> None:
-    """Do one file."""
-
-    def on_scenario(done: int) -> None:
-        progress("predict", job.before + done, job.everything, job.path.name)
-
-    _file(job.parts, job.number, job.path, job.methods, on_scenario)
-
-
 def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
     """Return a digest of names, sizes and times of the files, and of the settings."""
     stats = [
@@ -130,8 +121,8 @@ def _fingerprint(files: Sequence[Path], baselines: bool) -> str:
     return storage.fingerprint(stats, baselines)
 
 
-def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scenario: Callable[[int], None]) -> None:
-    """Predict the scenarios of one file and write its part; ``on_scenario`` is called with how many are done."""
+def _predict_file(job: _Job, progress: OnProgress) -> None:
+    """Predict one file's scenarios and write its part, which also says where pictures are drawn."""
     left_out: list[dict[str, str]] = []
     notes: list[dict[str, str]] = []
     scores: list[dict[str, Any]] = []
@@ -139,13 +130,13 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scen
     rows: list[dict[str, Any]] = []
     pictures: list[dict[str, str]] = []
     scenario_count = 0
-    for scenario in _readable(path, left_out):
-        on_scenario(scenario_count)
+    for scenario in _readable(job.path, left_out):
+        progress("predict", job.before + scenario_count, job.everything, job.path.name)
         scenario_count += 1
         scene = MapScene(scenario)
         notes += [{"scenario": scenario.id, "note": note} for note in _notes(scenario)]
         for index in scenario.to_predict:
-            done = _agent(scene, index, methods, left_out)
+            done = _agent(scene, index, job.methods, left_out)
             if done is None:
                 continue
             ours = done[OURS]
@@ -158,10 +149,10 @@ def _file(parts: Parts, number: int, path: Path, methods: Sequence[str], on_scen
             if len(pictures) < MOST_PICTURES:
                 block = page.picture(*scene_picture(scenario, ours))
                 pictures.append({"text": block.text, "image": block.image})
-    parts.write(number, "predictions", pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]))
-    parts.write(number, "parameters", pl.DataFrame(rows, schema=PARAMETERS))
-    parts.finish(
-        number,
+    job.parts.write(job.number, "predictions", pl.concat(tables or [pl.DataFrame(schema=SCHEMA)]))
+    job.parts.write(job.number, "parameters", pl.DataFrame(rows, schema=PARAMETERS))
+    job.parts.finish(
+        job.number,
         {
             "scenarios": scenario_count, "agents": len(tables), "scores": scores, "left_out": left_out, "notes": notes,
             "pictures": pictures,

@@ -164,13 +164,12 @@ def restored(parts: Parts, number: int, tracks: Sequence[TrackPiece]) -> list[Fi
     filtered = []
     for track in tracks:
         rows = by_key[(track.run_id, track.vehicle_id, track.piece)]
-        names = ("time_s", "position_m", "speed_mps", "accel_mps2")
-        motion = RegularMotion(*(rows[name].to_numpy() for name in names))
         sigma = rows.select("position_sigma_m", "speed_sigma_mps", "accel_sigma_mps2").to_numpy()
         filtered.append(
             Filtered(
-                track, motion, rows["imagined_gap_m"].to_numpy(), sigma, rows["leader_id"].fill_null("").to_numpy(),
-                rows["lane"].fill_null(-1).to_numpy(), rows["gap_m"].to_numpy(),
+                track, RegularMotion.of(rows), rows["imagined_gap_m"].to_numpy(), sigma,
+                rows["leader_id"].fill_null("").to_numpy(), rows["lane"].fill_null(-1).to_numpy(),
+                rows["gap_m"].to_numpy(),
             )
         )  # fmt: skip
     return filtered

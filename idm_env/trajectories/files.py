@@ -328,6 +328,5 @@ def _shown(out: Path, spool: Spool, bridge: float | None) -> list[tuple[TrackPie
     for track in chosen:
         mine = (pl.col("run_id") == track.run_id) & (pl.col("vehicle_id") == track.vehicle_id)
         rows = written.filter(mine & (pl.col("piece") == track.piece)).collect()
-        names = ("time_s", "position_m", "speed_mps", "accel_mps2")
-        pairs.append((track, RegularMotion(*(rows[name].to_numpy() for name in names))))
+        pairs.append((track, RegularMotion.of(rows)))
     return pairs

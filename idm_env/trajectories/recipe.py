@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from idm_env.data.columns import nearest_of
 from idm_env.trajectories.imagined import Driven, drive
 from idm_env.trajectories.scores import RegularMotion
 from idm_env.trajectories.smoother import PositionNoise, Smoothed, SmootherOptions, TrackObservations, smooth
@@ -62,9 +63,7 @@ def clock_of(track: TrackPiece, dt: float) -> np.ndarray:
 
 def nearest(track: TrackPiece, clock: np.ndarray) -> np.ndarray:
     """Return the index of the sample nearest in time to every tick."""
-    after = np.clip(np.searchsorted(track.time_s, clock), 1, len(track) - 1)
-    earlier = clock - track.time_s[after - 1] <= track.time_s[after] - clock
-    return np.where(earlier, after - 1, after)
+    return nearest_of(track.time_s, clock)
 
 
 class Neighbourhood:

@@ -5,9 +5,10 @@ Shapes: everything of a trajectory is ``[samples]``, in SI units.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
+import polars as pl
 
 IMPLAUSIBLE_MPS2 = 10.0
 """No road vehicle accelerates or brakes harder (m/s²): the paper's bound."""
@@ -21,6 +22,11 @@ class RegularMotion:
     position_m: np.ndarray
     speed_mps: np.ndarray
     accel_mps2: np.ndarray
+
+    @classmethod
+    def of(cls, table: pl.DataFrame) -> RegularMotion:
+        """Return the motion that rows of a written table [rows] tell."""
+        return cls(*(table[each.name].to_numpy() for each in fields(cls)))
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
         """Return the positions (m) at other times (s), by linear interpolation between samples."""

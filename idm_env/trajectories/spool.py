@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import polars as pl
 
 from idm_env.data import Repair, clean, clock, directions, leaders, prepare, units
-from idm_env.data.errors import Counted
+from idm_env.data.errors import Counted, repaired
 from idm_env.data.load import batches
 from idm_env.data.names import Columns
 from idm_env.data.schema import TRACK, of_run
@@ -124,8 +124,8 @@ class Spool:
             usable, repairs = prepare.rows(piece, self.source, ring_length, filled)
             self._counted.add(repairs)
             rows = usable.filter(pl.col("position_m").is_not_null())
-            if lost := usable.height - rows.height:
-                self._counted.add([Repair("no position", lost, f"{lost} rows without a position were left out.")])
+            lost = usable.height - rows.height
+            self._counted.add(repaired("no position", lost, "rows without a position were left out."))
             if rows.height == 0:
                 continue
             sample += [rows] if sum(some.height for some in sample) < BUCKET_ROWS else []
