@@ -14,6 +14,8 @@ from idm_env.discovery.judge import Judged
 DRAWS = 2000
 RUNS = 6
 """Held-out runs from which whole runs are drawn; of fewer, the followers within them."""
+TRIMMED = 0.1
+"""Share of followers that a trimmed error leaves out."""
 ERRORS = ("gap_rmse_m", "horizon_rmse_m", "speed_rmse_mps")
 """Errors that are compared: the gap in free simulation, the gap 5 s ahead, and the speed in free simulation."""
 
@@ -43,6 +45,9 @@ class Comparison:
     followers: int = 0
     driver: tuple[float, float, float] = (float("nan"), float("-inf"), float("inf"))
 
+    trimmed: tuple[float, float] = (float("nan"), float("nan"))
+    """Both errors without the tenth of followers that err most in both models together."""
+
     @property
     def outcome(self) -> ErrorChange:
         """``worse`` where an interval lies above 1, of the pooled errors or of the followers' ratios; so ``better``."""
@@ -66,18 +71,24 @@ def compare(before: Judged, after: Judged, seed: int = 0) -> dict[str, Compariso
     for key in ERRORS:
         (was, count), (now, _) = before.squares[key], after.squares[key]
         seen = count > 0
-        result[key] = compared(was[seen], now[seen], float(count[seen].sum()), runs[seen], seed)
+        result[key] = compared(was[seen], now[seen], count[seen], runs[seen], seed)
     return result
 
 
-def compared(was: np.ndarray, now: np.ndarray, samples: float, runs: np.ndarray, seed: int) -> Comparison:
-    """Compare sums of squares of followers [F] in runs [F]."""
-    errors = [float(np.sqrt(x.sum() / samples)) if samples else float("nan") for x in (was, now)]
-    change = 0.5 * np.log(now.sum() / was.sum()) if samples and was.sum() > 0 else float("nan")
+def compared(was: np.ndarray, now: np.ndarray, samples: np.ndarray, runs: np.ndarray, seed: int) -> Comparison:
+    """Compare sums of squares of followers [F] over their samples [F], in runs [F]."""
+    errors = [_rmse(x, samples) for x in (was, now)]
+    change = 0.5 * np.log(now.sum() / was.sum()) if len(samples) and was.sum() > 0 else float("nan")
     width = _width(was, now, runs, seed) if np.isfinite(change) else float("inf")
     improved = float((now < was).mean()) if len(was) else float("nan")
     ratio, low, high = (float(np.exp(x)) for x in (change, change - width, change + width))
-    return Comparison(errors[0], errors[1], ratio, low, high, improved, len(was), _of_drivers(was, now, runs))
+    best = np.argsort((was + now) / samples)[: len(was) - int(TRIMMED * len(was))]
+    trimmed = (_rmse(was[best], samples[best]), _rmse(now[best], samples[best]))
+    return Comparison(errors[0], errors[1], ratio, low, high, improved, len(was), _of_drivers(was, now, runs), trimmed)
+
+
+def _rmse(squares: np.ndarray, samples: np.ndarray) -> float:
+    return float(np.sqrt(squares.sum() / samples.sum())) if len(samples) else float("nan")
 
 
 def _of_drivers(was: np.ndarray, now: np.ndarray, runs: np.ndarray) -> tuple[float, float, float]:

@@ -87,6 +87,8 @@ class Change:
     drivers_low: float
     drivers_high: float
     share_of_drivers_improved: float
+    trimmed_before: float
+    trimmed_after: float
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,8 @@ def summarise(
         known=_known(final, interval_of(final, problem), base),
         helps={
             key: result.Change(
-                c.outcome.value, c.ratio, c.low, c.high, c.before, c.after, words.ERRORS[key][1], *c.driver, c.improved
+                c.outcome.value, c.ratio, c.low, c.high, c.before, c.after, words.ERRORS[key][1], *c.driver, c.improved,
+                *c.trimmed,
             )
             for key, c in errors.items()
         },

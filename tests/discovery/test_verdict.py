@@ -117,15 +117,22 @@ def test_intervals_cover_the_true_change() -> None:
             run = np.repeat(np.arange(runs), each)
             change = np.log(0.9) + common[run] + 0.2 * random.standard_normal(len(run))
             was = np.ones(len(run))
-            found = compare.compared(was, was * np.exp(2 * change), 10.0 * len(run), run, trial)
+            found = compare.compared(was, was * np.exp(2 * change), np.full(len(run), 10.0), run, trial)
             true = 0.9 * np.exp(0.2**2 * (2 if runs >= compare.RUNS else 1))  # of the root of the mean square
             covered.append(found.low < true < found.high)
         assert np.mean(covered) > 0.88, (runs, each)
 
 
 def test_one_follower_tells_nothing() -> None:
-    found = compare.compared(np.ones(1), np.full(1, 0.1), 10.0, np.array(["a"]), 0)
+    found = compare.compared(np.ones(1), np.full(1, 0.1), np.full(1, 10.0), np.array(["a"]), 0)
     assert found.outcome is ErrorChange.SAME and found.low == 0.0 and found.high == float("inf")
+
+
+def test_a_hopeless_follower_is_told_apart() -> None:
+    """He takes the pooled error up, and the trimmed one of the others falls."""
+    was, now = np.append(np.ones(19), 100.0), np.append(np.full(19, 0.25), 400.0)
+    found = compare.compared(was, now, np.ones(20), np.arange(20).astype(str), 0)
+    assert found.after > 1.8 * found.before and found.trimmed == (1.0, 0.5)
 
 
 def test_a_driver_in_pieces_is_one_driver() -> None:
