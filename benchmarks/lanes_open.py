@@ -21,6 +21,7 @@ from idm_env.multilane import demand
 from idm_env.roads import Lanes
 from idm_env.simulator import Simulator
 from idm_env.tasks import trip_table
+from idm_env.types import Trips
 
 LANES, LENGTH, FIRST, LAST = 3, 3000.0, 500.0, 2500.0
 SECONDS, COUNTED = 900.0, 600.0
@@ -54,7 +55,7 @@ def ours(flow: float, keep_right: float) -> Found:
     params["idm"]["desired_speed"] = torch.tensor(desired)
     params["mobil"]["keep_right"] = torch.tensor(keep_right)
     lengths = torch.tensor([TRUCK if kind else 5.0 for kind in table.kind])
-    state = demand.waiting(simulator, table.trips(), params, length=lengths)
+    state = demand.waiting(simulator, Trips.from_table(table._asdict()), params, length=lengths)
     counted, count, way = 0, 0, 0.0
     for second in range(int(SECONDS)):
         before, (state, _) = state, simulator.rollout(state, {}, params, round(1.0 / DT), keep=None)

@@ -14,9 +14,11 @@ Nobody there
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
 Tree = TypeVar("Tree")
@@ -67,6 +69,47 @@ class Trips(NamedTuple):
     speed: Tensor
     entered: Tensor
     left: Tensor
+
+    @classmethod
+    def from_table(cls, frame: Any, dtype: torch.dtype = torch.float32) -> Trips:
+        """Return one trip for each row of a table, none of them made again, in the order of departure.
+
+        ``frame`` gives columns by name, as a ``DataFrame`` or a mapping does: ``depart`` (s), ``lane`` (0 on the
+        right), and ``speed`` at the entry (m/s), 20 without that column. Others are for ``idm_env.tasks.trip_table``.
+
+        Raises:
+            ValueError: In one line, for columns that are missing, empty or of different lengths, or for a value that
+                no trip has.
+        """
+        names = list(getattr(frame, "columns", frame))
+        for name in ("depart", "lane"):
+            if name not in names:
+                raise ValueError(f"trips need a column '{name}'. Columns: depart, lane, speed.")
+        counts = {len(frame[name]) for name in names}
+        if len(counts) > 1 or 0 in counts:
+            raise ValueError("trips: every column must have a value for each trip, and at least one.")
+        numbers = []
+        for name, least in (("depart", 0.0), ("lane", 0.0), ("speed", 1.0)):
+            column = list(frame[name]) if name in names else [20.0] * max(counts)
+            numbers.append([_number(name, value, row, least) for row, value in enumerate(column)])
+        depart, lane, speed = (torch.tensor(x, dtype=torch.float64) for x in numbers)
+        order = depart.argsort(stable=True)
+        none = torch.zeros(len(order), dtype=torch.int64)
+        again = torch.full((len(order),), math.inf, dtype=dtype)
+        return cls(depart[order].to(dtype), again, lane[order].long(), speed[order].to(dtype), none, none.clone())
+
+
+def _number(name: str, value: Any, row: int, least: float) -> float:
+    """Return a value of a trip as a number; ValueError, in one line, for what is none."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not least <= number < math.inf:
+        raise ValueError(f"trips: {name} = {value!r} of row {row} must be a number of at least {least:g}.")
+    if name == "lane" and number != int(number):
+        raise ValueError(f"trips: lane = {number:g} of row {row} must be a whole number.")
+    return number
 
 
 class Moving(NamedTuple):

@@ -14,7 +14,7 @@ from idm_env.tasks.checks import KeywordError
 from idm_env.tasks.features import FEATURES, AgentView, Feature
 from idm_env.tasks.follow import FollowTask
 from idm_env.tasks.highway import HighwayTask
-from idm_env.tasks.open_lanes import BottleneckTask, MergeTask, OpenHighwayTask
+from idm_env.tasks.open_roads import BottleneckTask, MergeTask, OpenHighwayTask
 from idm_env.tasks.platoon import PlatoonTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.replay import ReplayTask

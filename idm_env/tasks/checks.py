@@ -41,6 +41,9 @@ class Range(NamedTuple):
             at_least(name, value, self.low, self.unit, self.high)
 
 
+FLOW = Range(0.0, 1e5, "vehicles an hour")
+
+
 def ranges(task: type) -> dict[str, Range]:
     """Return the ranges of all options of a kind of task: its own ``ranges``, and those of what it inherits."""
     return {name: x for kind in reversed(task.__mro__) for name, x in vars(kind).get("ranges", {}).items()}

@@ -1,4 +1,4 @@
-"""Tasks ``open_highway``, ``merge``, ``bottleneck``: traffic flows in, changes lanes, some of which end, and leaves."""
+"""What tasks share where traffic flows in, changes lanes, some of which may end, and leaves."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Control, Courtesy, Destination, Effect, GapAcceptance, MandatoryChange, Mobil
+from idm_env.effects import IDM, Brakes, Control, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
 from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
-from idm_env.roads import End, Lanes, lane_drop, on_ramp
+from idm_env.roads import Lanes
 from idm_env.tasks.base import EnvState, RewardRange
-from idm_env.tasks.checks import Range, at_least, span
+from idm_env.tasks.checks import FLOW, Range, at_least
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, lengths, loops_of, rules_of, with_classes
-from idm_env.tasks.trip_table import SECOND, TripTable, read, spread
+from idm_env.tasks.trip_table import TripTable, read, spread
 from idm_env.tasks.trip_table import table as made
 from idm_env.types import Params, State, Trips
 from idm_env.validation import nearest, one_of, shown
 
 _PLACE_STREAM = 37
-_FLOW = Range(0.0, 1e5, "vehicles an hour")
 _SIGHT = 500.0
 """How far ahead an agent sees that a lane ends (m)."""
 
@@ -52,13 +51,13 @@ def _next(view: AgentView) -> tuple[Tensor, Tensor]:
     state, task, road = view.state, view.task, view.task.road
     assert state.links is not None and isinstance(road, Lanes)
     own, lane = task.pick(state.position), task.pick(state.links.lane)
-    next_end, beside = torch.full_like(own, _SIGHT), torch.zeros_like(own)
+    next_end, left = torch.full_like(own, _SIGHT), torch.zeros_like(own)
     for end in road.ends:
         way = end.end - own
         nearer = end.closed & (way >= 0.0) & (way < next_end)
         next_end = torch.where(nearer, way, next_end)
-        beside = torch.where(nearer, (end.lane - lane).to(own.dtype), beside)
-    return task.there(state, next_end), task.there(state, beside)
+        left = torch.where(nearer, (end.lane - lane).to(own.dtype), left)
+    return task.there(state, next_end), task.there(state, left)
 
 
 def _next_end(view: AgentView) -> Tensor:
@@ -122,7 +121,7 @@ class OpenLanesTask(LanesTask):
     }
 
     usual_hold: ClassVar[float | None] = 1.0
-    ranges: ClassVar[Mapping[str, Range]] = {"entry_speed": Range(1.0, 70.0, "m/s"), "inflow": _FLOW}
+    ranges: ClassVar[Mapping[str, Range]] = {"entry_speed": Range(1.0, 70.0, "m/s"), "inflow": FLOW}
 
     vehicles: int = 120
     controlled: int | float | str | Sequence[int] = 0.1
@@ -268,16 +267,16 @@ class OpenLanesTask(LanesTask):
         flows, total = self.inflows, sum(self.inflows.values())
         counts = {k: max(1, round(self.vehicles * flow / total)) for k, flow in flows.items()}
         slots = sorted((3600.0 / flows[k] * i, k) for k, count in counts.items() for i in range(count))
-        found = [(float(k), 3600.0 / flows[k]) for _, k in slots[: self.vehicles]]
+        driving = [(float(k), 3600.0 / flows[k]) for _, k in slots[: self.vehicles]]
         # Shares that are rounded down leave a slot to spare: it never drives.
-        return (*found, *[(0.0, math.inf)] * (self.vehicles - len(found)))
+        return (*driving, *[(0.0, math.inf)] * (self.vehicles - len(driving)))
 
     def _trips(self, draw: Draw, dtype: torch.dtype) -> Trips:
         """Return trips at random headways, of which the first began before the episode did, in the order of time."""
         device = draw.key.device
         if self.table is not None:
-            given = self.table.trips(dtype)
-            return Trips(*(x.to(device).expand(len(draw.key), -1).contiguous() for x in given))
+            trips = Trips.from_table(self.table._asdict(), dtype)
+            return Trips(*(x.to(device).expand(len(draw.key), -1).contiguous() for x in trips))
         lane, mean = (torch.tensor(x, dtype=torch.float64, device=device) for x in zip(*self._slots, strict=True))
         some = mean.isfinite()
         shape = (len(draw.key), self.vehicles)
@@ -345,18 +344,18 @@ class OpenLanesTask(LanesTask):
         """
         state = world.state
         assert state.present is not None and state.trips is not None and state.links is not None
-        found, there = demand.counts(self.simulator, state), state.present > 0
+        counts, present = demand.counts(self.simulator, state), state.present > 0
         from_ramp = state.trips.lane == 0
-        still = from_ramp & there & (state.links.lane == 0)
+        still = from_ramp & present & (state.links.lane == 0)
         every = {
-            "queued": found.queued, "inside": found.inside, "outflow": found.left,
+            "queued": counts.queued, "inside": counts.inside, "outflow": counts.left,
             "ramp": (torch.where(from_ramp, state.trips.entered, 0) - still.long()).sum(-1),
-            "standing": (there & (state.speed < STANDS)).sum(-1),
-            "co2": CO2 * torch.where(there, fuel(state.speed, state.accel), 0.0).sum(-1),
+            "standing": (present & (state.speed < STANDS)).sum(-1),
+            "co2": CO2 * torch.where(present, fuel(state.speed, state.accel), 0.0).sum(-1),
         }  # fmt: skip
-        speeds = torch.where(there, state.speed, 0.0).sum(-1) / found.inside.clamp_min(1)
+        speeds = torch.where(present, state.speed, 0.0).sum(-1) / counts.inside.clamp_min(1)
         every["travel"] = (self.road.length or 0.0) / speeds.clamp_min(STANDS)
-        own = {**super().info(world), "present": self.pick(there)}
+        own = {**super().info(world), "present": self.pick(present)}
         return own | {n: x.unsqueeze(-1).expand(-1, len(self.agents)).contiguous() for n, x in every.items()}
 
     @property
@@ -411,168 +410,3 @@ class OpenLanesTask(LanesTask):
         who = f"vehicle {vehicle}" + (" (an agent)" if vehicle in self.agents else "")
         seconds = float(state.step[row]) * self.simulator.dt
         return f"{who} drove over the end of lane {int(state.links.lane[row, vehicle])} after {seconds:.1f} s"
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class OpenHighwayTask(OpenLanesTask):
-    """Several lanes, none of which ends: ``highway`` with vehicles that come and go, as in HighwayEnv's.
-
-    With a ramp lane 0 is that of the ramps, and the others are the road's. The on-ramp begins 300 m before one may
-    leave it, and ends where one may not; the off-ramp is left 200 m behind that.
-
-    Args:
-        lanes_count: Number of lanes, ramps not counted.
-        length: Length of the road (m).
-        inflow: Vehicles an hour on all lanes together.
-        on_ramp: Where one may merge from the on-ramp: ``[begin, end]`` (m); None is no such ramp.
-        off_ramp: Where one may change to the off-ramp: ``[begin, end]`` (m), behind the on-ramp.
-        ramp_inflow: Vehicles an hour on the on-ramp.
-        exits_share: Share of drivers who leave by the off-ramp; of a table those whose destination is ``exit``.
-    """
-
-    name: ClassVar[str] = "open_highway"
-
-    ranges: ClassVar[Mapping[str, Range]] = {
-        "lanes_count": Range(2, 100, whole=True),
-        "length": Range(100.0, 1e6, "m"),
-        "ramp_inflow": _FLOW,
-        "exits_share": Range(0.0, 1.0),
-    }
-
-    lanes_count: int = 4
-    length: float = 1000.0
-    inflow: float = 5000.0
-    on_ramp: Sequence[float] | None = None
-    off_ramp: Sequence[float] | None = None
-    ramp_inflow: float = 500.0
-    exits_share: float = 0.15
-
-    @cached_property
-    def _ramps(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-        on, off = (
-            None if x is None else span(name, x, 0.0, "m", self.length)
-            for name, x in (("on_ramp", self.on_ramp), ("off_ramp", self.off_ramp))
-        )
-        if on and off and off[0] <= on[1]:
-            raise ValueError(f"off_ramp = {list(off)} must begin behind the end of the on-ramp at {on[1]:g} m.")
-        return on, off
-
-    @cached_property
-    def road(self) -> Lanes:  # type: ignore[override]
-        """The road."""
-        on, off = self._ramps
-        ends: tuple[End, ...] = ()
-        if off:
-            leaves = min(off[1] + 200.0, float(self.length))
-            begin = max(on[0] - 300.0, 0.0) if on else off[0]
-            ends = (End(0, begin, leaves, closed=False, opens=on[0] if on else off[0], closes=off[1]),)
-        elif on:
-            ends = (on_ramp(0, *on, entry=max(on[0] - 300.0, 0.0)),)
-        return Lanes(self.lanes_count + bool(ends), length=float(self.length), ends=ends)
-
-    @cached_property
-    def rules(self) -> tuple[Effect, ...]:
-        """What the road tells its drivers."""
-        return (*super().rules, Destination()) if self._ramps[1] else super().rules
-
-    @property
-    def closed(self) -> Sequence[Mapping[str, Any]]:
-        """As they are given; between the ramps there is no lane 0."""
-        on, off = self._ramps
-        between = ({"lane": 0, "begin": on[1], "end": off[0]},) if on and off else ()
-        return (*self.closures, *between)
-
-    @property
-    def exits(self) -> Mapping[str, float]:
-        """The off-ramp."""
-        off = self._ramps[1]
-        return {"exit": off[1]} if off else {}
-
-    def params(self, dtype: torch.dtype, device: torch.device | str) -> dict[str, dict[str, Tensor]]:
-        """Return checked parameters as tensors, with who wants to leave by the off-ramp."""
-        values, off = super().params(dtype, device), self._ramps[1]
-        if not off:
-            return values
-        drawn = tuple(spread("exits_share", {"exit": self.exits_share}, self.vehicles, SECOND))
-        wanted = drawn if self.table is None else self.table.destination
-        leaves = torch.tensor([x == "exit" for x in wanted], device=device)
-        own = {
-            "first": torch.where(leaves, 0.0, 1.0), "last": torch.where(leaves, 0.0, 1000.0),
-            "place": torch.full((self.vehicles,), off[1], device=device),
-        }  # fmt: skip
-        mine = {name: x.to(dtype) for name, x in own.items()}
-        return {**values, "destination": {**values["destination"], **mine}}
-
-    @property
-    def inflows(self) -> Mapping[int, float]:
-        """The same for each lane, and the on-ramp's."""
-        first = self.road.count - self.lanes_count
-        own = dict.fromkeys(range(first, self.road.count), self.inflow / self.lanes_count)
-        return {0: self.ramp_inflow, **own} if self._ramps[0] else own
-
-    @property
-    def filled(self) -> float:
-        """Half of the road."""
-        return 0.5 * self.length
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MergeTask(OpenLanesTask):
-    """Two lanes, and a ramp on their right from which one must merge within 200 m; it begins at 100 m.
-
-    Args:
-        inflow: Vehicles an hour on the two lanes together.
-        ramp_inflow: Vehicles an hour on the ramp.
-    """
-
-    name: ClassVar[str] = "merge"
-    ranges: ClassVar[Mapping[str, Range]] = {"ramp_inflow": _FLOW}
-
-    inflow: float = 3000.0
-    ramp_inflow: float = 800.0
-
-    @cached_property
-    def road(self) -> Lanes:  # type: ignore[override]
-        """Two lanes of 900 m, and the ramp, which is lane 0."""
-        return Lanes(3, length=900.0, ends=(on_ramp(0, begin=400.0, end=600.0, entry=100.0),))
-
-    @property
-    def inflows(self) -> Mapping[int, float]:
-        """The ramp's, and half of the other for each lane."""
-        return {0: self.ramp_inflow, 1: 0.5 * self.inflow, 2: 0.5 * self.inflow}
-
-    @property
-    def filled(self) -> float:
-        """Up to where vehicles are when an episode begins (m)."""
-        return 350.0
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BottleneckTask(OpenLanesTask):
-    """Four lanes, of which the outer two end at 400 m and the left one of the others at 600 m: 4 → 2 → 1.
-
-    After the bottleneck of Flow (Vinitsky et al. 2018, CoRL, "Benchmarks for reinforcement learning in mixed-autonomy
-    traffic").
-
-    Args:
-        inflow: Vehicles an hour on all lanes together.
-    """
-
-    name: ClassVar[str] = "bottleneck"
-
-    inflow: float = 1900.0
-
-    @cached_property
-    def road(self) -> Lanes:  # type: ignore[override]
-        """The road, 800 m long."""
-        return Lanes(4, length=800.0, ends=(lane_drop(0, at=400.0), lane_drop(3, at=400.0), lane_drop(2, at=600.0)))
-
-    @property
-    def inflows(self) -> Mapping[int, float]:
-        """A quarter for each lane."""
-        return dict.fromkeys(range(4), 0.25 * self.inflow)
-
-    @property
-    def filled(self) -> float:
-        """Up to where vehicles are when an episode begins (m)."""
-        return 300.0

@@ -1,6 +1,7 @@
 """Trips as a table: who departs when, on which lane, how fast, of which class of drivers, and where to.
 
-A table is anything with columns (a ``DataFrame``, or a mapping of sequences), rows, or the path of a CSV file:
+A table is anything with columns (a ``DataFrame``, or a mapping of sequences), rows, or the path of a CSV file.
+``idm_env.types.Trips.from_table`` reads the first three columns:
 
 ===============  =======================================================================================================
 ``depart``       when the trip begins (s), from 0 on; of one lane in any order
@@ -27,7 +28,6 @@ from idm_env.types import Trips
 from idm_env.validation import finite, nearest, shown
 
 COLUMNS = ("depart", "lane", "speed", "class", "destination")
-USUAL_SPEED = 20.0
 FIRST, SECOND = 0.7548776662466927, 0.5698402909980532
 """Multiples of each are evenly spread, and go neither with each other nor with those by which desired speeds are."""
 
@@ -41,14 +41,6 @@ class TripTable(NamedTuple):
     kind: tuple[str, ...]
     destination: tuple[str, ...]
 
-    def trips(self, dtype: torch.dtype = torch.float32) -> Trips:
-        """Return the trips, a slot each."""
-        none = torch.zeros(len(self.depart), dtype=torch.int64)
-        return Trips(
-            torch.tensor(self.depart, dtype=dtype), torch.full((len(self.depart),), math.inf, dtype=dtype),
-            torch.tensor(self.lane), torch.tensor(self.speed, dtype=dtype), none, none.clone(),
-        )  # fmt: skip
-
 
 def read(given: Any) -> TripTable:
     """Return a table from columns, rows or a CSV file; ValueError, in one line, for what is none."""
@@ -56,28 +48,13 @@ def read(given: Any) -> TripTable:
     for name in columns:
         if name not in COLUMNS:
             raise ValueError(f"trips: column {shown(name)} is unknown.{nearest(str(name), COLUMNS)}")
-    for name in ("depart", "lane"):
-        if name not in columns:
-            raise ValueError(f"trips need a column '{name}'. Columns: {', '.join(COLUMNS)}.")
-    count = len(columns["depart"])
-    if not count or any(len(x) != count for x in columns.values()):
-        raise ValueError("trips: every column must have a value for each trip, and at least one.")
-    depart = [_number("depart", x, i, 0.0) for i, x in enumerate(columns["depart"])]
-    lane = [_number("lane", x, i, 0.0) for i, x in enumerate(columns["lane"])]
-    speed = [_number("speed", x, i, 1.0) for i, x in enumerate(columns.get("speed", [USUAL_SPEED] * count))]
-    if (bad := next((i for i, x in enumerate(lane) if x != int(x)), None)) is not None:
-        raise ValueError(f"trips: lane = {lane[bad]:g} of row {bad} must be a whole number.")
-    kind, destination = ([_name(x) for x in columns.get(n, [""] * count)] for n in ("class", "destination"))
-    rows = sorted(zip(depart, map(int, lane), speed, kind, destination, strict=True), key=lambda row: row[0])
-    return TripTable(*(tuple(column) for column in zip(*rows, strict=True)))
-
-
-def from_table(frame: Any, dtype: torch.dtype = torch.float32) -> Trips:
-    """Return the trips of a table, a slot each, in the order of departure; ValueError, in one line, for what is none.
-
-    Classes and destinations are the drivers', and stay in the table.
-    """
-    return read(frame).trips(dtype)
+    trips = Trips.from_table(columns, torch.float64)
+    departs = [float(x) for x in columns["depart"]]
+    order = sorted(range(len(departs)), key=departs.__getitem__)
+    none = [""] * len(departs)
+    kind, destination = (tuple(_name(columns.get(n, none)[i]) for i in order) for n in ("class", "destination"))
+    depart, lane, speed = (tuple(x.tolist()) for x in (trips.departs, trips.lane, trips.speed))
+    return TripTable(depart, lane, speed, kind, destination)
 
 
 def _columns(source: Any) -> dict[str, list[Any]]:
@@ -94,19 +71,9 @@ def _columns(source: Any) -> dict[str, list[Any]]:
         names = dict.fromkeys(name for row in source for name in row)
         return {str(name): [row.get(name) for row in source] for name in names}
     try:
-        return {str(name): list(source[name]) for name in source}
+        return {str(name): list(source[name]) for name in getattr(source, "columns", source)}
     except (TypeError, KeyError, IndexError):
         raise ValueError(f"trips = {shown(source)} must be a table, rows of it, or a CSV file.") from None
-
-
-def _number(name: str, value: Any, row: int, least: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not least <= number < math.inf:
-        raise ValueError(f"trips: {name} = {shown(value)} of row {row} must be a number of at least {least:g}.")
-    return number
 
 
 def _name(value: Any) -> str:
@@ -114,7 +81,7 @@ def _name(value: Any) -> str:
 
 
 def table(
-    per_hour: Mapping[int, Any], seconds: float, *, seed: int = 0, speed: float = USUAL_SPEED,
+    per_hour: Mapping[int, Any], seconds: float, *, seed: int = 0, speed: float = 20.0,
     classes: Mapping[str, float] | None = None, destinations: Mapping[str, float] | None = None,
 ) -> dict[str, list[Any]]:  # fmt: skip
     """Return a table of trips, as columns, with demand by lane and time.
@@ -176,4 +143,4 @@ def spread(name: str, given: Mapping[str, float], count: int, by: float = FIRST)
     return _of_shares(name, given, [(by * (i + 1)) % 1.0 for i in range(count)])
 
 
-__all__ = ["COLUMNS", "SECOND", "TripTable", "from_table", "read", "spread", "table"]
+__all__ = ["COLUMNS", "SECOND", "TripTable", "read", "spread", "table"]

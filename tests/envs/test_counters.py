@@ -8,6 +8,7 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
+import yaml
 
 from idm_env.envs.pettingzoo import parallel_env
 from idm_env.tasks import make_task
@@ -90,6 +91,27 @@ def test_every_face_tells_of_its_own_rows_and_begins_anew_with_an_episode():
     assert repr(first) != repr(second)
     vector.reset(seed=[5, None], options={"reset_mask": np.array([True, False])})
     assert vector.unwrapped.detectors[0] == [] and repr(vector.unwrapped.detectors[1]) == repr(second)
+
+
+def test_detectors_in_yaml_tell_what_those_in_python_do(tmp_path):
+    path = tmp_path / "jam.yaml"
+    path.write_text(yaml.safe_dump({"configures": "environment", **JAM}))
+    told = []
+    for given in ({"config": str(path)}, JAM):
+        env = gym.make("DiffIDM-v0", **given)
+        env.reset(seed=3)
+        for _ in range(10):
+            env.step(None)
+        told.append(repr(env.unwrapped.detectors))
+    assert told[0] == told[1] and "before the drop" in told[0]
+
+
+@pytest.mark.parametrize("asked", ["none", "co2", ("stops", "co2")])
+def test_nothing_is_counted_where_nobody_asks(asked):
+    env = gym.make("DiffIDM-v0", task="merge", vehicles=12, info=asked).unwrapped
+    env.reset(seed=1)
+    told = env.step(None)[4]
+    assert (env.batch.counters is None) == ("stops" not in asked) and ("stops" in told) == ("stops" in asked)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from idm_env.model_file import load_environment
 from idm_env.multilane import demand
 from idm_env.tasks import Draw, Task, make_task
 from idm_env.tasks import trip_table as table
-from idm_env.tasks.open_lanes import OpenHighwayTask
-from idm_env.types import Command
+from idm_env.tasks.open_roads import OpenHighwayTask
+from idm_env.types import Command, Trips
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS = [
@@ -43,7 +43,7 @@ def test_a_table_is_rows_columns_or_a_file(tmp_path: Path) -> None:
     full = [{"speed": 20.0, **row} for row in ROWS]
     tables = [table.read(x) for x in (full, pandas.DataFrame(full), path, str(path))]
     assert all(x == tables[0] for x in tables)
-    trips = table.from_table(full, torch.float64)
+    trips = Trips.from_table(pandas.DataFrame(full), torch.float64)
     assert trips.departs.tolist() == [5.0, 12.0, 30.0] and trips.lane.tolist() == [0, 2, 1]
     assert trips.speed.tolist() == [22.0, 25.0, 20.0] and bool(trips.again.isinf().all())
     assert tables[0].kind == ("", "", "truck") and tables[0].destination == ("", "", "exit")
