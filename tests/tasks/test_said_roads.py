@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
+import polars
 import pytest
 import torch
 
@@ -41,7 +42,8 @@ def test_a_table_is_rows_columns_or_a_file(tmp_path: Path) -> None:
         writer.writeheader()
         writer.writerows([{"speed": 20.0, **row} for row in ROWS])
     full = [{"speed": 20.0, **row} for row in ROWS]
-    tables = [table.read(x) for x in (full, pandas.DataFrame(full), path, str(path))]
+    frames = pandas.DataFrame(full), polars.DataFrame(full)
+    tables = [table.read(x) for x in (full, *frames, path, str(path))]
     assert all(x == tables[0] for x in tables)
     trips = Trips.from_table(pandas.DataFrame(full), torch.float64)
     assert trips.departs.tolist() == [5.0, 12.0, 30.0] and trips.lane.tolist() == [0, 2, 1]
