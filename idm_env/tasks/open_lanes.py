@@ -167,10 +167,10 @@ class OpenLanesTask(LanesTask):
     def filled(self) -> float:
         """Up to where vehicles are when an episode begins (m)."""
 
-    def _check_table(self, given: TripTable) -> None:
+    def _check_table(self, table: TripTable) -> None:
         """Raise ValueError for trips of this task that nobody could make."""
         horizon = self.steps * self.simulator.dt
-        for i, (depart, lane, destination) in enumerate(zip(given.depart, given.lane, given.destination, strict=True)):
+        for i, (depart, lane, destination) in enumerate(zip(table.depart, table.lane, table.destination, strict=True)):
             where = f"trips: row {i}, in the order of departure,"
             if depart > horizon:
                 raise ValueError(f"{where} departs at {depart:g} s, after the end of the episode at {horizon:g} s.")
