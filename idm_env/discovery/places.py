@@ -74,15 +74,14 @@ def respond(problem: Problem, solution: Solution) -> Responses:
     residual = problem.residual(problem.errors(theta, solution.model, values, pulses))
     change = (residual[1:] - residual[0]).reshape(len(WHATS), pieces, len(rows), -1) / PULSE
     middle = rows.start[:, None] + seconds * np.arange(pieces) + seconds // 2
-    signals = records.signals
-    place = signals[middle, 18]
+    place, speed = records.column("place")[middle], records.speed[middle]
     coordinates = {
         "position": np.mod(place, records.period) if records.period else place,
-        "time": signals[middle, 17],
-        "speed": signals[middle, 15],
-        "gap": signals[middle, 0] - signals[middle, 14],
-        "closing_speed": signals[middle, 15] - signals[middle, 1],
-        "lead_accel": signals[middle, 2],
+        "time": records.column("time")[middle],
+        "speed": speed,
+        "gap": records.gap[middle],
+        "closing_speed": speed - records.column("lead_speed")[middle],
+        "lead_accel": records.column("lead_accel")[middle],
         "relative_gap": relative_gap(solution, rows, middle),
     }
     linear = solution.linear
@@ -97,13 +96,13 @@ def respond(problem: Problem, solution: Solution) -> Responses:
 
 def relative_gap(solution: Solution, rows: Rows, at: np.ndarray) -> np.ndarray:
     """Return the gap over the one that each driver keeps, at samples [R, J]: the feature of that name."""
-    signals, catalogue = rows.records.signals, solution.model.catalogue
+    records, catalogue = rows.records, solution.model.catalogue
     theta = torch.from_numpy(np.exp(solution.theta[rows.group]))[..., None]
     own = {p.name: theta[:, i] for i, (_, p) in enumerate(catalogue.of_driver[: len(catalogue.base.parameters)])}
     driver = catalogue.base.driver(own)
-    speed = torch.from_numpy(signals[at, 15])
+    speed = torch.from_numpy(records.speed[at])
     desired = driver.min_gap + driver.extra_gap + driver.time_gap * speed
-    return np.clip((signals[at, 0] - signals[at, 14]) / desired.numpy(), 0.0, FREE)
+    return np.clip(records.gap[at] / desired.numpy(), 0.0, FREE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,7 +48,7 @@ def find(responses: Responses, seed: int) -> Shared | None:
     which an added acceleration explains most of that run, drivers re-calibrated.
     """
     rows, records = responses.rows, responses.rows.records
-    number = np.round(records.signals[rows.start, 17] / (rows.steps * records.dt)).astype(int)
+    number = np.round(records.column("time")[rows.start] / (rows.steps * records.dt)).astype(int)
     random = np.random.default_rng(seed)
     score, vehicles = np.full(len(records.runs), np.nan), np.zeros(len(records.runs), int)
     for run in range(len(records.runs)):
