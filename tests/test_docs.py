@@ -22,6 +22,7 @@ import torch
 
 from idm_env import IDM, Brakes, Lane, Replay, Simulator
 from idm_env.data import synthetic
+from idm_env.discovery.verdict import Verdict
 from idm_env.model_file import Model, save_model
 from idm_env.tasks import TASKS
 from idm_env.types import Record
@@ -254,6 +255,11 @@ def test_seven_questions_are_answered_two_clicks_from_the_readme() -> None:
         if words[page]:  # the others are made with the site, and looked at there: test_pages.py
             text = (ROOT / "docs" / page).read_text(encoding="utf-8")
             assert words[page] in text and (not place or f"## {place.replace('-', ' ').capitalize()}" in text), page
+
+
+def test_every_verdict_is_told_where_the_command_is() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| ", (ROOT / "docs/jobs/explain.md").read_text(), re.MULTILINE)
+    assert sorted(rows) == sorted(verdict.value for verdict in Verdict)
 
 
 def test_every_document_has_its_place_on_the_site() -> None:
