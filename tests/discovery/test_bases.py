@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -85,6 +86,12 @@ def test_another_law_is_completed_and_the_law_of_the_data_is_named_first(tmp_pat
     assert {e.name for e in saved["model_corrected.yaml"].effects} == {"iidm", "leader_acceleration", "brakes"}
     page = paths["report.html"].read_text()
     assert "Other laws on the same runs" in page and "or that improved IDM lacks something" in page
+    # Errors of the very data that a law is fitted to stand beside the null's of the same kind.
+    table = page[page.index("Other laws on the same runs") :]
+    for row in (row for row in rows[1:] if row["fitted_to_what_is_judged"]):
+        cell = table[table.index(f">{row['title']}</td>") :].split("<td", 2)[1].split(">")[1]
+        law, null = map(float, re.findall(r"[\d.]+", cell))
+        assert law / null == pytest.approx(row["against"]["gap_rmse_m"]["ratio"], rel=0.01), row["title"]
     assert found.report["reason"] == "law" and found.report["sentence"].startswith(
         "IDM predicts better than improved IDM"
     )
