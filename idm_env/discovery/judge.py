@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from idm_env.data import noise_sigma
-from idm_env.discovery import march, places
+from idm_env.discovery import places
 from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.noise import HEAVY
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
@@ -221,26 +221,23 @@ def ceiling(responses: places.Responses, prior_spread: float = 0.15) -> np.ndarr
     no names. The driver's own past is left out: it would tell of the driver's noise, which lasts.
     """
     rows = responses.rows
-    signals, dt = rows.records.signals, rows.records.dt
+    records, dt = rows.records, rows.records.dt
     pieces = responses.change.shape[1]
     second = max(1, round(1.0 / dt))
     middle = rows.start[:, None] + second * np.arange(pieces) + second // 2
-    column = {name: i for i, name in enumerate(march.COLUMNS)}
-
-    v = signals[middle, column["speed"]]
-    gap = signals[middle, column["lead_rear"]] - signals[middle, column["position"]]
-    closing = v - signals[middle, column["lead_speed"]]
-    now = [v / 10.0, 2.0 * np.log(np.maximum(gap, 0.5) / 15.0), closing / 2.0, signals[middle, column["lead_accel"]]]
+    v, gap, lead_speed = records.speed[middle], records.gap[middle], records.column("lead_speed")
+    closing, lead_accel = v - lead_speed[middle], records.column("lead_accel")[middle]
+    now = [v / 10.0, 2.0 * np.log(np.maximum(gap, 0.5) / 15.0), closing / 2.0, lead_accel]
     features = [*now, *(a * b for i, a in enumerate(now) for b in now[i:])]
     features += [a * b * c for a in now[:3] for b in now[:3] for c in now[:3]][::3]
     features += [np.abs(now[2]), np.minimum(now[3], 0.0)]
     for lag in (0.5, 1.0, 1.5):
-        j = np.maximum(middle - round(lag / dt), rows.records.bounds[rows.record][:, None])
-        change = (signals[j, column["lead_speed"]] - signals[middle, column["lead_speed"]]) / 2.0
+        j = np.maximum(middle - round(lag / dt), records.bounds[rows.record][:, None])
+        change = (lead_speed[j] - lead_speed[middle]) / 2.0
         features += [change, change * now[1], change * now[0], np.abs(change)]
     for name in ("second_speed", "behind_speed"):
-        present = signals[middle, column[name.replace("speed", "present")]]
-        features.append((signals[middle, column[name]] - signals[middle, column["speed"]]) / 3.0 * present)
+        present = records.column(name.replace("speed", "present"))[middle]
+        features.append((records.column(name)[middle] - v) / 3.0 * present)
     basis = np.clip(np.stack(features, axis=-1), -10.0, 10.0)
     scale = basis.std((0, 1)) + 1e-9
     keep = scale > 1e-6

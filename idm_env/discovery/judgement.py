@@ -102,12 +102,12 @@ class Judgement:
     @property
     def tried(self) -> str:
         """Plain names of ``terms``."""
-        return " and ".join(words.plain(t.effect or t.label) for t in self.terms)
+        return " and ".join(words.plain(t.name) for t in self.terms)
 
     @property
     def titles(self) -> tuple[str, ...]:
         """Plain names of the models: the null and, where there is one, the model beside it."""
-        null_terms = [words.plain(t.effect or t.label) for t in self.null.model.terms]
+        null_terms = [words.plain(t.name) for t in self.null.model.terms]
         lists = [null_terms] if self.compared is None else [null_terms, [*null_terms, self.tried]]
         law = self.null.model.catalogue.base.title
         return tuple(" with ".join([law, *([" and ".join(names)] if names else [])]) for names in lists)

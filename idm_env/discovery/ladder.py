@@ -15,7 +15,6 @@ from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from idm_env.discovery.judge import Judged
-from idm_env.discovery.march import COLUMNS
 from idm_env.discovery.records import Records, Rows, windows
 
 FEATURES = 200
@@ -213,34 +212,25 @@ def _drift(rows: Rows, error: np.ndarray) -> np.ndarray:
 
 def _scene(rows: Rows) -> np.ndarray:
     """Return the scene where a window begins [W, 9]: its state, the driver's usual gap, and the leader's next 5 s."""
-    signals, begin = rows.records.signals, rows.start
-    speed, lead, gap = _column(signals, begin, "speed"), _column(signals, begin, "lead_speed"), _gap(signals, begin)
+    records, begin = rows.records, rows.start
+    speed, gap, leader = records.speed[begin], records.gap[begin], records.column("lead_speed")
     headway = np.log(np.maximum(gap, 0.5) / (np.maximum(speed, 0.0) + 2.0))
-    ahead = [_column(signals, begin + round(share * rows.steps), "lead_speed") - lead for share in (0.2, 0.5, 1.0)]
+    # A window that is not whole may end behind the last record.
+    later = [np.minimum(begin + round(share * rows.steps), len(leader) - 1) for share in (0.2, 0.5, 1.0)]
+    ahead = [leader[sample] - leader[begin] for sample in later]
     usual = headway - _by_group(rows, headway)
-    return np.stack([speed, headway, usual, speed - lead, _column(signals, begin, "lead_accel"), np.log1p(gap.clip(0)),
-                     *ahead], axis=1)  # fmt: skip
+    return np.stack([speed, headway, usual, speed - leader[begin], records.column("lead_accel")[begin],
+                     np.log1p(gap.clip(0)), *ahead], axis=1)  # fmt: skip
 
 
 def _past(rows: Rows) -> np.ndarray:
     """Return how speed, gap and the leader's speed came about [W, 6]: their changes over ``PAST_S``."""
-    signals, begin = rows.records.signals, rows.start
+    records, begin = rows.records, rows.start
     past = []
     for seconds in PAST_S:
-        then = np.maximum(begin - round(seconds / rows.records.dt), rows.records.bounds[rows.record])
-        past += [_column(signals, begin, name) - _column(signals, then, name) for name in ("speed", "lead_speed")]
-        past.append(_gap(signals, begin) - _gap(signals, then))
+        then = np.maximum(begin - round(seconds / records.dt), records.bounds[rows.record])
+        past += [x[begin] - x[then] for x in (records.speed, records.column("lead_speed"), records.gap)]
     return np.stack(past, axis=1)
-
-
-def _column(signals: np.ndarray, sample: np.ndarray, name: str) -> np.ndarray:
-    result: np.ndarray = signals[np.minimum(sample, len(signals) - 1), COLUMNS.index(name)]
-    return result
-
-
-def _gap(signals: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    result: np.ndarray = _column(signals, sample, "lead_rear") - _column(signals, sample, "position")
-    return result
 
 
 def _share(rows: Rows, before: np.ndarray, after: np.ndarray, whole: np.ndarray) -> tuple[float, float, float]:

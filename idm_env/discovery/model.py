@@ -45,6 +45,11 @@ class Term:
     pinned: tuple[int, ...] = ()
 
     @property
+    def name(self) -> str:
+        """Name in the catalogue, or the label of what has none."""
+        return self.effect or self.label
+
+    @property
     def size(self) -> int:
         """Number of parameters."""
         return len(self.parameters)

@@ -161,7 +161,7 @@ def _with_history(signals: np.ndarray, speeds: np.ndarray, dt: float) -> np.ndar
         before[:, column[name]] = 0.0
     if len(speeds):
         before[:, column["accel"]] = np.gradient(np.append(speeds, signals[0, column["speed"]]), dt)[:-1]
-    before[:, 17] -= dt * np.arange(len(speeds), 0, -1)
+    before[:, column["time"]] -= dt * np.arange(len(speeds), 0, -1)
     return np.concatenate([before, signals])
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.signal import lfilter
 
 from idm_env.discovery import ladder
-from idm_env.discovery.march import COLUMNS
 from idm_env.discovery.model import Frozen, Hypothesis
 from idm_env.discovery.records import Records, Rows, whole, windows
 from idm_env.discovery.solve import Prior, Problem, Solution, solve
@@ -39,26 +38,28 @@ class NoisyDrivers:
 
     def drive(self, records: Records, random: np.random.Generator) -> Records:
         """Return the records that these drivers would have made behind the same leaders."""
-        signals, column = records.signals.copy(), {name: i for i, name in enumerate(COLUMNS)}
+        driven = replace(records, signals=records.signals.copy())
+        pushed, accel = driven.column("pushed"), driven.column("accel")
         keep = np.exp(-records.dt / self.memory_s)
         for r, (first, end) in enumerate(zip(records.bounds[:-1], records.bounds[1:], strict=True)):
             fresh = random.standard_normal(end - first)
             fresh[1:] *= np.sqrt(1.0 - keep**2)
             noise = lfilter([1.0], [1.0, -keep], fresh)
-            signals[first:end, column["pushed"]] = self.sigma[records.group[r]] * noise
-        rows = whole(replace(records, signals=signals), longest_s=np.inf, every_s=0.0)
+            pushed[first:end] = self.sigma[records.group[r]] * noise
+        rows = whole(driven, longest_s=np.inf, every_s=0.0)
         pulse = np.array([[1.0, 0.0, rows.steps, 1.0]])
         problem = Problem(rows, None, _no_prior(self.theta))
         gap, speed = (x[0][rows.valid] for x in problem.predict(self.theta[None], self.model, EMPTY, pulse))
         samples = rows.samples[rows.valid]
-        moved = signals[samples, column["lead_rear"]] - gap - signals[samples, column["position"]]
-        signals[samples, column["position"]] += moved
-        signals[samples, column["place"]] += moved
-        signals[samples, column["speed"]] = speed
+        moved = driven.column("lead_rear")[samples] - gap - driven.column("position")[samples]
+        for name in ("position", "place"):
+            driven.column(name)[samples] += moved
+        driven.speed[samples] = speed
         for first, end in zip(records.first, records.bounds[1:], strict=True):
-            signals[first:end, column["accel"]] = np.gradient(signals[first:end, column["speed"]], records.dt)
-        signals[:, column["pushed"]] = 1.0
-        return replace(records, signals=signals)
+            accel[first:end] = np.gradient(driven.speed[first:end], records.dt)
+        pushed[:] = 1.0
+        # ``gap`` of what was driven is that of other positions.
+        return replace(driven)
 
 
 def drivers_of(problem: Problem, solution: Solution) -> NoisyDrivers:

@@ -128,11 +128,12 @@ class Search:
         untried += [terms.given_profile(e) for e in self._sought("given") if e.name not in have]
         scored: list[Scored] = []
         responses = places.respond(self.problem, solution)
-        promised = {t.label: self._promise(solution, t)[0].max() for t in untried}
+        promises = [(t, self._promise(solution, t)) for t in untried]
         # What promises most comes first: all others need not be fitted to the end where they stay far behind it.
-        for i, term in enumerate(sorted(untried, key=lambda t: -promised[t.label])):
+        for i, (term, promise) in enumerate(sorted(promises, key=lambda pair: -pair[1][0].max())):
             self.on_progress(f"round {number}", i, len(untried) + 1, term.label)
-            scored.append(self._nested(solution, term, before, f"{number}/{term.label}", worth=_worth(scored)))
+            key, worth = f"{number}/{term.label}", _worth(scored)
+            scored.append(self._nested(solution, term, before, key, worth=worth, promise=promise))
         self.on_progress(f"round {number}", len(untried), len(untried) + 1, "places, times and shapes")
         scored += self._places(solution, responses, before, number, first, max(_worth(scored), WORTH))
         return scored, before
@@ -172,8 +173,12 @@ class Search:
         starts: Sequence[np.ndarray] | None = None,
         iterations: int = 8,
         worth: float = 0.0,
+        promise: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Scored:
-        """Score a term by a fit, which goes no further where even on the very data it gains less than ``worth``."""
+        """Score a term by a fit, which goes no further where even on the very data it gains less than ``worth``.
+
+        ``promise`` is that of these ``starts``, where it has been looked at.
+        """
         model = solution.model.adding(term)
         stored = self.saved.get(key)
         if stored is not None:
@@ -182,7 +187,7 @@ class Search:
             best = finish(self.problem, model, theta, values, linear, stored["cost"])
         else:
             starts = starts or [np.append(solution.values, s) for s in term.starts]
-            share, scaled = self._promise(solution, term, starts)
+            share, scaled = promise or self._promise(solution, term, starts)
             # Chance alone lowers the error by the number of parameters over that of the errors.
             if share.max() < FAINT + term.size / solution.linear.residual.size:
                 best = solve(self.problem, model, solution.theta, scaled[share.argmax()], iterations=1)

@@ -234,14 +234,12 @@ def _finding(
     contrast = contrast_of(compared, problem, term.label) if term.located and term.form == CURVE else None
     gains = np.array([s.gains for s in this.scored])
     close = [] if this.in_closed_loop else rivals(gains, winner, units(problem.rows.records).run)
-    equivalent, near = (
-        [this.scored[i].term.effect or this.scored[i].term.label for i in which] for which in (this.equivalent, close)
-    )
+    equivalent, near = ([this.scored[i].term.name for i in which] for which in (this.equivalent, close))
     effect = None if term.effect is None else ALL[term.effect]
     return result.TermFinding(
         effect=term.effect,
         label=term.label,
-        title=words.plain(term.effect or term.label),
+        title=words.plain(term.name),
         equation=words.CHANGES[term.what][3] if effect is None else effect.equation,
         clause=words.clause(term, intervals.tolist(), contrast, law),
         equivalent=equivalent,
@@ -281,7 +279,7 @@ def _candidate(number: int, this: Round, i: int) -> result.Candidate:
     return result.Candidate(
         round=number,
         errors="free simulation" if this.in_closed_loop else "windows",
-        effect=s.term.effect or s.term.label,
+        effect=s.term.name,
         named=s.term.effect is not None,
         p_value=float(this.tested.p_value[i]),
         held_out_gain=float(1.0 - np.exp(-this.tested.gain[i])),
