@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from idm_env.discovery import model as terms
-from idm_env.discovery.compare import Comparison, ErrorChange, compare
+from idm_env.discovery.compare import ERRORS, Comparison, ErrorChange, compare
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
@@ -120,6 +120,31 @@ def best_of(laws: Iterable[Law]) -> Law:
     """Return the law that predicts best of those that are better than the null, or the null."""
     first, *others = laws
     return min((law for law in others if law.is_better), key=lambda law: law.mean_ratio, default=first)
+
+
+class Use(NamedTuple):
+    """The law that errs least in one error, ``key``, and how all its errors compare with those of what is chosen."""
+
+    key: str
+    law: Law
+    against: dict[str, Comparison]
+
+
+def uses(laws: Iterable[Law], chosen: Judged, seed: int) -> list[Use]:
+    """Return the errors in which another law is better than the model that is ``chosen``: beyond chance, by ``LEAST``.
+
+    Laws that were not judged where they were not calibrated do not count.
+    """
+    fair = [law for law in laws if law.against and not law.at_best and law.errors is not chosen]
+    compared = [(law, compare(chosen, law.errors, seed)) for law in fair]
+    result = []
+    for key in ERRORS:
+        better = [
+            (law, c) for law, c in compared if c[key].outcome is ErrorChange.BETTER and c[key].ratio < 1.0 - LEAST
+        ]
+        if better:
+            result.append(Use(key, *min(better, key=lambda pair: pair[1][key].ratio)))
+    return result
 
 
 def rows(laws: Iterable[Law]) -> list[LawErrors]:

@@ -42,6 +42,7 @@ class TermFinding:
     """A term that was added, or that came nearest: an effect of the catalogue, or a label without a name.
 
     ``equivalent`` are candidates that these data do not tell from it, ``rivals`` such that gain no less beyond chance.
+    ``chosen_in_folds`` is the share of the folds of cross-fitting without which it would have been chosen, too.
     """
 
     effect: str | None
@@ -59,6 +60,7 @@ class TermFinding:
     p_value: float
     held_out_gain: float
     explained_share: float
+    chosen_in_folds: float
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,24 @@ class Round:
         shapes = (float(s.gains.mean()) for s in self.scored if s.term.fades)
         return max(0.0, float(self.left.mean()), *shapes)
 
+    def chosen_in(self, winner: int, fold: np.ndarray) -> float:
+        """Return the share of folds without whose units it, or what is ``equivalent``, gains most; ``fold`` [units].
+
+        Where that is 1, the errors of cross-fitting are those of a choice made anew without every fold. A candidate of
+        the catalogue goes before what is only located, as in the choice itself.
+        """
+        gains = np.array([s.gains for s in self.scored])
+        named = np.array([s.term.effect is not None for s in self.scored])
+        able = np.array([self.in_closed_loop or s.solution is not None for s in self.scored])
+        alike = [winner, *self.equivalent]
+        times = []
+        for k in np.unique(fold):
+            mean = np.where(able, gains[:, fold != k].mean(1), -np.inf)
+            of_name = np.where(named, mean, -np.inf)
+            first = (of_name if of_name.max() >= (1.0 - SAME) * mean.max() else mean).argmax()
+            times.append(first in alike)
+        return float(np.mean(times))
+
     @property
     def significant(self) -> bool:
         """Whether any candidate gained enough, beyond chance."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
-from idm_env.discovery import bases, judge, result, words
+from idm_env.discovery import bases, crossed, judge, result, words
 from idm_env.discovery.compare import DRAWS, unit_of
 from idm_env.discovery.judgement import Evaluation, Judgement
 from idm_env.discovery.ladder import Ladder
@@ -46,7 +46,7 @@ def summarise(
     compared, before, first, errors = judged.compared, judged.before, rounds[0], judged.errors
     law, base = judged.null.model.catalogue.base.title, len(judged.null.model.terms)
     final = compared if compared is not None and judged.added else judged.null
-    terms = [] if compared is None else _findings(compared, rounds, judged.intervals, base, problem, law)
+    terms = [] if compared is None else _findings(judged, compared, rounds, problem)
     added, nearest = (terms, []) if judged.added else ([], terms)
     test_runs = [] if evaluation.test is None else list(evaluation.test.runs)
     run = units(problem.rows.records).run
@@ -57,9 +57,15 @@ def summarise(
     sentence = words.headline(
         verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, strengths, law
     )
-    if judged.law is not None:
-        sentence = f"{words.law_first(judged.law, law, drivers[2])} {sentence}"
     after = judged.after if judged.added else before
+    best, name = (
+        (after, judged.titles[-1 if judged.added else 0])
+        if judged.law is None
+        else (judged.law.errors, judged.law.title)
+    )
+    uses = [] if best is None else bases.uses(laws, best, judged.seed)
+    of_law = "" if judged.law is None else words.law_first(judged.law, law, drivers[2])
+    sentence = " ".join(filter(None, (of_law, words.by_use(uses, name), sentence)))
     weight = decided.null_in_closed_loop
     return result.Result(
         schema=result.SCHEMA,
@@ -69,7 +75,7 @@ def summarise(
         details=[
             *words.details(verdict, added, nearest, 1.0 - float(np.exp(-first.smooth_gain))),
             *words.agreement(None if judged.ladder is None else judged.ladder.agreement),
-            *words.excluded(verdict, strengths), *words.by_use(laws, judged.law),
+            *words.excluded(verdict, strengths),
             *words.cautions(data.at_bounds, data.drivers),
         ],
         found=added,
@@ -208,20 +214,24 @@ def _where(term: Term, values: dict[str, float]) -> result.Location:
 
 
 def _findings(
-    compared: Solution, rounds: Sequence[Round], intervals: np.ndarray | None, base: int, problem: Problem, law: str
+    judged: Judgement, compared: Solution, rounds: Sequence[Round], problem: Problem
 ) -> list[result.TermFinding]:
-    """Return the terms of a model after the first ``base``; ``intervals`` [Q, 3] where they are not its own."""
-    intervals = interval_of(compared, problem) if intervals is None else intervals
-    findings, begin = [], sum(t.size for t in compared.model.terms[:base])
-    for term in compared.model.terms[base:]:
-        findings.append(_finding(term, compared, rounds, intervals[begin : begin + term.size], problem, law))
+    """Return the terms of the model that is ``compared`` after those of the null."""
+    intervals = interval_of(compared, problem) if judged.intervals is None else judged.intervals
+    counted, records = units(problem.rows.records), problem.rows.records
+    fold = crossed.folds_of(records.runs, (), judged.seed)[counted.run]
+    law = judged.null.model.catalogue.base.title
+    findings, begin = [], sum(t.size for t in judged.null.model.terms)
+    for term in judged.terms:
+        findings.append(_finding(term, compared, rounds, intervals[begin : begin + term.size], problem, law, fold))
         begin += term.size
     return findings
 
 
 def _finding(
-    term: Term, compared: Solution, rounds: Sequence[Round], intervals: np.ndarray, problem: Problem, law: str
-) -> result.TermFinding:
+    term: Term, compared: Solution, rounds: Sequence[Round], intervals: np.ndarray, problem: Problem, law: str,
+    fold: np.ndarray,
+) -> result.TermFinding:  # fmt: skip
     this, winner = next(
         (r, i)
         for r in rounds for i in (r.winner, r.partner, r.partial)
@@ -232,8 +242,8 @@ def _finding(
         for p, x in zip(term.parameters, intervals, strict=True)
     }
     contrast = contrast_of(compared, problem, term.label) if term.located and term.form == CURVE else None
-    gains = np.array([s.gains for s in this.scored])
-    close = [] if this.in_closed_loop else rivals(gains, winner, units(problem.rows.records).run)
+    gains, run = np.array([s.gains for s in this.scored]), units(problem.rows.records).run
+    close = [] if this.in_closed_loop else rivals(gains, winner, run)
     equivalent, near = ([this.scored[i].term.name for i in which] for which in (this.equivalent, close))
     effect = None if term.effect is None else ALL[term.effect]
     return result.TermFinding(
@@ -252,6 +262,7 @@ def _finding(
         p_value=float(this.tested.p_value[winner]),
         held_out_gain=float(1.0 - np.exp(-this.tested.gain[winner])),
         explained_share=this.share,
+        chosen_in_folds=this.chosen_in(winner, fold),
     )
 
 

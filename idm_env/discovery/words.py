@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from idm_env.discovery.bases import Law
+from idm_env.discovery.bases import Law, Use
 from idm_env.discovery.compare import Comparison, ErrorChange
 from idm_env.discovery.ladder import Agreement
 from idm_env.discovery.model import Term
@@ -256,7 +256,8 @@ def details(verdict: Verdict, found: Sequence[TermFinding], nearest: Sequence[Te
     parts = []
     for f in found:
         parts.append(
-            f"{f.title[0].upper()}{f.title[1:]}: p = {number(f.p_value, 2)} over the whole list of candidates."
+            f"{f.title[0].upper()}{f.title[1:]}: p = {number(f.p_value, 2)} over the whole list of candidates; first "
+            f"of it in {f.chosen_in_folds:.0%} of choices without a fold of the runs."
         )
         if f.equivalent:
             parts.append(f"These data cannot tell it from {', '.join(plain(x) for x in f.equivalent)}.")
@@ -360,23 +361,18 @@ def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
     )
 
 
-def by_use(laws: Sequence[Law], chosen: Law | None) -> list[str]:
-    """Say of every error which law is best for it, where that is another one and better beyond chance."""
+def by_use(uses: Sequence[Use], chosen: str) -> str:
+    """Say for which use another law than what is ``chosen``, by its title, is better beyond chance; "" for none."""
     sentences = []
-    for key, (name, _) in ERRORS.items():
-        fair = [law for law in laws if key in law.against and not law.at_best]
-        better = [law for law in fair if law.against[key].outcome is ErrorChange.BETTER]
-        best = min(better, key=lambda law: law.against[key].ratio, default=None)
-        if best is None or best is chosen:
-            continue
-        worse = [ERRORS[k][0] for k, c in best.against.items() if c.outcome is ErrorChange.WORSE]
-        but = f"; {' and '.join(worse)} worse" if worse else ""
-        title, c = best.title, best.against[key]
+    for key, law, against in uses:
+        worse = [ERRORS[k][0] for k, c in against.items() if c.outcome is ErrorChange.WORSE]
+        but = f"; it errs more in the {' and the '.join(worse)}" if worse else ""
+        c = against[key]
         sentences.append(
-            f"{title[:1].upper()}{title[1:]} errs least in the {name}: {percent(c.ratio)} "
+            f"For the {ERRORS[key][0]} {law.title} is better than {chosen}: {percent(c.ratio)} "
             f"(95 %: {percent(c.low)} to {percent(c.high)}){but}."
         )
-    return sentences
+    return " ".join(sentences)
 
 
 def _of_drivers(drivers: Solution) -> list[str]:

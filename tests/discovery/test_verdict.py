@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 
 from idm_env.data import Trajectories, episodes, synthetic
-from idm_env.discovery import Discovery, compare, crossed, discover, judge, page, verdict, words, write_report
+from idm_env.discovery import Discovery, bases, compare, crossed, discover, judge, page, verdict, words, write_report
 from idm_env.discovery import model as terms
 from idm_env.discovery.bases import Law, best_of
 from idm_env.discovery.calibrate import first_prior
@@ -22,6 +22,7 @@ from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.power import Strength
 from idm_env.discovery.records import gather
+from idm_env.discovery.selection import Round
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.verdict import Reason, Refusal, Verdict, conclude, improves
 from idm_env.effects import ALL, CANDIDATES, base_named
@@ -77,15 +78,40 @@ def test_a_law_is_better_where_an_error_is_lower_beyond_chance() -> None:
     assert best_of([null, gipps, law(BETTER, BETTER, SAME)]).mean_ratio == pytest.approx((0.9 * 0.9 * 0.99) ** (1 / 3))
     assert best_of([null, law(SAME, SAME, SAME)]) is null
     judgement = Judgement(None, None, False, Refusal(Reason.NO_GAIN), None, None, 0)  # type: ignore[arg-type]
-    soon = law(WORSE, replace(BETTER, ratio=0.7), SAME)
-    (told,) = words.by_use([null, gipps, soon], gipps)
-    assert told.startswith("Gipps' model errs least in the gap 5 s ahead: −30.0") and "free simulation worse." in told
-    assert words.by_use([null, gipps], gipps) == words.by_use([null], None) == []
     first = judgement.beside(gipps)
     assert first.law is gipps and first.refusal == Refusal(Reason.LAW) and judgement.beside(null) is judgement
     told = words.law_first(gipps, "IDM")
     assert told.startswith("Gipps' model predicts better than IDM calibrated alike: gap 5 s ahead −10.0")
     assert "explain --base gipps" in told
+
+
+def test_the_sentence_says_which_use_another_law_is_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond chance against the model that is chosen, and not by a trifle: that law was chosen among several."""
+    base = base_named("gipps")
+    of = errors(WORSE, replace(BETTER, ratio=0.7), SAME)
+    # Errors of laws are labels here, and how they compare is made up.
+    law = Law(base, Hypothesis((), Catalogue((), base, located=False)), "soon", of)  # type: ignore[arg-type]
+    found: dict[str, dict[str, Comparison]] = {"soon": of, "near": errors(SAME, replace(BETTER, ratio=0.98), SAME)}
+    monkeypatch.setattr(bases, "compare", lambda chosen, errors, seed: found[errors])
+    laws = [law._replace(against={}), law, law._replace(errors="near")]  # type: ignore[arg-type]
+    told = words.by_use(bases.uses(laws, "chosen", 0), "IDM")  # type: ignore[arg-type]
+    assert told.startswith("For the gap 5 s ahead Gipps' model is better than IDM: −30.0")
+    assert told.endswith("; it errs more in the gap in free simulation.") and told.count("Gipps") == 1
+    for others, chosen in ((laws[2:], "chosen"), (laws[:2], "soon"), ([law._replace(at_best=True)], "chosen")):
+        assert bases.uses(others, chosen, 0) == []  # type: ignore[arg-type]
+
+
+def test_a_choice_is_made_anew_without_every_fold() -> None:
+    """Two candidates, six runs in three folds: the first gains in one fold only."""
+    gains = np.array([[0.9, 0.9, 0.0, 0.0, 0.0, 0.0], [0.1] * 6])
+    scored = [
+        SimpleNamespace(gains=g, term=terms.simple(n), solution=1) for g, n in zip(gains, ("lag", "drag"), strict=True)
+    ]
+    this = Round(scored, None, None, None, 0)  # type: ignore[arg-type]
+    fold = np.array([1, 1, 2, 2, 3, 3])
+    assert this.chosen_in(0, fold) == pytest.approx(2 / 3) and this.chosen_in(1, fold) == pytest.approx(1 / 3)
+    this.equivalent = [1]
+    assert this.chosen_in(0, fold) == 1.0
 
 
 def test_the_verdict_is_made_from_what_was_added_and_why_not_more() -> None:
