@@ -17,7 +17,6 @@ from idm_env.data import Trajectories
 from idm_env.data.columns import with_step
 from idm_env.discovery import judge
 from idm_env.discovery.closed_loop import ClosedLoopFit
-from idm_env.discovery.model import Frozen
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.result import Ceilings
 from idm_env.discovery.solve import Problem, Solution, solve
@@ -79,7 +78,7 @@ def between_halves(at: ClosedLoopFit) -> float:
         return float("nan")
     rows = at.problem.rows
     other = replace(at.problem, rows=replace(rows, valid=at.scored))
-    theta = solve(other, Frozen(at.model, at.values), at.theta, np.zeros(0), iterations=10, tolerance=1e-4).theta
+    theta = solve(other, at.model.fixed(at.values), at.theta, np.zeros(0), iterations=10, tolerance=1e-4).theta
     names = [p.name for p in at.model.catalogue.own]
     if "time_gap" not in names:
         return float("nan")
@@ -94,7 +93,7 @@ def refitted(records: Records, null: Solution) -> float:
     for half in (second, rows.valid & ~second):
         own = replace(rows, valid=half)
         problem, theta = judge.unweighed(records, null.model, null.values, null.prior, own, null.theta)
-        errors = Problem(own, None, problem.prior).errors(theta[None], Frozen(null.model, null.values), empty)[0]
+        errors = Problem(own, None, problem.prior).errors(theta[None], null.model.fixed(null.values), empty)[0]
         square += float((errors**2).sum())
     return float(np.sqrt(square / rows.valid.sum()))
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from idm_env.discovery import judge
-from idm_env.discovery.model import Frozen, Hypothesis, Term
+from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.score import interval_of, log_gain, without_own_run
 from idm_env.discovery.solve import Linear, Prior, Problem, Solution, finish, linearise, solve
@@ -76,10 +76,10 @@ def evaluate(records: Records, model: Hypothesis, values: np.ndarray, prior: Pri
     are over-fitted, and an effect that only regularises them looks like a finding. So every model has the weight with
     which it predicts best what its drivers' parameters have not seen, on the validation runs.
     """
-    rows, frozen = whole(records).settled(), Frozen(model, values)
+    rows, frozen = whole(records).settled(), model.fixed(values)
     scored = judge.halves(rows)
     part = replace(rows, valid=rows.valid & ~scored)
-    problem = Problem(part, None, replace(prior, free=False))
+    problem = Problem(part, None, replace(prior, centre_follows=False))
     near = solve(problem, frozen, theta, np.zeros(0), iterations=15, tolerance=1e-4).theta
     heard = replace(problem, rows=replace(rows, valid=scored))
     fits: dict[float, tuple[Problem, Solution]] = {}
@@ -194,7 +194,7 @@ def gains(before: ClosedLoopFit, solution: Solution) -> np.ndarray:
 
 def in_windows(problem: Problem, solution: Solution) -> Solution:
     """Return a model that was fitted in free simulation as one of windows: φ stands, θ follows."""
-    frozen = Frozen(solution.model, solution.values)
+    frozen = solution.model.fixed(solution.values)
     theta = solve(problem, frozen, solution.theta, np.zeros(0)).theta
     linear = linearise(problem, solution.model, theta, solution.values)
     return finish(problem, solution.model, theta, solution.values, linear, solution.cost)

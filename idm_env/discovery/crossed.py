@@ -14,7 +14,7 @@ from idm_env.data import DataError
 from idm_env.discovery import closed_loop, judge
 from idm_env.discovery.calibrate import first_prior, population
 from idm_env.discovery.closed_loop import GRID_S, further
-from idm_env.discovery.model import Frozen, Hypothesis
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.score import without
@@ -55,7 +55,7 @@ class _Fold:
     """
 
     prior: Prior
-    frozen: Frozen
+    frozen: Hypothesis
     thetas: dict[float, np.ndarray]
     left: dict[float, np.ndarray]
 
@@ -98,7 +98,7 @@ def crossed(
     )
     second = judge.halves(rows)
     halves = [replace(rows, valid=part).settled() for part in (rows.valid & ~second, second)]
-    middle = Frozen(model, values.mean(0))
+    middle = model.fixed(values.mean(0))
     # Where every driver is the population's middle, no driver needs to be fitted to half of his time.
     near = np.stack([theta, theta]) if pooled else np.stack([
         solve(replace(problem, rows=half), middle, theta, EMPTY, iterations=10, tolerance=1e-4).theta for half in halves
@@ -108,7 +108,7 @@ def crossed(
     for k in np.unique(of_row):
         prior = population(theta, rows.some(of_row != k), own)
         mine = [half.some(of_row == k) for half in halves]
-        frozen = Frozen(model, values[k])
+        frozen = model.fixed(values[k])
         if pooled:
             everyone = np.broadcast_to(prior.centre, near.shape)
             parts[int(k)] = _Fold(prior, frozen, {POOLED_S: everyone}, {POOLED_S: np.ones(1)})
@@ -116,7 +116,7 @@ def crossed(
             parts[int(k)] = _weighed(mine, prior, frozen, near)
     gap, speed, thetas = _simulated(rows, second, fold, parts)
     short = windows(records)
-    problem = Problem(short, noise.alike(len(short)), first_prior(own))
+    problem = Problem(short, noise.unweighted(len(short)), first_prior(own))
     ahead = _predicted(problem, model, values, fold, thetas)
     if whitened is not False and not pooled:
         others = _whitened(problem, model, values, fold, theta)
@@ -155,7 +155,7 @@ def at_best(
     return judge.judge(records, model, values, theta), theta
 
 
-def _weighed(mine: list[Rows], prior: Prior, frozen: Frozen, near: np.ndarray) -> _Fold:
+def _weighed(mine: list[Rows], prior: Prior, frozen: Hypothesis, near: np.ndarray) -> _Fold:
     """Fit the drivers of a fold to each half of their time with every weight of the population."""
     thetas: dict[float, np.ndarray] = {}
     left: dict[float, np.ndarray] = {}
@@ -167,7 +167,7 @@ def _weighed(mine: list[Rows], prior: Prior, frozen: Frozen, near: np.ndarray) -
             begin = thetas[min(thetas, key=lambda s: abs(np.log(s / seconds)))] if thetas else near
             fitted, square = [], np.zeros(near.shape[1])
             for i, half in enumerate(mine):
-                problem = Problem(half, None, replace(prior, free=False, error_correlation_s=seconds))
+                problem = Problem(half, None, replace(prior, centre_follows=False, error_correlation_s=seconds))
                 problem = judge.scaled(problem, frozen, EMPTY, near[i])
                 fitted.append(solve(problem, frozen, begin[i], EMPTY, iterations=10, tolerance=1e-4).theta)
                 other_half = replace(problem, rows=mine[1 - i])
@@ -200,15 +200,15 @@ def _whitened(
     """Return log θ [2, G, P] of every fold, from whitened predictions 5 s ahead of each half of the drivers' blocks."""
     # The window before the first of a block is in the other half.
     rows = replace(problem.rows, joined=problem.rows.joined & (problem.rows.block == np.roll(problem.rows.block, 1)))
-    free, second = replace(problem, rows=rows, prior=replace(problem.prior, free=False)), rows.block % 2 == 1
-    all_time = solve(free, Frozen(model, values.mean(0)), theta, EMPTY, iterations=15, tolerance=1e-3).theta
+    free, second = replace(problem, rows=rows, prior=replace(problem.prior, centre_follows=False)), rows.block % 2 == 1
+    all_time = solve(free, model.fixed(values.mean(0)), theta, EMPTY, iterations=15, tolerance=1e-3).theta
     thetas = {}
     for k in np.unique(fold[rows.run]):
         mine = fold[rows.run] == k
-        prior = replace(population(all_time, rows.some(~mine), model.catalogue.own), free=False)
+        prior = replace(population(all_time, rows.some(~mine), model.catalogue.own), centre_follows=False)
         own = replace(free, prior=prior)
         thetas[int(k)] = np.stack([
-            solve(own.of_rows(mine & half), Frozen(model, values[k]), all_time, EMPTY, iterations=10).theta
+            solve(own.of_rows(mine & half), model.fixed(values[k]), all_time, EMPTY, iterations=10).theta
             for half in (~second, second)
         ])  # fmt: skip
     return thetas
@@ -223,8 +223,6 @@ def _predicted(
     for k, theta in thetas.items():
         mine = fold[rows.run] == k
         if mine.any():
-            both = Problem(rows.some(mine), None, problem.prior).errors(
-                theta, Frozen(model, values[k]), np.zeros((2, 0))
-            )
+            both = Problem(rows.some(mine), None, problem.prior).errors(theta, model.fixed(values[k]), np.zeros((2, 0)))
             ahead[mine] = np.take_along_axis(both[..., -1], copy[mine][None], 0)[0]
     return ahead

@@ -9,7 +9,7 @@ import numpy as np
 
 from idm_env.data import noise_sigma
 from idm_env.discovery import places
-from idm_env.discovery.model import Frozen, Hypothesis
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import HEAVY
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.solve import Prior, Problem, Solution, cost_of, solve
@@ -109,8 +109,8 @@ def unweighed(
     where that is of a model already ``calibrated`` on these records.
     """
     rows = (whole(records) if rows is None else rows).settled()
-    frozen, empty = Frozen(model, values), np.zeros(0)
-    problem = Problem(rows, None, replace(prior, free=False))
+    frozen, empty = model.fixed(values), np.zeros(0)
+    problem = Problem(rows, None, replace(prior, centre_follows=False))
     centre = np.tile(prior.centre, (problem.groups, 1))
     fits = [
         solve(problem, frozen, x, empty, iterations=25, tolerance=1e-5)
@@ -123,7 +123,7 @@ def unweighed(
 def weighed(problem: Problem, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Solution:
     """Return the calibration in which errors of ``error_correlation_s`` count as one, from a first fit [G, P]."""
     problem = scaled(problem, model, values, theta)
-    return solve(problem, Frozen(model, values), theta, np.zeros(0), iterations=25, tolerance=1e-5)
+    return solve(problem, model.fixed(values), theta, np.zeros(0), iterations=25, tolerance=1e-5)
 
 
 def scaled(problem: Problem, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Problem:
@@ -132,7 +132,7 @@ def scaled(problem: Problem, model: Hypothesis, values: np.ndarray, theta: np.nd
     They are as large as at log θ [G, P] and φ [Q].
     """
     rows = problem.rows
-    errors = problem.errors(theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
+    errors = problem.errors(theta[None], model.fixed(values), np.zeros((1, 0)))[0]
     square = (errors**2).sum(1) / np.maximum(rows.valid.sum(1), 1)
     correlated = problem.prior.error_correlation_s / (rows.every * rows.records.dt)
     return replace(problem, sigma=float(np.sqrt(max(np.median(square), 1e-4) * correlated)))
@@ -144,7 +144,7 @@ def closed_loop_squares(records: Records, s: Solution) -> np.ndarray:
     fitted = calibrate(records, model, values, prior, start=s.theta)
     rows = whole(records)
     problem = Problem(rows, None, prior)
-    errors = problem.errors(fitted.theta[None], Frozen(model, values), np.zeros((1, 0)))[0]
+    errors = problem.errors(fitted.theta[None], model.fixed(values), np.zeros((1, 0)))[0]
     return units(records).sums(rows.record, (np.clip(errors, -30.0, 30.0) ** 2).sum(1))
 
 
@@ -156,11 +156,11 @@ def confirmed(records: Records, problem: Problem, null: Solution, final: Solutio
     """
     rows = windows(records)
     assert problem.noise is not None
-    on_test = Problem(rows, problem.noise.alike(len(rows)), problem.prior)
+    on_test = Problem(rows, problem.noise.unweighted(len(rows)), problem.prior)
     squares = []
     for s in (null, final):
         start = np.tile(s.prior.centre, (on_test.groups, 1))
-        fitted = solve(on_test, Frozen(s.model, s.values), start, np.zeros(0), iterations=20)
+        fitted = solve(on_test, s.model.fixed(s.values), start, np.zeros(0), iterations=20)
         squares.append((np.minimum((fitted.linear.residual**2).mean(1), 9.0 * HEAVY**2)).sum())
     return float(0.5 * np.log(squares[0] / squares[1]))
 
@@ -169,9 +169,9 @@ def windowed(records: Records, problem: Problem, solution: Solution) -> tuple[Pr
     """Return a model in windows of all records, and its problem: φ as it stands, θ fitted, the noise of ``problem``."""
     assert problem.noise is not None
     rows = windows(records)
-    in_windows = Problem(rows, problem.noise.alike(len(rows)), replace(problem.prior, free=False))
+    in_windows = Problem(rows, problem.noise.unweighted(len(rows)), replace(problem.prior, centre_follows=False))
     start = np.tile(problem.prior.centre, (in_windows.groups, 1))
-    return in_windows, solve(in_windows, Frozen(solution.model, solution.values), start, np.zeros(0))
+    return in_windows, solve(in_windows, solution.model.fixed(solution.values), start, np.zeros(0))
 
 
 def halves(rows: Rows) -> np.ndarray:
@@ -188,7 +188,7 @@ def halves(rows: Rows) -> np.ndarray:
 
 def judge(records: Records, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Judged:
     """Return the errors of a model with log θ [G, P] and values [Q] on all of the records."""
-    rows, short, frozen, empty = whole(records), windows(records), Frozen(model, values), np.zeros((1, 0))
+    rows, short, frozen, empty = whole(records), windows(records), model.fixed(values), np.zeros((1, 0))
     prior = Prior(theta.mean(0), np.ones(theta.shape[-1]))
     gap, speed = (x[0] for x in Problem(rows, None, prior).predict(theta[None], frozen, empty))
     ahead = Problem(short, None, prior).errors(theta[None], frozen, empty)[0][:, -1]

@@ -81,11 +81,13 @@ class Hypothesis:
 
     terms: tuple[Term, ...] = ()
     catalogue: Catalogue = field(default_factory=march.default_catalogue)
+    fixed_phi: np.ndarray | None = None
+    """φ that stands, so that only the drivers' own parameters are left to fit."""
     entries: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         entries: list[int] = []
-        for term, slot in self._slots:
+        for term, slot in self._slots if self.fixed_phi is None else ():
             entries += term.entries(self.catalogue, slot)
         object.__setattr__(self, "entries", np.array(entries, dtype=np.int64))
 
@@ -105,6 +107,10 @@ class Hypothesis:
         """Return the model without a term."""
         return Hypothesis(self.terms[:index] + self.terms[index + 1 :], self.catalogue)
 
+    def fixed(self, values: np.ndarray) -> Hypothesis:
+        """Return the model with φ as the values [Q] of its parameters give it, the same for all copies and groups."""
+        return replace(self, fixed_phi=self.phi(values))
+
     def where(self, label: str) -> slice:
         """Return which entries are those of the term ``label``."""
         index = [t.label for t in self.terms].index(label)
@@ -119,7 +125,7 @@ class Hypothesis:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Declarations of all entries."""
-        return tuple(p for term in self.terms for p in term.parameters)
+        return () if self.fixed_phi is not None else tuple(p for term in self.terms for p in term.parameters)
 
     @property
     def named(self) -> list[Effect]:
@@ -147,6 +153,8 @@ class Hypothesis:
     def phi(self, values: np.ndarray) -> np.ndarray:
         """Return φ from the values of all parameters [..., Q]."""
         values = np.asarray(values, float)
+        if self.fixed_phi is not None:
+            return np.broadcast_to(self.fixed_phi, (*values.shape[:-1], len(self.fixed_phi)))
         phi = np.tile(self.catalogue.null, (*values.shape[:-1], 1))
         for term, slot in self._slots:
             if term.form == march.NONE:
@@ -163,25 +171,6 @@ class Hypothesis:
                 for name, weight in self.catalogue.shape(term.what, term.coordinate, str(slot), term.by)[1].items():
                     phi[..., self.catalogue.index[name]] = weight
         phi[..., self.entries] = values
-        return phi
-
-
-class Frozen(Hypothesis):
-    """A model whose φ stands: only the drivers' own parameters are left to fit."""
-
-    def __init__(self, model: Hypothesis, values: np.ndarray) -> None:
-        super().__init__(model.terms, model.catalogue)
-        object.__setattr__(self, "_phi", model.phi(values))
-        object.__setattr__(self, "entries", np.zeros(0, np.int64))
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """None."""
-        return ()
-
-    def phi(self, values: np.ndarray) -> np.ndarray:
-        """Return the same φ for every copy and group."""
-        phi: np.ndarray = np.broadcast_to(self._phi, (*values.shape[:-1], len(self._phi)))  # type: ignore[attr-defined]
         return phi
 
 

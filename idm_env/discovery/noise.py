@@ -47,7 +47,7 @@ class Noise:
         variance = (spread**2).sum(1)[: len(spread) - 2]
         return float(np.sqrt(max(variance[len(variance) // 2 - 1] - variance[0], 0.0)))
 
-    def alike(self, rows: int) -> Noise:
+    def unweighted(self, rows: int) -> Noise:
         """Return the same noise for so many other rows, of which none is weighed down."""
         return replace(self, weight=np.ones(rows))
 

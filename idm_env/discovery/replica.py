@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from idm_env.discovery import ladder
-from idm_env.discovery.model import Frozen, Hypothesis
+from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, Rows, whole, windows
 from idm_env.discovery.solve import Prior, Problem, Solution, solve
 
@@ -31,7 +31,7 @@ EMPTY = np.zeros((1, 0))
 class NoisyDrivers:
     """A calibrated model: φ stands in ``model``, log θ [G, P]; noise of σ [G] (m/s²) with a memory of τ (s)."""
 
-    model: Frozen
+    model: Hypothesis
     theta: np.ndarray
     sigma: np.ndarray
     memory_s: float
@@ -64,7 +64,7 @@ class NoisyDrivers:
 
 def drivers_of(problem: Problem, solution: Solution) -> NoisyDrivers:
     """Return a calibrated model of windows with its drivers' noise: as records driven with it look most alike."""
-    records, model = problem.rows.records, Frozen(solution.model, solution.values)
+    records, model = problem.rows.records, solution.model.fixed(solution.values)
     near, far, of_group = _increments(problem.rows, model, solution.theta)
     none = NoisyDrivers(model, solution.theta, np.zeros(problem.groups), MEMORIES_S[0])
     if near <= 0.0:

@@ -30,7 +30,9 @@ LONGEST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Log-normal prior of θ: centre [P] and width [P] of log θ; ``free`` lets the centre follow the drivers.
+    """Log-normal prior of θ: centre [P] and width [P] of log θ.
+
+    The centre moves with the drivers where ``centre_follows``.
 
     ``error_correlation_s`` is its weight in closed loop: errors of so many seconds count as one (``closed_loop``).
     ``seen`` are the groups that have data: their mean is the centre, so that a shift of all of them costs nothing.
@@ -38,7 +40,7 @@ class Prior:
 
     centre: np.ndarray
     width: np.ndarray
-    free: bool = True
+    centre_follows: bool = True
     error_correlation_s: float = 5.0
     seen: tuple[int, ...] = ()
 
@@ -49,7 +51,7 @@ class Prior:
 
     def following(self, own: Tensor) -> Prior:
         """Return the prior centred at the mean of the drivers [1, G, 5], if there are enough of them."""
-        if not self.free or len(self.seen) < 5:
+        if not self.centre_follows or len(self.seen) < 5:
             return self
         return replace(self, centre=own[0, list(self.seen)].mean(0).numpy())
 

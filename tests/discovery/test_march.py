@@ -15,7 +15,6 @@ import torch
 from idm_env.discovery import march
 from idm_env.discovery import model as terms
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.judge import Frozen
 from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, Rows, whole, windows
@@ -87,7 +86,7 @@ def twin(records: Records, model: Hypothesis, values: np.ndarray) -> np.ndarray:
     rows = whole(records)
     problem = Problem(rows, None, first_prior())
     theta = np.tile(THETA, (1, problem.groups, 1))
-    return problem.predict(theta, Frozen(model, values), np.zeros((1, 0)))[0][0]
+    return problem.predict(theta, model.fixed(values), np.zeros((1, 0)))[0][0]
 
 
 def modelled(term: Term | None) -> Hypothesis:
