@@ -89,10 +89,10 @@ class Arguments(common.Arguments):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, known in (("algorithm", ("ppo", "sac")), ("activation", tuple(ACTIVATIONS))):
-            if getattr(self, name) not in known:
+        for name, words in (("algorithm", ("ppo", "sac")), ("activation", tuple(ACTIVATIONS))):
+            if getattr(self, name) not in words:
                 value = getattr(self, name)
-                raise ValueError(f"{name} = '{value}' is unknown.{nearest(value, known)}")
+                raise ValueError(f"{name} = '{value}' is unknown.{nearest(value, words)}")
 
 
 class Normalised(BaseFeaturesExtractor):
@@ -126,9 +126,9 @@ class Desynchronised(SB3VecEnv):
         """Step ``hold`` times, and reset what ended; return observations, sums of rewards, dones and infos."""
         observation, reward, done, infos = super().step_wait()
         for _ in range(self.hold - 1):
-            observation, more, ended, told = super().step_wait()
+            observation, more, ended, details = super().step_wait()
             reward = np.where(done, reward, reward + more)
-            infos = [before if over else now for over, before, now in zip(done, infos, told, strict=True)]
+            infos = [before if over else now for over, before, now in zip(done, infos, details, strict=True)]
             done = done | ended
         return observation, reward, done, infos
 
@@ -171,15 +171,15 @@ class Shared(Desynchronised):
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Step, and reset what ended; return observations, rewards, dones and infos of every agent."""
         observation, reward, done, infos = super().step_wait()
-        told: list[dict[str, Any]] = []
+        details: list[dict[str, Any]] = []
         for info in infos:
             last = info.get("terminal_observation")
             rows = [None] * self.agents if last is None else last.reshape(self.agents, -1)
-            told += [info if row is None else {**info, "terminal_observation": row} for row in rows]
+            details += [info if row is None else {**info, "terminal_observation": row} for row in rows]
         reward, done = (np.repeat(x, self.agents) for x in (reward, done))
         observation = observation.reshape(self.num_envs, -1)
         away = False if self.present is None else observation[:, self.present] <= 0.0
-        return observation, reward, done | away, told
+        return observation, reward, done | away, details
 
 
 def present_in(task: Task) -> int | None:
@@ -195,38 +195,38 @@ _DRAWS = 100
 class OnTheRoad(RolloutBuffer):
     """PPO's samples, of which those count whose agent is on the road: its observation's ``present`` is above 0."""
 
-    def __init__(self, *given: Any, present: int, **keywords: Any) -> None:
+    def __init__(self, *sizes: Any, present: int, **keywords: Any) -> None:
         self.present = present
-        super().__init__(*given, **keywords)
+        super().__init__(*sizes, **keywords)
 
     def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
         """Yield batches without whoever is away, so that neither loss nor advantages' mean and deviation see him."""
         for samples in super().get(batch_size):
-            there = samples.observations[:, self.present] > 0.0
-            if int(there.sum()) > 1:
-                yield RolloutBufferSamples(*(part[there] for part in samples))
+            present = samples.observations[:, self.present] > 0.0
+            if int(present.sum()) > 1:
+                yield RolloutBufferSamples(*(part[present] for part in samples))
 
 
 class RoadReplay(ReplayBuffer):
     """SAC's memory, of which those samples are drawn whose agent was on the road."""
 
-    def __init__(self, *given: Any, present: int, **keywords: Any) -> None:
+    def __init__(self, *sizes: Any, present: int, **keywords: Any) -> None:
         self.present = present
-        super().__init__(*given, **keywords)
+        super().__init__(*sizes, **keywords)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw until so many are found; whoever is away at all draws of a memory that holds nobody else is taken."""
-        parts, found = list[list[Any]](), 0
+        parts, count = list[list[Any]](), 0
         for _ in range(_DRAWS):
-            drawn = super().sample(batch_size, env)
-            there = drawn.observations[:, self.present] > 0.0
-            parts.append([None if x is None else x[there] for x in drawn])
-            found += int(there.sum())
-            if found >= batch_size:
+            batch = super().sample(batch_size, env)
+            present = batch.observations[:, self.present] > 0.0
+            parts.append([None if x is None else x[present] for x in batch])
+            count += int(present.sum())
+            if count >= batch_size:
                 columns: Any = zip(*parts, strict=True)
                 cut: list[Any] = [None if x[0] is None else torch.cat(x)[:batch_size] for x in columns]
                 return ReplayBufferSamples(*cut)
-        return drawn
+        return batch
 
 
 class RoadRewards(VecNormalize):
@@ -239,9 +239,9 @@ class RoadRewards(VecNormalize):
     def _update_reward(self, reward: np.ndarray) -> None:
         """Count the returns of those who are there after a step."""
         self.returns = self.returns * self.gamma + reward
-        there = ... if self._present is None else self.old_obs[:, self._present] > 0.0  # type: ignore[index]
-        if np.size(self.returns[there]):
-            self.ret_rms.update(self.returns[there])
+        present = ... if self._present is None else self.old_obs[:, self._present] > 0.0  # type: ignore[index]
+        if np.size(self.returns[present]):
+            self.ret_rms.update(self.returns[present])
 
 
 def make_model(arguments: Arguments, env: VecEnv, policy: Policy, present: int | None = None) -> BaseAlgorithm:
@@ -319,7 +319,7 @@ MEMORY = ("observations", "next_observations", "actions", "rewards", "dones", "t
 def learned(model: BaseAlgorithm, env: VecNormalize) -> dict[str, Any]:
     """Return what learning goes on with, as tensors and numbers."""
     rewards = env.ret_rms
-    kept: dict[str, Any] = {
+    state: dict[str, Any] = {
         "schema": common.SCHEMA,
         "parameters": model.get_parameters(),
         "variables": {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]},
@@ -329,25 +329,25 @@ def learned(model: BaseAlgorithm, env: VecNormalize) -> dict[str, Any]:
     }
     if isinstance(model, SAC):
         memory: Any = model.replay_buffer
-        kept["memory"] = {name: torch.from_numpy(getattr(memory, name)[: memory.size()]) for name in MEMORY}
-        kept["place"] = memory.pos
-    return kept
+        state["memory"] = {name: torch.from_numpy(getattr(memory, name)[: memory.size()]) for name in MEMORY}
+        state["place"] = memory.pos
+    return state
 
 
-def goes_on(model: BaseAlgorithm, env: VecNormalize, kept: dict[str, Any]) -> None:
+def goes_on(model: BaseAlgorithm, env: VecNormalize, state: dict[str, Any]) -> None:
     """Put what ``learned`` returned into a new model."""
-    model.set_parameters(kept["parameters"], device="cpu")
-    for name, value in kept["variables"].items():
+    model.set_parameters(state["parameters"], device="cpu")
+    for name, value in state["variables"].items():
         getattr(model, name).data.copy_(value)
-    model.num_timesteps, model._n_updates = int(kept["steps"]), int(kept["updates"])
-    mean, variance, count = kept["returns"]
+    model.num_timesteps, model._n_updates = int(state["steps"]), int(state["updates"])
+    mean, variance, count = state["returns"]
     env.ret_rms.mean, env.ret_rms.var, env.ret_rms.count = np.asarray(mean), np.asarray(variance), count
     if isinstance(model, SAC):
         memory: Any = model.replay_buffer
         for name in MEMORY:
-            rows = kept["memory"][name].numpy()
+            rows = state["memory"][name].numpy()
             getattr(memory, name)[: len(rows)] = rows
-        memory.pos, memory.full = int(kept["place"]), len(rows) == memory.buffer_size
+        memory.pos, memory.full = int(state["place"]), len(rows) == memory.buffer_size
 
 
 def train(arguments: Arguments) -> list[dict[str, Any]]:
@@ -357,16 +357,16 @@ def train(arguments: Arguments) -> list[dict[str, Any]]:
     name = arguments.algorithm
     squash = "tanh" if name == "sac" else "clip"
     policy, saved = common.begin(arguments, name, activation=arguments.activation, squash=squash)
-    made = environments.make_env(arguments.trained_in, arguments.count, output="numpy")
-    present = present_in(made.task)
-    alone = len(made.task.agents) == 1 and present is None
-    vector = (Desynchronised if alone else Shared)(made, arguments.hold)
+    environment = environments.make_env(arguments.trained_in, arguments.count, output="numpy")
+    present = present_in(environment.task)
+    is_single = len(environment.task.agents) == 1 and present is None
+    vector = (Desynchronised if is_single else Shared)(environment, arguments.hold)
     # Returns of 1/(1 − γ) rewards are large: both algorithms get rewards over the running deviation of returns.
     env = RoadRewards(vector, present, arguments.gamma)
     file, model = arguments.out / "learner.pt", make_model(arguments, env, policy, present)
     if saved:
         storage.read(file, lambda path: goes_on(model, env, torch.load(path, weights_only=True)), storage.AFRESH)
-    elif arguments.clone or made.task.as_driver:
+    elif arguments.clone or environment.task.as_driver:
         for mine, other in layers(model, policy):
             other.load_state_dict(mine.state_dict())
     chunk = arguments.n_steps * vector.num_envs

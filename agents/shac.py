@@ -80,12 +80,12 @@ def _gaps(view: AgentView) -> Tensor:
     return view.state.gap.clamp_max(_FAR)
 
 
-def _mean(of: Callable[[AgentView], Tensor], view: AgentView) -> Tensor:
-    return view.mean(of(view))
+def _mean(column: Callable[[AgentView], Tensor], view: AgentView) -> Tensor:
+    return view.mean(column(view))
 
 
-def _deviation(of: Callable[[AgentView], Tensor], view: AgentView) -> Tensor:
-    x = of(view)
+def _deviation(column: Callable[[AgentView], Tensor], view: AgentView) -> Tensor:
+    x = column(view)
     return (view.mean((x - x.mean(-1, keepdim=True)).square()) + 2.25e-4).sqrt()
 
 
@@ -178,18 +178,18 @@ class Window:
 def roll(env: DiffIDMVectorEnv, sighted: Sighted, target: nn.Module, a: Arguments) -> Window:
     """Drive one window and return it, its gain with the graph; ``env`` is one of ``with_road``."""
     push = a.explore * torch.randn(env.num_envs, 1)
-    told = env.unroll(sighted, a.window, push)
-    ended = told.terminated | told.truncated
-    value = torch.where(told.terminated, 0.0, target(sighted.scene(told.final)))
+    unrolled = env.unroll(sighted, a.window, push)
+    ended = unrolled.terminated | unrolled.truncated
+    value = torch.where(unrolled.terminated, 0.0, target(sighted.scene(unrolled.final)))
     # How many steps of its episode have gone before, within the window.
     step = torch.arange(a.window).unsqueeze(-1)
     begun = torch.where(ended, step + 1, 0).cummax(0).values.roll(1, 0)
     begun[0] = 0
-    discount = a.gamma ** (step - begun).to(told.reward.dtype)
+    discount = a.gamma ** (step - begun).to(unrolled.reward.dtype)
     last = ended | (step == a.window - 1)
-    gains = (1.0 - a.gamma) * discount * told.reward + torch.where(last, a.gamma * discount * value, 0.0)
-    scenes = sighted.scene(told.observation[:-1]).detach()
-    return Window(scenes, told.reward.detach(), value.detach(), ended, gains.sum(0))
+    gains = (1.0 - a.gamma) * discount * unrolled.reward + torch.where(last, a.gamma * discount * value, 0.0)
+    scenes = sighted.scene(unrolled.observation[:-1]).detach()
+    return Window(scenes, unrolled.reward.detach(), value.detach(), ended, gains.sum(0))
 
 
 def returns(window: Window, gamma: float, lam: float) -> Tensor:
@@ -210,11 +210,11 @@ def learn_values(
     critic: nn.Module, optimiser: torch.optim.Optimizer, window: Window, a: Arguments, update: int, kept: Path
 ) -> float:
     """Fit the critic to a window's returns; return the last mean squared error. DivergedError as ``descend``."""
-    scenes, wanted = window.scenes.flatten(0, 1), returns(window, a.gamma, a.lam).flatten()
+    scenes, targets = window.scenes.flatten(0, 1), returns(window, a.gamma, a.lam).flatten()
     error = torch.zeros(())
     for _ in range(a.critic_epochs):
-        for part in torch.randperm(len(wanted)).chunk(4):
-            error = (critic(scenes[part]) - wanted[part]).square().mean()
+        for part in torch.randperm(len(targets)).chunk(4):
+            error = (critic(scenes[part]) - targets[part]).square().mean()
             common.descend(error, critic.parameters(), optimiser, a.clip, update, kept)
     return float(error.detach())
 

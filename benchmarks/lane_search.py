@@ -79,8 +79,8 @@ class Drivers(nn.Module):
 
     def _accel(self, speed: Tensor, lead_speed: Tensor, gap: Tensor, *numbers: Tensor) -> Tensor:
         v0, time_gap, s0, a, b = numbers
-        kept = interaction(Driver(a, b, time_gap, s0, v0), speed, gap.clamp_min(0.5), lead_speed)
-        return a * (1.0 - (speed / v0) ** 4 - kept)
+        restraint = interaction(Driver(a, b, time_gap, s0, v0), speed, gap.clamp_min(0.5), lead_speed)
+        return a * (1.0 - (speed / v0) ** 4 - restraint)
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class Part:
         return {**DEMANDS[self.name], **added}
 
 
-def task_of(given: dict[str, Any]) -> OpenLanesTask:
+def task_of(environment: dict[str, Any]) -> OpenLanesTask:
     """Return the task."""
-    task = episodes_start(given, 1).task
+    task = episodes_start(environment, 1).task
     assert isinstance(task, OpenLanesTask)
     return task
 
@@ -117,49 +117,49 @@ def numbers_of(shares: Tensor) -> Tensor:
     return low + (high - low) * shares
 
 
-def driven(given: dict[str, Any], log: Tensor, episodes: int, draw: int) -> list[Found]:
+def driven(environment: dict[str, Any], log: Tensor, episodes: int, draw: int) -> list[Found]:
     """Return the figures of each of some drivers in the same episodes."""
-    start = episodes_start(given, episodes, len(log), draws=(draw,))
+    start = episodes_start(environment, episodes, len(log), draws=(draw,))
     act: Act = Drivers(log, start.task.command_limits[1], episodes)
     return judge_lanes(start, act, len(log))
 
 
-def returns(given: dict[str, Any], log: Tensor, episodes: int, draw: int) -> Tensor:
+def returns(environment: dict[str, Any], log: Tensor, episodes: int, draw: int) -> Tensor:
     """Return the mean return (vehicle-hours) of each of some drivers; a crash is worse than any delay."""
-    found = driven(given, log, episodes, draw)
-    return torch.tensor([row["reward"] / 3600.0 - 1e3 * row["collisions"] for row in found])
+    rows = driven(environment, log, episodes, draw)
+    return torch.tensor([row["reward"] / 3600.0 - 1e3 * row["collisions"] for row in rows])
 
 
-def blind(given: dict[str, Any], seed: int) -> Tensor:
+def blind(environment: dict[str, Any], seed: int) -> Tensor:
     """Return the best driver of a random search, ``(1, 1, 5)``."""
     generator = torch.Generator().manual_seed(seed)
     log = numbers_of(torch.rand(ROUNDS[0][0], 1, 5, generator=generator))
     for i, (count, episodes) in enumerate(ROUNDS):
         left = ROUNDS[i + 1][0] if i + 1 < len(ROUNDS) else 1
-        log = log[returns(given, log[:count], episodes, 1000 + 500 * seed + i).topk(left).indices]
+        log = log[returns(environment, log[:count], episodes, 1000 + 500 * seed + i).topk(left).indices]
     return log
 
 
-def evolved(given: dict[str, Any], seed: int) -> Tensor:
+def evolved(environment: dict[str, Any], seed: int) -> Tensor:
     """Return the mean of the last generation of CMA-ES, ``(1, lanes, 5)``."""
     import cma
 
-    lanes, (low, high) = task_of(given).road.count, numbers_of(torch.tensor([[0.0] * 5, [1.0] * 5]))
+    lanes, (low, high) = task_of(environment).road.count, numbers_of(torch.tensor([[0.0] * 5, [1.0] * 5]))
     begin = ((torch.tensor(HUMAN).log() - low) / (high - low)).clamp(0.05, 0.95).repeat(lanes).tolist()
     options = {"seed": seed + 1, "bounds": [0.0, 1.0], "verbose": -9, "popsize": DRIVERS}
     search = cma.CMAEvolutionStrategy(begin, 0.2, options)
     for generation in range(GENERATIONS):
-        asked = search.ask()
-        log = numbers_of(torch.from_numpy(np.array(asked, np.float32)).view(DRIVERS, lanes, 5))
-        search.tell(asked, (-returns(given, log, EPISODES, 1001 + 500 * seed + generation)).tolist())
+        population = search.ask()
+        log = numbers_of(torch.from_numpy(np.array(population, np.float32)).view(DRIVERS, lanes, 5))
+        search.tell(population, (-returns(environment, log, EPISODES, 1001 + 500 * seed + generation)).tolist())
     return numbers_of(torch.tensor(search.result.xfavorite, dtype=torch.float32).view(1, lanes, 5))
 
 
-def pathwise(given: dict[str, Any], seed: int) -> Tensor:
+def pathwise(environment: dict[str, Any], seed: int) -> Tensor:
     """Return what gradients through traffic make of humans, ``(1, lanes, 5)``; their choices of lanes are frozen."""
-    task = task_of(given)
+    task = task_of(environment)
     drivers = Drivers(torch.tensor(HUMAN).log().repeat(1, task.road.count, 1), task.command_limits[1], 1)
-    env = make_env(given, ROWS, output="torch")
+    env = make_env(environment, ROWS, output="torch")
     env.reset(seed=1000 * seed + 5)
     optimiser = torch.optim.Adam(drivers.parameters(), lr=RATE)
     for update in range(UPDATES):
@@ -178,16 +178,16 @@ FOUND_BY = {"random search": blind, "evolution": evolved, "gradients": pathwise}
 def network(part: Part) -> dict[str, Any]:
     """Return the row of a policy of ``agents``, trained as its file says but for where."""
     module: Any = importlib.import_module(f"agents.{part.how}")
-    given = {name: x for name, x in part.given.items() if name != "observation"}
+    environment = {name: x for name, x in part.given.items() if name != "observation"}
     with TemporaryDirectory() as folder:
         arguments = load_agent(CONFIGS / f"merge-{part.how}.yaml", module.Arguments, part.how)
         updates, seconds = round(part.budget * arguments.updates), part.budget * arguments.cpu_seconds
         own = {"updates": updates, "evaluate_every": updates, "cpu_seconds": seconds}
-        arguments = replace(arguments, environment=given, seed=part.seed, out=Path(folder), **own)
+        arguments = replace(arguments, environment=environment, seed=part.seed, out=Path(folder), **own)
         spent = module.train(arguments)[-1]["cpu_seconds"]
         policy, _ = load(arguments.out / "last.pt")
-    found = judge_lanes(episodes_start(given, JUDGED_ON, draws=(1,)), policy, 1)[0]
-    return {"seconds": spent, "numbers": None, "found": found}
+    figures = judge_lanes(episodes_start(environment, JUDGED_ON, draws=(1,)), policy, 1)[0]
+    return {"seconds": spent, "numbers": None, "found": figures}
 
 
 def row_of(part: Part, on_progress: OnProgress) -> dict[str, Any]:
@@ -196,13 +196,13 @@ def row_of(part: Part, on_progress: OnProgress) -> dict[str, Any]:
     if part.how in NETWORKS:
         return network(part)
     if part.how == "humans":
-        found = judge_lanes(episodes_start(part.given, JUDGED_ON, draws=(1,)), None, 1)[0]
-        return {"seconds": 0.0, "numbers": None, "found": found}
+        figures = judge_lanes(episodes_start(part.given, JUDGED_ON, draws=(1,)), None, 1)[0]
+        return {"seconds": 0.0, "numbers": None, "found": figures}
     begin = time.process_time()
     log = FOUND_BY[part.how](part.given, part.seed)
     spent = time.process_time() - begin
-    found = driven(part.given, log, JUDGED_ON, 1)[0]
-    return {"seconds": spent, "numbers": log.exp().tolist(), "found": found}
+    figures = driven(part.given, log, JUDGED_ON, 1)[0]
+    return {"seconds": spent, "numbers": log.exp().tolist(), "found": figures}
 
 
 def shown(title: str, rows: dict[Part, dict[str, Any]]) -> Table:
@@ -212,12 +212,12 @@ def shown(title: str, rows: dict[Part, dict[str, Any]]) -> Table:
         table.add_column(head)
     humans = torch.tensor(next(row for part, row in rows.items() if part.how == "humans")["found"]["rewards"])
     for part, row in rows.items():
-        found = row["found"]
-        more = (torch.tensor(found["rewards"]) - humans) / 3600.0
+        figures = row["found"]
+        more = (torch.tensor(figures["rewards"]) - humans) / 3600.0
         half = STUDENT * float(more.std()) / len(more) ** 0.5
         table.add_row(
-            part.how, str(part.seed), f"{found['reward'] / 3600.0:.2f}", f"{float(more.mean()):+.2f} ± {half:.2f}",
-            f"{found['outflow']:.0f}", f"{found['ramp']:.0f}", str(found["collisions"]), f"{row['seconds']:.0f}",
+            part.how, str(part.seed), f"{figures['reward'] / 3600.0:.2f}", f"{float(more.mean()):+.2f} ± {half:.2f}",
+            f"{figures['outflow']:.0f}", f"{figures['ramp']:.0f}", str(figures["collisions"]), f"{row['seconds']:.0f}",
         )  # fmt: skip
     return table
 
@@ -238,9 +238,9 @@ def main(
         out: File of rows.
         place: Where searches run.
     """
-    wanted = [("humans", 0), *((way, seed) for seed in range(seeds) for way in how)]
+    searches = [("humans", 0), *((way, seed) for seed in range(seeds) for way in how)]
     budgets = dict.fromkeys(NETWORKS, budget)
-    rows = [Part(name, share, way, seed, budgets.get(way, 1.0)) for way, seed in wanted]
+    rows = [Part(name, share, way, seed, budgets.get(way, 1.0)) for way, seed in searches]
     parts = {str(part): part for part in rows}
     done = named_rows(row_of, parts, out, place)
     Console(width=140).print(shown(name, {part: done[label] for label, part in parts.items()}))

@@ -226,12 +226,13 @@ def shown(name: str, rows: dict[str, Found]) -> Table:
     for head in ("row", "return, vehicle-h", "more than humans", "out, 1/h", "ramp, 1/h", "crashes", "CPU s"):
         table.add_column(head)
     humans = torch.tensor(rows["humans"]["rewards"])
-    for who, found in rows.items():
-        more = (torch.tensor(found["rewards"]) - humans) / 3600.0
+    for who, figures in rows.items():
+        more = (torch.tensor(figures["rewards"]) - humans) / 3600.0
         half = 2.040 * float(more.std()) / JUDGED_ON**0.5  # Student's t of 31 degrees of freedom
         table.add_row(
-            who, f"{found['reward'] / 3600.0:.2f}", f"{float(more.mean()):+.2f} ± {half:.2f}",
-            f"{found['outflow']:.0f}", f"{found['ramp']:.0f}", str(found["collisions"]), f"{found['seconds']:.0f}",
+            who, f"{figures['reward'] / 3600.0:.2f}", f"{float(more.mean()):+.2f} ± {half:.2f}",
+            f"{figures['outflow']:.0f}", f"{figures['ramp']:.0f}", str(figures["collisions"]),
+            f"{figures['seconds']:.0f}",
         )  # fmt: skip
     return table
 

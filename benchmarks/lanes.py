@@ -323,7 +323,7 @@ def picture(found: Rows, path: Path) -> None:
     for axis in axes[0]:
         axis.grid(alpha=0.25)
     path.parent.mkdir(parents=True, exist_ok=True)
-    storage.write(path, lambda beside: figure.savefig(beside, dpi=110))
+    storage.write(path, lambda file: figure.savefig(file, dpi=110))
 
 
 def flow(path: Path = Path("out/lanes-flow.png"), place: Place = HERE) -> None:

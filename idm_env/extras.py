@@ -16,10 +16,13 @@ OF = {
 
 @contextmanager
 def needed(what: str) -> Iterator[None]:
-    """Import in here what an extra installs: where it is missing the ImportError names ``what`` and the cure."""
+    """Import in here what an extra installs: where it is missing the ImportError names ``what`` and the cure.
+
+    Of one within another the outer has its say: a command is what somebody asked for, not the loop that it runs.
+    """
     try:
         yield
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         name = (error.name or "").partition(".")[0]
         if name not in OF:
             raise

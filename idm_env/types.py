@@ -27,6 +27,9 @@ Tree = TypeVar("Tree")
 FAR = 1e4
 """Gap to a neighbour that is not there (m): finite, so that nothing downstream meets an infinity."""
 
+ENTRY_SPEED = 20.0
+"""Speed that a trip asks for at the entry (m/s), where nothing else is said."""
+
 Params = Mapping[str, Mapping[str, Tensor]]
 """Effect name → parameter name → tensor that broadcasts against ``(..., vehicles)``."""
 
@@ -90,7 +93,7 @@ class Trips(NamedTuple):
             raise ValueError("trips: every column must have a value for each trip, and at least one.")
         numbers = []
         for name, least in (("depart", 0.0), ("lane", 0.0), ("speed", 1.0)):
-            column = list(frame[name]) if name in names else [20.0] * max(counts)
+            column = list(frame[name]) if name in names else [ENTRY_SPEED] * max(counts)
             numbers.append([_number(name, value, row, least) for row, value in enumerate(column)])
         depart, lane, speed = (torch.tensor(x, dtype=torch.float64) for x in numbers)
         order = depart.argsort(stable=True)

@@ -33,5 +33,5 @@ def draw(result: dict[str, Any], path: Path) -> page.Block:
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("ns per vehicle-step")
     panels[1].legend()
-    storage.write(path, lambda beside: figure.savefig(beside, dpi=120))
+    storage.write(path, lambda file: figure.savefig(file, dpi=120))
     return page.picture(figure, "Time of one core per vehicle-step over the number of vehicles; lower is faster.")

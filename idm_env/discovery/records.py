@@ -154,14 +154,14 @@ def _histories(episodes: Sequence[Episode], trajectories: Trajectories | None) -
 def _with_history(signals: np.ndarray, speeds: np.ndarray, dt: float) -> np.ndarray:
     """Put the driver's past in front: his own speeds, everything else as at the episode's first sample."""
     before = np.repeat(signals[:1], len(speeds), axis=0)
-    column = {name: i for i, name in enumerate(march.COLUMNS)}
-    before[:, column["speed"]] = speeds
+    column = march.COLUMNS.index
+    before[:, column("speed")] = speeds
     # Nobody knows where the others were: they stand still in the driver's eyes, rather than accelerate for minutes.
     for name in ("lead_accel", "second_accel", "behind_accel"):
-        before[:, column[name]] = 0.0
+        before[:, column(name)] = 0.0
     if len(speeds):
-        before[:, column["accel"]] = np.gradient(np.append(speeds, signals[0, column["speed"]]), dt)[:-1]
-    before[:, column["time"]] -= dt * np.arange(len(speeds), 0, -1)
+        before[:, column("accel")] = np.gradient(np.append(speeds, signals[0, column("speed")]), dt)[:-1]
+    before[:, column("time")] -= dt * np.arange(len(speeds), 0, -1)
     return np.concatenate([before, signals])
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from idm_env.roads.lanes import Lanes
 from idm_env.roads.linked import Linked, standing, still_changing, without_absent
 from idm_env.step import CarFollowingStep
-from idm_env.types import FAR, Moving, Params, State, Trips
+from idm_env.types import ENTRY_SPEED, FAR, Moving, Params, State, Trips
 
 
 class Counts(NamedTuple):
@@ -31,7 +31,7 @@ class Counts(NamedTuple):
 
 
 def trips(
-    per_hour: Mapping[int, float], seconds: float, *, speed: float = 20.0, slots: int | None = None,
+    per_hour: Mapping[int, float], seconds: float, *, speed: float = ENTRY_SPEED, slots: int | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Trips:  # fmt: skip
     """Return trips that begin evenly in time, so many an hour on each lane, as long as ``seconds``.

@@ -24,7 +24,7 @@ from idm_env.tasks.random import Draw
 from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, lengths, loops_of, rules_of, with_classes
 from idm_env.tasks.trip_table import TripTable, read, spread
 from idm_env.tasks.trip_table import table as made
-from idm_env.types import Params, State, Trips
+from idm_env.types import ENTRY_SPEED, Params, State, Trips
 from idm_env.validation import nearest, one_of, shown
 
 _PLACE_STREAM = 37
@@ -126,7 +126,7 @@ class OpenLanesTask(LanesTask):
     vehicles: int = 120
     controlled: int | float | str | Sequence[int] = 0.1
     max_command: float | Sequence[float] = 2.0
-    entry_speed: float = 20.0
+    entry_speed: float = ENTRY_SPEED
     careful: bool = True
     added: bool = False
     classes: Mapping[str, Any] | None = None

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from idm_env.types import Trips
+from idm_env.types import ENTRY_SPEED, Trips
 from idm_env.validation import finite, nearest, shown
 
 COLUMNS = ("depart", "lane", "speed", "class", "destination")
@@ -81,7 +81,7 @@ def _name(value: Any) -> str:
 
 
 def table(
-    per_hour: Mapping[int, Any], seconds: float, *, seed: int = 0, speed: float = 20.0,
+    per_hour: Mapping[int, Any], seconds: float, *, seed: int = 0, speed: float = ENTRY_SPEED,
     classes: Mapping[str, float] | None = None, destinations: Mapping[str, float] | None = None,
 ) -> dict[str, list[Any]]:  # fmt: skip
     """Return a table of trips, as columns, with demand by lane and time.

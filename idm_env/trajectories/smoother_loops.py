@@ -12,9 +12,7 @@ import numpy as np
 from idm_env.extras import needed
 
 with needed("filtering or reconstruction"):  # these have no other path
-    import numba  # noqa: F401
-
-from idm_env.kernels.compiler import compiler
+    from idm_env.kernels.compiler import compiler
 
 compiled = compiler(fastmath={"contract"})
 

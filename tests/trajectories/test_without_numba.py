@@ -29,14 +29,18 @@ def command(*arguments: object) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["filter", "reconstruct"])
-def test_filtering_names_the_extra(tmp_path: Path, name: str) -> None:
-    done = command(name, lane(tmp_path / "lane.csv", vehicles=1, seconds=5.0), "--out", tmp_path / "out")
+@pytest.mark.parametrize(
+    ("name", "work"),
+    [
+        ("filter", "filtering or reconstruction"), ("reconstruct", "filtering or reconstruction"),
+        ("drift", "estimating drift"),
+    ],
+)  # fmt: skip
+def test_a_command_names_itself_and_the_extra(tmp_path: Path, name: str, work: str) -> None:
+    done = command(name, lane(tmp_path / "lane.csv", vehicles=3, seconds=30.0), "--out", tmp_path / "out")
     assert done.returncode == 1
     line = done.stderr.strip().splitlines()[-1]
-    assert (
-        line.startswith("error: filtering or reconstruction needs numba.") and "pip install 'idm-env[kernels]'" in line
-    )
+    assert line == f"error: {work} needs numba. Install it with: pip install 'idm-env[kernels]'"
     assert not (tmp_path / "out").exists()
 
 
