@@ -12,10 +12,7 @@ from torch import Tensor
 from idm_env.envs.settings import KEYWORDS
 from idm_env.envs.vector import DiffIDMVectorEnv
 from idm_env.tasks import Task, make_task
-from idm_env.types import Links, Moving, State, Trips
-
-PARTS: dict[str, Any] = {"links": Links, "trips": Trips, "moving": Moving}
-"""Parts of a state that are several tensors."""
+from idm_env.types import LaneState, Moving, State, Trips
 
 
 def task_of(environment: Mapping[str, Any]) -> Task:
@@ -56,12 +53,13 @@ def snapshot(env: DiffIDMVectorEnv) -> dict[str, Any]:
     """Return everything that ``restore`` needs to continue the episodes of a vector exactly."""
     batch, world = env.batch, env.batch.world
     assert world is not None
-    state = {k: v for k, v in world.state._asdict().items() if k not in ("memory", *PARTS)}
-    parts = {k: getattr(world.state, k) for k in PARTS}
+    state = {k: v for k, v in world.state._asdict().items() if k not in ("memory", "lanes")}
+    lanes = {} if world.state.lanes is None else world.state.lanes._asdict()
+    parts = {k: lanes.pop(k) for k in ("trips", "moving") if k in lanes}
     return {
         "state": state,
         # As plain mappings, which a checkpoint may hold.
-        "parts": {k: dict(v._asdict()) for k, v in parts.items() if v is not None},
+        "parts": {"links": lanes} | {k: dict(v._asdict()) for k, v in parts.items() if v is not None} if lanes else {},
         "memory": dict(world.state.memory),
         "episode": dict(world.episode),
         "seeds": batch.seeds.tolist(),
@@ -74,8 +72,10 @@ def restore(env: DiffIDMVectorEnv, saved: Mapping[str, Any]) -> Tensor:
     batch = env.batch
     env.reset(seed=list(saved["seeds"]))
     batch.episodes[:] = np.asarray(saved["numbers"]) - 1
-    parts: Any = {name: PARTS[name](**columns) for name, columns in saved.get("parts", {}).items()}
-    state = State(**saved["state"], memory=saved["memory"], **parts)
+    parts = saved.get("parts", {})
+    more: Any = {name: kind(**parts[name]) for name, kind in (("trips", Trips), ("moving", Moving)) if name in parts}
+    lanes = LaneState(**parts["links"], **more) if parts else None
+    state = State(**saved["state"], memory=saved["memory"], lanes=lanes)
     env.reset(options={"state": state})
     assert batch.world is not None
     batch.world = batch.world._replace(episode=saved["episode"])

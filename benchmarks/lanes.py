@@ -73,8 +73,8 @@ def traffic(rows: int, per_km: float, dtype: torch.dtype, each: int = EACH) -> t
 
 def changes(state: State) -> int:
     """Return how often lanes have been changed so far."""
-    assert state.links is not None
-    return int(state.links.changed.sum())
+    assert state.lanes is not None
+    return int(state.lanes.changed.sum())
 
 
 def sumo(
@@ -395,11 +395,10 @@ def world(kind: str, seed: int, rows: int, each: int, dtype: torch.dtype) -> tup
 
 def broken(simulator: Simulator, before: State, after: State, kept: Any, params: Params) -> Counts:
     """Return what happened between two decisions, and how often each law was broken."""
-    links, was, counts = after.links, before.links, Counts()
+    links, was, counts = after.lanes, before.lanes, Counts()
     assert links is not None and was is not None
     own = torch.arange(after.speed.shape[-1])
     on_road = torch.ones_like(after.speed, dtype=torch.bool) if after.present is None else after.present > 0
-    assert before.links is not None
     # Somebody alone on a ring follows himself, and has the ring as his gap.
     counts["overlaps"] = int(((kept.gap <= 0) & on_road).any(0).sum())
     inverse = (links.follower.gather(-1, links.leader) == own) | (links.leader == own)
@@ -411,13 +410,13 @@ def broken(simulator: Simulator, before: State, after: State, kept: Any, params:
     slack = 1e-6 if after.gap.dtype == torch.float64 else 0.5
     counts["gaps that positions deny"] = int(((after.gap - fresh).abs() > slack)[near].sum())
     stays = on_road if before.present is None else on_road & (before.present > 0)
-    if after.trips is not None and before.trips is not None:
-        stays = stays & (after.trips.entered == before.trips.entered)
+    if links.trips is not None and was.trips is not None:
+        stays = stays & (links.trips.entered == was.trips.entered)
         due, inside, left, queued = demand.counts(simulator, after)
-        gone = (after.trips.entered - after.trips.left).sum(-1) != inside
+        gone = (links.trips.entered - links.trips.left).sum(-1) != inside
         counts["vehicles lost"] = int(((due != inside + left + queued) | (queued < 0) | gone).sum())
-        counts["entered"] = int((after.trips.entered - before.trips.entered).sum())
-        counts["left"] = int((after.trips.left - before.trips.left).sum())
+        counts["entered"] = int((links.trips.entered - was.trips.entered).sum())
+        counts["left"] = int((links.trips.left - was.trips.left).sum())
     moved = (after.position - before.position)[stays]
     counts["moved too far"] = int(((moved < -1e-3) | (moved > 60.0 * DT * EVERY)).sum())
     for name in ("changed", "refused", "blocked", "unjudged"):
@@ -506,17 +505,21 @@ def stood(task: OpenLanesTask, rows: int = 8, seconds: int = 600) -> Stood:
     for _ in range(seconds):
         before = state
         state, motion = simulator.rollout(state, {}, params, round(1.0 / simulator.dt))
-        assert before.links and state.links and before.trips and state.trips and state.present is not None
-        same = (state.present > 0) & (state.trips.entered == before.trips.entered)
+        assert before.lanes and state.lanes and before.lanes.trips and state.lanes.trips and state.present is not None
+        same = (state.present > 0) & (state.lanes.trips.entered == before.lanes.trips.entered)
         now = torch.where(same & (state.speed < 0.5), now + 1.0, 0.0)
         longest = torch.maximum(longest, now)
         hard += int((same & (motion.accel < -6.0).any(0)).sum())
         touched += int((same & (motion.gap <= 0.0).any(0)).sum())
-        merged += int((same & (before.links.lane == 0) & (state.links.lane != 0)).sum())
-    assert state.trips is not None
+        merged += int((same & (before.lanes.lane == 0) & (state.lanes.lane != 0)).sum())
+    assert state.lanes is not None and state.lanes.trips is not None
     hourly = 3600.0 / seconds / rows
     return Stood(
-        longest.amax(-1).tolist(), merged * hourly, float(state.trips.left.sum()) * hourly, hard / rows, touched / rows
+        longest.amax(-1).tolist(),
+        merged * hourly,
+        float(state.lanes.trips.left.sum()) * hourly,
+        hard / rows,
+        touched / rows,
     )
 
 

@@ -59,10 +59,10 @@ def ours(flow: float, keep_right: float) -> Found:
     counted, count, way = 0, 0, 0.0
     for second in range(int(SECONDS)):
         before, (state, _) = state, simulator.rollout(state, {}, params, round(1.0 / DT), keep=None)
-        assert state.links is not None and before.links is not None and state.present is not None
+        assert state.lanes is not None and before.lanes is not None and state.present is not None
         inside = (state.present > 0) & (state.position > FIRST) & (state.position < LAST)
         if second >= SECONDS - COUNTED:
-            counted += int((inside & (state.links.changed > before.links.changed)).sum())
+            counted += int((inside & (state.lanes.changed > before.lanes.changed)).sum())
             count, way = count + int(inside.sum()), way + float(state.speed[inside].sum())
     return found(counted, count, way)
 

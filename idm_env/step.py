@@ -240,7 +240,7 @@ class CarFollowingStep:
             step=torch.as_tensor(step, device=position.device),
             present=present,
             memory={},
-            links=self.road.links(position, length, lane, present),
+            lanes=self.road.lane_state(position, length, lane, present),
         )
         road = self.road.view(start)
         gap = road.gaps(position, length, circumference)
@@ -263,7 +263,7 @@ class CarFollowingStep:
             memory[PAST] = History.beginning(scene, self.looks_back).buffer
         if self.sees_lanes:
             on_one = torch.zeros_like(state.speed)
-            memory[merging.LANE] = on_one if state.links is None else state.links.lane.to(state.speed.dtype)
+            memory[merging.LANE] = on_one if state.lanes is None else state.lanes.lane.to(state.speed.dtype)
         return {**memory, **merging.nobody(state.speed)} if self.sees_mergers else memory
 
     def scene(self, state: State, inputs: Inputs) -> Scene:
@@ -356,21 +356,16 @@ class CarFollowingStep:
         if scene.history is not None:
             memory[PAST] = scene.history.pushed(scene)
         memory |= merging.driven_on(state.memory, motion.displacement, self.dt)
-        gap, links = self._gaps(state, motion), state.links
-        if motion.lane is not None:
-            gap, links = self.road.view(state).placed(state, motion, gap)
-            if merging.LANE in memory and links is not None:
-                memory[merging.LANE] = links.lane.to(motion.speed.dtype)
-        return state._replace(
+        after = state._replace(
             position=motion.position,
             speed=motion.speed,
             accel=motion.accel,
-            gap=gap,
+            gap=self._gaps(state, motion),
             step=state.step + 1,
             present=motion.present,
             memory=memory,
-            links=links,
         )
+        return after if motion.lane is None else self.road.view(state).placed(state, motion.lane, after)
 
     def _gaps(self, state: State, motion: Motion) -> Tensor:
         road = self.road.view(state)

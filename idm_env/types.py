@@ -15,6 +15,7 @@ Nobody there
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -40,14 +41,17 @@ Memory = Mapping[str, Tensor]
 """Effect name → state of its own that the effect carries from step to step."""
 
 
-class Links(NamedTuple):
-    """Who drives where on a road of several lanes: integer tensors of shape ``(..., vehicles)``.
+class LaneState(NamedTuple):
+    """What a road of several lanes adds to a state: links, which are integer tensors of shape ``(..., vehicles)``.
 
     ``lane`` counts from the right, which is 0. ``leader`` and ``follower`` are slots in the last dimension, a vehicle's
     own slot where there is nobody (on a ring: nobody but itself), so that a leader's follower is oneself. ``changed``,
     ``refused`` and ``blocked`` count what became of each vehicle's wishes for another lane: done; lost to a better
     claim on the same gap; not possible, because there was no lane or no room that is safe. ``unjudged`` are changes in
     front of another follower than the one who was judged, because he changed himself at the same time.
+
+    ``trips`` is None where nobody comes: otherwise who is not present waits for his trip, or has made it. ``moving`` is
+    None until a decision about lanes is made that takes time to do.
     """
 
     lane: Tensor
@@ -57,6 +61,12 @@ class Links(NamedTuple):
     refused: Tensor
     blocked: Tensor
     unjudged: Tensor
+    trips: Trips | None = None
+    moving: Moving | None = None
+
+
+LINKS: tuple[str, ...] = LaneState._fields[:7]
+"""The links of a ``LaneState``: one whole number of each for every vehicle."""
 
 
 class Trips(NamedTuple):
@@ -132,10 +142,8 @@ class State(NamedTuple):
 
     ``gap`` is state although positions imply it: in float32 the difference of two positions cancels, and the
     gradients with it. A step adds ``displacement[leader] - displacement`` instead. ``step`` is an integer
-    tensor (scalar or one per batch row), so that time never forces a device to synchronise. ``links`` is None on roads
-    whose order never changes; where lanes change, vehicles keep their slots and links say who leads whom. ``trips`` is
-    None where nobody comes: otherwise who is not present waits for his trip, or has made it. ``moving`` is None until a
-    decision about lanes is made that takes time to do.
+    tensor (scalar or one per batch row), so that time never forces a device to synchronise. ``lanes`` is None on roads
+    whose order never changes; where it does, vehicles keep their slots and ``lanes`` says who leads whom.
     """
 
     position: Tensor
@@ -146,9 +154,13 @@ class State(NamedTuple):
     step: Tensor
     present: Tensor | None
     memory: Memory
-    links: Links | None = None
-    trips: Trips | None = None
-    moving: Moving | None = None
+    lanes: LaneState | None = None
+
+    @property
+    def links(self) -> LaneState | None:
+        """``lanes`` by its old name, for one version: with a DeprecationWarning."""
+        warnings.warn("State.links is called State.lanes now.", DeprecationWarning, stacklevel=2)
+        return self.lanes
 
     @property
     def clock(self) -> Tensor:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterator
 from datetime import date
 from functools import cache
 from pathlib import Path
+from types import FrameType
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -173,6 +174,57 @@ def test_the_package_fits_into_one_head(count: Callable[[], Collection[object]],
     found = count()
     print(f"{len(found)} (at most {most})")
     assert len(found) <= most, sorted(map(str, found))
+
+
+@pytest.mark.parametrize(("several", "most"), [(False, 3), (True, 13)], ids=["one lane", "several lanes"])
+def test_a_state_passes_few_hands_in_a_step(several: bool, most: int) -> None:
+    """Returns of a state from one step of a busy road to the next; of lanes with entries, exits and slow changes."""
+    import torch
+
+    from idm_env import IDM, Brakes, Lane, Simulator, effects
+    from idm_env.multilane import demand
+    from idm_env.roads import Lanes, lane_drop
+    from idm_env.types import State
+
+    if several:
+        road = Lanes(3, length=400.0, ends=(lane_drop(2, at=300.0),), duration=3.0)
+        changes = (effects.Mobil(), effects.MandatoryChange(), effects.Courtesy())
+        simulator = Simulator(road, (IDM(), *changes, effects.SpeedLimit(), Brakes()))
+        params = simulator.defaults()
+        state = demand.waiting(simulator, demand.trips(dict.fromkeys(range(3), 1500.0), 60.0), params)
+    else:
+        simulator = Simulator(Lane(), (IDM(), Brakes()))
+        params = simulator.defaults()
+        state = simulator.state(torch.tensor([60.0, 30.0, 0.0]), torch.full((3,), 12.0), params)
+    returned: list[str] = []
+
+    def look(frame: FrameType, event: str, value: object) -> None:
+        if event == "return" and isinstance(value, State) and str(PACKAGE) in frame.f_code.co_filename:
+            returned.append(frame.f_code.co_name)
+
+    longest: list[str] = []
+    for _ in range(300 if several else 3):
+        returned.clear()
+        sys.setprofile(look)
+        try:
+            state = simulator.step(state, {}, params)
+        finally:
+            sys.setprofile(None)
+        longest = max(longest, list(returned), key=len)
+    assert len(longest) == most, longest
+
+
+def test_the_old_name_of_a_state_s_lanes_is_warned_of() -> None:
+    """For one version documents' ``state.links`` is ``state.lanes``."""
+    import torch
+
+    from idm_env import IDM, Lanes, Simulator
+
+    simulator = Simulator(Lanes(2), (IDM(),))
+    place = torch.tensor([30.0, 0.0])
+    state = simulator.state(place, torch.full_like(place, 9.0), simulator.defaults(), lane=1)
+    with pytest.warns(DeprecationWarning, match="State.lanes"):
+        assert state.links is state.lanes and state.links.changed.sum() == 0
 
 
 @pytest.mark.parametrize("name", sorted(idm_env._MOVED))

@@ -216,7 +216,7 @@ class LaneCommand(Effect):
     """An agent's wish in place of the driver's: 1 to the left, −1 to the right, 0 to stay; NaN leaves it to the driver.
 
     Input ``lane_command``: that number for every vehicle. A command counts at the next decision. What is unsafe, or off
-    the road, is not done but counted (``links.blocked``), and so is what another claim wins (``links.refused``).
+    the road, is not done but counted (``lanes.blocked``), and so is what another claim wins (``lanes.refused``).
     """
 
     kind: ClassVar[str] = "lane_command"

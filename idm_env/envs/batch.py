@@ -24,7 +24,6 @@ from idm_env.envs.given import checked
 from idm_env.envs.moves import Moves
 from idm_env.envs.settings import INFO, Settings
 from idm_env.kernels import dispatch
-from idm_env.roads import Lanes
 from idm_env.scalar.record import Unordered, Untraceable
 from idm_env.tasks import Draw, EnvState
 from idm_env.tasks.open_lanes import OpenLanesTask
@@ -110,7 +109,7 @@ class Batch:
         self._world: EnvState | None = None
         self._moves = Moves(settings)
         self._values = self._compiled()
-        self._on_lanes = 0
+        self._several, self._on_lanes = self.task.road.outline is not None, 0
         self._loaded = False
         self._seen: Any = None
         self._reasons: dict[int, str] = {}
@@ -356,7 +355,7 @@ class Batch:
         return outcome
 
     def _stepped(self, action: Tensor | np.ndarray | None, live: Tensor | None, observed: bool) -> Outcome:
-        self._on_lanes += isinstance(self.task.road, Lanes)
+        self._on_lanes += self._several
         eager = self.task.simulator.untried or 0 < self._on_lanes <= EAGER_STEPS
         if self._values is not None and not eager:
             outputs = self._step_values(action, live)
@@ -398,7 +397,7 @@ class Batch:
             self.used, self._block = used, block
             if not isinstance(why, Unordered):
                 # Where an effect is why it was said before (``kernels.printed``); NaN the step itself tells.
-                if self.settings.output == "torch" or isinstance(self.task.road, Lanes):
+                if self.settings.output == "torch" or self._several:
                     warnings.warn(f"no compiled step, the torch path runs instead: {why}.", stacklevel=4)
                 self._values = None
             return None

@@ -34,9 +34,9 @@ class _Seen(NamedTuple):
 
     @classmethod
     def of(cls, state: State, places: bool) -> _Seen:
-        assert state.present is not None and state.links is not None and state.trips is not None
-        motion = _array(state.speed), _array(state.present) > 0, _array(state.trips.left)
-        where = (_array(state.position), _array(state.links.lane)) if places else (motion[0], motion[0])
+        assert state.present is not None and state.lanes is not None and state.lanes.trips is not None
+        motion = _array(state.speed), _array(state.present) > 0, _array(state.lanes.trips.left)
+        where = (_array(state.position), _array(state.lanes.lane)) if places else (motion[0], motion[0])
         return cls(_array(state.step), *motion, *where)
 
     def same(self, later: _Seen) -> np.ndarray:

@@ -10,16 +10,15 @@ import torch
 from torch import Tensor
 
 from idm_env.roads import Road
-from idm_env.types import FAR, Links, State
+from idm_env.types import FAR, State, mapped
 
 _MOST = 1e9
 """No number of a state is further from 0, but the times of trips that never begin."""
-_FROM_0 = ("speed", "length", "step", "present", "links.", "moving.", "trips.again", "trips.lane", "trips.speed",
-           "trips.entered", "trips.left")  # fmt: skip
-_LANES = ("links.lane", "trips.lane", "moving.origin")
-_VEHICLES = (*(f"links.{name}" for name in Links._fields[1:3]), "moving.shadow")
-_ENDLESS = ("trips.departs", "trips.again")
-_LATER = "moving."
+_ENDLESS = ("lanes.trips.departs", "lanes.trips.again")
+_FROM_0 = ("speed", "length", "step", "present", "lanes.")
+_LANES = ("lanes.lane", "lanes.trips.lane", "lanes.moving.origin")
+_VEHICLES = ("lanes.leader", "lanes.follower", "lanes.moving.shadow")
+_LATER = "lanes.moving."
 """Part that a state has only once a decision about lanes was made, where changes take time."""
 _STEP_ASIDE = 1e-3
 """By how much a number may lie below its bound, as differences for a derivative at rest need."""
@@ -47,34 +46,26 @@ def checked(given: Any, like: State, road: Road) -> State:
         if name not in expected and not name.startswith(_LATER):
             raise ValueError(f"options['state'].{name} is no part of this task's state. Leave it out.")
         tensors[name] = _fitting(name, x, expected.get(name), like, road)
-    parts: dict[str, Any] = {}
-    for field, value in given._asdict().items():
-        if isinstance(value, tuple):
-            parts[field] = type(value)(**{n: tensors[f"{field}.{n}"] for n in value._asdict()})  # type: ignore[attr-defined]
-        elif isinstance(value, Mapping):
-            parts[field] = {n: tensors[f"{field}.{n}"] for n in value}
-        else:
-            parts[field] = tensors.get(field, {} if isinstance(getattr(like, field), Mapping) else None)
-    state = State(**parts)
+    in_order = iter(tensors.values())
+    state = mapped(lambda _: next(in_order), given._replace(memory=given.memory or {}))
     with torch.no_grad():
         _linked(state, road)
         _spaced(state, road)
     return state
 
 
-def _leaves(state: State) -> Iterator[tuple[str, Any]]:
-    for field, value in state._asdict().items():
-        if isinstance(value, Mapping):
-            yield from ((f"{field}.{name}", x) for name, x in value.items())
-        elif isinstance(value, tuple) and hasattr(value, "_asdict"):
-            yield from ((f"{field}.{name}", x) for name, x in value._asdict().items())
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Give everything in a state, or a part of it, with its name, in the order of ``mapped``."""
+    for name, value in (tree if isinstance(tree, Mapping) else tree._asdict()).items():
+        if isinstance(value, Mapping) or hasattr(value, "_asdict"):
+            yield from _leaves(value, f"{path}{name}.")
         elif value is not None:
-            yield field, value
+            yield f"{path}{name}", value
 
 
 def _fitting(name: str, x: Any, like: Tensor | None, state: State, road: Road) -> Tensor:
     """Return a copy of a tensor in its full shape, all of whose numbers lie where they can."""
-    here, (rows, vehicles), lanes = f"options['state'].{name}", state.position.shape, getattr(road, "count", 1)
+    here, (rows, vehicles), outline = f"options['state'].{name}", state.position.shape, road.outline
     if like is None:
         like = state.step.new_empty(()).expand(rows, vehicles)
     if not isinstance(x, Tensor) or x.dtype != like.dtype or x.device != like.device:
@@ -87,10 +78,10 @@ def _fitting(name: str, x: Any, like: Tensor | None, state: State, road: Road) -
         raise ValueError(
             f"{here} has shape {tuple(x.shape)}, and {tuple(like.shape)} is needed: environments, vehicles."
         )
-    low = 0.0 if name.startswith(_FROM_0) else -_MOST
+    low = 0.0 if name.startswith(_FROM_0) and name != _ENDLESS[0] else -_MOST
     high = math.inf if name in _ENDLESS else _MOST
     if name in _LANES:
-        high = lanes - 1
+        high = 0.0 if outline is None else len(outline.lanes) - 1.0
     elif name in _VEHICLES:
         high = vehicles - 1
     elif name == "present":
@@ -105,13 +96,13 @@ def _fitting(name: str, x: Any, like: Tensor | None, state: State, road: Road) -
 
 def _linked(state: State, road: Road) -> None:
     """Refuse links to another lane, to nobody, or not back, or, where nobody touches, past others."""
-    links = state.links
+    links = state.lanes
     if links is None:
         return
     own = torch.arange(state.speed.shape[-1], device=state.speed.device).expand_as(links.lane)
     present = torch.ones_like(own, dtype=torch.bool) if state.present is None else state.present > 0
     apart = (state.gap > 0).all(-1, keepdim=True)
-    order = road.links(state.position, state.length, links.lane, state.present)
+    order = road.lane_state(state.position, state.length, links.lane, state.present)
     assert order is not None
     for to, back, nearest in (
         (links.leader, links.follower, order.leader),
@@ -122,14 +113,14 @@ def _linked(state: State, road: Road) -> None:
         if bool(wrong.any()):
             row, vehicle = wrong.nonzero()[0].tolist()
             raise ValueError(
-                f"options['state'].links: vehicles {vehicle} and {int(to[row, vehicle])} of environment {row} do not "
+                f"options['state'].lanes: vehicles {vehicle} and {int(to[row, vehicle])} of environment {row} do not "
                 "follow one another on one lane. Make it with task.simulator.state(…, lane=…)."
             )
 
 
 def _spaced(state: State, road: Road) -> None:
     """Refuse gaps that are not those of the positions; vehicles that touch are left to the task."""
-    around = road.lap(state) if state.links is None else None  # links know their own
+    around = road.lap(state) if state.lanes is None else None  # links know their own
     view = road.view(state)
     led = view.leader_present(state.present, state.speed) > 0
     gap = torch.where(led, view.gaps(state.position, state.length, around), FAR)

@@ -50,14 +50,13 @@ from idm_env.kernels.operands import operand, table
 from idm_env.kernels.rows import RowFunction, adjoint, storage
 from idm_env.kernels.world_loop import workspaces
 from idm_env.multilane.demand import turned
-from idm_env.multilane.incentives import on_lanes, seen_merging
+from idm_env.multilane.incentives import seen_merging
 from idm_env.roads import Lanes
-from idm_env.roads.linked import Linked
+from idm_env.roads.merging import on_lanes
 from idm_env.scalar.record import Form, Unordered, Untraceable
 from idm_env.tasks import EnvState
-from idm_env.types import Params
+from idm_env.types import LINKS, Params
 
-LINKS = ("lane", "leader", "follower", "changed", "refused", "blocked", "unjudged")
 WHOLE = (*(f"links_{n}" for n in LINKS), "trips_entered", "trips_left")
 """Whole numbers of every vehicle that steps change, in the order in which they lie."""
 
@@ -328,7 +327,7 @@ class LanePlan(Plan):
         truths = {"fresh": torch.ones(recorded.many, self.size, dtype=torch.bool)}
         self.found: Any = None
         if simulator.lane_change_models:
-            self.found = decision(simulator, Form.of(like._replace(links=None, trips=None), recorded.inputs))
+            self.found = decision(simulator, Form.of(like._replace(lanes=None), recorded.inputs))
             if isinstance(self.found, str):
                 raise Untraceable(self.found)
             slots = torch.zeros(recorded.many, self.size, dtype=torch.int64)
@@ -373,7 +372,6 @@ class LanePlan(Plan):
         """Return gaps to new leaders, and who signals, after a decision."""
         state = world_of(leaves, self.world).state
         view = self.road.view(state)
-        assert isinstance(view, Linked)
         gap = torch.where(leaves["fresh"], view.gaps(state.position, state.length), state.gap)
         after = on_lanes(state)
         if "merger" in leaves:

@@ -135,8 +135,8 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
             self._slots = list(self.possible_agents)
             return list(self._slots)
         state = self.batch.glance().state
-        assert state.present is not None and state.trips is not None
-        presence, trip = (self.task.pick(x)[0].tolist() for x in (state.present, state.trips.entered))
+        assert state.present is not None and state.lanes is not None and state.lanes.trips is not None
+        presence, trip = (self.task.pick(x)[0].tolist() for x in (state.present, state.lanes.trips.entered))
         self._slots = [
             f"vehicle_{i}_trip_{k}" if here else "" for i, here, k in zip(self.task.agents, presence, trip, strict=True)
         ]

@@ -31,7 +31,7 @@ from idm_env.kernels.several import between
 from idm_env.kernels.world_loop import retreat_worlds, step_worlds, workspaces
 from idm_env.scalar.record import Form, Untraceable, slot_name
 from idm_env.tasks import EnvState
-from idm_env.types import Params, Record, State
+from idm_env.types import LINKS, Params, Record, State, Trips
 
 Array = np.ndarray
 _ROWS = (1009, 1013, 1019, 1021, 1031)
@@ -478,7 +478,7 @@ def _record(moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple
     """Record a step with or without actions, and with or without saying whose count (``kind`` as in ``Plan``)."""
     idle, every = kind
     task = moves.task
-    simulator = task.simulator if world.state.links is None else between(task.simulator)
+    simulator = task.simulator if world.state.lanes is None else between(task.simulator)
     size, count = world.state.speed.shape[-1], len(task.agents)
     # A number of rows that is no other dimension tells rows apart from everything else.
     many = next(p for p in _ROWS if p not in (size, count))
@@ -506,7 +506,7 @@ def _record(moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple
 
     first = RowFunction(early, {**sample, **actions}, many)
     inside = {effect: _without_lane(value) for effect, value in seen.items() if effect in simulator.by_name}
-    kernel = tile_kernel(simulator, Form.of(world.state._replace(links=None, trips=None), inside))
+    kernel = tile_kernel(simulator, Form.of(world.state._replace(lanes=None), inside))
     if isinstance(kernel, str):
         raise Untraceable(kernel)
 
@@ -592,9 +592,10 @@ def named(world: EnvState) -> dict[str, Tensor]:
     leaves = {f"state_{n}": x for n, x in zip(State._fields, state, strict=True) if isinstance(x, Tensor)}
     shape = state.speed.shape
     leaves |= {f"memory_{n}": x.expand(shape) for n, x in state.memory.items() if n != PAST}
-    for part in ("links", "trips"):
-        held = getattr(state, part)
-        leaves |= {} if held is None else {f"{part}_{n}": x.expand(shape) for n, x in held._asdict().items()}
+    if state.lanes is not None:
+        leaves |= {f"links_{n}": getattr(state.lanes, n).expand(shape) for n in LINKS}
+        trips = {} if state.lanes.trips is None else state.lanes.trips._asdict()
+        leaves |= {f"trips_{n}": x.expand(shape) for n, x in trips.items()}
     return leaves | {f"episode_{n}": x for n, x in world.episode.items()}
 
 
@@ -603,12 +604,13 @@ def world_of(leaves: Mapping[str, Tensor], like: EnvState, prefix: str = "") -> 
     own = {n.removeprefix(prefix): x for n, x in leaves.items() if n.startswith(prefix)}
     fields = {n.removeprefix("state_"): x for n, x in own.items() if n.startswith("state_")}
     episode = {n.removeprefix("episode_"): x for n, x in own.items() if n.startswith("episode_")}
-    state = like.state._replace(**fields)  # type: ignore[arg-type]
-    for part in ("links", "trips"):
-        held = getattr(state, part)
-        if held is not None:
-            parts = {n: own[f"{part}_{n}"] for n in held._fields}
-            state = state._replace(**{part: held._replace(**parts)})
+    state, lanes = like.state._replace(**fields), like.state.lanes  # type: ignore[arg-type]
+    if lanes is not None:
+        links: Any = {n: own[f"links_{n}"] for n in LINKS}
+        lanes = lanes._replace(**links)
+        if lanes.trips is not None:
+            lanes = lanes._replace(trips=Trips(*(own[f"trips_{n}"] for n in Trips._fields)))
+        state = state._replace(lanes=lanes)
     memory = {n: own.get(f"memory_{n}", x) for n, x in state.memory.items()}
     return EnvState(state._replace(memory=memory), episode)
 

@@ -56,9 +56,9 @@ def panels_of(task: Task, states: Sequence[State]) -> list[Panel]:
     position, speed = (torch.cat([getattr(state, name) for state in states]) for name in ("position", "speed"))
     motion, lap = states[0]._replace(position=position, speed=speed), task.road.lap(states[0])
     ring = None if lap is None else float(lap.reshape(-1)[0])
-    if states[0].links is None:
+    if states[0].lanes is None:
         return [rollout_panel(motion, dt=task.step_time, ring_length=ring, marked=task.agents)]
-    lane = torch.cat([state.links.lane for state in states if state.links is not None])
+    lane = torch.cat([state.lanes.lane for state in states if state.lanes is not None])
     present = torch.cat([torch.ones_like(s.speed) if s.present is None else s.present for s in states])
     return lane_panels(motion, lane, present, dt=task.step_time, ring_length=ring, marked=task.agents)
 
@@ -175,13 +175,13 @@ class Viewer:
 
         With the ``params`` of its episodes, what stands on the road is drawn, too.
         """
-        ring = state.links is None and task.road.lap(state) is not None
+        ring = state.lanes is None and task.road.lap(state) is not None
         lane, lanes = np.array(task.lanes), min(max(task.lanes) + 1, _MOST_LANES)
         outline = task.road.outline
-        if outline is not None and state.links is not None:
+        if outline is not None and state.lanes is not None:
             # The left lane is on top, as seen by drivers who go to the right.
             lanes = len(outline.lanes)
-            lane = lanes - 1 - state.links.lane[row].cpu().numpy()
+            lane = lanes - 1 - state.lanes.lane[row].cpu().numpy()
         values = {
             name: getattr(state, name)[row].detach().cpu().double().numpy()
             for name in ("position", "speed", "gap", "length")

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from idm_env.envs.batch import Batch
 from idm_env.kernels import dispatch
-from idm_env.roads import Lanes
 from idm_env.scalar.record import Untraceable
 
 
@@ -50,7 +49,7 @@ def unroll(
             f"environments, in {extra.dtype}."
         )
     # On several lanes, and where actions are held, a window is its steps, each of which is compiled.
-    fits = task.held == 1 and not (isinstance(task.road, Lanes) or task.simulator.untried)
+    fits = task.held == 1 and task.road.outline is None and not task.simulator.untried
     if fits and values is not None and dispatch.surroundings() is None:
         from idm_env.envs import window
 

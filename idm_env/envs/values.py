@@ -202,7 +202,7 @@ class Values:
         plan = self._plans.get(kind)
         if plan is None:
             world = self.glance()
-            make = Plan if world.state.links is None else LanePlan
+            make = Plan if world.state.lanes is None else LanePlan
             plan = make(self._moves, world, self.layout, kind, draws)
             if self._graph:
                 _ = plan.recorded.backward
@@ -314,8 +314,7 @@ def _world(
     leaves = dict(zip(layout.blocks, blocks, strict=True))
     if whole is not None:
         shape = like.state.speed.shape
-        names = (n for n in WHOLE if n.startswith("links") or like.state.trips is not None)
-        leaves |= {n: torch.from_numpy(x).view(shape) for n, x in zip(names, whole, strict=True)}
+        leaves |= {n: torch.from_numpy(x).view(shape) for n, x in zip(WHOLE, whole, strict=False)}
     for name, x in named(like).items():
         if name not in leaves:
             array = clock if name == "state_step" else layout.still[name]

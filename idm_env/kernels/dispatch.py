@@ -30,7 +30,7 @@ def found(simulator: CarFollowingStep, state: State, inputs: Inputs, params: Par
     why = switched_off() or surroundings() or _unfit_tensors(state, inputs, params)
     if why is not None:
         return why
-    if state.links is not None:
+    if state.lanes is not None:
         from idm_env.kernels.several import kernel_of
 
         return kernel_of(simulator, state, inputs)  # type: ignore[arg-type]
@@ -68,7 +68,7 @@ def rollout(
     kernel = found(simulator, state, inputs, params)
     if isinstance(kernel, str):
         return None
-    if state.links is not None:
+    if state.lanes is not None:
         from idm_env.kernels import several
 
         return several.rollout(kernel, simulator, state, inputs, params, steps, keep)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,17 +16,18 @@ from idm_env.kernels.operands import dense, operand
 from idm_env.kernels.printed import HEADER, printed
 from idm_env.kernels.tiles import ROW, Array
 from idm_env.multilane.demand import turnover
-from idm_env.multilane.incentives import on_lanes, seen_merging
+from idm_env.multilane.incentives import seen_merging
 from idm_env.multilane.lane_change import decided
 from idm_env.roads import Lanes
 from idm_env.roads.chains import Places
 from idm_env.roads.linked import Linked
+from idm_env.roads.merging import on_lanes
 from idm_env.scalar import library
 from idm_env.scalar.graph import Leaf
 from idm_env.scalar.record import Form
 from idm_env.scalar.wishes import HERE, SEARCHED, SIDES, Wishes
 from idm_env.step import CarFollowingStep
-from idm_env.types import Inputs, Links, Params, State
+from idm_env.types import LINKS, Inputs, LaneState, Params, State
 
 if TYPE_CHECKING:
     from idm_env.simulator import Simulator
@@ -63,39 +64,44 @@ def _decision(simulator: CarFollowingStep, form: Form) -> Decision:
 
 
 class Traffic:
-    """The links of a state, in arrays of their own that decisions change."""
+    """The lanes of a state, whose links are in arrays of their own that decisions change."""
+
+    _lanes: LaneState
+    _changed: bool
 
     def __init__(self, simulator: Simulator, state: State) -> None:
-        assert isinstance(simulator.road, Lanes) and state.links is not None
+        assert isinstance(simulator.road, Lanes) and state.lanes is not None
         self.simulator, self.road = simulator, simulator.road
         self.shape = tuple(state.speed.shape)
         self.n = self.shape[-1]
         self.rows = state.speed.numel() // self.n
-        self._given: Links | None = state.links
+        self._take(state.lanes)
         self._lasting: _Lasting | None = None
         self._order: tuple[Array, Array] | None = None
 
     @property
-    def links(self) -> Links:
-        """The links as they are now: those that were given, or after a decision in memory that decisions change."""
-        if self._given is None:
-            self._given = Links(*(torch.from_numpy(x).view(self.shape) for x in self._links))
-        return self._given
+    def lanes(self) -> LaneState:
+        """The lanes as they are now: those that were given, or after a decision in memory that decisions change."""
+        if self._changed:
+            links: Any = (torch.from_numpy(x).view(self.shape) for x in self._links)
+            self._lanes = self._lanes._replace(**dict(zip(LINKS, links, strict=True)))
+            self._changed = False
+        return self._lanes
 
     @cached_property
     def _links(self) -> Array:
-        assert self._given is not None
-        return np.stack([x.expand(self.shape).reshape(-1).numpy() for x in self._given])
+        return np.stack([getattr(self._lanes, n).expand(self.shape).reshape(-1).numpy() for n in LINKS])
 
-    def _take(self, links: Links | None) -> None:
-        self._given = links
+    def _take(self, lanes: LaneState | None) -> None:
+        assert lanes is not None
+        self._lanes, self._changed = lanes, False
         self.__dict__.pop("_links", None)
 
     def begin(self, state: State, params: Params) -> State:
         """Return the state after those have left and entered for whom it is time."""
         if state.present is not None:
-            state = turnover(self.simulator, state._replace(links=self.links), params)
-            self._take(state.links)
+            state = turnover(self.simulator, state._replace(lanes=self.lanes), params)
+            self._take(state.lanes)
         return state
 
     @cached_property
@@ -119,7 +125,7 @@ class Traffic:
         slot_of = slot_of.view(shape)
         ends = None
         if self.road.closed:
-            lane = self.links.lane.expand(self.shape).gather(-1, slot_of)
+            lane = self.lanes.lane.expand(self.shape).gather(-1, slot_of)
             ends = self.road.closed_at(lane, state.position)
         return Places(slot_of, torch.from_numpy(own).view(self.shape), first.view(shape), last.view(shape), ends)
 
@@ -130,7 +136,7 @@ class Traffic:
         if order is not None:
             order_loops.laid_by(*order, self.rows, self.n, count, around, wide, *to)
             return True
-        lanes_of, leader, follower = (dense(x, self.shape) for x in self.links[:3])
+        lanes_of, leader, follower = (dense(x, self.shape) for x in self.lanes[:3])
         position, presence = dense(state.position, self.shape), self._present(state)
         arguments = leader, follower, lanes_of, position, *presence, np.arange(self.rows), self.n, count, self._ring
         return bool(order_loops.laid(*arguments, around, wide, *to))
@@ -138,8 +144,8 @@ class Traffic:
     def decide(self, found: Decision | str, state: State, inputs: Inputs, params: Params, stage: int) -> State | None:
         """Return the state after those have decided whose turn it is at a stage, or None where links are no order."""
         if isinstance(found, str):
-            after = decided(self.simulator, state._replace(links=self.links), inputs, params)
-            self._take(after.links)
+            after = decided(self.simulator, state._replace(lanes=self.lanes), inputs, params)
+            self._take(after.lanes)
             return after
         kind = state.speed.detach().numpy().dtype
         phase, constants = found.compiled(kind.name)
@@ -156,17 +162,17 @@ class Traffic:
             places, phase, constants, len(found.slots), fresh, merger, turns, order, begin,
         )  # fmt: skip
         del held
-        self._given = None
+        self._changed = True
         if not done:
             return None
         self._order = order, begin
         which = torch.from_numpy(np.flatnonzero(fresh))
-        links = self.links
+        links = self.lanes
         if len(which):
             gap = Linked(self.road, links, state.position).gaps_of(which, state.position, state.length)
             full = state.gap.expand(self.shape).reshape(-1)
             state = state._replace(gap=full.index_put((which,), gap).view(self.shape))
-        state = on_lanes(state._replace(links=links))
+        state = on_lanes(state._replace(lanes=links))
         if not sees:
             return state
         due = torch.ones((), dtype=torch.bool) if state.present is None else state.present > 0

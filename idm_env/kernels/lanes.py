@@ -131,7 +131,7 @@ def static_of(simulator: CarFollowingStep, state: State, params: Params, name: s
     if name == "leads":
         return simulator.road.view(state).leads(state.speed)
     if name == "ends":
-        return state.links.ends  # type: ignore[union-attr]
+        return state.lanes.ends  # type: ignore[union-attr]
     if name in ("length", "present"):
         value = getattr(state, name)
         assert value is not None

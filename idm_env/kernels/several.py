@@ -53,8 +53,8 @@ class _LaidOut:
 
     @staticmethod
     def _parts(state: State) -> tuple[Tensor | None, ...]:
-        assert state.links is not None
-        return *state.links[:3], state.present
+        assert state.lanes is not None
+        return *state.lanes[:3], state.present
 
     def of(self, state: State, halo: int) -> Places | None:
         """Return the places of a state, or None where they are not known."""
@@ -93,7 +93,7 @@ def kernel_of(simulator: Simulator, state: State, inputs: Inputs) -> TileKernel 
         return "compiled changes take no time, and Lanes has a duration"
     inner = between(simulator)
     own_inputs = {name: x for name, x in inputs.items() if name in inner.by_name}
-    return tile_kernel(inner, Form.of(state._replace(links=None), own_inputs))
+    return tile_kernel(inner, Form.of(state._replace(lanes=None), own_inputs))
 
 
 def rollout(
@@ -119,7 +119,7 @@ def rollout(
         own_turn = np.isin(phase, stages) if blocks else (phase == 0) & stops
         wishes: Any = ""
         if simulator.lane_change_models and own_turn.any():
-            wishes = decision(simulator, Form.of(state._replace(links=None), inputs))
+            wishes = decision(simulator, Form.of(state._replace(lanes=None), inputs))
         alike = len(phase) == 1
         if own_turn.all() and alike:
             after = _decided(traffic, wishes, state, _cut(inputs, done, None), params, int(phase[0]))
@@ -130,7 +130,7 @@ def rollout(
         count = min(until, block, steps - done)
         halo = tiles.halo(count, kernel.program.reach)
         # Within a rollout decisions change links in place, so only what comes in is looked up.
-        places = _LAID_OUT.of(state, halo) if state.links is first.links else None
+        places = _LAID_OUT.of(state, halo) if state.lanes is first.lanes else None
         for stage in () if alike else np.unique(phase[own_turn]).tolist():
             which = torch.from_numpy(np.flatnonzero(phase == stage))
             now = _cut(inputs, done, None)
@@ -152,7 +152,7 @@ def rollout(
         if some is not None:
             motions.append(tuple(x.gather(-1, places.own.expand(count, *places.own.shape)) for x in some))
         done += count
-    state = state._replace(links=traffic.links)
+    state = state._replace(lanes=traffic.lanes)
     if places is not None:
         _LAID_OUT.put(state, halo, places)
     return state, tuple(torch.cat(column) for column in zip(*motions, strict=True)) if keep else None
@@ -183,7 +183,7 @@ def _some_decided(
     after = _decided(traffic, wishes, part, own_inputs, own, stage)
     if after is None:
         return None
-    after = after._replace(links=traffic.links, step=state.step)
+    after = after._replace(lanes=traffic.lanes, step=state.step)
     if places is not None:
         fresh = traffic.places(after._replace(step=part.step), halo)
         places = None if fresh is None else _put(places, places, fresh, which, rows)
@@ -248,7 +248,7 @@ def _row(state: State, places: Places) -> State:
         **{n: getattr(state, n).gather(-1, index) for n in ("position", "speed", "accel", "gap", "length")},
         present=None if state.present is None else state.present.gather(-1, index),
         memory=_moved(state.memory, index, state.speed.shape[-1]),
-        links=places,  # type: ignore[arg-type]
+        lanes=places,  # type: ignore[arg-type]
     )
 
 

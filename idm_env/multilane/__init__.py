@@ -10,7 +10,7 @@ from idm_env.types import Inputs, Params, State
 
 def before(stepping: CarFollowingStep, state: State, inputs: Inputs, params: Params) -> State:
     """Return the state after entries, exits and lane changes that are due at this step; on one lane, the same state."""
-    if state.links is None:
+    if state.lanes is None:
         return state
     if state.present is not None:
         state = turnover(stepping, state, params)

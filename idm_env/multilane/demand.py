@@ -15,8 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from idm_env.roads.lanes import Lanes
-from idm_env.roads.linked import Linked, standing, still_changing, without_absent
+from idm_env.roads import Road
+from idm_env.roads.linked import standing, still_changing, without_absent
 from idm_env.step import CarFollowingStep
 from idm_env.types import ENTRY_SPEED, FAR, Moving, Params, State, Trips
 
@@ -89,14 +89,21 @@ def waiting(stepping: CarFollowingStep, schedule: Trips, params: Params, *, leng
 
     ValueError for a road without a beginning, or a lane that does not exist.
     """
-    road = stepping.road
-    if not isinstance(road, Lanes) or road.ring is not None:
-        raise ValueError("trips need a road that begins somewhere: Lanes(count), or Lanes(count, length=…).")
-    begin = road.at_lane(schedule.lane.clamp(0, road.count - 1), schedule.speed, "begins")
+    begins = _begins(stepping.road, schedule.speed)
+    begin = begins[schedule.lane.clamp(0, len(begins) - 1)]
     state = stepping.state(
         begin, schedule.speed, params, length=length, lane=schedule.lane, present=torch.zeros_like(begin)
     )  # fmt: skip
-    return state._replace(trips=schedule)
+    assert state.lanes is not None
+    return state._replace(lanes=state.lanes._replace(trips=schedule))
+
+
+def _begins(road: Road, like: Tensor) -> Tensor:
+    """Return where each lane begins (m); ValueError for a road that begins nowhere."""
+    outline = road.outline
+    if outline is None or outline.ring is not None:
+        raise ValueError("trips need a road that begins somewhere: Lanes(count), or Lanes(count, length=…).")
+    return torch.tensor([begin for begin, *_ in outline.lanes], dtype=like.dtype, device=like.device)
 
 
 def due(schedule: Trips, time: Tensor) -> Tensor:
@@ -107,10 +114,11 @@ def due(schedule: Trips, time: Tensor) -> Tensor:
 
 def counts(stepping: CarFollowingStep, state: State) -> Counts:
     """Return what became of all trips; ValueError for a state without any."""
-    if state.trips is None or state.present is None:
+    if state.lanes is None or state.lanes.trips is None or state.present is None:
         raise ValueError("this state has no trips. Make it with multilane.demand.waiting(…).")
-    now = due(state.trips, stepping.time(state)).expand(state.speed.shape)
-    begun, left = (x.expand(state.speed.shape) for x in (state.trips.entered, state.trips.left))
+    trips = state.lanes.trips
+    now = due(trips, stepping.time(state)).expand(state.speed.shape)
+    begun, left = (x.expand(state.speed.shape) for x in (trips.entered, trips.left))
     inside = state.present.expand(state.speed.shape) > 0
     return Counts(*(x.sum(-1) for x in (now, inside.long(), left, now - begun)))
 
@@ -120,8 +128,6 @@ def turnover(stepping: CarFollowingStep, state: State, params: Params) -> State:
 
     This, too, is done when lanes are decided about: until then whoever is beyond the end drives on, and is followed.
     """
-    if state.present is None or state.links is None:
-        return state
     now = state.clock.remainder(stepping.decides_after) == 0
     return turned(stepping, state, params, now, bool) if bool(now.any()) else state
 
@@ -136,22 +142,20 @@ def turned(
     """Return the state after that, in all rows where it is ``now``; a recording does not ask whether anybody waits."""
     if stepping.road.leaving:
         state = _departed(stepping, state, now)
-    return state if state.trips is None else _entered(stepping, state, params, now, sure)
+    return _entered(stepping, state, params, now, sure)
 
 
 def _departed(stepping: CarFollowingStep, state: State, now: Tensor) -> State:
     """Return the state after those have left who have come to the end of the road: nobody follows them any more."""
     view = stepping.road.view(state)
     stay = view.remaining(state.present, state.position)
-    assert stay is not None and state.present is not None and state.links is not None
+    assert stay is not None and state.present is not None and state.lanes is not None
     stay = torch.where(now, stay, state.present)
-    trips = state.trips
-    if trips is not None:
-        trips = trips._replace(left=trips.left + ((state.present > 0) & (stay <= 0)))
-    followed = view.leader_present(stay, state.speed) > 0
-    return state._replace(
-        present=stay, trips=trips, gap=torch.where(followed, state.gap, FAR), links=without_absent(state.links, stay)
-    )
+    lanes, followed = without_absent(state.lanes, stay), view.leader_present(stay, state.speed) > 0
+    if lanes.trips is not None:
+        left = lanes.trips.left + ((state.present > 0) & (stay <= 0))
+        lanes = lanes._replace(trips=lanes.trips._replace(left=left))
+    return state._replace(present=stay, gap=torch.where(followed, state.gap, FAR), lanes=lanes)
 
 
 def _entered(
@@ -166,18 +170,18 @@ def _entered(
     with v the speed that he asks for, or if it must be that of the vehicle ahead (v_l) if that is less. Gradients flow
     through speed and gap, not through who enters when.
     """
-    assert state.trips is not None and state.links is not None and state.present is not None
-    road, schedule = stepping.road, state.trips
-    assert isinstance(road, Lanes)
+    assert state.lanes is not None and state.present is not None
+    schedule = state.lanes.trips
+    if schedule is None:
+        return state
     waits = (state.present <= 0) & (due(schedule, stepping.time(state)) > schedule.entered) & now
     if not sure(waits.any()):
         return state
-    view = road.view(state)
-    assert isinstance(view, Linked)
-    lanes = torch.arange(road.count, device=state.speed.device)
+    begins = _begins(stepping.road, state.speed)
+    lanes = torch.arange(len(begins), device=begins.device)
     first, some = _first(waits, schedule, lanes)
-    last, followed = _last(view, state, lanes)
-    begins = torch.tensor(road.table("begins"), dtype=state.speed.dtype, device=state.speed.device).expand(some.shape)
+    last, followed = _last(state, lanes)
+    begins = begins.expand(some.shape)
     gap = torch.where(followed, state.position.gather(-1, last) - state.length.gather(-1, last) - begins, FAR)
     ahead, desired = state.speed.gather(-1, last), schedule.speed.expand_as(state.speed).gather(-1, first)
     driver = stepping.base.driver(dict(params[stepping.base.name]))
@@ -192,16 +196,16 @@ def _entered(
     slow = torch.minimum(desired, ahead)
     speed = torch.where(fast, desired, slow)
     goes = some & (fast | fits(slow))
-    if state.moving is not None:  # whoever is still leaving a lane is in the way there
+    if state.lanes.moving is not None:  # whoever is still leaving a lane is in the way there
         goes = goes & (_rear_of_leaving(state, lanes) - begins >= least + speed * time_gap)
     return _placed(stepping, state, params, _Entry(goes, first, last, followed, begins, gap, speed))
 
 
 def _rear_of_leaving(state: State, lanes: Tensor) -> Tensor:
     """Return where the last of those ends who are still leaving each lane (m)."""
-    assert state.moving is not None and state.present is not None
+    assert state.lanes is not None and state.lanes.moving is not None and state.present is not None
     leaving = still_changing(state) & (state.present > 0)
-    mine = leaving.unsqueeze(-2) & (state.moving.origin.unsqueeze(-2) == lanes.unsqueeze(-1))
+    mine = leaving.unsqueeze(-2) & (state.lanes.moving.origin.unsqueeze(-2) == lanes.unsqueeze(-1))
     return torch.where(mine, (state.position - state.length).unsqueeze(-2), FAR).amin(-1)
 
 
@@ -228,23 +232,21 @@ def _first(waits: Tensor, schedule: Trips, lanes: Tensor) -> tuple[Tensor, Tenso
     return best.clamp_max(waits.shape[-1] - 1), mine.any(-1)
 
 
-def _last(view: Linked, state: State, lanes: Tensor) -> tuple[Tensor, Tensor]:
+def _last(state: State, lanes: Tensor) -> tuple[Tensor, Tensor]:
     """Return the slot of each lane's last vehicle, and whether there is one."""
-    present = state.present
-    assert present is not None
-    present = present > 0
-    follower = view.links_now.follower
+    assert state.present is not None and state.lanes is not None
+    present, follower = state.present > 0, state.lanes.follower
     own = torch.arange(present.shape[-1], device=lanes.device)
     last = present & ((follower == own) | ~present.gather(-1, follower))
-    mine = last.unsqueeze(-2) & (view.links_now.lane.unsqueeze(-2) == lanes.unsqueeze(-1))
+    mine = last.unsqueeze(-2) & (state.lanes.lane.unsqueeze(-2) == lanes.unsqueeze(-1))
     return torch.where(mine, own, 0).amax(-1), mine.any(-1)
 
 
 def _placed(stepping: CarFollowingStep, state: State, params: Params, entry: _Entry) -> State:
     """Return the state with those on the road who enter."""
-    assert state.trips is not None and state.present is not None and state.links is not None
+    assert state.present is not None and state.lanes is not None and state.lanes.trips is not None
     goes, first, last, followed, begins, gap, speed = entry
-    links = without_absent(state.links, state.present)
+    links = without_absent(state.lanes, state.present)
     lanes = torch.arange(goes.shape[-1], device=goes.device).expand(goes.shape)
     n = state.speed.shape[-1]
 
@@ -253,32 +255,32 @@ def _placed(stepping: CarFollowingStep, state: State, params: Params, entry: _En
         wide = torch.cat((x.expand(state.speed.shape), x.new_zeros(*state.speed.shape[:-1], 1)), -1)
         return wide.scatter(-1, torch.where(where, slots, n), value.to(x.dtype).expand(slots.shape))[..., :n]
 
+    one = torch.ones_like(gap)
+    new = put(torch.zeros_like(state.speed), one, goes, first) > 0
+    trips = state.lanes.trips
     after = links._replace(
         lane=put(links.lane, lanes, goes, first),
         leader=put(links.leader, torch.where(followed, last, first), goes, first),
         follower=put(put(links.follower, first, goes, first), first, goes & followed, last),
+        trips=trips._replace(entered=trips.entered + new),
     )
-    one = torch.ones_like(gap)
-    new = put(torch.zeros_like(state.speed), one, goes, first) > 0
     begun = state._replace(
         position=put(state.position, begins, goes, first),
         speed=put(state.speed, speed, goes, first),
         accel=torch.where(new, 0.0, state.accel),
         gap=put(state.gap, gap, goes, first),
         present=put(state.present, one, goes, first),
-        links=after,
-        trips=state.trips._replace(entered=state.trips.entered + new),
+        lanes=after,
     )
     fresh = stepping.remembered(begun, params)
     memory = {
         name: torch.where(new if x.dim() <= new.dim() else new[..., None, None], fresh[name], x)
         for name, x in state.memory.items()
     }
-    if begun.moving is not None:
-        fresh_moving = standing(begun)
-        moving = (torch.where(new, x, y) for x, y in zip(fresh_moving, begun.moving, strict=True))
-        begun = begun._replace(moving=Moving(*moving))
-    return begun._replace(memory=memory)
+    if after.moving is not None:
+        moving = (torch.where(new, x, y) for x, y in zip(standing(begun), after.moving, strict=True))
+        after = after._replace(moving=Moving(*moving))
+    return begun._replace(memory=memory, lanes=after)
 
 
 __all__ = ["Counts", "counts", "due", "spread", "trips", "turnover", "waiting"]

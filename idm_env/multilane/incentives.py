@@ -42,15 +42,6 @@ def seen_merging(view: Linked, state: State, who: Tensor, due: Tensor) -> State:
     return state._replace(memory={**state.memory, **memory})
 
 
-def on_lanes(state: State) -> State:
-    """Return the state in which drivers remember on which lanes they are, where some effect looks at that."""
-    if LANE not in state.memory:
-        return state
-    assert state.links is not None
-    lane = state.links.lane.to(state.speed.dtype).expand(state.speed.shape)
-    return state._replace(memory={**state.memory, LANE: lane})
-
-
 def wished(stepping: CarFollowingStep, scene: Scene, params: Params) -> Wish:
     """Return the sum and the largest of all utilities, and the least of all margins."""
     driver = stepping.wanted(scene, params)[2]
@@ -179,4 +170,4 @@ def _one_side(
     )
 
 
-__all__ = ["NOW", "lane_scene", "on_lanes", "seen_merging", "wished"]
+__all__ = ["NOW", "lane_scene", "seen_merging", "wished"]

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import torch
 
-from idm_env.multilane.incentives import lane_scene, on_lanes, seen_merging, wished
+from idm_env.multilane.incentives import lane_scene, seen_merging, wished
 from idm_env.roads.adjacent import preferred
 from idm_env.roads.linked import Linked, still_changing, without_absent
+from idm_env.roads.merging import on_lanes
 from idm_env.step import CarFollowingStep
 from idm_env.types import Inputs, Params, State
 
@@ -19,17 +20,18 @@ def decided(stepping: CarFollowingStep, state: State, inputs: Inputs, params: Pa
     due = stepping.due(state)
     if not bool(due.any()):
         return state
-    assert state.links is not None
-    state = state._replace(links=without_absent(state.links, state.present))
+    assert state.lanes is not None
+    lanes = without_absent(state.lanes, state.present)
+    state = state._replace(lanes=lanes)
     view = stepping.road.view(state)
     assert isinstance(view, Linked)
     due = due if state.present is None else due & (state.present > 0)
-    if state.moving is not None:
+    if lanes.moving is not None:
         due = due & ~still_changing(state)
     with torch.no_grad():
         order = view.order(state.present)
         sides = view.side(order, 1, state), view.side(order, -1, state)
-        seen = sides if state.moving is None else view.with_leaving(state, sides)
+        seen = sides if lanes.moving is None else view.with_leaving(state, sides)
         wish = wished(stepping, lane_scene(stepping, view, seen, state, inputs, params), params)
         claim = view.chosen(sides, preferred(*seen, wish, view.road.handed == "left"), due)
     after = view.changed(state, claim)

@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from idm_env.types import FAR, Links, Motion, Neighbour, State
+from idm_env.types import FAR, LaneState, Neighbour, State
 
 
 class Outline(NamedTuple):
@@ -43,7 +43,7 @@ class Road(abc.ABC):
 
     Tensors have the shape ``(…, vehicles)``; circumferences have ``(…)``, one number per row.
     Written with shifted views instead of index gathers, because compilers fuse those. A road on which the order changes
-    (``Lanes``) answers through ``view(state)``, which is bound to the links of that state.
+    (``Lanes``) answers through ``view(state)``, which is bound to the lanes of that state.
     """
 
     beside: ClassVar[bool] = False
@@ -55,10 +55,10 @@ class Road(abc.ABC):
         """Return this road as it is in a state: itself, where the order never changes."""
         return self
 
-    def links(
+    def lane_state(
         self, position: Tensor, length: Tensor, lane: Tensor | int | None, present: Tensor | None
-    ) -> Links | None:
-        """Return the links of vehicles of these positions, lengths (m) and lanes: None where the order never changes.
+    ) -> LaneState | None:
+        """Return who leads whom at these positions, lengths (m) and lanes: None where the order never changes.
 
         ValueError for lanes on a road that has one only.
         """
@@ -66,8 +66,8 @@ class Road(abc.ABC):
             raise ValueError(f"a {type(self).__name__} has one lane, and lane = … was given. Use Lanes(count).")
         return None
 
-    def placed(self, state: State, motion: Motion, gap: Tensor) -> tuple[Tensor, Links | None]:
-        """Return gaps (m) and links after records have said who is on which lane; ``gap`` are those of before.
+    def placed(self, state: State, lane: Tensor, after: State) -> State:
+        """Return the state ``after`` a step in which records say who is on which lane, −1 where they do not.
 
         ValueError on a road that has one lane only.
         """

@@ -39,9 +39,9 @@ class Chains(Lane):
     closed: bool = False
 
     def view(self, state: State) -> Road:
-        """Return the chains of a state, whose links are ``Places``."""
-        assert isinstance(state.links, Places)
-        return _Chained(self, state.links, state.position)
+        """Return the chains of a state, whose lanes are ``Places``."""
+        assert isinstance(state.lanes, Places)
+        return _Chained(self, state.lanes, state.position)
 
     def led(self, x: Tensor) -> Tensor:
         """Raise TypeError: who is led is known in a state only."""

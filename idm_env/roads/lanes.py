@@ -1,7 +1,7 @@
 """Several lanes side by side: vehicles keep their slot for life, and links say who leads whom.
 
-Between two lane changes the order within a lane does not change, so gaps stay state; ``Lanes.links`` sorts anew only
-where somebody changes, comes or goes.
+Between two lane changes the order within a lane does not change, so gaps stay state; ``Lanes.lane_state`` sorts anew
+only where somebody changes, comes or goes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from idm_env.roads.base import Outline, Road
 from idm_env.roads.layout import LaneLayout
 from idm_env.roads.linked import Linked
 from idm_env.roads.order import Order
-from idm_env.types import Links, State
+from idm_env.types import LaneState, State
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,10 @@ class Lanes(LaneLayout, Road):
         """Return the circumference (m) in every row of a state, None where lanes go straight on."""
         return None if self.ring is None else torch.full_like(state.speed[..., 0], self.ring)
 
-    def links(self, position: Tensor, length: Tensor, lane: Tensor | int | None, present: Tensor | None) -> Links:
-        """Return the links of vehicles of these positions, lengths (m) and lanes.
+    def lane_state(
+        self, position: Tensor, length: Tensor, lane: Tensor | int | None, present: Tensor | None
+    ) -> LaneState:
+        """Return who leads whom at these positions, lengths (m) and lanes.
 
         ValueError for a lane that does not exist, or vehicles that do not fit theirs on a ring.
         """
@@ -73,14 +75,14 @@ class Lanes(LaneLayout, Road):
                 )
         order = Order.of(position, lane, present, self.count, self.ring)
         none = torch.zeros_like(lane)
-        return Links(lane, *order.links(), none, none, none, none)
+        return LaneState(lane, *order.links(), none, none, none, none)
 
-    def view(self, state: State) -> Road:
-        """Return the road as it is in this state; ValueError for a state without links."""
-        if state.links is None:
-            raise ValueError("this state has no links. Make it with simulator.state(…, lane=…).")
-        shadow = None if state.moving is None else state.moving.shadow
-        return Linked(self, state.links, state.position, shadow, state.length)
+    def view(self, state: State) -> Linked:
+        """Return the road as it is in this state; ValueError for a state without lanes."""
+        if state.lanes is None:
+            raise ValueError("this state has no lanes. Make it with simulator.state(…, lane=…).")
+        shadow = None if state.lanes.moving is None else state.lanes.moving.shadow
+        return Linked(self, state.lanes, state.position, shadow, state.length)
 
     def ahead(self, x: Tensor) -> Tensor:
         """Raise TypeError: who leads whom is known in a state only."""

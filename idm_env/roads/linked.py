@@ -14,8 +14,9 @@ from torch import Tensor
 from idm_env.roads.adjacent import Preference, Side, Sideways
 from idm_env.roads.ends import either
 from idm_env.roads.layout import LaneLayout
+from idm_env.roads.merging import on_lanes
 from idm_env.roads.order import Order, laps
-from idm_env.types import FAR, Links, Motion, Moving, Neighbour, State
+from idm_env.types import FAR, LaneState, Moving, Neighbour, State
 
 
 class Claim(NamedTuple):
@@ -36,18 +37,18 @@ class Claim(NamedTuple):
 
 def still_changing(state: State) -> Tensor:
     """Return who is still leaving a lane (bool)."""
-    assert state.moving is not None
-    return state.moving.until > state.clock
+    assert state.lanes is not None and state.lanes.moving is not None
+    return state.lanes.moving.until > state.clock
 
 
 def standing(state: State) -> Moving:
     """Return the changes of vehicles of which none is changing lanes."""
-    assert state.links is not None
-    own = torch.arange(state.speed.shape[-1], device=state.speed.device).expand_as(state.links.lane)
-    return Moving(state.links.lane, torch.full_like(own, torch.iinfo(own.dtype).min), own)
+    assert state.lanes is not None
+    own = torch.arange(state.speed.shape[-1], device=state.speed.device).expand_as(state.lanes.lane)
+    return Moving(state.lanes.lane, torch.full_like(own, torch.iinfo(own.dtype).min), own)
 
 
-def without_absent(links: Links, present: Tensor | None) -> Links:
+def without_absent(links: LaneState, present: Tensor | None) -> LaneState:
     """Return links in which nobody follows who has left: his slot may be another vehicle's before long."""
     if present is None:
         return links
@@ -93,7 +94,7 @@ class Linked(Sideways):
     """Lanes as they are in one state: neighbours by its links; ends of lanes and who is leaving merged into leaders."""
 
     road: LaneLayout
-    links_now: Links
+    links_now: LaneState
     position: Tensor
     shadow: Tensor | None = None
     length: Tensor | None = None
@@ -159,22 +160,20 @@ class Linked(Sideways):
             return present
         return present * (position < self.road.left_at(self.links_now.lane, position)).to(present.dtype)
 
-    def placed(self, state: State, motion: Motion, gap: Tensor) -> tuple[Tensor, Links]:
-        """Return gaps (m) and links after records have said who is on which lane: gaps of new leaders are measured.
+    def placed(self, state: State, lane: Tensor, after: State) -> State:
+        """Return the state ``after`` a step in which records say who is on which lane, with gaps to new leaders.
 
         Whoever is placed may be anywhere, so all are laid out anew.
         """
-        assert motion.lane is not None
-        before, position = self.links_now, motion.position
-        lane = torch.where(motion.lane >= 0, motion.lane, before.lane)
-        order = Order.of(position, lane, motion.present, self.road.count, self.road.ring)
-        leader, follower = order.links()
+        before, position = self.links_now, after.position
+        lane = torch.where(lane >= 0, lane, before.lane)
+        leader, follower = Order.of(position, lane, after.present, self.road.count, self.road.ring).links()
         changed = lane != before.lane
-        for mask in (state.present, motion.present):
+        for mask in (state.present, after.present):
             changed = changed if mask is None else changed & (mask > 0)
-        links = before._replace(lane=lane, leader=leader, follower=follower, changed=before.changed + changed)
-        fresh = Linked(self.road, links, position).gaps(position, state.length)
-        return torch.where(leader == before.leader, gap, fresh), links
+        lanes = before._replace(lane=lane, leader=leader, follower=follower, changed=before.changed + changed)
+        fresh = Linked(self.road, lanes, position).gaps(position, state.length)
+        return on_lanes(after._replace(lanes=lanes, gap=torch.where(leader == before.leader, after.gap, fresh)))
 
     # -- who is still leaving a lane ------------------------------------------------------------------------------
 
@@ -207,11 +206,11 @@ class Linked(Sideways):
 
     def _leaving(self, state: State) -> Order:
         """Return those who are still leaving a lane, in order."""
-        assert state.moving is not None
+        assert state.lanes is not None and state.lanes.moving is not None
         leaving = still_changing(state)
         if state.present is not None:
             leaving = leaving & (state.present > 0)
-        origin, position = state.moving.origin, state.position
+        origin, position = state.lanes.moving.origin, state.position
         return Order.of(position, origin, leaving.to(position.dtype), self.road.count, self.road.ring)
 
     def with_leaving(self, state: State, sides: tuple[Side, Side]) -> tuple[Side, Side]:
@@ -233,13 +232,13 @@ class Linked(Sideways):
 
     def on_the_way(self, before: State, after: State, claim: Claim, steps: int) -> State:
         """Return the state after a decision in which those who were granted a change take some steps for it."""
-        assert before.links is not None and after.links is not None
-        moving = before.moving or standing(before)
+        assert before.lanes is not None and after.lanes is not None
+        moving = before.lanes.moving or standing(before)
         until = torch.where(claim.granted, before.clock + steps, moving.until)
-        moving = Moving(torch.where(claim.granted, before.links.lane, moving.origin), until, moving.shadow)
-        lane, after = after.links.lane, after._replace(moving=moving)
-        around = self._leaving(after).around(lane, after.position)
-        return after._replace(moving=moving._replace(shadow=around.leader))
+        moving = Moving(torch.where(claim.granted, before.lanes.lane, moving.origin), until, moving.shadow)
+        lanes = after.lanes
+        around = self._leaving(after._replace(lanes=lanes._replace(moving=moving))).around(lanes.lane, after.position)
+        return after._replace(lanes=lanes._replace(moving=moving._replace(shadow=around.leader)))
 
     # -- changes -------------------------------------------------------------------------------------------------
 
@@ -331,13 +330,13 @@ class Linked(Sideways):
             blocked=links.blocked + claim.blocked,
         )
         if not bool(claim.granted.any()):
-            return state._replace(links=links)
+            return state._replace(lanes=links)
         order = Order.of(self.position, claim.lane, state.present, self.road.count, self.road.ring)
         leader, follower = order.links()
         other = claim.granted & claim.judged & (follower != claim.follower)
         links = links._replace(lane=claim.lane, leader=leader, follower=follower, unjudged=links.unjudged + other)
         fresh = Linked(self.road, links, self.position).gaps(self.position, state.length)
-        return state._replace(links=links, gap=torch.where(leader != self.links_now.leader, fresh, state.gap))
+        return state._replace(lanes=links, gap=torch.where(leader != self.links_now.leader, fresh, state.gap))
 
 
 def _most(room: tuple[int, ...], key: Tensor, value: Tensor, how: Literal["amax", "amin"]) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from idm_env.types import FAR, Memory, Neighbour
+from idm_env.types import FAR, Memory, Neighbour, State
 
 MERGER_GAP, MERGER_SPEED = "merger_gap", "merger_speed"
 """Memories of whoever drivers see signalling beside them: the gap to him (m) and his speed (m/s), as they last decided.
@@ -36,6 +36,15 @@ def merger(memory: Memory, speed: Tensor) -> Neighbour:
     return Neighbour(gap, torch.where(some, memory[MERGER_SPEED], speed), none, torch.where(some, none + 1.0, none))
 
 
+def on_lanes(state: State) -> State:
+    """Return the state in which drivers remember on which lanes they are, where some effect looks at that."""
+    if LANE not in state.memory:
+        return state
+    assert state.lanes is not None
+    lane = state.lanes.lane.to(state.speed.dtype).expand(state.speed.shape)
+    return state._replace(memory={**state.memory, LANE: lane})
+
+
 def driven_on(memory: Memory, displacement: Tensor, dt: float) -> dict[str, Tensor]:
     """Return these memories a step later, if there are any."""
     held = {LANE: memory[LANE]} if LANE in memory else {}
@@ -46,4 +55,4 @@ def driven_on(memory: Memory, displacement: Tensor, dt: float) -> dict[str, Tens
     return {**held, MERGER_GAP: gap, MERGER_SPEED: speed}
 
 
-__all__ = ["LANE", "MERGER_GAP", "MERGER_SPEED", "driven_on", "merger", "nobody"]
+__all__ = ["LANE", "MERGER_GAP", "MERGER_SPEED", "driven_on", "merger", "nobody", "on_lanes"]

@@ -609,8 +609,8 @@ class Task(abc.ABC):
         vehicle = int(gap.argmin()) if agent is None else self.agents[agent]
         ids = self.vehicle_ids or tuple(str(i) for i in range(self.vehicles))
         seconds = float(world.state.step[row]) * self.simulator.dt
-        links = world.state.links
-        leader = None if links is None else int(links.leader[row, vehicle])
+        lanes = world.state.lanes
+        leader = None if lanes is None else int(lanes.leader[row, vehicle])
         return contact(ids, self.agents, vehicle, float(gap[vehicle]), seconds, leader)
 
     def clip(self, features: list[Tensor]) -> Tensor:

@@ -160,8 +160,8 @@ def mean_speed(view: AgentView) -> Tensor:
 
 def lane(view: AgentView) -> Tensor:
     """Return the lane, counted from 0 at the right; 0 on a road that has one."""
-    links = view.state.links
-    return view.own(torch.zeros_like(view.state.speed) if links is None else links.lane.to(view.state.speed.dtype))
+    lanes = view.state.lanes
+    return view.own(torch.zeros_like(view.state.speed) if lanes is None else lanes.lane.to(view.state.speed.dtype))
 
 
 FEATURES: dict[str, Feature] = {

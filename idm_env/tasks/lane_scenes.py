@@ -119,8 +119,8 @@ def made_up_lanes(dt: float, vehicles: int = 24, seconds: float = 90.0) -> Lanes
     state = simulator.state(position, speed, params, length=4.5, lane=index % 3)
 
     def seen(now: State) -> tuple[torch.Tensor, torch.Tensor]:
-        assert now.links is not None
-        return torch.stack((now.position, now.speed, now.accel), -1), now.links.lane
+        assert now.lanes is not None
+        return torch.stack((now.position, now.speed, now.accel), -1), now.lanes.lane
 
     with torch.no_grad():
         _, steps = simulator.rollout(state, {}, params, round(seconds / dt), keep=seen)

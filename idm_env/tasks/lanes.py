@@ -6,7 +6,7 @@ import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -81,16 +81,16 @@ class LanesTask(Task):
     def reset(self, draw: Draw, params: Params) -> EnvState:
         """Return the worlds at the beginning of an episode, in which nobody has changed lanes yet."""
         world = super().reset(draw, params)
-        links = world.state.links
-        assert links is not None
-        none = {name: torch.zeros_like(links.lane) for name in ("changed", "refused", "blocked", "unjudged")}
-        return world._replace(state=world.state._replace(links=links._replace(**none)))
+        lanes = world.state.lanes
+        assert lanes is not None
+        none: Any = {name: torch.zeros_like(lanes.lane) for name in ("changed", "refused", "blocked", "unjudged")}
+        return world._replace(state=world.state._replace(lanes=lanes._replace(**none)))
 
     def info(self, world: EnvState) -> dict[str, Tensor]:
         """Return how often agents' vehicles changed lanes in this episode, and how often they could not."""
-        links = world.state.links
-        assert links is not None
-        return {"lane_changes": self.pick(links.changed), "lane_refusals": self.pick(links.blocked + links.refused)}
+        lanes = world.state.lanes
+        assert lanes is not None
+        return {"lane_changes": self.pick(lanes.changed), "lane_refusals": self.pick(lanes.blocked + lanes.refused)}
 
     @property
     def commands(self) -> tuple[str, ...]:
@@ -115,8 +115,8 @@ class LanesTask(Task):
         if not self.road.closed:
             return highest
         state = world.state
-        assert state.links is not None
-        room = self.pick(self.road.closed_at(state.links.lane, state.position) - state.position)
+        assert state.lanes is not None
+        room = self.pick(self.road.closed_at(state.lanes.lane, state.position) - state.position)
         return torch.minimum(highest, self._safe_behind(state, torch.zeros_like(room), room))
 
     def inputs(
@@ -189,10 +189,10 @@ class LanesTask(Task):
 
         Each ``(…, seen, agents)``, 0 for nobody.
         """
-        assert state.links is not None
+        assert state.lanes is not None
         agents, count = len(self.agents), min(self.seen, self.vehicles - 1)
         own = self.constant("agents", self.agents, state.speed.device, torch.int64)
-        lane, position = state.links.lane.to(state.speed.dtype), state.position.detach()
+        lane, position = state.lanes.lane.to(state.speed.dtype), state.position.detach()
         away = self.apart(position.unsqueeze(-2) - self.pick(position).unsqueeze(-1)).abs()
         if state.present is not None:
             both = state.present.unsqueeze(-2) * self.pick(state.present).unsqueeze(-1)

@@ -42,15 +42,15 @@ def _present(view: AgentView) -> Tensor:
 def _ends(view: AgentView) -> Tensor:
     """Return how far the lane goes on (m), as far as it is seen."""
     state, road = view.state, view.task.road
-    assert state.links is not None and isinstance(road, Lanes)
-    return view.own((road.closed_at(state.links.lane, state.position) - state.position).clamp(0.0, _SIGHT))
+    assert state.lanes is not None and isinstance(road, Lanes)
+    return view.own((road.closed_at(state.lanes.lane, state.position) - state.position).clamp(0.0, _SIGHT))
 
 
 def _next(view: AgentView) -> tuple[Tensor, Tensor]:
     """Return how far it is to the next end of any lane (m), as far as it is seen, and how many lanes to the left."""
     state, task, road = view.state, view.task, view.task.road
-    assert state.links is not None and isinstance(road, Lanes)
-    own, lane = task.pick(state.position), task.pick(state.links.lane)
+    assert state.lanes is not None and isinstance(road, Lanes)
+    own, lane = task.pick(state.position), task.pick(state.lanes.lane)
     next_end, left = torch.full_like(own, _SIGHT), torch.zeros_like(own)
     for end in road.ends:
         way = end.end - own
@@ -312,9 +312,10 @@ class OpenLanesTask(LanesTask):
             present=inside.to(like.dtype), lane=trips.lane,
             step=torch.full((len(place),), -self.warmup, device=like.device),
         )  # fmt: skip
+        assert state.lanes is not None
         free = self.simulator.base.driver(dict(params[self.simulator.base.name])).desired_speed.detach()
         return EnvState(
-            state._replace(trips=trips._replace(entered=inside.long())),
+            state._replace(lanes=state.lanes._replace(trips=trips._replace(entered=inside.long()))),
             {"free_speed": free.to(place.dtype).expand_as(place).contiguous()},
         )
 
@@ -343,13 +344,13 @@ class OpenLanesTask(LanesTask):
         ``travel``: time (s) over the length of the road at the mean speed of now, at least 0.5 m/s.
         """
         state = world.state
-        assert state.present is not None and state.trips is not None and state.links is not None
-        counts, present = demand.counts(self.simulator, state), state.present > 0
-        from_ramp = state.trips.lane == 0
-        still = from_ramp & present & (state.links.lane == 0)
+        assert state.present is not None and state.lanes is not None and state.lanes.trips is not None
+        counts, present, trips = demand.counts(self.simulator, state), state.present > 0, state.lanes.trips
+        from_ramp = trips.lane == 0
+        still = from_ramp & present & (state.lanes.lane == 0)
         every = {
             "queued": counts.queued, "inside": counts.inside, "outflow": counts.left,
-            "ramp": (torch.where(from_ramp, state.trips.entered, 0) - still.long()).sum(-1),
+            "ramp": (torch.where(from_ramp, trips.entered, 0) - still.long()).sum(-1),
             "standing": (present & (state.speed < STANDS)).sum(-1),
             "co2": CO2 * torch.where(present, fuel(state.speed, state.accel), 0.0).sum(-1),
         }  # fmt: skip
@@ -397,8 +398,8 @@ class OpenLanesTask(LanesTask):
 
     def _over(self, state: State) -> Tensor:
         """Return which vehicles have driven over the end of their lane (bool)."""
-        assert state.links is not None and state.present is not None
-        return (state.position > self.road.closed_at(state.links.lane, state.position)) & (state.present > 0)
+        assert state.lanes is not None and state.present is not None
+        return (state.position > self.road.closed_at(state.lanes.lane, state.position)) & (state.present > 0)
 
     def crash_reason(self, world: EnvState, row: int, agent: int | None = None) -> str:
         """As ``Task`` says; or who has driven over the end of which lane, where nobody has touched anybody."""
@@ -406,7 +407,7 @@ class OpenLanesTask(LanesTask):
         if float(state.gap[row].min()) <= 0.0 or not bool(over.any()):
             return super().crash_reason(world, row, agent)
         vehicle = int(over.int().argmax())
-        assert state.links is not None
+        assert state.lanes is not None
         who = f"vehicle {vehicle}" + (" (an agent)" if vehicle in self.agents else "")
         seconds = float(state.step[row]) * self.simulator.dt
-        return f"{who} drove over the end of lane {int(state.links.lane[row, vehicle])} after {seconds:.1f} s"
+        return f"{who} drove over the end of lane {int(state.lanes.lane[row, vehicle])} after {seconds:.1f} s"

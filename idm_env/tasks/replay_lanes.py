@@ -136,11 +136,11 @@ class ReplayLanesTask(ReplayTask, LanesTask):
     def crash_reason(self, world: EnvState, row: int, agent: int | None = None) -> str:
         """Return who touched whom: an agent its leader, or a recorded vehicle an agent."""
         state = world.state
-        links = state.links
-        assert links is not None
+        lanes = state.lanes
+        assert lanes is not None
         nearest = self.pick(torch.minimum(state.gap, self._behind(state)))[row].detach()
         vehicle = self.agents[int(nearest.argmin()) if agent is None else agent]
         if float(state.gap[row, vehicle]) > 0.0:
-            vehicle = int(links.follower[row, vehicle])
-        seconds, leader = float(state.step[row]) * self.simulator.dt, int(links.leader[row, vehicle])
+            vehicle = int(lanes.follower[row, vehicle])
+        seconds, leader = float(state.step[row]) * self.simulator.dt, int(lanes.leader[row, vehicle])
         return contact(self.vehicle_ids, self.agents, vehicle, float(state.gap[row, vehicle]), seconds, leader)

@@ -30,7 +30,7 @@ def by_hand(states):
             count, speeds, above = intervals.setdefault(key, (0, [], 0))
             covered = False
             for v in range(JAM["vehicles"]):
-                if after.links.lane[0, v] != loop["lane"] or not after.present[0, v]:
+                if after.lanes.lane[0, v] != loop["lane"] or not after.present[0, v]:
                     continue
                 front, place = float(after.position[0, v]), loop["place"]
                 covered |= front - float(after.length[0, v]) < place <= front
@@ -45,7 +45,11 @@ def stops_of(states):
     stops = 0
     for before, after in pairwise(states):
         for v in range(JAM["vehicles"]):
-            there = before.present[0, v] and after.present[0, v] and before.trips.left[0, v] == after.trips.left[0, v]
+            there = (
+                before.present[0, v]
+                and after.present[0, v]
+                and before.lanes.trips.left[0, v] == after.lanes.trips.left[0, v]
+            )
             stops += bool(there and before.speed[0, v] >= 0.5 > after.speed[0, v])
     return stops
 

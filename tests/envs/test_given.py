@@ -54,21 +54,17 @@ def test_every_state_on_the_way_is_taken_as_it_is(name: str) -> None:
         state = env.unwrapped.state
 
 
-def put(field: str, value: Any, part: str | None = None):
+def put(path: str, value: Any):
     """Return the change of one number of a state, of its first environment and second vehicle."""
 
-    def change(state: State) -> State:
-        def written(x: torch.Tensor) -> torch.Tensor:
-            x = x.clone()
-            x[(0, 1) if x.dim() > 1 else 0] = value
-            return x
+    def written(part: Any, names: list[str]) -> Any:
+        if names:
+            return part._replace(**{names[0]: written(getattr(part, names[0]), names[1:])})
+        x = part.clone()
+        x[(0, 1) if x.dim() > 1 else 0] = value
+        return x
 
-        held = getattr(state, field)
-        return state._replace(
-            **{field: written(held) if part is None else held._replace(**{part: written(getattr(held, part))})}
-        )
-
-    return change
+    return lambda state: written(state, path.split("."))
 
 
 NUMBERS = [
@@ -93,21 +89,22 @@ SHAPES = [
     (lambda s: s._replace(memory={"lag": s.speed}), r"memory\.(lag is no part|(past|gap_acceptance) is missing)"),
 ]  # fmt: skip
 LINKS = [
-    *((put("links", lane, "lane"), f"links.lane = {lane} is outside") for lane in (100_000, 50, -3)),
-    *((put("links", slot, part), f"links.{part} = {slot} is outside") for slot in (100_000, -1)
+    *((put("lanes.lane", lane), f"lanes.lane = {lane} is outside") for lane in (100_000, 50, -3)),
+    *((put(f"lanes.{part}", slot), f"lanes.{part} = {slot} is outside") for slot in (100_000, -1)
       for part in ("leader", "follower")),
-    (lambda s: s._replace(moving=Moving(s.links.lane, s.links.lane, s.links.lane + 100_000)), "moving.shadow = "),
-    (lambda s: s._replace(links=None), "links.lane is missing"),
-    (lambda s: s._replace(links=s.links._replace(lane=s.links.lane.float())), "lane is a torch.Tensor of torch.f"),
-    (lambda s: s._replace(links=s.links._replace(leader=s.links.leader.roll(1, -1))), "do not follow"),
-    (lambda s: s._replace(links=s.links._replace(lane=s.links.lane.clamp_max(0))), "do not follow"),
-    (lambda s: s._replace(links=s.links._replace(leader=s.links.follower, follower=s.links.leader)), "do not follow"),
+    (lambda s: s._replace(lanes=s.lanes._replace(moving=Moving(*[s.lanes.lane] * 2, s.lanes.lane + 100_000))),
+     "moving.shadow = "),
+    (lambda s: s._replace(lanes=None), "lanes.lane is missing"),
+    (lambda s: s._replace(lanes=s.lanes._replace(lane=s.lanes.lane.float())), "lane is a torch.Tensor of torch.f"),
+    (lambda s: s._replace(lanes=s.lanes._replace(leader=s.lanes.leader.roll(1, -1))), "do not follow"),
+    (lambda s: s._replace(lanes=s.lanes._replace(lane=s.lanes.lane.clamp_max(0))), "do not follow"),
+    (lambda s: s._replace(lanes=s.lanes._replace(leader=s.lanes.follower, follower=s.lanes.leader)), "do not follow"),
 ]  # fmt: skip
 TRIPS = [
-    (lambda s: s._replace(trips=None), "trips.departs is missing"),
+    (lambda s: s._replace(lanes=s.lanes._replace(trips=None)), "lanes.trips.departs is missing"),
     (lambda s: s._replace(present=None), "present is missing"),
-    (put("trips", np.nan, "departs"), "trips.departs = nan"),
-    (put("trips", 100_000, "lane"), "trips.lane = 100000 is outside"),
+    (put("lanes.trips.departs", np.nan), "lanes.trips.departs = nan"),
+    (put("lanes.trips.lane", 100_000), "lanes.trips.lane = 100000 is outside"),
     (put("present", 2.0), "present = 2 is outside"),
 ]  # fmt: skip
 BAD = [

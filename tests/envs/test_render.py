@@ -169,7 +169,7 @@ def test_arrows_show_who_has_changed_lanes():
         env.step(np.array([0.0, 1.0], np.float32))
         seen.append(int((env.render() == np.array([208, 60, 150])).all(-1).sum()))
     # The one change, in the first step, is shown for a second.
-    assert env.unwrapped.state.links.changed[0, 1] == 1
+    assert env.unwrapped.state.lanes.changed[0, 1] == 1
     shown = np.flatnonzero(seen)
     assert 8 <= len(shown) <= 12 and (np.diff(shown) == 1).all()
 

@@ -127,8 +127,8 @@ def driven(seconds: int = 60) -> Trajectories:
     state = made.state(position, speed, params, lane=place % 3)
     rows = []
     for step in range(10 * seconds):
-        assert state.links is not None
-        numbers = zip(state.position.tolist(), state.speed.tolist(), state.links.lane.tolist(), strict=True)
+        assert state.lanes is not None
+        numbers = zip(state.position.tolist(), state.speed.tolist(), state.lanes.lane.tolist(), strict=True)
         rows += [("a", i, step / 10, x % 900.0, v, 5.0, 3 - k, 900.0) for i, (x, v, k) in enumerate(numbers)]
         state = made.step(state, {}, params)
     names = ("run_id", "vehicle_id", "time_s", "position_m", "speed_mps", "length_m", "lane", "ring_length_m")

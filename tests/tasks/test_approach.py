@@ -51,7 +51,7 @@ def test_agents_see_the_signal_that_stops_traffic() -> None:
 def test_vehicles_come_in_platoons(platoon: float) -> None:
     """In the first part of every cycle of the signal upstream, in later trips of a slot, too."""
     _, worlds = rolled(0, platoon=platoon)
-    trips = worlds[0].state.trips
+    trips = worlds[0].state.lanes.trips
     some = trips.again.isfinite()
     assert torch.allclose(trips.again[some].remainder(60.0), torch.zeros(()).double())
     departs = (trips.departs[some] + 300.0 / 14.0).remainder(60.0)

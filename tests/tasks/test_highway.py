@@ -21,7 +21,7 @@ def lanes_of(env: gym.Env, action: np.ndarray, steps: int) -> list[int]:
     seen = []
     for _ in range(steps):
         env.step(action)
-        seen.append(int(env.unwrapped.state.links.lane[0, 1]))
+        seen.append(int(env.unwrapped.state.lanes.lane[0, 1]))
     return seen
 
 
@@ -31,7 +31,7 @@ def test_agents_command_lanes_where_that_is_asked_for() -> None:
     assert env.action_space.shape == (2,)
     left = lanes_of(env, np.array([0.0, 1.0], np.float32), 25)
     assert left[0] == left[9] == 2 and left[10] == left[24] == 2
-    blocked = int(env.unwrapped.state.links.blocked[0, 1])
+    blocked = int(env.unwrapped.state.lanes.blocked[0, 1])
     assert blocked == 2
     right = lanes_of(env, np.array([0.0, -1.0], np.float32), 25)
     assert right[0] == right[24] == 0
@@ -39,13 +39,13 @@ def test_agents_command_lanes_where_that_is_asked_for() -> None:
     vector = gym.make_vec("DiffIDM-v0", num_envs=2, lane_commands=True, **EMPTY)
     vector.reset(seed=1)
     vector.step(np.array([[0.0, 1.0], [0.0, -1.0]], np.float32))
-    assert vector.state.links.lane[:, 1].tolist() == [2, 0]
+    assert vector.state.lanes.lane[:, 1].tolist() == [2, 0]
     each = parallel_env(lane_commands=True, **EMPTY)
     each.reset(seed=1)
     (agent,) = each.agents
     assert each.action_space(agent).shape == (2,)
     each.step({agent: np.array([0.0, 1.0], np.float32)})
-    assert each.batch.world.state.links.lane[0, 1] == 2
+    assert each.batch.world.state.lanes.lane[0, 1] == 2
 
 
 def test_actions_may_be_whole_numbers_in_every_face() -> None:
@@ -60,7 +60,7 @@ def test_actions_may_be_whole_numbers_in_every_face() -> None:
             first = env.step(np.array(whole))
             other = box.step(np.array(number, np.float32))
             np.testing.assert_array_equal(first[0], other[0])
-        assert env.unwrapped.state.links.lane.tolist() == box.unwrapped.state.links.lane.tolist()
+        assert env.unwrapped.state.lanes.lane.tolist() == box.unwrapped.state.lanes.lane.tolist()
     with pytest.raises(ValueError, match="must hold whole numbers"):
         env.step(np.array([0, 1, 2, 3]))
     with pytest.raises(ValueError, match="must hold whole numbers"):
@@ -74,7 +74,7 @@ def test_actions_may_be_whole_numbers_in_every_face() -> None:
     each.reset(seed=1)
     assert each.action_space("vehicle_1") == gym.spaces.MultiDiscrete([3, 3])
     each.step({agent: np.array([1, 2]) for agent in each.agents})
-    assert each.batch.world.state.links.lane[0].tolist() == [0, 2, 2]
+    assert each.batch.world.state.lanes.lane[0].tolist() == [0, 2, 2]
 
 
 def test_stable_baselines3_takes_whole_numbers() -> None:

@@ -68,7 +68,7 @@ def everybody(task, first: int, steps: int) -> Record:
 
 def check_links(task, state, at: int) -> None:
     """Leaders, followers, gaps and lanes are those of the record at this time."""
-    scene, links = task.scene, state.links
+    scene, links = task.scene, state.lanes
     place, there, lane = scene.motion[at, :, 0], scene.present[at], scene.lane[at]
     np.testing.assert_array_equal(links.lane[0].numpy()[there], lane[there])
     for i in np.flatnonzero(there):
@@ -105,9 +105,9 @@ def test_with_nobody_handed_over_the_file_comes_back(road):
             slot = task.scene.ids.index(f"r/{row['vehicle_id']}")
             assert float(state.position[0, slot]) == pytest.approx(row["position_m"], abs=1e-6)
             assert float(state.speed[0, slot]) == pytest.approx(row["speed_mps"], abs=1e-6)
-            assert int(state.links.lane[0, slot]) == 3 - row["lane"]
+            assert int(state.lanes.lane[0, slot]) == 3 - row["lane"]
         check_links(task, state, at)
-    changed = dict(zip(task.scene.ids, state.links.changed[0].tolist(), strict=True))
+    changed = dict(zip(task.scene.ids, state.lanes.changed[0].tolist(), strict=True))
     assert changed == {"r/a": 0, "r/b": 1, "r/c": 0, "r/d": 1, "r/e": 0}
 
 
@@ -122,7 +122,7 @@ def test_whoever_drives_as_recorded_stays_on_the_record(road, vehicle):
         world = task.step(world, ((speed[t + 1] - speed[t]) / DT).view(1, 1), None, params)
         assert float(task.distance(world)) < 1e-3
         assert not task.crashed(world).any()
-        assert int(world.state.links.lane[0, own]) == task.scene.lane[t + 1, own]
+        assert int(world.state.lanes.lane[0, own]) == task.scene.lane[t + 1, own]
 
 
 def test_the_leader_is_whoever_is_ahead_on_the_lane_now(road):
@@ -133,7 +133,7 @@ def test_the_leader_is_whoever_is_ahead_on_the_lane_now(road):
     for t in range(1, 61):
         world = task.step(world, torch.full((1, 1), -9.0, dtype=torch.float64), None, params)
         state = world.state
-        leader = int(state.links.leader[0, own])
+        leader = int(state.lanes.leader[0, own])
         assert ids[leader] == ("r/b" if t < 30 else "r/d")
         gap = float(state.position[0, leader] - 5.0 - state.position[0, own])
         assert float(state.gap[0, own]) == pytest.approx(gap, abs=1e-9)
@@ -177,12 +177,12 @@ def test_drivers_and_agents_may_change_lanes_themselves():
                 inputs = task.with_lane_commands(task.inputs(world, command, None), action)
                 world = world._replace(state=task.simulator.step(world.state, inputs, params))
         at = (world.episode["start"] + 150).numpy()
-        lanes = world.state.links.lane.numpy()
+        lanes = world.state.lanes.lane.numpy()
         place = world.state.position.numpy()
         recorded = ~own.numpy()
         np.testing.assert_array_equal(lanes[:, recorded], task.scene.lane[at][:, recorded])
         np.testing.assert_allclose(place[:, recorded], task.scene.motion[at][:, recorded, 0], atol=1e-9)
-        assert (world.state.links.changed[:, own] > 0).any()
+        assert (world.state.lanes.changed[:, own] > 0).any()
         assert (lanes[:, ~recorded] != task.scene.lane[at][:, ~recorded]).any()
 
 
@@ -284,7 +284,7 @@ def test_the_whole_i75_recording(measured):
             check_links(task, state, at)
             rows = table.filter((pl.col("time_s") - table["time_s"].min() - DT * at).abs() < 1e-3)
             slots = [task.scene.ids.index(f"i75/{v}") for v in rows["vehicle_id"]]
-            np.testing.assert_array_equal(state.links.lane[0, slots].numpy(), 4 - rows["lane"].to_numpy())
+            np.testing.assert_array_equal(state.lanes.lane[0, slots].numpy(), 4 - rows["lane"].to_numpy())
             np.testing.assert_allclose(state.position[0, slots].numpy(), rows["position_m"].to_numpy(), atol=0.12)
         last = state
-    assert int(last.links.changed.sum()) == 51
+    assert int(last.lanes.changed.sum()) == 51

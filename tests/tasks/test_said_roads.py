@@ -64,9 +64,9 @@ def test_everybody_departs_when_and_as_his_row_says() -> None:
     for _ in range(2000):
         state = task.simulator.advance(state, {"control": _nobody(state)}, params)
         now = float(task.simulator.time(state))
-        fresh = (state.trips.entered[0] > 0) & (entered < 0)
+        fresh = (state.lanes.trips.entered[0] > 0) & (entered < 0)
         entered[fresh] = now
-        lane = torch.where(state.present[0] > 0, state.links.lane[0], lane)
+        lane = torch.where(state.present[0] > 0, state.lanes.lane[0], lane)
     assert torch.allclose(entered, torch.tensor([5.0, 12.0, 30.0]), atol=1.2)
     assert int(demand.counts(task.simulator, state).left) == 3 and lane.tolist()[2] == 0 and lane.tolist()[0] > 0
 
@@ -97,7 +97,7 @@ def test_what_is_not_said_leaves_no_trace() -> None:
     for _ in range(400):
         one = plain.simulator.step(one, {"control": _nobody(one)}, params)
         other = said.simulator.step(other, {"control": _nobody(other)}, own)
-    assert torch.equal(one.position, other.position) and torch.equal(one.links.lane, other.links.lane)
+    assert torch.equal(one.position, other.position) and torch.equal(one.lanes.lane, other.lanes.lane)
 
 
 ROW = {"depart": 5.0, "lane": 1}
