@@ -1,7 +1,7 @@
 """Benchmarks: every figure in README and docs comes from one of these commands.
 
-What they share is here: how a function becomes a command, where parts run, the rows that are done and kept, and tables.
-Importing this imports no numpy, since some set threads before it starts.
+What they share is here: how a function becomes a command, the rows that are done and kept, and tables. Importing
+this imports no numpy, since some set threads before it starts.
 """
 
 from __future__ import annotations
@@ -11,39 +11,16 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 if TYPE_CHECKING:
-    from idm_env.jobs.executor import Executor, Work
+    from idm_env.jobs.executor import Work
+    from idm_env.jobs.workers import Workers
 
 P = TypeVar("P")
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where parts run; no result depends on it.
-
-    Args:
-        executor: Here, in processes, or as tasks of a Ray cluster.
-        jobs: Parts that run at a time; by default one per processor.
-        ray_address: Of a Ray cluster, host:port or auto; by default Ray on this machine.
-    """
-
-    executor: Literal["serial", "processes", "ray"] = "serial"
-    jobs: int | None = None
-    ray_address: str | None = None
-
-    def opened(self) -> AbstractContextManager[Executor]:
-        """Give the executor."""
-        from idm_env.jobs.executor import opened
-
-        return opened(self.executor, self.jobs, self.ray_address)
-
-
-HERE, IN_PROCESSES = Place(), Place("processes")
 DATA = Path(os.environ.get("IDM_ENV_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 """Folder of the measured files."""
 
@@ -76,7 +53,7 @@ def _keep(row: dict[str, Any], file: TextIO) -> dict[str, Any]:
 
 
 def rows_of(
-    work: Work[P, Any], parts: Mapping[str, P], out: Path, place: Place, column: str, told: Callable[[Any], str]
+    work: Work[P, Any], parts: Mapping[str, P], out: Path, place: Workers, column: str, told: Callable[[Any], str]
 ) -> list[dict[str, Any]]:
     """Return the row of every part; those that a file has under their ``column`` are not done again.
 
@@ -91,7 +68,7 @@ def rows_of(
     return [done[name] for name in parts]
 
 
-def named_rows(work: Work[P, Any], parts: Mapping[str, P], out: Path, place: Place) -> dict[str, Any]:
+def named_rows(work: Work[P, Any], parts: Mapping[str, P], out: Path, place: Workers) -> dict[str, Any]:
     """Return what every part gives, by name; each is kept in a file when it is done, and not done again.
 
     What a part says of itself (``repr``) is kept beside it: where that differs, or is missing, it is done anew.

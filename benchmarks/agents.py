@@ -72,9 +72,10 @@ from agents.reference import (  # noqa: E402
     tried,
 )  # fmt: skip
 from agents.rollout import FRESH, LENGTHS, Act  # noqa: E402
-from benchmarks import HERE, Place, command, table  # noqa: E402
+from benchmarks import command, table  # noqa: E402
 from idm_env.jobs.progress import OnProgress  # noqa: E402
 from idm_env.jobs.storage import write_text  # noqa: E402
+from idm_env.jobs.workers import HERE, Workers  # noqa: E402
 from idm_env.model_file import read_yaml  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -293,7 +294,7 @@ def chosen(config: str, out: Path) -> tuple[int, list[dict[str, Any]]]:
 
 def run(
     only: Sequence[str] = tuple(SEARCH), out: Path = OUT, seeds: int = len(SEEDS), trial: int | None = None,
-    times: int = 1, place: Place = HERE,
+    times: int = 1, place: Workers = HERE,
 ) -> None:  # fmt: skip
     """Do every search, and train the first seeds of its best trial.
 

@@ -21,7 +21,8 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 
-from benchmarks import IN_PROCESSES, Place, command, rows_of  # noqa: E402
+from benchmarks import command, rows_of  # noqa: E402
+from idm_env.jobs.workers import IN_PROCESSES, Workers  # noqa: E402
 
 RESPONSE = {"delay", "lag"}
 TRUE = {
@@ -333,7 +334,7 @@ def draw(folder: Path) -> None:
 
 def main(
     sets: int = 1, clean: int = 6, few: int = 0, first_seed: int = 70_000, only: str = "",
-    out: Path = Path("discovery_benchmark.jsonl"), pictures: Path | None = None, place: Place = IN_PROCESSES,
+    out: Path = Path("discovery_benchmark.jsonl"), pictures: Path | None = None, place: Workers = IN_PROCESSES,
 ) -> None:  # fmt: skip
     """Run the sets that are not there yet, and print the table.
 

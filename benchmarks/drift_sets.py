@@ -28,7 +28,7 @@ import polars as pl  # noqa: E402
 import torch  # noqa: E402
 from scipy.stats import t as student  # noqa: E402
 
-from benchmarks import HERE, Place, command, rows_of, table  # noqa: E402
+from benchmarks import command, rows_of, table  # noqa: E402
 from idm_env.data import Trajectories, episodes  # noqa: E402
 from idm_env.drift.estimate import estimate, usual  # noqa: E402
 from idm_env.drift.kinds import behind_a_record, tell  # noqa: E402
@@ -36,6 +36,7 @@ from idm_env.effects import DRIFTS, AccelNoise, Effect, PerceptionNoise, Wander 
 from idm_env.fitting.batch import Batch  # noqa: E402
 from idm_env.fitting.problem import IDM_NAMES  # noqa: E402
 from idm_env.jobs.progress import OnProgress, silent  # noqa: E402
+from idm_env.jobs.workers import HERE, Workers  # noqa: E402
 from idm_env.types import Record  # noqa: E402
 
 DT, SECONDS, DRIVERS = 0.2, 90.0, 20
@@ -173,7 +174,7 @@ def recovered(rows: list[dict[str, Any]], i: int, number: str) -> str:
 
 def main(
     sets: int = 60, first_seed: int = 1000, out: Path = Path("drift_sets.jsonl"), drivers: int = DRIVERS,
-    seconds: float = SECONDS, alone: bool = False, steady: bool = False, place: Place = HERE,
+    seconds: float = SECONDS, alone: bool = False, steady: bool = False, place: Workers = HERE,
 ) -> None:  # fmt: skip
     """Run the sets that are not there yet, and print the table.
 

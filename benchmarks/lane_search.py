@@ -35,10 +35,11 @@ from agents.common import load, load_agent
 from agents.environments import make_env
 from agents.evaluate import judge_lanes
 from agents.rollout import Act, episodes_start
-from benchmarks import HERE, Place, command, named_rows
+from benchmarks import command, named_rows
 from benchmarks.lane_tasks import DEMANDS, Found
 from idm_env.effects.idm import interaction
 from idm_env.jobs.progress import OnProgress
+from idm_env.jobs.workers import HERE, Workers
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.types import Driver
 
@@ -225,7 +226,7 @@ def shown(title: str, rows: dict[Part, dict[str, Any]]) -> Table:
 def main(
     name: tyro.conf.Positional[Literal[tuple(DEMANDS)]], share: float = 0.3,
     how: Sequence[Literal[(*FOUND_BY, *NETWORKS)]] = (*FOUND_BY, *NETWORKS), seeds: int = 5, budget: float = 1.0,
-    out: Path = Path("runs/lane_search.jsonl"), place: Place = HERE,
+    out: Path = Path("runs/lane_search.jsonl"), place: Workers = HERE,
 ) -> None:  # fmt: skip
     """Search where that is not done yet, and print all rows.
 

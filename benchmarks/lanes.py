@@ -33,12 +33,13 @@ from rich.table import Table
 from torch import Tensor
 
 import idm_env  # noqa: F401  (registers the environments)
-from benchmarks import HERE, Place, command, named_rows, table
+from benchmarks import command, named_rows, table
 from benchmarks.bench.measure import Case, measure, rate, turning
 from benchmarks.bench.peers import highway, started
 from idm_env.effects import IDM, Brakes, LaneCommand, MandatoryChange, Mobil
 from idm_env.jobs import progress, storage
 from idm_env.jobs.progress import OnProgress
+from idm_env.jobs.workers import HERE, Workers
 from idm_env.multilane import demand
 from idm_env.reports import page
 from idm_env.roads import Lanes, lane_drop, off_ramp, on_ramp
@@ -326,7 +327,7 @@ def picture(found: Rows, path: Path) -> None:
     storage.write(path, lambda file: figure.savefig(file, dpi=110))
 
 
-def flow(path: Path = Path("out/lanes-flow.png"), place: Place = HERE) -> None:
+def flow(path: Path = Path("out/lanes-flow.png"), place: Workers = HERE) -> None:
     """Print flow (vehicles per hour and lane) and changes per vehicle and hour, and draw them.
 
     Args:

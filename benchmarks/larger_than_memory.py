@@ -14,10 +14,11 @@ import resource
 import time
 from pathlib import Path
 
-from benchmarks import HERE, Place, command
+from benchmarks import command
 from idm_env.data import synthetic
 from idm_env.fitting.job import fit_file
 from idm_env.fitting.options import Options, Source
+from idm_env.jobs.workers import HERE, Workers
 
 FOLLOWERS, RUNS = 10, 200
 SECONDS = 15.0
@@ -43,7 +44,7 @@ def megabytes(who: int) -> float:
 
 
 def main(
-    drivers: int = 20_000, folder: Path = Path("out/drives"), out: Path = Path("out/drives-fit"), place: Place = HERE
+    drivers: int = 20_000, folder: Path = Path("out/drives"), out: Path = Path("out/drives-fit"), place: Workers = HERE
 ) -> None:
     """Make, fit, print."""
     drivers = make(folder, drivers)

@@ -20,10 +20,11 @@ for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "POLARS_MAX_THREADS"):
 import numpy as np  # noqa: E402 (threads are set before numpy starts)
 import polars as pl  # noqa: E402
 
-from benchmarks import DATA, HERE, Place, command, rows_of, table  # noqa: E402
+from benchmarks import DATA, command, rows_of, table  # noqa: E402
 from idm_env.data import load  # noqa: E402
 from idm_env.discovery import Discovery, discover  # noqa: E402
 from idm_env.jobs.progress import OnProgress, silent  # noqa: E402
+from idm_env.jobs.workers import HERE, Workers  # noqa: E402
 
 FEWEST_RUNS = 7
 
@@ -148,7 +149,7 @@ def shown(rows: list[dict[str, Any]]) -> str:
 
 def main(
     data: Path = DATA, out: Path = Path("measured.jsonl"),
-    only: str = "", place: Place = HERE,
+    only: str = "", place: Workers = HERE,
 ) -> None:  # fmt: skip
     """Do the cases that are not done yet, and print the table.
 

@@ -16,10 +16,11 @@ from pathlib import Path
 
 import tyro
 
-from benchmarks import HERE, Place, command
+from benchmarks import command
 from idm_env.data.scenario import Scenario
 from idm_env.data.womd import scenarios
 from idm_env.jobs.progress import OnProgress, silent
+from idm_env.jobs.workers import HERE, Workers
 from idm_env.prediction.files import OURS, case_of
 from idm_env.prediction.metrics import Score, score, summary
 from idm_env.prediction.mixture import SHARES, Seen, Shares, fit_shares, seen
@@ -93,7 +94,7 @@ def compared(agents: Iterable[tuple[Known, Shares]], methods: Sequence[str]) -> 
     }
 
 
-def main(files: tyro.conf.Positional[list[Path]], shares: bool = False, place: Place = HERE) -> None:
+def main(files: tyro.conf.Positional[list[Path]], shares: bool = False, place: Workers = HERE) -> None:
     """Score the scenes of the files.
 
     Args:

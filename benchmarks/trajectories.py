@@ -21,10 +21,11 @@ import numpy as np
 import polars as pl
 import torch
 
-from benchmarks import HERE, Place, command
+from benchmarks import command
 from idm_env.data import synthetic
 from idm_env.data.scenario import Agent, MapLane, Scenario, TrafficControl
 from idm_env.jobs.progress import OnProgress, silent
+from idm_env.jobs.workers import HERE, Workers
 from idm_env.prediction.pictures import scene_picture
 from idm_env.prediction.predict import predict
 from idm_env.prediction.scene import MapScene
@@ -285,7 +286,7 @@ def draw(folder: Path) -> None:
 
 def main(
     data: Path | None = None, part: Literal["filter", "reconstruct", "time"] | None = None, tracks: int = 200,
-    seconds: float = 60.0, pictures: Path | None = None, place: Place = HERE,
+    seconds: float = 60.0, pictures: Path | None = None, place: Workers = HERE,
 ) -> None:  # fmt: skip
     """Print the scores of every method, and times.
 

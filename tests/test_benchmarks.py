@@ -10,8 +10,9 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import Place, command, kept_rows, lane_search, lane_tasks, lanes, named_rows
+from benchmarks import command, kept_rows, lane_search, lane_tasks, lanes, named_rows
 from idm_env.jobs.progress import OnProgress
+from idm_env.jobs.workers import Workers
 from idm_env.tasks import make_task
 
 COMMANDS = sorted(p.stem for p in (Path(__file__).parents[1] / "benchmarks").glob("*.py") if p.stem != "__init__")
@@ -36,7 +37,7 @@ def _refused(part: int, on_progress: OnProgress) -> int:
 
 
 def test_rows_are_kept_and_not_done_again(tmp_path: Path) -> None:
-    given = Place()
+    given = Workers()
     rows = {"two": 2, "three": 3}
     at = tmp_path / "out" / "rows.jsonl"
     for work in (_squared, _refused):

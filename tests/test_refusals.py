@@ -17,6 +17,7 @@ from idm_env.effects import BASES
 from idm_env.fitting.fit import Method
 from idm_env.fitting.problem import Loss, Objective
 from idm_env.jobs.executor import KINDS
+from idm_env.jobs.workers import Kind
 from idm_env.step import INTEGRATORS
 from idm_env.tasks.replay_lanes import FIRST_LANES
 from idm_env.trajectories.chunks import Recipe
@@ -32,6 +33,7 @@ def test_words_of_options_are_those_of_whoever_uses_them() -> None:
         "loss": get_args(Loss), "method": get_args(Method), "objective": get_args(Objective),
         "recipe": get_args(Recipe),
     } == refusals.CHOICES  # fmt: skip
+    assert get_args(Kind) == KINDS
 
 
 def refused(name: str, command: Any, folder: Path) -> dict[str, list[str]]:

@@ -306,7 +306,7 @@ def test_places_without_a_class_are_one_line(
 def test_every_command_that_reads_a_model_can_be_told_to_trust_and_is_in_the_law() -> None:
     commands = {str(c.name or c.callback.__name__): get_type_hints(c.callback) for c in cli.app.registered_commands}  # type: ignore[union-attr]
     reads = {name for name, hints in commands.items() if "model" in hints} | {"plot"}
-    assert reads == {name for name, hints in commands.items() if "trusted" in hints} and len(reads) == 6
+    assert reads == {name for name, hints in commands.items() if "trust" in hints} and len(reads) == 6
     assert reads <= set(WAYS)
 
 

@@ -15,27 +15,20 @@ import idm_env
 from idm_env import validation
 from idm_env.cli import refusals
 from idm_env.cli.options import (
-    Base,
-    Columns,
-    Corrected,
-    Data,
-    DataOrFolder,
+    OUT,
+    POSITIONAL,
     FileOptions,
     JobOptions,
-    Layout,
+    Limits,
     MaxGap,
     MinSeconds,
-    Out,
     RingLength,
     Seed,
     SourceOptions,
     Step,
     TrackOptions,
-    Trust,
-    Where,
-    ranged,
     spread,
-)  # fmt: skip
+)
 from idm_env.extras import needed
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, shown
@@ -121,49 +114,55 @@ def _show(title: str, rows: list[dict[str, Any]]) -> None:
 def fit(
     context: typer.Context,
     *,
-    data: DataOrFolder,
-    out: Out = Path("out/fit"),
-    by: Annotated[str, typer.Option(help="driver, all, or a column such as vehicle_name.")] = "driver",
-    held_out: Annotated[str | None, typer.Option(help='"column=value", or a share of the runs such as 0.25.')] = None,
-    objective: Annotated[str, typer.Option(help="spacing, speed or both.")] = "spacing",
-    relative: Annotated[bool, typer.Option(help="Divide residuals by each driver's mean.")] = False,
-    loss: Annotated[str, typer.Option(help="rmse (mean over episodes) or mse (all samples alike).")] = "rmse",
-    method: Annotated[str, typer.Option(help="lm (Levenberg-Marquardt) or adam (as in the paper).")] = "lm",
-    integration: Annotated[str, typer.Option(help="ballistic, or euler as in the paper.")] = "ballistic",
-    starts: Annotated[int, ranged(help="Starts per group.", low=1, high=1000)] = 4,
-    substeps: Annotated[
-        int | None, ranged(help="Simulated steps per sample; default: steps of 25 ms.", low=1, high=1000)
-    ] = None,
-    model: Corrected = None,
-    base: Base = None,
+    data: Path,
+    job: JobOptions,
+    by: str = "driver",
+    held_out: str | None = None,
+    objective: str = "spacing",
+    relative: bool = False,
+    loss: str = "rmse",
+    method: str = "lm",
+    integration: str = "ballistic",
+    starts: Annotated[int, Limits(1, 1000)] = 4,
+    substeps: Annotated[int | None, Limits(1, 1000)] = None,
+    model: str | None = None,
+    base: str | None = None,
     seed: Seed = 0,
     file: SourceOptions,
-    job: JobOptions,
-    sumo: Annotated[
-        Path | None, typer.Option(help="Also write the drivers as SUMO's vTypes, an additional file: vtypes.add.xml.")
-    ] = None,
-    lane_changes: Annotated[
-        bool, typer.Option("--lane-changes", help="Fit MOBIL to the lane changes of the file, by their likelihood.")
-    ] = False,
-    every: Annotated[
-        float, ranged(help="--lane-changes: seconds between decisions.", low=0.1, high=60.0, unit="s")
-    ] = 1.0,
-    ahead: Annotated[
-        float, ranged(help="--lane-changes: seconds from a decision to the new lane number.", low=0.0, high=10.0)
-    ] = 0.0,
-    first_lane: Annotated[str, typer.Option(help="--lane-changes: where the lowest lane is, left or right.")] = "left",
-    trusted: Trust = False,
+    sumo: Path | None = None,
+    lane_changes: bool = False,
+    every: Annotated[float, Limits(0.1, 60.0, "s")] = 1.0,
+    ahead: Annotated[float, Limits(0.0, 10.0)] = 0.0,
+    first_lane: str = "left",
+    trust: bool = False,
 ) -> None:
     """Calibrate IDM, or another law, by gradients through the simulator, per driver, group or pooled.
 
     Writes parameters.parquet, model.yaml, report.json and report.html. With --lane-changes MOBIL's are fitted,
     and judged on drivers held out; hypothetical accelerations are those of --model or --base.
+
+    Args:
+        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
+        by: driver, all, or a column such as vehicle_name.
+        held_out: "column=value", or a share of the runs such as 0.25.
+        objective: spacing, speed or both.
+        relative: Divide residuals by each driver's mean.
+        loss: rmse (mean over episodes) or mse (all samples alike).
+        method: lm (Levenberg-Marquardt) or adam (as in the paper).
+        integration: ballistic, or euler as in the paper.
+        starts: Starts per group.
+        substeps: Simulated steps per sample; default: steps of 25 ms.
+        sumo: Also write the drivers as SUMO's vTypes, an additional file: vtypes.add.xml.
+        lane_changes: Fit MOBIL to the lane changes of the file, by their likelihood.
+        every: --lane-changes: seconds between decisions.
+        ahead: --lane-changes: seconds from a decision to the new lane number.
+        first_lane: --lane-changes: where the lowest lane is, left or right.
     """
     if lane_changes:
         source_of_changes = {"data", "out", "model", "base", "seed", "ring_length", "layout", "columns", "where",
-                             "lane_changes", "every", "ahead", "first_lane", "trusted"}  # fmt: skip
+                             "lane_changes", "every", "ahead", "first_lane", "trust"}  # fmt: skip
         _only(context, "--lane-changes", source_of_changes)
-        _fit_lane_changes(data, out, model, base, seed, file, every, ahead, first_lane)
+        _fit_lane_changes(data, job.out, model, base, seed, file, every, ahead, first_lane)
         return
     _only(context, "", set(context.params) - {"every", "ahead", "first_lane"})
     share: str | float | None = held_out
@@ -184,10 +183,10 @@ def fit(
         options = Options(
             by, share, objective, relative, loss, method, integration, starts, seed, substeps, model, base,  # type: ignore[arg-type]
         )  # fmt: skip
-        with job.workers() as workers:
-            result = fit_file(source, options, out, resume=job.resume, executor=workers, on_progress=report)
+        with job.running(report) as run:
+            result = fit_file(source, options, job.out, **run)
         if sumo is not None:
-            vtypes.write(sumo, load_model(out / "model.yaml"))
+            vtypes.write(sumo, load_model(job.out / "model.yaml"))
     if result["over_fitting"]:
         console.print(result["over_fitting"], soft_wrap=True, highlight=False)
     rows = [{"": "fitted", **result["fit"]}]
@@ -195,7 +194,7 @@ def fit(
         rows.append({"": "held out", **result["held_out"]})
     _show("Errors in free simulation", in_words(rows))
     console.print(result["at_bounds"], soft_wrap=True, highlight=False)
-    _done(out, result["data"]["account"])
+    _done(job.out, result["data"]["account"])
 
 
 def _only(context: typer.Context, mode: str, accepted: set[str]) -> None:
@@ -231,31 +230,29 @@ def _fit_lane_changes(
 @app.command()
 def explain(
     *,
-    data: Annotated[
-        list[Path],
-        typer.Argument(help="Trajectories: csv, csv.gz, parquet. Several data sets: files, a folder, 'drives/*.csv'."),
-    ],
-    out: Out = Path("out/explain"),
-    by: Annotated[str, typer.Option(help="Who shares IDM parameters: driver, all, or a column.")] = "driver",
-    effects: Annotated[
-        str | None,
-        typer.Option(help="Candidates, by comma: names, or my_file.py:MyEffect; default: the whole catalogue."),
-    ] = None,
-    known: Annotated[str | None, typer.Option(help="Effects whose values are in the file, such as grade.")] = None,
-    base: Base = None,
+    data: list[Path],
+    job: JobOptions,
+    by: str = "driver",
+    effects: str | None = None,
+    known: str | None = None,
+    base: str | None = None,
     seed: Seed = 0,
     file: FileOptions,
-    split_runs: Annotated[
-        str | None,
-        typer.Option(help="Cut recordings into runs of so many seconds, 60s; each driver counts in one of them."),
-    ] = None,
-    job: JobOptions,
+    split_runs: str | None = None,
 ) -> None:
     """Find the effect that a calibrated car-following model lacks, add it, and report the errors before and after.
 
     Writes report.json, report.html and model.yaml, the corrected model. Errors are of a test set: runs used
     neither for fitting nor for model selection.
+
+    Args:
+        data: Trajectories: csv, csv.gz, parquet. Several data sets: files, a folder, 'drives/*.csv'.
+        by: Who shares IDM parameters: driver, all, or a column.
+        effects: Candidates, by comma: names, or my_file.py:MyEffect; default: the whole catalogue.
+        known: Effects whose values are in the file, such as grade.
+        split_runs: Cut recordings into runs of so many seconds, 60s; each driver counts in one of them.
     """
+    out = job.out
     with shown(console) as report:
         from idm_env.data import pieces
         from idm_env.data.load import files_of
@@ -285,8 +282,8 @@ def explain(
                 files[0], out, question, resume=job.resume, on_progress=report, trajectories=read
             )
         else:
-            with job.workers() as workers:
-                rows = explain_sets(files, out, question, resume=job.resume, executor=workers, on_progress=report)
+            with job.running(report) as run:
+                rows = explain_sets(files, out, question, **run)
     if not rows:
         _explained(result, models, out)
         return
@@ -366,16 +363,18 @@ def _names(option: str, text: str | None) -> tuple[str, ...] | None:
 
 @app.command()
 def demo(
-    data: Annotated[
-        Path | None, typer.Option(help="Your own file; default: generated data with a hidden effect.")
-    ] = None,
-    columns: Columns = None,
-    out: Out = Path("out/demo"),
-    seed: Annotated[int, ranged(help="Seed of the generated data.", low=0, high=1e9)] = 7,
+    data: Path | None = None,
+    columns: str | None = None,
+    out: Path = OUT,
+    seed: Annotated[int, Limits(0, 1e9)] = 7,
 ) -> None:
     """Generate platoons with a hidden effect, and find it: the whole of `explain` in half a minute.
 
     The data are written to OUT/platoon.csv first; nothing in them names the effect.
+
+    Args:
+        data: Your own file; default: generated data with a hidden effect.
+        seed: Seed of the generated data.
     """
     from idm_env.reports.undecided import EXPLAINED
 
@@ -401,15 +400,19 @@ def demo(
 @app.command()
 def simulate(
     *,
-    data: Data,
-    model: Annotated[Path | None, typer.Option(help="A model.yaml of fit or explain, or one of your own.")] = None,
-    base: Base = None,
-    out: Out = Path("out/simulate"),
+    data: Path,
+    model: Path | None = None,
+    base: str | None = None,
+    out: Path = OUT,
     seed: Seed = 0,
     file: SourceOptions,
-    trusted: Trust = False,
+    trust: bool = False,
 ) -> None:
-    """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html."""
+    """Roll a saved model out behind the measured leaders. Writes simulated.parquet, report.json and report.html.
+
+    Args:
+        model: A model.yaml of fit or explain, or one of your own.
+    """
     if (model is None) == (base is None):
         raise ValueError("simulate takes either a model (--model) or a car-following law (--base). Give one of them.")
     with shown(console) as report:
@@ -427,18 +430,20 @@ def simulate(
 @app.command()
 def drift(
     *,
-    data: Data,
-    out: Out = Path("out/drift"),
-    drivers: Annotated[int, ranged(help="Drivers at most, evenly spread over the file.", low=2, high=10000)] = 60,
+    data: Path,
+    job: JobOptions,
+    drivers: Annotated[int, Limits(2, 10000)] = 60,
     file: FileOptions,
     max_gap: MaxGap = 80.0,
     min_seconds: MinSeconds = 20.0,
     dt: Step = None,
-    job: JobOptions,
 ) -> None:
     """Estimate how unsteady drivers are: which quantity wanders, by how much (sigma), with which memory time (tau).
 
     Writes report.json, and model.yaml with drivers who drift, for simulate --model and as `effects` of environments.
+
+    Args:
+        drivers: Drivers at most, evenly spread over the file.
     """
     with shown(console) as report:
         from idm_env.drift.job import drift_file
@@ -446,10 +451,8 @@ def drift(
 
         _work_begins()
         source = Source(data, max_gap=max_gap, min_seconds=min_seconds, dt=dt, **dataclasses.asdict(file))
-        with job.workers() as workers:
-            result = drift_file(
-                source, out, drivers=drivers, resume=job.resume, executor=workers, on_progress=report
-            )  # fmt: skip
+        with job.running(report) as run:
+            result = drift_file(source, job.out, drivers=drivers, **run)
     names = {"log_likelihood": "gain in log-likelihood", "tau_s": "tau (s)"}
     rows = [{names.get(name, name): x for name, x in row.items()} for row in result["sorts"]]
     _show("Every sort of drift against drivers who do not drift", rows)
@@ -460,16 +463,21 @@ def drift(
         _show(f"Forecasts of the gap of {result['kept_back']['drivers']} drivers kept back", forecasts)
     console.print(result["sentence"], soft_wrap=True, highlight=False)
     console.print(result["data"]["account"], soft_wrap=True, highlight=False)
-    _told("Model", out / "model.yaml")
+    _told("Model", job.out / "model.yaml")
 
 
 @app.command()
 def effects(
-    model: Annotated[Path | None, typer.Argument(help="A model.yaml: only the effects in it.")] = None,
-    cite: Annotated[bool, typer.Option("--cite", help="Print the publications that they are taken from.")] = False,
-    trusted: Trust = False,
+    model: Annotated[Path | None, POSITIONAL] = None,
+    cite: bool = False,
+    trust: bool = False,
 ) -> None:
-    """List the catalogue of effects, or the effects of a model, with their parameters or their publications."""
+    """List the catalogue of effects, or the effects of a model, with their parameters or their publications.
+
+    Args:
+        model: A model.yaml: only the effects in it.
+        cite: Print the publications that they are taken from.
+    """
     from idm_env.effects import ALL
     from idm_env.parameters import table
 
@@ -519,31 +527,29 @@ def doctor() -> None:
 
 @app.command()
 def plot(
-    source: Annotated[Path, typer.Argument(help="A trajectory file, or a YAML file of configs/ to roll out.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The picture: png, svg or pdf.")] = Path(
-        "out/space-time.png"
-    ),
-    html: Annotated[
-        bool, typer.Option("--html", help="Write an interactive page too, beside the picture: zoom, and point.")
-    ] = False,
-    panels: Annotated[
-        int, ranged(help="Panels at most, one per run and lane, the largest first.", low=1, high=1000)
-    ] = 6,
+    source: Path,
+    out: Path = OUT / "space-time.png",
+    html: bool = False,
+    panels: Annotated[int, Limits(1, 1000)] = 6,
     ring_length: RingLength = None,
-    layout: Layout = "auto",
-    columns: Columns = None,
-    where: Where = None,
-    seconds: Annotated[
-        float,
-        ranged(help="Length of a rollout, all vehicles left to their drivers (s).", low=0.1, high=1e5, unit="s"),
-    ] = 300.0,
+    layout: str = "auto",
+    columns: str | None = None,
+    where: list[str] | None = None,
+    seconds: Annotated[float, Limits(0.1, 1e5, "s")] = 300.0,
     seed: Seed = 0,
-    trusted: Trust = False,
+    trust: bool = False,
 ) -> None:
     """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
 
     One panel per run and lane, of a rollout the left lane first; controlled vehicles (of a rollout, or a column
     "controlled") are underlined in blue.
+
+    Args:
+        source: A trajectory file, or a YAML file of configs/ to roll out.
+        out: The picture: png, svg or pdf.
+        html: Write an interactive page too, beside the picture: zoom, and point.
+        panels: Panels at most, one per run and lane, the largest first.
+        seconds: Length of a rollout, all vehicles left to their drivers (s).
     """
     from idm_env.reports.page import account
 
@@ -615,22 +621,24 @@ def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress)
 @app.command("filter")
 def filter_(
     *,
-    data: DataOrFolder,
-    out: Out = Path("out/filter"),
-    tracks: TrackOptions,
+    data: Path,
     job: JobOptions,
-    trusted: Trust = False,
+    tracks: TrackOptions,
+    trust: bool = False,
 ) -> None:
-    """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters."""
+    """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters.
+
+    Args:
+        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
+    """
     with shown(console) as report:
         from idm_env.trajectories.files import filter_file
 
         _work_begins()
-        with job.workers() as workers:
-            options: dict[str, Any] = dataclasses.asdict(tracks)
-            result = filter_file(data, out, **options, resume=job.resume, executor=workers, on_progress=report)
+        with job.running(report) as run:
+            result = filter_file(data, job.out, **dataclasses.asdict(tracks), **run)
     _methods(result)
-    _done(out, result["account"])
+    _done(job.out, result["account"])
 
 
 def _methods(result: dict[str, Any]) -> None:
@@ -647,57 +655,70 @@ def _methods(result: dict[str, Any]) -> None:
 @app.command()
 def reconstruct(
     *,
-    data: DataOrFolder,
-    out: Out = Path("out/reconstruct"),
-    dt: Annotated[float, ranged(help="Step of the dense trajectories (s).", low=0.01, high=2.0, unit="s")] = 0.1,
-    tracks: TrackOptions,
+    data: Path,
     job: JobOptions,
-    trusted: Trust = False,
+    dt: Annotated[float, Limits(0.01, 2.0, "s")] = 0.1,
+    tracks: TrackOptions,
+    trust: bool = False,
 ) -> None:
-    """Reconstruct dense trajectories from sparse ones, a second or more between points."""
+    """Reconstruct dense trajectories from sparse ones, a second or more between points.
+
+    Args:
+        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
+        dt: Step of the dense trajectories (s).
+    """
     with shown(console) as report:
         from idm_env.trajectories.files import reconstruct_file
 
         _work_begins()
-        with job.workers() as workers:
-            options: dict[str, Any] = {**dataclasses.asdict(tracks), "dt": dt}
-            result = reconstruct_file(data, out, **options, resume=job.resume, executor=workers, on_progress=report)
+        with job.running(report) as run:
+            result = reconstruct_file(data, job.out, **dataclasses.asdict(tracks), dt=dt, **run)
     _methods(result)
-    _done(out, result["account"])
+    _done(job.out, result["account"])
 
 
 @app.command()
 def predict(
     *,
-    scenarios: Annotated[list[Path], typer.Argument(help="Waymo Open Motion scenarios: JSON, json.gz or TFRecord.")],
-    out: Out = Path("out/predict"),
+    scenarios: list[Path],
     job: JobOptions,
 ) -> None:
-    """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map."""
+    """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map.
+
+    Args:
+        scenarios: Waymo Open Motion scenarios: JSON, json.gz or TFRecord.
+    """
     with shown(console) as report:
         from idm_env.prediction.files import predict_files
 
         _work_begins()
-        with job.workers() as workers:
-            result = predict_files(scenarios, out, resume=job.resume, executor=workers, on_progress=report)
+        with job.running(report) as run:
+            result = predict_files(scenarios, job.out, **run)
     names = {"minADE_8s": "minADE (m)", "minFDE_8s": "minFDE (m)", "miss_rate_8s": "miss rate", "mAP_8s": "mAP"}
     rows = [{"method": r["method"], **{title: r[key] for key, title in names.items()}} for r in result["methods"]]
     _show(f"8 s ahead, {result['agents_with_known_future']} agents", rows)
-    _done(out, result["account"])
+    _done(job.out, result["account"])
 
 
 @app.command()
 def bench(
-    out: Out = Path("out/bench"),
-    sizes: Annotated[str, typer.Option(help="Numbers of vehicles, by comma.")] = "2000,20000,200000,2000000",
-    rounds: Annotated[int, ranged(help="Interleaved rounds; minimum and median are reported.", low=1, high=1000)] = 5,
-    compiled: Annotated[bool, typer.Option(help="Include the step compiled by inductor.")] = True,
-    peers: Annotated[bool, typer.Option(help="Include SUMO and HighwayEnv.")] = True,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Say which path ran, and why.")] = False,
+    out: Path = OUT,
+    sizes: str = "2000,20000,200000,2000000",
+    rounds: Annotated[int, Limits(1, 1000)] = 5,
+    compiled: bool = True,
+    peers: bool = True,
+    verbose: bool = False,
 ) -> None:
     """Measure speed beside diffidm, SUMO, HighwayEnv and the memory's limit, in one run on this machine.
 
     Writes report.html and performance.json. It is a benchmark of the checkout, and no part of an installed wheel.
+
+    Args:
+        sizes: Numbers of vehicles, by comma.
+        rounds: Interleaved rounds; minimum and median are reported.
+        compiled: Include the step compiled by inductor.
+        peers: Include SUMO and HighwayEnv.
+        verbose: Say which path ran, and why.
     """
     if not (CHECKOUT / "benchmarks" / "bench").is_dir():
         raise ValueError(

@@ -6,68 +6,66 @@ import dataclasses
 import functools
 import inspect
 import math
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from idm_env import validation
 from idm_env.extras import needed
 from idm_env.jobs import trust
+from idm_env.jobs.progress import OnProgress
+from idm_env.jobs.workers import HERE, Workers
 
 with needed("the command line"):
     import typer
 
-if TYPE_CHECKING:
-    from idm_env.jobs.executor import Executor
+OUT = Path("out")
+"""Folder of results where none is named: a command has its own in it."""
+POSITIONAL = "positional"
+"""Marks an option that is written without its name, and may be left out."""
 
 
-def ranged(*names: str, help: str, low: float, high: float, unit: str = "") -> Any:
-    """Return an option whose number must lie in ``[low, high]``: all flags' numbers are checked here."""
+class Limits(NamedTuple):
+    """Where an option's number may lie, ends included, in its unit: all flags' numbers are checked here."""
 
-    def check(param: typer.CallbackParam, value: float | None) -> float | None:
+    low: float
+    high: float
+    unit: str = ""
+
+    def check(self, param: typer.CallbackParam, value: float | None) -> float | None:
+        """Return the value; ValueError for one outside."""
         if value is not None:
-            validation.within(param.opts[0], value, low, high, unit)
+            validation.within(param.opts[0], value, *self)
         return value
 
-    return typer.Option(*names, help=help, callback=check)
+
+class SharedOptions:
+    """Options of several commands: what a command or a group of options does not describe itself means this.
+
+    Args:
+        data: Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.
+        out: Folder for the results; made if missing.
+        seed: Seed of everything random.
+        model: A model.yaml of explain: its effects stay, IDM is fitted.
+        base: Car-following law: idm (the default), idm_plus, iidm, fvdm, gipps, constant_time_gap, my_file.py:MyLaw.
+        layout: auto, tidy, ngsim, openacc, ultra_av, highd, exid, pneuma or i24.
+        columns: Your names and units: time_s=t,vehicle_id=car,position_m=x[ft],speed_mps=v[km/h].
+        where: Only runs or drivers with "column=value"; given twice, both must hold.
+        ring_length: Circumference (m), if the traffic runs on a ring.
+        max_gap: Gaps above this (m) mean a lost leader and are left out.
+        min_seconds: Shorter stretches behind one leader are left out (s).
+        dt: Use every n-th sample, to this step (s).
+        trust: Run Python code that YAML files name, as my_file.py:MyEffect.
+    """
 
 
-Data = Annotated[Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet; tidy, NGSIM or OpenACC layout.")]
-DataOrFolder = Annotated[
-    Path, typer.Argument(help="Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.")
-]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results; made if missing.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
-Seed = Annotated[int, ranged(help="Seed of everything random.", low=0, high=1e9)]
-RingLength = Annotated[
-    float | None, ranged(help="Circumference (m), if the traffic runs on a ring.", low=1.0, high=1e6, unit="m")
-]
-Place = Annotated[str | None, typer.Option(help="Column that names places, such as track_s_m on a lap.")]
-Layout = Annotated[str, typer.Option(help="auto, tidy, ngsim, openacc, ultra_av, highd, exid, pneuma or i24.")]
-Columns = Annotated[
-    str | None, typer.Option(help="Your names and units: time_s=t,vehicle_id=car,position_m=x[ft],speed_mps=v[km/h].")
-]
-MaxGap = Annotated[
-    float,
-    ranged(help="Gaps above this (m) mean a lost leader and are left out.", low=0.1, high=math.inf, unit="m"),
-]
-MinSeconds = Annotated[
-    float, ranged(help="Shorter stretches behind one leader are left out (s).", low=0.0, high=1e6, unit="s")
-]
-Where = Annotated[
-    list[str] | None, typer.Option(help='Only runs or drivers with "column=value"; given twice, both must hold.')
-]
-Window = Annotated[
-    float | None, ranged(help="Cut longer stretches into windows of so many seconds.", low=1.0, high=1e6, unit="s")
-]
-Corrected = Annotated[str | None, typer.Option(help="A model.yaml of explain: its effects stay, IDM is fitted.")]
-Base = Annotated[
-    str | None,
-    typer.Option(
-        help="Car-following law: idm (the default), idm_plus, iidm, fvdm, gipps, constant_time_gap, my_file.py:MyLaw."
-    ),
-]
+Seed = Annotated[int, Limits(0, 1e9)]
+RingLength = Annotated[float | None, Limits(1.0, 1e6, "m")]
+MaxGap = Annotated[float, Limits(0.1, math.inf, "m")]
+MinSeconds = Annotated[float, Limits(0.0, 1e6, "s")]
+Step = Annotated[float | None, Limits(0.001, 100.0, "s")]
 
 
 def _trust(is_given: bool) -> None:
@@ -75,95 +73,131 @@ def _trust(is_given: bool) -> None:
         trust.always()
 
 
-Trust = Annotated[
-    bool, typer.Option("--trust", callback=_trust, help="Run Python code that YAML files name, as my_file.py:MyEffect.")
-]
-Step = Annotated[
-    float | None, ranged("--dt", help="Use every n-th sample, to this step (s).", low=0.001, high=100.0, unit="s")
-]
-
-Workers = Annotated[
-    str, typer.Option("--executor", help="Where parts of the work run: serial, processes or ray. Results are the same.")
-]
-Jobs = Annotated[
-    int | None, ranged(help="Parts that run at a time, one thread each; default: one per processor.", low=1, high=1e5)
-]
-RayAddress = Annotated[
-    str | None, typer.Option(help="Address of a Ray cluster, host:port or auto; default: Ray on this machine.")
-]
-Recipe = Annotated[str, typer.Option(help="default, or paper: the published recipe, to compare with.")]
-FixedParameters = Annotated[bool, typer.Option("--fixed-parameters", help="Keep the driver parameters fixed.")]
-
-
 @dataclasses.dataclass(frozen=True)
 class FileOptions:
-    """How a file of traffic is read: whole or in part, on a ring or not, with which columns."""
+    """How a file of traffic is read: whole or in part, on a ring or not, with which columns.
+
+    Args:
+        place: Column that names places, such as track_s_m on a lap.
+    """
 
     ring_length: RingLength = None
-    place: Place = None
-    layout: Layout = "auto"
-    columns: Columns = None
-    where: Where = None
+    place: str | None = None
+    layout: str = "auto"
+    columns: str | None = None
+    where: list[str] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class SourceOptions(FileOptions):
-    """How stretches behind one leader are taken from a file of traffic."""
+    """How stretches behind one leader are taken from a file of traffic.
+
+    Args:
+        window: Cut longer stretches into windows of so many seconds.
+    """
 
     max_gap: MaxGap = 80.0
     min_seconds: MinSeconds = 5.0
-    window: Window = None
+    window: Annotated[float | None, Limits(1.0, 1e6, "s")] = None
     dt: Step = None
 
 
 @dataclasses.dataclass(frozen=True)
 class TrackOptions:
-    """How trajectories are filtered or reconstructed."""
+    """How trajectories are filtered or reconstructed.
 
-    recipe: Recipe = "default"
-    fixed_parameters: FixedParameters = False
-    model: Corrected = None
-    layout: Layout = "auto"
-    columns: Columns = None
+    Args:
+        recipe: default, or paper: the published recipe, to compare with.
+        fixed_parameters: Keep the driver parameters fixed.
+    """
+
+    recipe: str = "default"
+    fixed_parameters: bool = False
+    model: str | None = None
+    layout: str = "auto"
+    columns: str | None = None
     ring_length: RingLength = None
 
 
 @dataclasses.dataclass(frozen=True)
 class JobOptions:
-    """Work that takes long: where its parts run, and whether an interrupted run goes on."""
+    """Work that takes long: where its results go and its parts run, and whether an interrupted run goes on.
 
-    resume: Resume = False
-    executor: Workers = "serial"
-    jobs: Jobs = None
-    ray_address: RayAddress = None
+    Args:
+        resume: Go on where an interrupted run stopped.
+    """
 
-    def workers(self) -> AbstractContextManager[Executor]:
-        """Return whoever does the parts, for a ``with``."""
-        from idm_env.jobs.executor import opened
+    out: Path = OUT
+    resume: bool = False
+    place: Workers = HERE
 
-        return opened(self.executor, self.jobs, self.ray_address)
+    @contextmanager
+    def running(self, report: OnProgress) -> Iterator[dict[str, Any]]:
+        """Yield the keywords that all long work takes: whether it goes on, who does its parts, and who is told."""
+        with self.place.opened() as workers:
+            yield {"resume": self.resume, "executor": workers, "on_progress": report}
+
+
+def _args_of(thing: Any) -> dict[str, str]:
+    """Return by name what the section ``Args`` of a docstring says; of a class, what those of its bases say too."""
+    entries: dict[str, str] = {}
+    for each in reversed(getattr(thing, "__mro__", (thing,))):
+        section = inspect.cleandoc(each.__doc__ or "").partition("\nArgs:\n")[2]
+        entries |= dict(re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE))
+    return {name: " ".join(text.split()) for name, text in entries.items()}
+
+
+def _options(declared: Any, name: str) -> Iterator[inspect.Parameter]:
+    """Yield the options of a function or of a dataclass, the fields of dataclasses among them one by one."""
+    hints, helps = get_type_hints(declared, include_extras=True), _args_of(SharedOptions) | _args_of(declared)
+    for parameter in inspect.signature(declared).parameters.values():
+        kind = hints[parameter.name]
+        if dataclasses.is_dataclass(kind):
+            yield from _options(kind, name)
+        else:
+            default = OUT / name if parameter.default is OUT else parameter.default
+            kind = _for_typer(parameter.name, kind, default, helps.get(parameter.name, ""))
+            yield inspect.Parameter(parameter.name, parameter.KEYWORD_ONLY, default=default, annotation=kind)
+
+
+def _for_typer(name: str, kind: Any, default: Any, meaning: str) -> Any:
+    """Return the annotation of one option: its type, what its docstring says, and the limits of its number."""
+    base, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+    if base is typer.Context:
+        return base
+    base = str if get_origin(base) is Literal else base  # the words are checked, and named, in ``refusals``
+    if default is inspect.Parameter.empty or POSITIONAL in marks:
+        return Annotated[base, typer.Argument(help=meaning)]
+    flag = f"--{name.replace('_', '-')}"
+    flags = (flag, "-o") if name == "out" else (flag,) if default is not True else ()  # True has a flag for no, too
+    check = _trust if name == "trust" else next((Limits(*m).check for m in marks if isinstance(m, tuple)), None)
+    return Annotated[base, typer.Option(*flags, help=meaning, callback=check)]
+
+
+def _gathered(kind: Any, values: dict[str, Any]) -> Any:
+    """Return a dataclass of the options that are its fields, which are taken out of ``values``."""
+    hints = get_type_hints(kind)
+    names = [field.name for field in dataclasses.fields(kind)]
+    return kind(**{
+        name: _gathered(hints[name], values) if dataclasses.is_dataclass(hints[name]) else values.pop(name)
+        for name in names
+    })  # fmt: skip
 
 
 def spread(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command in which every parameter that is a dataclass stands for the options that are its fields."""
-    hints = get_type_hints(command, include_extras=True)
+    """Return a command in which every parameter that is a dataclass stands for the options that are its fields.
+
+    What an option means is said in the section ``Args`` of the docstring of the command, or of the dataclass.
+    """
+    hints = get_type_hints(command)
     groups = {name: kind for name, kind in hints.items() if dataclasses.is_dataclass(kind)}
-    options: list[inspect.Parameter] = []
-    for parameter in inspect.signature(command).parameters.values():
-        kind = hints[parameter.name]
-        if parameter.name not in groups:
-            options.append(parameter.replace(annotation=kind))
-            continue
-        types = get_type_hints(kind, include_extras=True)
-        for field in dataclasses.fields(kind):
-            options.append(parameter.replace(name=field.name, annotation=types[field.name], default=field.default))
+    options = list(_options(command, command.__name__.rstrip("_")))
 
     @functools.wraps(command)
     def spreading(**values: Any) -> None:
-        for name, kind in groups.items():
-            values[name] = kind(**{field.name: values.pop(field.name) for field in dataclasses.fields(kind)})  # type: ignore[operator]
-        command(**values)
+        command(**{name: _gathered(kind, values) for name, kind in groups.items()}, **values)
 
+    spreading.__doc__ = inspect.cleandoc(command.__doc__ or "").partition("\nArgs:\n")[0]
     spreading.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     spreading.__annotations__ = {option.name: option.annotation for option in options}
     return spreading
