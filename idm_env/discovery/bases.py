@@ -5,7 +5,7 @@ The law that is completed is among them once more, with the strengths of effects
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 from idm_env.discovery import model as terms
@@ -152,7 +152,12 @@ def rows(laws: Iterable[Law]) -> list[LawErrors]:
     return [
         LawErrors(
             each.law.kind, each.title, each.law.equation, list(each.own), each.at_best, **each.errors.summary(),
-            against={key: Against(c.outcome.value, c.ratio, c.low, c.high) for key, c in each.against.items()},
+            against=against_rows(each.against),
         )
         for each in laws
     ]  # fmt: skip
+
+
+def against_rows(against: Mapping[str, Comparison]) -> dict[str, Against]:
+    """Return what a report says of how errors compare."""
+    return {key: Against(c.outcome.value, c.ratio, c.low, c.high) for key, c in against.items()}

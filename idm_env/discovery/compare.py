@@ -33,7 +33,8 @@ class Comparison:
     """One error before and after; ``ratio`` is after / before, with its 95 % interval from ``low`` to ``high``.
 
     ``driver`` is the geometric mean of the followers' own ratios, in which a hopeless follower counts as one, with its
-    95 % interval; ``improved`` is the share of followers whose error falls, and ``followers`` their number.
+    95 % interval; ``improved`` is the share of followers whose error falls (a tie counts half), and ``followers`` their
+    number.
     """
 
     before: float
@@ -64,13 +65,13 @@ class Comparison:
         return bool(binomtest(better, self.followers, alternative="less").pvalue < 0.05)
 
 
-def compare(before: Judged, after: Judged, seed: int = 0) -> dict[str, Comparison]:
-    """Return how every error of ``ERRORS`` changed, on the same followers and samples."""
+def compare(before: Judged, after: Judged, seed: int = 0, among: np.ndarray | bool = True) -> dict[str, Comparison]:
+    """Return how every error of ``ERRORS`` changed, on the same followers and samples; ``among`` followers [F]."""
     runs = np.array([run for run, _ in before.followers])
     result = {}
     for key in ERRORS:
         (was, count), (now, _) = before.squares[key], after.squares[key]
-        seen = count > 0
+        seen = (count > 0) & among
         result[key] = compared(was[seen], now[seen], count[seen], runs[seen], seed)
     return result
 
@@ -80,7 +81,7 @@ def compared(was: np.ndarray, now: np.ndarray, samples: np.ndarray, runs: np.nda
     errors = [_rmse(x, samples) for x in (was, now)]
     change = 0.5 * np.log(now.sum() / was.sum()) if len(samples) and was.sum() > 0 else float("nan")
     width = _width(was, now, runs, seed) if np.isfinite(change) else float("inf")
-    improved = float((now < was).mean()) if len(was) else float("nan")
+    improved = float(((now < was) + 0.5 * (now == was)).mean()) if len(was) else float("nan")
     ratio, low, high = (float(np.exp(x)) for x in (change, change - width, change + width))
     best = np.argsort((was + now) / samples)[: len(was) - int(TRIMMED * len(was))]
     trimmed = (_rmse(was[best], samples[best]), _rmse(now[best], samples[best]))

@@ -124,12 +124,12 @@ def crossed(
         left = [_loss(np.bincount(short.group, x**2)[np.unique(short.group)]) ** 0.25 for x in (ahead, other)]
         whitened = bool(whitened or left[1] < CLEARLY * left[0])
         ahead, thetas = (other, others) if whitened else (ahead, thetas)
-    longer = _in_blocks(records)
+    longer = in_blocks(records)
     further = EMPTY if longer is None else _predicted(Problem(longer, None, problem.prior), model, values, fold, thetas)
     return judge.Judged(rows, gap, speed, ahead, short.record, bool(whitened), further)
 
 
-def _in_blocks(records: Records) -> Rows | None:
+def in_blocks(records: Records) -> Rows | None:
     """Return the windows of 10 s that end in the block that they begin in, or None where there are none."""
     try:
         rows = windows(records, FURTHER_S)

@@ -18,6 +18,7 @@ from idm_env.discovery import (
     bases,
     calibrate,
     ceilings,
+    fleet,
     found,
     judge,
     march,
@@ -282,6 +283,8 @@ def _finish(
     if before is not None:
         laws = bases.compared(null.model, before, evaluation.against_null, evaluation.seed, on_law)
         judgement = judgement.beside(bases.best_of(laws))
+        if evaluation.adapt and judgement.of_all is not None:
+            judgement = judgement.split(fleet.found(laws, judgement.of_all, evaluation.among, evaluation.seed))
     final = judgement.compared if judgement.added and judgement.compared is not None else null
     everywhere = judge.windowed(prepared, problem, final)
     judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
@@ -290,7 +293,7 @@ def _finish(
     if evaluation.adapt and before is not None:
         pooled = evaluation.judged(null, pooled=True)[1]
         ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
-        if not judgement.added and judgement.law is None and not ladder.unnamed:
+        if not (judgement.added or judgement.law or judgement.fleet) and not ladder.unnamed:
             agreement = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed)
             ladder = replace(ladder, agreement=agreement)
         judgement = replace(judgement, ladder=ladder)
@@ -306,7 +309,12 @@ def _finish(
     pairs = [(null, first), (shown, last)][: len(judgement.titles)]
     if of_law is not None:
         pairs.append((of_law, of_law))
-    saved = [replace(corrected(prepared, s, theta.theta, by), fitted_on=seen) for s, theta in pairs]
+    parts = [(prepared, s, theta) for s, theta in pairs]
+    if judgement.fleet is not None:
+        for of_kind, mine in zip(judgement.fleet.laws, judgement.fleet.records, strict=True):
+            its = evaluation.calibrated_among(of_kind.model, mine)
+            parts.append((prepared.some(mine), its, its))
+    saved = [replace(corrected(part, s, theta.theta, by), fitted_on=seen) for part, s, theta in parts]
     models = dict(zip(judgement.names(), saved, strict=True))
     return Discovery(
         result, models, prepared, null, shown, problem, decided.rounds, judgement, places.respond(problem, shown)

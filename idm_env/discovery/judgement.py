@@ -10,6 +10,7 @@ import numpy as np
 from idm_env.discovery import bases, calibrate, closed_loop, crossed, judge, words
 from idm_env.discovery import ladder as ladders
 from idm_env.discovery.compare import Comparison, compare
+from idm_env.discovery.fleet import Kinds, is_worth
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records
@@ -18,6 +19,7 @@ from idm_env.discovery.selection import Decided
 from idm_env.discovery.shared import Shared
 from idm_env.discovery.solve import Problem, Solution
 from idm_env.discovery.verdict import Reason, Refusal, improves, mean_ratio
+from idm_env.reports.undecided import GROUPS
 
 Calibration = tuple[Solution, judge.Judged | None]
 """Parameters of all drivers, and errors on the test set where there is one."""
@@ -43,6 +45,8 @@ class Judgement:
     """What vehicles of one run do alike, beyond the model."""
     law: bases.Law | None = None
     """A law that predicts better than the null, and than what was added to it."""
+    fleet: Kinds | None = None
+    """Laws of several kinds of drivers, which predict better than one model for all."""
     ladder: Ladder | None = None
     """What is left of predictions 5 s ahead, rung by rung, where every run is held out once."""
 
@@ -83,13 +87,28 @@ class Judgement:
             return replace(self, law=best)
         return replace(self, law=best, added=False, refusal=Refusal(Reason.LAW))
 
+    @property
+    def of_all(self) -> judge.Judged | None:
+        """Errors of the model for all drivers that is chosen: the other law, what was added to the null, or that."""
+        if self.law is not None:
+            return self.law.errors
+        return self.after if self.added else self.before
+
+    def split(self, fleet: Kinds | None) -> Judgement:
+        """Return the judgement beside laws for several kinds of drivers, which were better than ``of_all``."""
+        if fleet is None:
+            return self
+        if self.refusal is not None and self.refusal.reason is Reason.FEW_RUNS:
+            return replace(self, fleet=fleet)
+        return replace(self, fleet=fleet, added=False, refusal=Refusal(Reason.LAW))
+
     def climbed(self, records: Records, pooled: judge.Judged | None, floor_m: float) -> Ladder:
         """Return the ladder, from the ``pooled`` null to what sensors alone leave 5 s ahead (m)."""
         assert self.before is not None and pooled is not None
         models = {"one set of parameters for all": pooled, (own := "parameters of every driver"): self.before}
         last = own
-        if self.law is not None:
-            models[last := self.law.title] = self.law.errors
+        if (other := self.fleet or self.law) is not None:
+            models[last := other.title] = other.errors
         elif self.added and self.after is not None:
             models[last := f"with {self.tried}"] = self.after
         return ladders.climb(records, models, own, last, floor_m, self.seed)
@@ -113,17 +132,22 @@ class Judgement:
         return tuple(" with ".join([law, *([" and ".join(names)] if names else [])]) for names in lists)
 
     def names(self) -> dict[str, str]:
-        """Return which model every file holds: the law alone, then the model beside it, then another law.
+        """Return which model every file holds: the law alone, the model beside it, another law, those of kinds.
 
-        ``model.yaml`` is the one that predicts best on the test set.
+        ``model.yaml`` is the one for all drivers that predicts best on the test set.
         """
+        corrected = ["model_corrected.yaml"] if self.compared is not None else []
+        files = ["model.yaml", *corrected]
         if self.law is not None:
-            files = ("model_idm.yaml", *(["model_corrected.yaml"] if self.compared is not None else []), "model.yaml")
-            return dict(zip(files, (*self.titles, self.law.title), strict=True))
-        if self.compared is None:
-            return {"model.yaml": self.titles[0]}
-        files = ("model_idm.yaml", "model.yaml") if self.corrected_is_best else ("model.yaml", "model_corrected.yaml")
-        return dict(zip(files, self.titles, strict=True))
+            files = ["model_idm.yaml", *corrected, "model.yaml"]
+        elif self.compared is not None and self.corrected_is_best:
+            files = ["model_idm.yaml", "model.yaml"]
+        titles = [*self.titles, *([self.law.title] if self.law is not None else [])]
+        if self.fleet is not None:
+            files += GROUPS[: len(self.fleet.laws)]
+            each = zip(self.fleet.laws, self.fleet.counts, strict=True)
+            titles += [f"{law.title}, of {count} drivers" for law, count in each]
+        return dict(zip(files, titles, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,10 +216,25 @@ class Evaluation:
             return errors, before
         of_null = self._null_at_best
         at_best, theta = crossed.at_best(self.records, model, self.null.values)
-        if bases.is_far(at_best, of_null, bool(model.catalogue.personal)):
+        own = bool(model.catalogue.personal)
+        if bases.is_far(at_best, of_null, own) and (own or not is_worth(at_best, of_null)):
             return at_best, of_null
         values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
         return self._crossed(model, values, theta, before.whitened), before
+
+    def among(self, model: Hypothesis, wanted: np.ndarray) -> judge.Judged:
+        """Return the errors of a law for the drivers of the records ``wanted`` [records], its population."""
+        records, noise, before = self.records.some(wanted), self.searching.problem.noise, self.of_null[1]
+        assert noise is not None and before is not None
+        fold = self._fold[[self.records.runs.index(run) for run in records.runs]]
+        values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
+        return crossed.crossed(records, model, values, fold, noise, whitened=before.whitened)
+
+    def calibrated_among(self, model: Hypothesis, wanted: np.ndarray) -> Solution:
+        """Return the parameters by a law of the drivers of records ``wanted`` [records], its population."""
+        records = self.records.some(wanted)
+        population = calibrate.calibrate(records, model, self.null.values)
+        return calibrate.judged(population, records, None, records, adapt=True)[0]
 
 
 def judgement_of(evaluation: Evaluation, decided: Decided) -> tuple[Judgement, Solution]:

@@ -63,9 +63,14 @@ class Records:
     def of_runs(self, runs: Sequence[str]) -> Records:
         """Return the records of some runs; groups and their numbers stay."""
         chosen = set(runs)
-        keep = [i for i, e in enumerate(self.episodes) if e.run_id in chosen]
+        return self.some(np.array([e.run_id in chosen for e in self.episodes]))
+
+    def some(self, wanted: np.ndarray) -> Records:
+        """Return the records that are ``wanted`` [records]; groups and their numbers stay."""
+        keep = np.flatnonzero(wanted).tolist()
         pieces = [self.signals[self.bounds[i] : self.bounds[i + 1]] for i in keep]
-        names = tuple(r for r in self.runs if r in chosen)
+        seen = {self.episodes[i].run_id for i in keep}
+        names = tuple(r for r in self.runs if r in seen)
         return replace(
             self,
             episodes=tuple(self.episodes[i] for i in keep),

@@ -273,6 +273,34 @@ class LawErrors:
 
 
 @dataclass(frozen=True)
+class Kind:
+    """Drivers (run/vehicle) who follow one law: its name, the values of the column that tell them, and their errors.
+
+    ``errors`` are theirs with that law, ``with_one`` with the model that is best for all drivers together.
+    """
+
+    base: str
+    title: str
+    classes: list[str]
+    drivers: list[str]
+    errors: Errors
+    with_one: Errors
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Kinds of drivers, told by ``column`` or, where that is "", by their errors, in which halves of time ``agreed``.
+
+    ``against`` are all drivers' errors to those of one model for all.
+    """
+
+    column: str
+    kinds: list[Kind]
+    agreed: int
+    against: dict[str, Against]
+
+
+@dataclass(frozen=True)
 class Result:
     """Everything that a discovery says."""
 
@@ -299,3 +327,4 @@ class Result:
     prior: Weight
     ceilings: Ceilings
     bases: list[LawErrors]
+    fleet: Fleet | None

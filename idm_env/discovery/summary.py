@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
-from idm_env.discovery import bases, crossed, judge, result, words
+from idm_env.discovery import bases, crossed, fleet, judge, result, words
 from idm_env.discovery.compare import DRAWS, unit_of
 from idm_env.discovery.judgement import Evaluation, Judgement
 from idm_env.discovery.ladder import Ladder
@@ -58,14 +58,7 @@ def summarise(
         verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, strengths, law
     )
     after = judged.after if judged.added else before
-    best, name = (
-        (after, judged.titles[-1 if judged.added else 0])
-        if judged.law is None
-        else (judged.law.errors, judged.law.title)
-    )
-    uses = [] if best is None else bases.uses(laws, best, judged.seed)
-    of_law = "" if judged.law is None else words.law_first(judged.law, law, drivers[2])
-    sentence = " ".join(filter(None, (of_law, words.by_use(uses, name), sentence)))
+    sentence = " ".join(filter(None, (*_of_laws(judged, laws, drivers[2]), sentence)))
     weight = decided.null_in_closed_loop
     return result.Result(
         schema=result.SCHEMA,
@@ -110,7 +103,19 @@ def summarise(
         ),
         ceilings=ceilings,
         bases=bases.rows(laws),
+        fleet=None if judged.fleet is None else fleet.told(judged.fleet),
     )  # fmt: skip
+
+
+def _of_laws(judged: Judgement, laws: Sequence[bases.Law], drivers: Solution | None) -> list[str]:
+    """Return what is said of laws before effects; ``drivers`` are the parameters of one that is better."""
+    null, best = judged.null.model.catalogue.base.title, judged.fleet or judged.law
+    sentences = [] if judged.fleet is None else [words.fleet_first(judged.fleet)]
+    sentences += [] if judged.law is None else [words.law_first(judged.law, null, drivers)]
+    chosen, name = (
+        (judged.of_all, judged.titles[-1 if judged.added else 0]) if best is None else (best.errors, best.title)
+    )
+    return sentences if chosen is None else [*sentences, words.by_use(bases.uses(laws, chosen, judged.seed), name)]
 
 
 def _verdict(

@@ -10,6 +10,7 @@ import numpy as np
 
 from idm_env.discovery.bases import Law, Use
 from idm_env.discovery.compare import Comparison, ErrorChange
+from idm_env.discovery.fleet import Kinds
 from idm_env.discovery.ladder import Agreement
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Strength
@@ -344,21 +345,41 @@ def agreement(of: Agreement | None) -> list[str]:
     ]
 
 
-def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
-    """Say that another law predicts better than the null, and in what; ``drivers`` are its parameters."""
+def fleet_first(fleet: Kinds) -> str:
+    """Say which drivers follow which law, and what that is worth against one model for all."""
+    kinds = [
+        f"{count}{f' of {len(fleet.group)} drivers' if not i else ''}"
+        f"{f' ({fleet.column} {_any(fleet.classes[i])})' if fleet.column else ''} "
+        f"{'are predicted best ' if not i else ''}by {law.title}"
+        for i, (law, count) in enumerate(zip(fleet.laws, fleet.counts, strict=True))
+    ]
+    note = f"told by half of each driver's time, judged on the other; the halves agree for {fleet.agreed}"
+    if fleet.column:
+        note = f"what a kind lacks: explain --where {fleet.column}={fleet.classes[0][0]}"
+    return f"{', '.join(kinds)}; against one model for all: {_changes(fleet.against)} ({note})."
+
+
+def _any(values: Sequence[str]) -> str:
+    return values[0] if len(values) == 1 else f"{', '.join(values[:-1])} or {values[-1]}"
+
+
+def _changes(against: Mapping[str, Comparison]) -> str:
+    """Say which errors fall beyond chance, and which do not."""
     better = [
         f"{ERRORS[key][0]} {percent(c.ratio)} (95 %: {percent(c.low)} to {percent(c.high)})"
-        for key, c in law.against.items() if c.outcome is ErrorChange.BETTER
+        for key, c in against.items() if c.outcome is ErrorChange.BETTER
     ]  # fmt: skip
-    same = [ERRORS[key][0] for key, c in law.against.items() if c.outcome is ErrorChange.SAME]
-    rest = f"; {' and '.join(same)} the same beyond chance" if same else ""
+    same = [ERRORS[key][0] for key, c in against.items() if c.outcome is ErrorChange.SAME]
+    return ", ".join(better) + (f"; {' and '.join(same)} the same beyond chance" if same else "")
+
+
+def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
+    """Say that another law predicts better than the null, and in what; ``drivers`` are its parameters."""
     note = f"what it lacks: explain --base {law.law.kind}"
     if law.own and drivers is not None:
         note = f"median driver and 10 to 90 %: {', '.join(_of_drivers(drivers))}"
-    return (
-        f"{law.title[:1].upper()}{law.title[1:]} predicts better than {null} calibrated alike: "
-        f"{', '.join(better)}{rest} ({note})."
-    )
+    title = f"{law.title[:1].upper()}{law.title[1:]}"
+    return f"{title} predicts better than {null} calibrated alike: {_changes(law.against)} ({note})."
 
 
 def by_use(uses: Sequence[Use], chosen: str) -> str:

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 FOUND = "found_effect.py"
 """An effect in a state that has no name."""
-EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml", FOUND)
+GROUPS = tuple(f"model_group_{number}.yaml" for number in range(1, 9))
+"""Laws of several kinds of drivers."""
+EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml", *GROUPS, FOUND)
 """What ``explain`` writes."""
 
 
@@ -30,7 +32,8 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
         "known": [], "helps": {}, "ladder": None, "interval": None, "models": {}, "partial": None, "candidates": [],
         "shared": None,
         "error": {"held_out_runs": [], "held_out_drivers": [], "before": None, "after": None}, "excluded": [],
-        "parameters": [], "data": trajectories.summary(), "prior": None, "bases": [], "versions": page.versions(),
+        "parameters": [], "data": trajectories.summary(), "prior": None, "bases": [], "fleet": None,
+        "versions": page.versions(),
     }  # fmt: skip
     cards = [
         ("Recordings", "", "1"),

@@ -2,17 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 
-from idm_env.data import episodes, synthetic
+from idm_env.data import episodes, hidden, synthetic
 from idm_env.discovery.records import Records, gather
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> None:
     torch.set_num_threads(1)
+
+
+Mixing = Callable[[np.ndarray], None]
+
+
+@pytest.fixture
+def kinds(monkeypatch: pytest.MonkeyPatch) -> Mixing:
+    """Return what makes drivers of ``synthetic``, where [runs, followers] says so, linear controllers."""
+    idm = hidden.desired_accel
+
+    def of(linear: np.ndarray) -> None:
+        def accel(view, seen, drivers, on):  # type: ignore[no-untyped-def]
+            gap, speed, lead_speed = seen
+            follow = 0.3 * (gap - drivers.min_gap - speed * drivers.time_gap) + 0.6 * (lead_speed - speed)
+            wanted = np.minimum(follow, 0.4 * (drivers.desired_speed - speed))
+            law = np.clip(wanted, -2.0 * drivers.comfort_decel, drivers.max_accel)
+            return np.where(linear, law, idm(view, seen, drivers, on))
+
+        monkeypatch.setattr(hidden, "desired_accel", accel)
+
+    return of
 
 
 @pytest.fixture(scope="session")
