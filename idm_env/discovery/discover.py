@@ -293,9 +293,10 @@ def _finish(
     if evaluation.adapt and before is not None:
         pooled = evaluation.judged(null, pooled=True)[1]
         ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
-        if not (judgement.added or judgement.law or judgement.fleet) and not ladder.unnamed:
-            agreement = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed)
-            ladder = replace(ladder, agreement=agreement)
+        if not (judgement.added or judgement.law or judgement.fleet):
+            leading = decided.rounds[0].leading
+            agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
+            ladder = replace(ladder, agreement=agreements[0], leading=None if leading is None else agreements[1])
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     result = summary.summarise(

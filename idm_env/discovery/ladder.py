@@ -36,8 +36,8 @@ The scene tells a part of drivers' noise, too: of six sets without an effect, no
 class Agreement:
     """Whether errors 5 s ahead look like what drivers' and sensors' noise leave: see ``replica.agreement``.
 
-    ``share`` of the squared error a smooth function of the scene takes from drivers fitted to the very windows, and
-    ``p_value`` is how often it takes as much in ``replicas`` in which nothing is missing.
+    ``share`` of the squared error is what something takes from drivers fitted to the very windows, and ``p_value`` is
+    how often it takes as much in ``replicas`` in which nothing is missing.
     """
 
     share: float
@@ -46,8 +46,8 @@ class Agreement:
 
     @property
     def is_refused(self) -> bool:
-        """Whether noise leaves so much hardly ever, and it is no trifle."""
-        return self.p_value < 0.05 and self.share > STRUCTURED
+        """Whether noise leaves so much hardly ever."""
+        return self.p_value < 0.05
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,23 @@ class Ladder:
     """By rung, where it has them: the gap's error in closed-loop simulation, 10 s ahead, and the CRPS 5 s ahead (m)."""
 
     agreement: Agreement | None = None
-    """Where nothing was added."""
+    """Of what a smooth function of the scene takes, where nothing was added."""
+    leading: Agreement | None = None
+    """Of what the leading candidate takes, in whitened windows, where one gains beyond chance and nothing was added."""
 
     @property
     def unnamed(self) -> float:
         """Share that the scene tells, beyond chance and beyond what drivers' noise looks like; 0 if none does."""
         share, low, _ = self.structure
-        if share > STRUCTURED and low > 0.0:
-            return share
-        return self.agreement.share if self.agreement is not None and self.agreement.is_refused else 0.0
+        sure = share if low > 0.0 else 0.0
+        if self.agreement is not None:
+            sure = max(sure, self.agreement.share) if self.agreement.is_refused else 0.0
+        return sure if sure > STRUCTURED else 0.0
+
+    @property
+    def leads(self) -> bool:
+        """Whether the leading candidate gains what noise hardly ever makes; True where that was not asked."""
+        return self.leading is None or self.leading.is_refused
 
 
 def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, floor_m: float, seed: int) -> Ladder:

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from idm_env.discovery import ladder
-from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, Rows, whole, windows
+from idm_env.discovery.score import held_out, log_gain
 from idm_env.discovery.solve import Prior, Problem, Solution, solve
 
 LAGS_S = (0.5, 1.5)
@@ -36,8 +37,8 @@ class NoisyDrivers:
     sigma: np.ndarray
     memory_s: float
 
-    def drive(self, records: Records, random: np.random.Generator) -> Records:
-        """Return the records that these drivers would have made behind the same leaders."""
+    def drive(self, records: Records, random: np.random.Generator, noise_m: float = 0.0) -> Records:
+        """Return the records that these drivers would have made behind the same leaders, positions with white noise."""
         driven = replace(records, signals=records.signals.copy())
         pushed, accel = driven.column("pushed"), driven.column("accel")
         keep = np.exp(-records.dt / self.memory_s)
@@ -52,6 +53,7 @@ class NoisyDrivers:
         gap, speed = (x[0][rows.valid] for x in problem.predict(self.theta[None], self.model, EMPTY, pulse))
         samples = rows.samples[rows.valid]
         moved = driven.column("lead_rear")[samples] - gap - driven.column("position")[samples]
+        moved += noise_m * random.standard_normal(len(moved))
         for name in ("position", "place"):
             driven.column(name)[samples] += moved
         driven.speed[samples] = speed
@@ -62,8 +64,12 @@ class NoisyDrivers:
         return replace(driven)
 
 
-def drivers_of(problem: Problem, solution: Solution) -> NoisyDrivers:
-    """Return a calibrated model of windows with its drivers' noise: as records driven with it look most alike."""
+def drivers_of(problem: Problem, solution: Solution, noise_m: float) -> NoisyDrivers:
+    """Return a calibrated model of windows with its drivers' noise: as records driven with it look most alike.
+
+    Noise makes drivers look as if they pulled less at their gaps: what changed a gap goes on. So θ is moved by as much
+    as drivers fitted to a replica are off, in the mean of all.
+    """
     records, model = problem.rows.records, solution.model.fixed(solution.values)
     near, far, of_group = _increments(problem.rows, model, solution.theta)
     none = NoisyDrivers(model, solution.theta, np.zeros(problem.groups), MEMORIES_S[0])
@@ -79,15 +85,22 @@ def drivers_of(problem: Problem, solution: Solution) -> NoisyDrivers:
     if not tried:
         return none
     best = min(tried, key=lambda one: one[0])[1]
-    # Increments tell what is drift and its memory; how large it is shows better in what it comes to.
-    replica, theta = _fitted(problem, best, np.random.default_rng(0))
-    sizes = [float(np.median(_ahead(t, x, model) ** 2)) for t, x in ((problem, solution.theta), (replica, theta))]
-    return replace(best, sigma=best.sigma * np.sqrt(sizes[0] / sizes[1]))
+    seen, goal = np.unique(problem.rows.group), np.median(_ahead(problem, solution.theta, model) ** 2)
+    low, high = model.catalogue.bounds.T
+    for _ in range(2):
+        replica, theta = _fitted(problem, best, np.random.default_rng(0), noise_m)
+        off = np.median((theta - best.theta)[seen], axis=0)
+        # Increments tell what is drift and its memory; how large it is shows better in what it comes to.
+        scale = np.sqrt(goal / np.median(_ahead(replica, theta, model) ** 2))
+        best = replace(best, theta=np.clip(solution.theta - off, low, high), sigma=best.sigma * scale)
+    return best
 
 
-def _fitted(problem: Problem, drivers: NoisyDrivers, random: np.random.Generator) -> tuple[Problem, np.ndarray]:
+def _fitted(
+    problem: Problem, drivers: NoisyDrivers, random: np.random.Generator, noise_m: float
+) -> tuple[Problem, np.ndarray]:
     """Return the windows of a replica, and log θ [G, P] of drivers fitted to it in them."""
-    replica = replace(problem, rows=windows(drivers.drive(problem.rows.records, random)))
+    replica = replace(problem, rows=windows(drivers.drive(problem.rows.records, random, noise_m)))
     return replica, solve(replica, drivers.model, drivers.theta, EMPTY[0], iterations=3).theta
 
 
@@ -114,26 +127,40 @@ def _increments(rows: Rows, model: Hypothesis, theta: np.ndarray) -> tuple[float
     return near / total * usual, far / total * usual, square / usual
 
 
-def agreement(problem: Problem, solution: Solution, floor_m: float, seed: int) -> ladder.Agreement:
-    """Return whether a model's errors 5 s ahead agree with noise, by a posterior predictive p-value.
+def agreement(
+    problem: Problem, solution: Solution, noise_m: float, seed: int, term: Term | None = None
+) -> list[ladder.Agreement]:
+    """Return whether a model's errors 5 s ahead agree with noise, by posterior predictive p-values.
 
-    The statistic is the share of the squared error that a smooth function of the scene takes beside drift, as on the
-    ladder with fewer features. Every replica has drivers' noise, that of sensors (``floor_m``), and drivers fitted to
-    it in windows of 5 s, as those of ``solution`` are to the data.
+    The first statistic is the share of the squared error that a smooth function of the scene takes beside drift, as on
+    the ladder with fewer features; the second, of a ``term``, is the share of the whitened squared error that it
+    takes. Every replica has drivers' noise, that of sensors (``noise_m``), and drivers fitted to it in windows of 5 s,
+    as those of ``solution`` are to the data.
     """
-    drivers, random, above = drivers_of(problem, solution), np.random.default_rng(seed), 0
+    drivers, random = drivers_of(problem, solution, noise_m), np.random.default_rng(seed)
 
-    def share(rows: Rows, error: np.ndarray) -> float:
-        return ladder.structure(rows, error, seed, FEATURES)[0]
+    def smooth(of: Problem, theta: np.ndarray) -> float:
+        return ladder.structure(of.rows, _ahead(of, theta, drivers.model), seed, FEATURES)[0]
 
-    mine = share(problem.rows, _ahead(problem, solution.theta, drivers.model))
+    def gain(of: Problem, theta: np.ndarray) -> float:
+        assert term is not None
+        before = solve(of, solution.model, theta, solution.values, iterations=1)
+        begin = np.append(before.values, term.starts[0])
+        after = solve(of, solution.model.adding(term), before.theta, begin, iterations=2)
+        mean = float(log_gain(held_out(of, before), held_out(of, after)).mean())
+        return 1.0 - float(np.exp(-2.0 * mean))
+
+    statistics = [smooth] if term is None else [smooth, gain]
+    mine, above, drawn = ([f(problem, solution.theta) for f in statistics], [0, 0], [0, 0])
     for draw in range(1, DRAWS + 1):
-        replica, theta = _fitted(problem, drivers, random)
-        noise = floor_m * random.standard_normal(len(replica.rows))
-        above += share(replica.rows, _ahead(replica, theta, drivers.model) + noise) >= mine
-        if above == ENOUGH:
-            return ladder.Agreement(mine, above / draw, draw)
-    return ladder.Agreement(mine, (above + 1) / (DRAWS + 1), DRAWS)
+        if (still := [i for i in range(len(statistics)) if above[i] < ENOUGH]) == []:
+            break
+        replica, theta = _fitted(problem, drivers, random, noise_m)
+        for i in still:
+            above[i] += statistics[i](replica, theta) >= mine[i]
+            drawn[i] = draw
+    p = [a / n if a == ENOUGH else (a + 1) / (n + 1) for a, n in zip(above, drawn, strict=True)]
+    return [ladder.Agreement(*told) for told in zip(mine, p, drawn, strict=False)]
 
 
 def _no_prior(theta: np.ndarray) -> Prior:

@@ -113,6 +113,7 @@ class Rungs:
     parts: dict[str, float]
     structure: Share
     agreement: Agreement | None = None
+    leading: Agreement | None = None
 
 
 @dataclass(frozen=True)

@@ -87,10 +87,11 @@ class Round:
         return float(np.mean(times))
 
     @property
-    def significant(self) -> bool:
-        """Whether any candidate gained enough, beyond chance."""
+    def leading(self) -> Term | None:
+        """The candidate that gained most of those that gained enough, beyond chance."""
         least = together.LEAST_GAIN if self.in_closed_loop else LEAST_GAIN
-        return bool(((self.tested.p_value < ALPHA) & (self.tested.gain >= least)).any())
+        able = np.flatnonzero((self.tested.p_value < ALPHA) & (self.tested.gain >= least))
+        return self.scored[able[self.tested.gain[able].argmax()]].term if len(able) else None
 
 
 @dataclass(frozen=True, eq=False)

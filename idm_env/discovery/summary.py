@@ -67,7 +67,7 @@ def summarise(
         sentence=sentence,
         details=[
             *words.details(verdict, added, nearest, 1.0 - float(np.exp(-first.smooth_gain))),
-            *words.agreement(None if judged.ladder is None else judged.ladder.agreement),
+            *words.agreement(judged.ladder, first.leading),
             *words.excluded(verdict, strengths),
             *words.cautions(data.at_bounds, data.drivers),
         ],
@@ -128,13 +128,16 @@ def _verdict(
     power = len(problem.rows.records.runs) >= MANY_RUNS or powerful(
         [s for s in strengths.values() if s.knots == 1], first.tested, smallest_p(counted.run)
     )
-    structured = any(r.significant for r in (first, *(r for r in rounds if r.in_closed_loop)))
+    leads = first.leading is not None and (ladder is None or ladder.leads)
+    structured = leads or any(r.leading is not None for r in rounds if r.in_closed_loop)
     unnamed = 0.0 if ladder is None else ladder.unnamed
     verdict = conclude(
         bool(added), any(f.effect for f in added), refusal, structured or unnamed > 0.0, first.left, power,
         judged.shared is not None, apart=not others,
         in_a_state=all(f.where.coordinate in (*STATES, "state") for f in added),
     )  # fmt: skip
+    if verdict is Verdict.NONE and refusal is not None:
+        return verdict, Refusal(Reason.NO_GAIN)
     if refusal is not None and refusal.reason is not Reason.NO_GAIN:
         return verdict, refusal
     if verdict is Verdict.UNEXPLAINED and unnamed and refusal is not None:
@@ -166,7 +169,7 @@ def _strengths(first: Round, problem: Problem, reached: Bar) -> dict[str, Streng
 def _rungs(ladder: Ladder) -> result.Rungs:
     return result.Rungs(
         ladder.rungs, **ladder.others, parts=ladder.parts, structure=result.Share(*ladder.structure),
-        agreement=ladder.agreement,
+        agreement=ladder.agreement, leading=ladder.leading,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from idm_env.discovery.bases import Law, Use
 from idm_env.discovery.compare import Comparison, ErrorChange
 from idm_env.discovery.fleet import Kinds
-from idm_env.discovery.ladder import Agreement
+from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.model import Term
 from idm_env.discovery.power import Strength
 from idm_env.discovery.result import Ceilings, TermFinding, Weight
@@ -335,14 +335,18 @@ def cautions(at_bounds: Mapping[str, int], groups: int) -> list[str]:
     ]  # fmt: skip
 
 
-def agreement(of: Agreement | None) -> list[str]:
-    """Say whether what is left looks like noise, where nothing was added."""
-    if of is None:
+def agreement(ladder: Ladder | None, leading: Term | None) -> list[str]:
+    """Say whether what is left, and what the ``leading`` candidate gains, looks like noise, where nothing was added."""
+    if ladder is None:
         return []
+    asked = {"a smooth function of the scene": ladder.agreement}
+    if leading is not None:
+        asked[plain(leading.name)] = ladder.leading
     return [
-        "A smooth function of the scene tells as much of the errors where drivers' and sensors' noise is all there is: "
+        f"How often {who} takes as much off the squared error where drivers' and sensors' noise is all there is: "
         f"p = {number(of.p_value, 2)}, from {of.replicas} simulations."
-    ]
+        for who, of in asked.items() if of is not None
+    ]  # fmt: skip
 
 
 def fleet_first(fleet: Kinds) -> str:

@@ -8,16 +8,17 @@ import pytest
 from idm_env.data import episodes, hidden, synthetic
 from idm_env.discovery import judge, replica, search
 from idm_env.discovery.calibrate import first_prior
-from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.model import Hypothesis, curve, simple
 from idm_env.discovery.records import gather, windows
 from idm_env.discovery.search import Search
+from idm_env.discovery.selection import LEAST_GAIN
 from idm_env.discovery.solve import Problem, Solution
 from idm_env.jobs.storage import Store
 
 
-def fitted(ou: float) -> tuple[Problem, Solution]:
-    """Return the windows of 24 drivers with noise, and drivers of IDM fitted to them."""
-    made, _ = synthetic.generate(4, runs=8, followers=3, seconds=120.0, ou=ou)
+def fitted(seed: int, ou: float, runs: int = 8, seconds: float = 120.0) -> tuple[Problem, Solution]:
+    """Return the windows of three drivers in every run, with noise, and drivers of IDM fitted to them."""
+    made, _ = synthetic.generate(seed, runs=runs, followers=3, seconds=seconds, ou=ou)
     records = gather(list(episodes(made, smooth=True, min_seconds=12.0)))
     rows = windows(records)
     problem = Problem(rows, search.first_noise(rows), first_prior())
@@ -26,15 +27,26 @@ def fitted(ou: float) -> tuple[Problem, Solution]:
     return judge.windowed(records, searching.problem, null)
 
 
+def floor_of(problem: Problem) -> float:
+    return judge.floor(problem.rows.records)["horizon_rmse_m"]
+
+
 @pytest.mark.parametrize("ou", [0.0, 0.1])
 def test_noise_of_drivers_is_that_of_the_data_and_what_it_leaves_agrees(ou: float) -> None:
     """An Ornstein–Uhlenbeck acceleration of 0.1 m/s² whose memory is 5 s."""
-    problem, found = fitted(ou)
-    drivers = replica.drivers_of(problem, found)
-    assert np.median(drivers.sigma) == pytest.approx(ou, abs=0.03)
+    problem, found = fitted(4, ou)
+    drivers = replica.drivers_of(problem, found, floor_of(problem))
+    assert np.median(drivers.sigma) == pytest.approx(ou, abs=0.02)
     assert not ou or 2.0 <= drivers.memory_s <= 8.0
-    agreement = replica.agreement(problem, found, judge.floor(problem.rows.records)["horizon_rmse_m"], 0)
+    agreement = replica.agreement(problem, found, floor_of(problem), 0)[0]
     assert not agreement.is_refused and agreement.p_value >= 0.05 and agreement.replicas >= replica.ENOUGH
+
+
+def test_noise_gains_a_candidate_as_much_in_replicas() -> None:
+    """Noise of 0.2 m/s² passes for a weaker pull to the gap, which sign flips of runs take for an effect."""
+    problem, found = fitted(599009, 0.2, runs=10, seconds=180.0)
+    leading = replica.agreement(problem, found, floor_of(problem), 0, simple("gap_stiffness"))[1]
+    assert leading.share > 1.5 * LEAST_GAIN and not leading.is_refused
 
 
 def test_what_drivers_do_in_a_state_is_no_noise(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,5 +57,5 @@ def test_what_drivers_do_in_a_state_is_no_noise(monkeypatch: pytest.MonkeyPatch)
         return usual(speed, np.where(closing > 2.0, 2.0 * closing - 2.0, closing), time_gap, drivers)
 
     monkeypatch.setattr(hidden, "_desired_gap", doubled)
-    agreement = replica.agreement(*fitted(0.1), 0.05, 0)
-    assert agreement.is_refused and agreement.replicas == replica.DRAWS
+    told = replica.agreement(*fitted(4, 0.1), 0.05, 0, curve("time_gap", "closing_speed", -3.0, 1.0, 8))
+    assert all(one.is_refused and one.replicas == replica.DRAWS for one in told) and told[0].share > 0.02
