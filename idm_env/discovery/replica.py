@@ -139,28 +139,28 @@ def agreement(
     """
     drivers, random = drivers_of(problem, solution, noise_m), np.random.default_rng(seed)
 
-    def smooth(of: Problem, theta: np.ndarray) -> float:
-        return ladder.structure(of.rows, _ahead(of, theta, drivers.model), seed, FEATURES)[0]
+    def smooth(windowed: Problem, theta: np.ndarray) -> float:
+        return ladder.structure(windowed.rows, _ahead(windowed, theta, drivers.model), seed, FEATURES)[0]
 
-    def gain(of: Problem, theta: np.ndarray) -> float:
+    def gain(windowed: Problem, theta: np.ndarray) -> float:
         assert term is not None
-        before = solve(of, solution.model, theta, solution.values, iterations=1)
+        before = solve(windowed, solution.model, theta, solution.values, iterations=1)
         begin = np.append(before.values, term.starts[0])
-        after = solve(of, solution.model.adding(term), before.theta, begin, iterations=2)
-        mean = float(log_gain(held_out(of, before), held_out(of, after)).mean())
+        after = solve(windowed, solution.model.adding(term), before.theta, begin, iterations=2)
+        mean = float(log_gain(held_out(windowed, before), held_out(windowed, after)).mean())
         return 1.0 - float(np.exp(-2.0 * mean))
 
     statistics = [smooth] if term is None else [smooth, gain]
-    mine, above, drawn = ([f(problem, solution.theta) for f in statistics], [0, 0], [0, 0])
+    mine, above, draws = ([f(problem, solution.theta) for f in statistics], [0, 0], [0, 0])
     for draw in range(1, DRAWS + 1):
         if (still := [i for i in range(len(statistics)) if above[i] < ENOUGH]) == []:
             break
         replica, theta = _fitted(problem, drivers, random, noise_m)
         for i in still:
             above[i] += statistics[i](replica, theta) >= mine[i]
-            drawn[i] = draw
-    p = [a / n if a == ENOUGH else (a + 1) / (n + 1) for a, n in zip(above, drawn, strict=True)]
-    return [ladder.Agreement(*told) for told in zip(mine, p, drawn, strict=False)]
+            draws[i] = draw
+    p = [a / n if a == ENOUGH else (a + 1) / (n + 1) for a, n in zip(above, draws, strict=True)]
+    return [ladder.Agreement(*one) for one in zip(mine, p, draws, strict=False)]
 
 
 def _no_prior(theta: np.ndarray) -> Prior:

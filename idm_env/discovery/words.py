@@ -339,13 +339,13 @@ def agreement(ladder: Ladder | None, leading: Term | None) -> list[str]:
     """Say whether what is left, and what the ``leading`` candidate gains, looks like noise, where nothing was added."""
     if ladder is None:
         return []
-    asked = {"a smooth function of the scene": ladder.agreement}
+    agreements = {"a smooth function of the scene": ladder.agreement}
     if leading is not None:
-        asked[plain(leading.name)] = ladder.leading
+        agreements[plain(leading.name)] = ladder.leading
     return [
         f"How often {who} takes as much off the squared error where drivers' and sensors' noise is all there is: "
-        f"p = {number(of.p_value, 2)}, from {of.replicas} simulations."
-        for who, of in asked.items() if of is not None
+        f"p = {number(one.p_value, 2)}, from {one.replicas} simulations."
+        for who, one in agreements.items() if one is not None
     ]  # fmt: skip
 
 
