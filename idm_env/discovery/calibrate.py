@@ -16,7 +16,7 @@ from idm_env.discovery.closed_loop import ClosedLoopFit, evaluate
 from idm_env.discovery.march import BASE
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, Rows
-from idm_env.discovery.solve import Prior, Solution
+from idm_env.discovery.solve import Population, Solution
 from idm_env.parameters import Parameter
 
 POPULATION = {"max_accel": 1.3, "comfort_decel": 1.8, "time_gap": 1.3, "min_gap": 2.2, "desired_speed": 32.0}
@@ -34,7 +34,7 @@ class Calibrated:
     model: Hypothesis
     values: np.ndarray
     theta: np.ndarray
-    prior: Prior
+    prior: Population
     fit: ClosedLoopFit
 
 
@@ -65,7 +65,7 @@ def judged(
     return own, judge.judge(kept, model, values, own.theta)
 
 
-def population(theta: np.ndarray, rows: Rows, own: Sequence[Parameter] = BASE.declared) -> Prior:
+def population(theta: np.ndarray, rows: Rows, own: Sequence[Parameter] = BASE.declared) -> Population:
     """Return the drivers' own spread as prior: median and scaled median deviation of log θ [G, P].
 
     Of fewer than five groups with rows it is the first, weak prior.
@@ -75,10 +75,10 @@ def population(theta: np.ndarray, rows: Rows, own: Sequence[Parameter] = BASE.de
         return first_prior(own)
     centre = np.median(theta[seen], axis=0)
     spread = 1.4826 * np.median(np.abs(theta[seen] - centre), axis=0)
-    return Prior(centre, np.clip(1.5 * spread, 0.3, WIDTH))
+    return Population(centre, np.clip(1.5 * spread, 0.3, WIDTH))
 
 
-def first_prior(own: Sequence[Parameter] = BASE.declared) -> Prior:
+def first_prior(own: Sequence[Parameter] = BASE.declared) -> Population:
     """Return the weak prior that a search starts from, of the drivers' own parameters."""
     centre = [POPULATION.get(p.name, p.default if p.null is None else p.null) for p in own]
-    return Prior(np.log(centre), np.full(len(centre), WIDTH))
+    return Population(np.log(centre), np.full(len(centre), WIDTH))

@@ -16,7 +16,7 @@ from idm_env.discovery import judge
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, whole
 from idm_env.discovery.score import interval_of, log_gain, without_own_run
-from idm_env.discovery.solve import Linear, Prior, Problem, Solution, finish, linearise, solve
+from idm_env.discovery.solve import Linear, Population, Problem, Solution, finish, linearise, solve
 from idm_env.discovery.units import MANY_RUNS, Units, units
 
 GRID_S = (5.0, 15.0, 50.0, 150.0, 500.0)
@@ -69,7 +69,9 @@ class ClosedLoopFit:
         return result
 
 
-def evaluate(records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, theta: np.ndarray) -> ClosedLoopFit:
+def evaluate(
+    records: Records, model: Hypothesis, values: np.ndarray, prior: Population, theta: np.ndarray
+) -> ClosedLoopFit:
     """Calibrate a model on every other block of time in closed loop, from log θ [G, P], and evaluate it on the rest.
 
     The weight of the prior decides more on short or noisy records than any effect does: with too light a one drivers

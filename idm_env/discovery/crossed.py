@@ -18,7 +18,7 @@ from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import Noise
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
 from idm_env.discovery.score import without
-from idm_env.discovery.solve import Prior, Problem, Solution, solve
+from idm_env.discovery.solve import Population, Problem, Solution, solve
 
 FOLDS = 4
 POOLED_S = closed_loop.ENDS_S[1]
@@ -54,7 +54,7 @@ class _Fold:
     ``left`` [drivers] is what every weight leaves of the gap on the half that was not fitted (m²).
     """
 
-    prior: Prior
+    prior: Population
     frozen: Hypothesis
     thetas: dict[float, np.ndarray]
     left: dict[float, np.ndarray]
@@ -155,7 +155,7 @@ def at_best(
     return judge.judge(records, model, values, theta), theta
 
 
-def _weighed(mine: list[Rows], prior: Prior, frozen: Hypothesis, near: np.ndarray) -> _Fold:
+def _weighed(mine: list[Rows], prior: Population, frozen: Hypothesis, near: np.ndarray) -> _Fold:
     """Fit the drivers of a fold to each half of their time with every weight of the population."""
     thetas: dict[float, np.ndarray] = {}
     left: dict[float, np.ndarray] = {}

@@ -12,7 +12,7 @@ from idm_env.discovery import places
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.noise import HEAVY
 from idm_env.discovery.records import Records, Rows, block_seconds, whole, windows
-from idm_env.discovery.solve import Prior, Problem, Solution, cost_of, solve
+from idm_env.discovery.solve import Population, Problem, Solution, cost_of, solve
 from idm_env.discovery.units import units
 
 
@@ -86,7 +86,7 @@ class Judged:
 
 
 def calibrate(
-    records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, rows: Rows | None = None,
+    records: Records, model: Hypothesis, values: np.ndarray, prior: Population, rows: Rows | None = None,
     start: np.ndarray | None = None,
 ) -> Solution:  # fmt: skip
     """Fit θ of every group in free simulation behind the measured leader, with φ as it stands: ``values`` [Q].
@@ -100,7 +100,7 @@ def calibrate(
 
 
 def unweighed(
-    records: Records, model: Hypothesis, values: np.ndarray, prior: Prior, rows: Rows | None = None,
+    records: Records, model: Hypothesis, values: np.ndarray, prior: Population, rows: Rows | None = None,
     start: np.ndarray | None = None, calibrated: bool = False,
 ) -> tuple[Problem, np.ndarray]:  # fmt: skip
     """Return the problem of a calibration and its first fit: log θ [G, P] with a prior that hardly weighs anything.
@@ -189,7 +189,7 @@ def halves(rows: Rows) -> np.ndarray:
 def judge(records: Records, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Judged:
     """Return the errors of a model with log θ [G, P] and values [Q] on all of the records."""
     rows, short, frozen, empty = whole(records), windows(records), model.fixed(values), np.zeros((1, 0))
-    prior = Prior(theta.mean(0), np.ones(theta.shape[-1]))
+    prior = Population(theta.mean(0), np.ones(theta.shape[-1]))
     gap, speed = (x[0] for x in Problem(rows, None, prior).predict(theta[None], frozen, empty))
     ahead = Problem(short, None, prior).errors(theta[None], frozen, empty)[0][:, -1]
     return Judged(rows, gap, speed, ahead, short.record)

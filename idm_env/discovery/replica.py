@@ -16,7 +16,7 @@ from idm_env.discovery import ladder
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records, Rows, whole, windows
 from idm_env.discovery.score import held_out, log_gain
-from idm_env.discovery.solve import Prior, Problem, Solution, solve
+from idm_env.discovery.solve import Population, Problem, Solution, solve
 
 LAGS_S = (0.5, 1.5)
 """Lags at which increments of the speed's error are compared: at these, white noise of sensors is gone."""
@@ -163,5 +163,5 @@ def agreement(
     return [ladder.Agreement(*one) for one in zip(mine, p, draws, strict=False)]
 
 
-def _no_prior(theta: np.ndarray) -> Prior:
-    return Prior(theta.mean(0), np.ones(theta.shape[-1]))
+def _no_prior(theta: np.ndarray) -> Population:
+    return Population(theta.mean(0), np.ones(theta.shape[-1]))

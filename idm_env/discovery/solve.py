@@ -29,11 +29,11 @@ LONGEST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
-    """Log-normal prior of θ: centre [P] and width [P] of log θ.
+class Population:
+    """Drivers' own θ as the prior of each: log-normal, centre [P] and width [P] of log θ, which is what moves here.
 
+    Fits know another one (``fitting.prior.Prior``), of θ itself, with the noise of their residuals.
     The centre moves with the drivers where ``centre_follows``.
-
     ``error_correlation_s`` is its weight in closed loop: errors of so many seconds count as one (``closed_loop``).
     ``seen`` are the groups that have data: their mean is the centre, so that a shift of all of them costs nothing.
     """
@@ -49,7 +49,7 @@ class Prior:
         off, weight = own - torch.from_numpy(self.centre), torch.from_numpy(self.width**-2.0)
         return (weight * off.square()).sum(-1), weight * off, torch.diag(weight)
 
-    def following(self, own: Tensor) -> Prior:
+    def following(self, own: Tensor) -> Population:
         """Return the prior centred at the mean of the drivers [1, G, 5], if there are enough of them."""
         if not self.centre_follows or len(self.seen) < 5:
             return self
@@ -65,7 +65,7 @@ class Problem:
 
     rows: Rows
     noise: Noise | None
-    prior: Prior
+    prior: Population
     sigma: float = 0.3
 
     @property
@@ -118,7 +118,7 @@ class Problem:
         return self.noise.whiten(errors, self.rows.joined)
 
     @cached_property
-    def known(self) -> Prior:
+    def known(self) -> Population:
         """The prior, which knows what groups have data."""
         return replace(self.prior, seen=tuple(np.unique(self.rows.group)))
 
@@ -175,7 +175,7 @@ class Solution:
     cost: float
     linear: Linear
     reduced_hessian: np.ndarray
-    prior: Prior
+    prior: Population
     row_group: np.ndarray
     follow: np.ndarray
 
@@ -222,10 +222,9 @@ def prior_of(model: Hypothesis) -> np.ndarray:
 def equations(problem: Problem, theta: np.ndarray, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
     """Return every group's gradient [G, P + Q] and matrix [G, P + Q, P + Q], with the prior of θ in them."""
     gradient, matrix = _sums(problem, linear)
-    weight = problem.prior.width**-2.0
-    own = linear.own
-    gradient[:, :own] += weight * (theta - problem.prior.centre)
-    matrix[:, :own, :own] += np.diag(weight)
+    _, pull, stiffness = problem.prior.equations(torch.from_numpy(theta))
+    gradient[:, : linear.own] += pull.numpy()
+    matrix[:, : linear.own, : linear.own] += stiffness.numpy()
     return gradient, matrix
 
 
@@ -242,8 +241,9 @@ def _sums(problem: Problem, linear: Linear) -> tuple[np.ndarray, np.ndarray]:
 
 def cost_of(problem: Problem, theta: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return the cost of every copy and group [C, G]: squared residuals and the prior."""
-    pull = (((theta - problem.prior.centre) / problem.prior.width) ** 2).sum(-1)
-    return np.asarray(problem.per_group(_squares(residual).T).T + pull)
+    return np.asarray(
+        problem.per_group(_squares(residual).T).T + problem.prior.equations(torch.from_numpy(theta))[0].numpy()
+    )
 
 
 def _squares(residual: np.ndarray) -> np.ndarray:

@@ -341,7 +341,6 @@ def standard_errors(solution: Solution) -> np.ndarray:
     # The groups of a calibration are those of its normal equations; rows are summed by group there already.
     groups = len(solution.theta)
     matrix = np.tile(np.diag(solution.prior.width**-2.0), (groups, 1, 1))
-    variance = np.ones(groups)
     count = np.zeros(groups)
     square = np.zeros(groups)
     group = solution.row_group
