@@ -12,7 +12,7 @@ import yaml
 
 import idm_env
 from idm_env.cli import doctor
-from idm_env.cli.commands import citations
+from idm_env.cli.answers import citations
 from idm_env.effects import ALL, IDM, Brakes, Delay
 from idm_env.model_file import Model, save_model
 

@@ -1,4 +1,4 @@
-"""The command ``idm-env``: thin, one function per verb, errors in one line."""
+"""The command ``idm-env``: thin, one function per verb, in the order of the help; errors in one line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typing import Annotated, Any, NoReturn
 
 import idm_env
 from idm_env import validation
-from idm_env.cli import refusals
+from idm_env.cli import answers, refusals
+from idm_env.cli.answers import console
 from idm_env.cli.options import (
     OUT,
     POSITIONAL,
@@ -36,9 +37,6 @@ from idm_env.jobs.progress import OnProgress, shown
 with needed("the command line"):
     import typer
     import typer.core
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
 
 class _Refusing(typer.core.TyperCommand):
@@ -59,9 +57,6 @@ app = typer.Typer(
     "time_s and position_m (SI units, front bumper), or the official NGSIM or OpenACC layout; leader_id, lane, gap_m, "
     "speed_mps, length_m and run_id are used where present. Ctrl-C keeps what is done: add `--resume` to go on.",
 )
-# A path, a column or a sentence may have brackets and colons in it: nothing is markup.
-PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
-console = Console(stderr=True, **PLAIN)
 PICTURES = (".png", ".svg", ".pdf")
 CHECKOUT = Path(__file__).resolve().parents[2]
 """Where this package lies: a checkout, or the libraries of an installation."""
@@ -97,17 +92,181 @@ def _stop(number: int, frame: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _show(title: str, rows: list[dict[str, Any]]) -> None:
-    from idm_env.reports.page import number
+@app.command()
+def demo(
+    data: Path | None = None,
+    columns: str | None = None,
+    out: Path = OUT,
+    seed: Annotated[int, Limits(0, 1e9)] = 7,
+) -> None:
+    """Generate platoons with a hidden effect, and find it: the whole of `explain` in half a minute.
 
-    table = Table(title=title, title_justify="left")
-    for name in rows[0]:
-        table.add_column(
-            name.replace("_", " "), overflow="fold", justify="left" if isinstance(rows[0][name], str) else "right"
-        )
-    for row in rows:
-        table.add_row(*("–" if v is None else number(v) if isinstance(v, float) else str(v) for v in row.values()))
-    Console(**PLAIN).print(table)
+    The data are written to OUT/platoon.csv first; nothing in them names the effect.
+
+    Args:
+        data: Your own file; default: generated data with a hidden effect.
+        seed: Seed of the generated data.
+    """
+    from idm_env.reports.undecided import EXPLAINED
+
+    names = (*EXPLAINED, *(("platoon.csv",) if data is None else ()))
+    with storage.results(out, names, [data]) as folder, shown(console) as report:
+        from idm_env.data import synthetic
+        from idm_env.discovery.sets import Question
+        from idm_env.discovery.sets import explain as explain_one
+
+        _work_begins()
+        path = data
+        if path is None:
+            report("generating", 0, 0, "platoon.csv")
+            path = folder / "platoon.csv"
+            trajectories, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
+            measured = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
+            storage.write_csv(path, trajectories.table.select(measured))
+            console.print(f"Ten runs of a leader and three followers: {path}", soft_wrap=True)
+        result, models = explain_one(path, out, Question(columns=columns if data else None), on_progress=report)
+    answers.explained(result, models, out)
+
+
+@app.command()
+def plot(
+    source: Path,
+    out: Path = OUT / "space-time.png",
+    html: bool = False,
+    panels: Annotated[int, Limits(1, 1000)] = 6,
+    ring_length: RingLength = None,
+    layout: str = "auto",
+    columns: str | None = None,
+    where: list[str] | None = None,
+    seconds: Annotated[float, Limits(0.1, 1e5, "s")] = 300.0,
+    seed: Seed = 0,
+    trust: bool = False,
+) -> None:
+    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
+
+    One panel per run and lane, of a rollout the left lane first; controlled vehicles (of a rollout, or a column
+    "controlled") are underlined in blue.
+
+    Args:
+        source: A trajectory file, or a YAML file of configs/ to roll out.
+        out: The picture: png, svg or pdf.
+        html: Write an interactive page too, beside the picture: zoom, and point.
+        panels: Panels at most, one per run and lane, the largest first.
+        seconds: Length of a rollout, all vehicles left to their drivers (s).
+    """
+    from idm_env.reports.page import account
+
+    if out.is_dir() or out.suffix.lower() not in PICTURES:
+        fault = "is a folder" if out.is_dir() else "names no kind of picture"
+        raise ValueError(f"--out = {out} {fault}. Give a file that ends in {', '.join(PICTURES)}.")
+    written = [out, *([out.with_suffix(".html")] if html else [])]
+    for path in written:
+        storage.not_an_input(path, [source])
+    if html and written[1].exists() and 'id="diagram"' not in written[1].read_text(errors="replace"):
+        raise ValueError(f"{written[1]} was not written by idm-env plot. Move it, or give --out another name.")
+    repairs: tuple[Any, ...] = ()
+    with shown(console) as report:
+        from idm_env.reports import diagrams, fonts
+
+        if source.suffix in (".yaml", ".yml"):
+            drawings = _rollout_panels(source, seconds, seed, report)
+        else:
+            from idm_env.data import load
+
+            _work_begins()
+            report("reading", 0, 0, source.name)
+            trajectories = load(source, ring_length=ring_length, layout=layout, columns=columns)
+            if where is not None:
+                trajectories = trajectories.where(where)
+            drawings, repairs = diagrams.panels(trajectories), trajectories.repairs
+        report("drawing", 0, 0, out.name)
+        largest = drawings[:panels]
+        more = f", the largest {len(largest)} of {len(drawings)} panels" if len(drawings) > len(largest) else ""
+        title = f"{source.name}{more}" if len(largest) > 1 else f"{source.name}: {largest[0].title}{more}"
+        out.parent.mkdir(parents=True, exist_ok=True)
+        figure = diagrams.figure_of(largest, title)
+        numbers = fonts.legible(figure)
+        storage.write(out, figure.savefig)
+        if html:
+            diagrams.write_html(out.with_suffix(".html"), largest, title)
+    if more:
+        console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
+    if numbers:
+        unreadable = ", ".join(f"{number}: {word}" for number, word in numbers.items())
+        console.print(f"No font here has these names: {unreadable}.", soft_wrap=True, highlight=False)
+    if source.suffix not in (".yaml", ".yml"):
+        console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, highlight=False)
+    for path in written:
+        answers.written("Picture", path)
+
+
+def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress) -> list[Any]:
+    """Return the panel of a rollout, or one for each of several lanes."""
+    from idm_env.envs.gym import DiffIDMEnv
+    from idm_env.envs.render import panels_of
+    from idm_env.model_file import load_environment
+
+    _work_begins()
+    # The picture is as long as it was asked for, whatever the limit of an episode.
+    env: Any = DiffIDMEnv(**{**load_environment(config), "max_episode_steps": -1})
+    env.reset(seed=seed)
+    dt = env.task.step_time  # of a step of the environment, for which an action is held
+    states, steps = [], max(1, round(seconds / dt))
+    for step in range(steps):
+        _, _, terminated, truncated, _ = env.step(None)
+        states.append(env.state)
+        report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
+        if terminated or truncated:
+            break
+    return panels_of(env.task, states)
+
+
+@app.command("filter")
+def filter_(
+    *,
+    data: Path,
+    job: JobOptions,
+    tracks: TrackOptions,
+    trust: bool = False,
+) -> None:
+    """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters.
+
+    Args:
+        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
+    """
+    with shown(console) as report:
+        from idm_env.trajectories.files import filter_file
+
+        _work_begins()
+        with job.running(report) as run:
+            result = filter_file(data, job.out, **dataclasses.asdict(tracks), **run)
+    answers.methods(result)
+    answers.finished(job.out, result["account"])
+
+
+@app.command()
+def reconstruct(
+    *,
+    data: Path,
+    job: JobOptions,
+    dt: Annotated[float, Limits(0.01, 2.0, "s")] = 0.1,
+    tracks: TrackOptions,
+    trust: bool = False,
+) -> None:
+    """Reconstruct dense trajectories from sparse ones, a second or more between points.
+
+    Args:
+        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
+        dt: Step of the dense trajectories (s).
+    """
+    with shown(console) as report:
+        from idm_env.trajectories.files import reconstruct_file
+
+        _work_begins()
+        with job.running(report) as run:
+            result = reconstruct_file(data, job.out, **dataclasses.asdict(tracks), dt=dt, **run)
+    answers.methods(result)
+    answers.finished(job.out, result["account"])
 
 
 @app.command()
@@ -192,9 +351,9 @@ def fit(
     rows = [{"": "fitted", **result["fit"]}]
     if result["held_out"] is not None:
         rows.append({"": "held out", **result["held_out"]})
-    _show("Errors in free simulation", in_words(rows))
+    answers.show("Errors in free simulation", in_words(rows))
     console.print(result["at_bounds"], soft_wrap=True, highlight=False)
-    _done(job.out, result["data"]["account"])
+    answers.finished(job.out, result["data"]["account"])
 
 
 def _only(context: typer.Context, mode: str, accepted: set[str]) -> None:
@@ -220,11 +379,15 @@ def _fit_lane_changes(
         source = Source(data, **dataclasses.asdict(file))
         result = fit_lane_changes(source, options, out, on_progress=report)
     shown_of = ("parameter", "symbol", "unit", "estimate", "standard_error", "identified")
-    _show("MOBIL by the likelihood of lane changes", [{n: row[n] for n in shown_of} for row in result["parameters"]])
+    answers.show(
+        "MOBIL by the likelihood of lane changes", [{n: row[n] for n in shown_of} for row in result["parameters"]]
+    )
     names = ("model", "parameters", "fitted", "held_out", "mobil_gains", "standard_error")
-    _show("Log-likelihood, of all drivers and of those held out", [{n: r[n] for n in names} for r in result["models"]])
+    answers.show(
+        "Log-likelihood, of all drivers and of those held out", [{n: r[n] for n in names} for r in result["models"]]
+    )
     console.print(result["sentence"], soft_wrap=True, highlight=False)
-    _done(out, result["data"]["account"])
+    answers.finished(out, result["data"]["account"])
 
 
 @app.command()
@@ -266,7 +429,7 @@ def explain(
             read = pieces.recordings(files[0], **dataclasses.asdict(file), seconds=seconds)
             cure = pieces.cure(read)
             if cure is not None:
-                _undecided(undecided.write(read, cure, out, files), out)
+                answers.undecided(undecided.write(read, cure, out, files), out)
                 return
         from idm_env.discovery.sets import Question, explain_sets
         from idm_env.discovery.sets import explain as explain_one
@@ -285,71 +448,12 @@ def explain(
             with job.running(report) as run:
                 rows = explain_sets(files, out, question, **run)
     if not rows:
-        _explained(result, models, out)
+        answers.explained(result, models, out)
         return
-    _show(f"{len(rows)} data sets", [
+    answers.show(f"{len(rows)} data sets", [
         {"set": row["set"], "verdict": row["verdict"].replace("_", " "), "effects": row["effects"]} for row in rows
     ])  # fmt: skip
-    _done(out, f"Every set's own report is in {out}/NAME; sets.csv has them all.")
-
-
-def _undecided(result: dict[str, Any], out: Path) -> None:
-    from idm_env.reports.page import account
-
-    console.print(Text.assemble("Verdict: ", ("cannot tell", "bold"), f". {result['sentence']}"), soft_wrap=True)
-    _done(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
-
-
-def _explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
-    if not result["models"]:
-        _undecided(result, out)
-        return
-    from idm_env.discovery.result import Ceilings, Weight
-    from idm_env.discovery.words import ERRORS, ceilings, laws, weight
-    from idm_env.reports.page import account
-    from idm_env.reports.undecided import FOUND
-
-    console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
-    console.print(result["sentence"], soft_wrap=True, highlight=False)
-    before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
-    if before is not None:
-        _show("Errors on the test set", [
-            _error_row(name, unit, before[key], after[key], models, result["helps"].get(key))
-            for key, (name, unit) in ERRORS.items()
-        ])  # fmt: skip
-    if result["interval"]:
-        console.print(result["interval"], style="dim", highlight=False)
-    console.print(weight(Weight(**result["prior"])), style="dim", highlight=False)
-    if before is not None:
-        limits = ceilings(Ceilings(**result["ceilings"]), before["gap_rmse_m"], result["error"]["floor"]["gap_rmse_m"])
-        console.print(f"What could be explained at all: {limits}", style="dim", highlight=False)
-    if result["bases"]:
-        console.print(laws(result["bases"]), soft_wrap=True, highlight=False)
-    files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
-    best = ", which predicts best" if len(files) > 1 else ""
-    console.print(
-        "; ".join(f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files)), highlight=False
-    )
-    if (out / FOUND).is_file():
-        console.print(f"{FOUND} is the shape as an effect, to be used and changed", highlight=False)
-    _done(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
-
-
-def _error_row(
-    name: str, unit: str, before: float, after: float, models: tuple[str, ...], compared: dict[str, Any] | None
-) -> dict[str, Any]:
-    """Return one error of explain: that of every model, and whether the second's is better, the same or worse."""
-    from idm_env.discovery.words import percent
-
-    row: dict[str, Any] = {"error": f"{name} ({unit})"} | dict(zip(models, (before, after), strict=False))
-    if len(models) > 1:
-        has_interval = compared is not None and compared["high"] is not None
-        row["change"] = percent(after / before) if before else ""
-        row["95 % interval"] = (
-            f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and has_interval else ""
-        )
-        row["verdict"] = compared["verdict"] if compared else ""
-    return row
+    answers.finished(out, f"Every set's own report is in {out}/NAME; sets.csv has them all.")
 
 
 def _names(option: str, text: str | None) -> tuple[str, ...] | None:
@@ -359,42 +463,6 @@ def _names(option: str, text: str | None) -> tuple[str, ...] | None:
             f"{option} = {validation.shown(text)} names nothing. Give names by comma, or leave {option} out."
         )
     return names
-
-
-@app.command()
-def demo(
-    data: Path | None = None,
-    columns: str | None = None,
-    out: Path = OUT,
-    seed: Annotated[int, Limits(0, 1e9)] = 7,
-) -> None:
-    """Generate platoons with a hidden effect, and find it: the whole of `explain` in half a minute.
-
-    The data are written to OUT/platoon.csv first; nothing in them names the effect.
-
-    Args:
-        data: Your own file; default: generated data with a hidden effect.
-        seed: Seed of the generated data.
-    """
-    from idm_env.reports.undecided import EXPLAINED
-
-    names = (*EXPLAINED, *(("platoon.csv",) if data is None else ()))
-    with storage.results(out, names, [data]) as folder, shown(console) as report:
-        from idm_env.data import synthetic
-        from idm_env.discovery.sets import Question
-        from idm_env.discovery.sets import explain as explain_one
-
-        _work_begins()
-        path = data
-        if path is None:
-            report("generating", 0, 0, "platoon.csv")
-            path = folder / "platoon.csv"
-            trajectories, _ = synthetic.generate(seed, runs=10, followers=3, seconds=180.0, effect="delay", noise=0.1)
-            measured = ("run_id", "vehicle_id", "leader_id", "time_s", "position_m", "speed_mps", "length_m")
-            storage.write_csv(path, trajectories.table.select(measured))
-            console.print(f"Ten runs of a leader and three followers: {path}", soft_wrap=True)
-        result, models = explain_one(path, out, Question(columns=columns if data else None), on_progress=report)
-    _explained(result, models, out)
 
 
 @app.command()
@@ -422,9 +490,9 @@ def simulate(
         _work_begins()
         source = Source(data, **dataclasses.asdict(file))
         result = simulate_file(source, model, out, base=base, seed=seed, on_progress=report)
-    _show("Errors in free simulation", in_words([result["error"]]))
+    answers.show("Errors in free simulation", in_words([result["error"]]))
     console.print(f"Gap RMSE {result['error']['gap_rmse_m']:.2f} m, {result['fitted_on']['words']}", soft_wrap=True)
-    _done(out, result["data"]["account"])
+    answers.finished(out, result["data"]["account"])
 
 
 @app.command()
@@ -455,15 +523,38 @@ def drift(
             result = drift_file(source, job.out, drivers=drivers, **run)
     names = {"log_likelihood": "gain in log-likelihood", "tau_s": "tau (s)"}
     rows = [{names.get(name, name): x for name, x in row.items()} for row in result["sorts"]]
-    _show("Every sort of drift against drivers who do not drift", rows)
+    answers.show("Every sort of drift against drivers who do not drift", rows)
     if scores := result["kept_back"]["scores"]:
         titles = {"model": "model", "ahead_s": "ahead (s)", "gap_rmse_m": "RMSE (m)", "gap_crps_m": "CRPS (m)",
                   "in_90_percent": "in the 90 % band (%)"}  # fmt: skip
         forecasts = [{title: row[name] for name, title in titles.items()} for row in scores]
-        _show(f"Forecasts of the gap of {result['kept_back']['drivers']} drivers kept back", forecasts)
+        answers.show(f"Forecasts of the gap of {result['kept_back']['drivers']} drivers kept back", forecasts)
     console.print(result["sentence"], soft_wrap=True, highlight=False)
     console.print(result["data"]["account"], soft_wrap=True, highlight=False)
-    _told("Model", job.out / "model.yaml")
+    answers.written("Model", job.out / "model.yaml")
+
+
+@app.command()
+def predict(
+    *,
+    scenarios: list[Path],
+    job: JobOptions,
+) -> None:
+    """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map.
+
+    Args:
+        scenarios: Waymo Open Motion scenarios: JSON, json.gz or TFRecord.
+    """
+    with shown(console) as report:
+        from idm_env.prediction.files import predict_files
+
+        _work_begins()
+        with job.running(report) as run:
+            result = predict_files(scenarios, job.out, **run)
+    names = {"minADE_8s": "minADE (m)", "minFDE_8s": "minFDE (m)", "miss_rate_8s": "miss rate", "mAP_8s": "mAP"}
+    rows = [{"method": r["method"], **{title: r[key] for key, title in names.items()}} for r in result["methods"]]
+    answers.show(f"8 s ahead, {result['agents_with_known_future']} agents", rows)
+    answers.finished(job.out, result["account"])
 
 
 @app.command()
@@ -488,7 +579,7 @@ def effects(
     else:
         chosen = {name: cls() for name, cls in ALL.items()}
     if cite:
-        for line in citations({name: type(effect) for name, effect in chosen.items()}):
+        for line in answers.citations({name: type(effect) for name, effect in chosen.items()}):
             print(line)
         return
     rows = []
@@ -500,18 +591,7 @@ def effects(
             }
             rows.append({**keep, "what": summary})
             summary = ""
-    _show("Effects", rows)
-
-
-def citations(effects: dict[str, Any]) -> list[str]:
-    """Return every publication once, with the effects that are taken from it, and which effects name none."""
-    by_source: dict[str, list[str]] = {}
-    for name, cls in effects.items():
-        for source in cls.sources:
-            by_source.setdefault(source, []).append(name)
-    bare = [name for name, cls in effects.items() if not cls.sources]
-    lines = [f"{source} [{', '.join(names)}]" for source, names in sorted(by_source.items())]
-    return [*lines, *([f"Without a publication of their own: {', '.join(bare)}."] if bare else [])]
+    answers.show("Effects", rows)
 
 
 @app.command()
@@ -520,184 +600,9 @@ def doctor() -> None:
     from idm_env.cli.doctor import findings
 
     results = findings()
-    _show("This machine", [{"what": f.what, "state": f.state, "found": f.told, "cure": f.cure} for f in results])
+    answers.show("This machine", [{"what": f.what, "state": f.state, "found": f.told, "cure": f.cure} for f in results])
     if any(finding.state == "broken" for finding in results):
         raise typer.Exit(1)
-
-
-@app.command()
-def plot(
-    source: Path,
-    out: Path = OUT / "space-time.png",
-    html: bool = False,
-    panels: Annotated[int, Limits(1, 1000)] = 6,
-    ring_length: RingLength = None,
-    layout: str = "auto",
-    columns: str | None = None,
-    where: list[str] | None = None,
-    seconds: Annotated[float, Limits(0.1, 1e5, "s")] = 300.0,
-    seed: Seed = 0,
-    trust: bool = False,
-) -> None:
-    """Draw a space-time diagram, position over time coloured by speed, of a file or of a rollout.
-
-    One panel per run and lane, of a rollout the left lane first; controlled vehicles (of a rollout, or a column
-    "controlled") are underlined in blue.
-
-    Args:
-        source: A trajectory file, or a YAML file of configs/ to roll out.
-        out: The picture: png, svg or pdf.
-        html: Write an interactive page too, beside the picture: zoom, and point.
-        panels: Panels at most, one per run and lane, the largest first.
-        seconds: Length of a rollout, all vehicles left to their drivers (s).
-    """
-    from idm_env.reports.page import account
-
-    if out.is_dir() or out.suffix.lower() not in PICTURES:
-        fault = "is a folder" if out.is_dir() else "names no kind of picture"
-        raise ValueError(f"--out = {out} {fault}. Give a file that ends in {', '.join(PICTURES)}.")
-    written = [out, *([out.with_suffix(".html")] if html else [])]
-    for path in written:
-        storage.not_an_input(path, [source])
-    if html and written[1].exists() and 'id="diagram"' not in written[1].read_text(errors="replace"):
-        raise ValueError(f"{written[1]} was not written by idm-env plot. Move it, or give --out another name.")
-    repairs: tuple[Any, ...] = ()
-    with shown(console) as report:
-        from idm_env.reports import diagrams, fonts
-
-        if source.suffix in (".yaml", ".yml"):
-            drawings = _rollout_panels(source, seconds, seed, report)
-        else:
-            from idm_env.data import load
-
-            _work_begins()
-            report("reading", 0, 0, source.name)
-            trajectories = load(source, ring_length=ring_length, layout=layout, columns=columns)
-            if where is not None:
-                trajectories = trajectories.where(where)
-            drawings, repairs = diagrams.panels(trajectories), trajectories.repairs
-        report("drawing", 0, 0, out.name)
-        largest = drawings[:panels]
-        more = f", the largest {len(largest)} of {len(drawings)} panels" if len(drawings) > len(largest) else ""
-        title = f"{source.name}{more}" if len(largest) > 1 else f"{source.name}: {largest[0].title}{more}"
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure = diagrams.figure_of(largest, title)
-        numbers = fonts.legible(figure)
-        storage.write(out, figure.savefig)
-        if html:
-            diagrams.write_html(out.with_suffix(".html"), largest, title)
-    if more:
-        console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
-    if numbers:
-        unreadable = ", ".join(f"{number}: {word}" for number, word in numbers.items())
-        console.print(f"No font here has these names: {unreadable}.", soft_wrap=True, highlight=False)
-    if source.suffix not in (".yaml", ".yml"):
-        console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, highlight=False)
-    for path in written:
-        _told("Picture", path)
-
-
-def _rollout_panels(config: Path, seconds: float, seed: int, report: OnProgress) -> list[Any]:
-    """Return the panel of a rollout, or one for each of several lanes."""
-    from idm_env.envs.gym import DiffIDMEnv
-    from idm_env.envs.render import panels_of
-    from idm_env.model_file import load_environment
-
-    _work_begins()
-    # The picture is as long as it was asked for, whatever the limit of an episode.
-    env: Any = DiffIDMEnv(**{**load_environment(config), "max_episode_steps": -1})
-    env.reset(seed=seed)
-    dt = env.task.step_time  # of a step of the environment, for which an action is held
-    states, steps = [], max(1, round(seconds / dt))
-    for step in range(steps):
-        _, _, terminated, truncated, _ = env.step(None)
-        states.append(env.state)
-        report("rollout", step + 1, steps, f"{(step + 1) * dt:.0f} s")
-        if terminated or truncated:
-            break
-    return panels_of(env.task, states)
-
-
-@app.command("filter")
-def filter_(
-    *,
-    data: Path,
-    job: JobOptions,
-    tracks: TrackOptions,
-    trust: bool = False,
-) -> None:
-    """Filter noisy trajectories into physical ones: position, speed, acceleration, gap, and driver parameters.
-
-    Args:
-        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
-    """
-    with shown(console) as report:
-        from idm_env.trajectories.files import filter_file
-
-        _work_begins()
-        with job.running(report) as run:
-            result = filter_file(data, job.out, **dataclasses.asdict(tracks), **run)
-    _methods(result)
-    _done(job.out, result["account"])
-
-
-def _methods(result: dict[str, Any]) -> None:
-    from idm_env.trajectories.report import COLUMNS
-
-    if result["left_out_points"]:
-        names = {"method": "method", "rmse_m": "RMSE (m)", "mae_m": "mean |error| (m)", "p95_m": "95 % below (m)"}
-        rows = [{title: row[name] for name, title in names.items()} for row in result["left_out_points"]]
-        _show(f"{result['left_out_points'][0]['points']} points of the file that were left out", rows)
-    rows = [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in result["methods"]]
-    _show("Methods on these data", rows)
-
-
-@app.command()
-def reconstruct(
-    *,
-    data: Path,
-    job: JobOptions,
-    dt: Annotated[float, Limits(0.01, 2.0, "s")] = 0.1,
-    tracks: TrackOptions,
-    trust: bool = False,
-) -> None:
-    """Reconstruct dense trajectories from sparse ones, a second or more between points.
-
-    Args:
-        data: Trajectories: csv, csv.gz or parquet, or a folder of parquet files larger than memory.
-        dt: Step of the dense trajectories (s).
-    """
-    with shown(console) as report:
-        from idm_env.trajectories.files import reconstruct_file
-
-        _work_begins()
-        with job.running(report) as run:
-            result = reconstruct_file(data, job.out, **dataclasses.asdict(tracks), dt=dt, **run)
-    _methods(result)
-    _done(job.out, result["account"])
-
-
-@app.command()
-def predict(
-    *,
-    scenarios: list[Path],
-    job: JobOptions,
-) -> None:
-    """Predict up to six futures of eight seconds per agent, from one second of history and the lanes of the map.
-
-    Args:
-        scenarios: Waymo Open Motion scenarios: JSON, json.gz or TFRecord.
-    """
-    with shown(console) as report:
-        from idm_env.prediction.files import predict_files
-
-        _work_begins()
-        with job.running(report) as run:
-            result = predict_files(scenarios, job.out, **run)
-    names = {"minADE_8s": "minADE (m)", "minFDE_8s": "minFDE (m)", "miss_rate_8s": "miss rate", "mAP_8s": "mAP"}
-    rows = [{"method": r["method"], **{title: r[key] for key, title in names.items()}} for r in result["methods"]]
-    _show(f"8 s ahead, {result['agents_with_known_future']} agents", rows)
-    _done(job.out, result["account"])
 
 
 @app.command()
@@ -734,8 +639,8 @@ def bench(
             say=console.print if verbose else None,
         )  # fmt: skip
     for title, rows, _ in benchmark.tables.of(result)[: len(numbers) + 2]:  # the rest is in the report
-        _show(title, rows)
-    _done(out, benchmark.tables.absent(result))
+        answers.show(title, rows)
+    answers.finished(out, benchmark.tables.absent(result))
 
 
 def _number(option: str, text: str, wrong: str) -> float:
@@ -745,21 +650,7 @@ def _number(option: str, text: str, wrong: str) -> float:
         raise ValueError(f"{option} = {validation.shown(text)} is {wrong}.") from None
 
 
-def _told(word: str, path: Path) -> None:
-    console.print(Text.assemble(f"{word}: ", (os.path.realpath(path), "bold")), soft_wrap=True)
-
-
-def _done(out: Path, account: str) -> None:
-    console.print(account, soft_wrap=True, highlight=False)
-    _told("Report", out / "report.html")
-
-
-_ORDER = (
-    "demo", "plot", "filter", "reconstruct", "fit", "explain", "simulate", "drift", "predict", "effects", "doctor",
-    "bench",
-)  # fmt: skip
-"""Of commands in the help and on the site: each takes a file of the one before."""
-app.registered_commands.sort(key=lambda c: _ORDER.index(str(c.name or getattr(c.callback, "__name__", ""))))
+# Each command takes a file of the one before, in the help and on the site.
 for _command in app.registered_commands:
     assert _command.callback is not None
     _command.cls, _command.callback = _Refusing, spread(_command.callback)

@@ -1,0 +1,127 @@
+"""What commands print of their results: tables and sentences, on stderr but for the tables."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from idm_env.extras import needed
+
+with needed("the command line"):
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+# A path, a column or a sentence may have brackets and colons in it: nothing is markup.
+PLAIN: dict[str, Any] = {"markup": False, "emoji": False}
+console = Console(stderr=True, **PLAIN)
+
+
+def show(title: str, rows: list[dict[str, Any]]) -> None:
+    """Print rows as a table on stdout; the names of columns are those of the first row."""
+    from idm_env.reports.page import number
+
+    table = Table(title=title, title_justify="left")
+    for name in rows[0]:
+        table.add_column(
+            name.replace("_", " "), overflow="fold", justify="left" if isinstance(rows[0][name], str) else "right"
+        )
+    for row in rows:
+        table.add_row(*("–" if v is None else number(v) if isinstance(v, float) else str(v) for v in row.values()))
+    Console(**PLAIN).print(table)
+
+
+def methods(result: dict[str, Any]) -> None:
+    """Print the errors of a filter or a reconstruction beside those of other methods."""
+    from idm_env.trajectories.report import COLUMNS
+
+    if result["left_out_points"]:
+        names = {"method": "method", "rmse_m": "RMSE (m)", "mae_m": "mean |error| (m)", "p95_m": "95 % below (m)"}
+        rows = [{title: row[name] for name, title in names.items()} for row in result["left_out_points"]]
+        show(f"{result['left_out_points'][0]['points']} points of the file that were left out", rows)
+    rows = [{"method": row["method"], **{title: row[key] for key, title, _ in COLUMNS}} for row in result["methods"]]
+    show("Methods on these data", rows)
+
+
+def undecided(result: dict[str, Any], out: Path) -> None:
+    """Say why nothing can be told."""
+    from idm_env.reports.page import account
+
+    console.print(Text.assemble("Verdict: ", ("cannot tell", "bold"), f". {result['sentence']}"), soft_wrap=True)
+    finished(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
+
+
+def explained(result: dict[str, Any], models: tuple[str, ...], out: Path) -> None:
+    """Say what ``explain`` found, and what it does for the errors on the test set."""
+    if not result["models"]:
+        undecided(result, out)
+        return
+    from idm_env.discovery.result import Ceilings, Weight
+    from idm_env.discovery.words import ERRORS, ceilings, laws, weight
+    from idm_env.reports.page import account
+    from idm_env.reports.undecided import FOUND
+
+    console.print(Text.assemble("Verdict: ", (result["verdict"].replace("_", " "), "bold"), ". "), end="")
+    console.print(result["sentence"], soft_wrap=True, highlight=False)
+    before, after = result["error"]["before"], (result["partial"] or result["error"])["after"]
+    if before is not None:
+        show("Errors on the test set", [
+            _error_row(name, unit, before[key], after[key], models, result["helps"].get(key))
+            for key, (name, unit) in ERRORS.items()
+        ])  # fmt: skip
+    if result["interval"]:
+        console.print(result["interval"], style="dim", highlight=False)
+    console.print(weight(Weight(**result["prior"])), style="dim", highlight=False)
+    if before is not None:
+        limits = ceilings(Ceilings(**result["ceilings"]), before["gap_rmse_m"], result["error"]["floor"]["gap_rmse_m"])
+        console.print(f"What could be explained at all: {limits}", style="dim", highlight=False)
+    if result["bases"]:
+        console.print(laws(result["bases"]), soft_wrap=True, highlight=False)
+    files = sorted(result["models"].items(), key=lambda item: item[0] != "model.yaml")
+    best = ", which predicts best" if len(files) > 1 else ""
+    console.print(
+        "; ".join(f"{file} is {name}{best if not i else ''}" for i, (file, name) in enumerate(files)), highlight=False
+    )
+    if (out / FOUND).is_file():
+        console.print(f"{FOUND} is the shape as an effect, to be used and changed", highlight=False)
+    finished(out, account((r["kind"], r["count"]) for r in result["data"]["repairs"]))
+
+
+def _error_row(
+    name: str, unit: str, before: float, after: float, models: tuple[str, ...], compared: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Return one error of explain: that of every model, and whether the second's is better, the same or worse."""
+    from idm_env.discovery.words import percent
+
+    row: dict[str, Any] = {"error": f"{name} ({unit})"} | dict(zip(models, (before, after), strict=False))
+    if len(models) > 1:
+        has_interval = compared is not None and compared["high"] is not None
+        row["change"] = percent(after / before) if before else ""
+        row["95 % interval"] = (
+            f"{percent(compared['low'])} to {percent(compared['high'])}" if compared and has_interval else ""
+        )
+        row["verdict"] = compared["verdict"] if compared else ""
+    return row
+
+
+def citations(effects: dict[str, Any]) -> list[str]:
+    """Return every publication once, with the effects that are taken from it, and which effects name none."""
+    by_source: dict[str, list[str]] = {}
+    for name, cls in effects.items():
+        for source in cls.sources:
+            by_source.setdefault(source, []).append(name)
+    bare = [name for name, cls in effects.items() if not cls.sources]
+    lines = [f"{source} [{', '.join(names)}]" for source, names in sorted(by_source.items())]
+    return [*lines, *([f"Without a publication of their own: {', '.join(bare)}."] if bare else [])]
+
+
+def written(word: str, path: Path) -> None:
+    """Say where a file lies, in full."""
+    console.print(Text.assemble(f"{word}: ", (os.path.realpath(path), "bold")), soft_wrap=True)
+
+
+def finished(out: Path, account: str) -> None:
+    """Say what became of the data, and where the report lies."""
+    console.print(account, soft_wrap=True, highlight=False)
+    written("Report", out / "report.html")
