@@ -10,15 +10,18 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import numpy as np
 import polars as pl
 import pytest
+from typer.models import CommandInfo
 
 from idm_env.cli.commands import app
-from idm_env.cli.options import FileOptions
+from idm_env.cli.options import FileOptions, JobOptions, SharedOptions, SourceOptions, TrackOptions, args_of
 from idm_env.data import synthetic
 from idm_env.jobs import storage
 from tests.commands import spawned, typed
@@ -100,6 +103,27 @@ def test_options_that_go_together_are_in_every_command_of_their_kind() -> None:
         == {"fit", "explain", "filter", "reconstruct", "predict", "drift"}
     )
     assert {name for name, options in commands.items() if file <= options} == {"fit", "explain", "simulate", "drift"}
+
+
+@pytest.mark.parametrize("command", app.registered_commands, ids=lambda c: c.callback.__name__)
+def test_every_option_means_something_and_nothing_else_is_described(command: CommandInfo) -> None:
+    """What a docstring forgets has an empty help, and what it names beside would be read by nobody."""
+    assert command.callback is not None
+    hints = get_type_hints(command.callback, include_extras=True)
+    said = {name: get_args(hint)[1].help for name, hint in hints.items() if get_args(hint)}
+    assert all(said.values()), said
+    own = args_of(inspect.unwrap(command.callback))
+    assert own.items() <= said.items() and "Args:" not in (command.callback.__doc__ or "")
+
+
+def test_what_several_commands_have_is_described_where_it_is_used() -> None:
+    """A field of a group is described by it or by all groups' page; that page describes what two commands have."""
+    named = Counter(
+        name for c in app.registered_commands if c.callback for name in inspect.signature(c.callback).parameters
+    )
+    assert all(named[name] > 1 for name in args_of(SharedOptions))
+    for group in (FileOptions, SourceOptions, TrackOptions, JobOptions):
+        assert args_of(group).keys() <= {field.name for field in dataclasses.fields(group)}
 
 
 def test_bad_paths_and_options(frame: pl.DataFrame, tmp_path: Path) -> None:

@@ -138,7 +138,7 @@ class JobOptions:
             yield {"resume": self.resume, "executor": workers, "on_progress": report}
 
 
-def _args_of(thing: Any) -> dict[str, str]:
+def args_of(thing: Any) -> dict[str, str]:
     """Return by name what the section ``Args`` of a docstring says; of a class, what those of its bases say too."""
     entries: dict[str, str] = {}
     for each in reversed(getattr(thing, "__mro__", (thing,))):
@@ -149,7 +149,7 @@ def _args_of(thing: Any) -> dict[str, str]:
 
 def _options(declared: Any, name: str) -> Iterator[inspect.Parameter]:
     """Yield the options of a function or of a dataclass, the fields of dataclasses among them one by one."""
-    hints, helps = get_type_hints(declared, include_extras=True), _args_of(SharedOptions) | _args_of(declared)
+    hints, helps = get_type_hints(declared, include_extras=True), args_of(SharedOptions) | args_of(declared)
     for parameter in inspect.signature(declared).parameters.values():
         kind = hints[parameter.name]
         if dataclasses.is_dataclass(kind):
