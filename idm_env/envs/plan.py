@@ -34,31 +34,110 @@ from idm_env.tasks import EnvState
 from idm_env.types import LINKS, Params, Record, State, Trips
 
 Array = np.ndarray
+Group = tuple[str, Sequence[str], int]
+"""Arrays that lie one after another: what their names begin with, their names, and the bytes of each."""
 _ROWS = (1009, 1013, 1019, 1021, 1031)
 _GIVEN = ("command", "given")
 
 
-@dataclass
 class Recorded:
-    """A task's step as it was recorded: functions before and after it, the kernel, and the inputs between.
+    """A task's step as it was recorded: functions ``before`` and ``after`` it, the ``kernel``, and inputs between.
 
-    ``normals`` are the kernel's slots for what effects draw, ``many`` the number of rows in the recording, and
-    ``flowing`` what is told and has derivatives.
+    ``kind`` is as in ``Plan``. ``normals`` are the kernel's slots for what effects draw, ``many`` the number of rows in
+    the recording, ``moving`` the leaves that steps change with a derivative, and ``flowing`` what is told and has one.
     """
 
-    before: RowFunction
-    kernel: TileKernel
-    after: RowFunction
-    inputs: Mapping[str, Any]
-    normals: Mapping[str, str]
-    many: int
-    flowing: list[str]
-    back: Callable[[], tuple[RowFunction, RowFunction]]
+    def __init__(self, moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple[str, ...]) -> None:
+        (idle, every), task = kind, moves.task
+        self._moves, self._world, self._count = moves, world, len(task.agents)
+        simulator = task.simulator if world.state.lanes is None else between(task.simulator)
+        size, dtype = world.state.speed.shape[-1], world.state.speed.dtype
+        # A number of rows that is no other dimension tells rows apart from everything else.
+        many = self.many = next(p for p in _ROWS if p not in (size, self._count))
+        self._sample = examples_of(world, many)
+        acts = {} if idle else {"action": torch.zeros(many, self._count * len(task.commands), dtype=dtype)}
+        if not (idle or every):
+            acts["live"] = torch.ones(many, self._count, dtype=torch.bool)
+        self._given = () if idle else _GIVEN
+        self._early = {**self._sample, **acts}
+        self._drawn = {name: torch.zeros(many, size, dtype=dtype) for name in draws}
+        self.inputs: dict[str, Any] = {}
+        self.normals: dict[str, str] = {}
+        self.before = RowFunction(self._before, self._early, many)
+        inside = {effect: _without_lane(value) for effect, value in self.inputs.items() if effect in simulator.by_name}
+        kernel = tile_kernel(simulator, Form.of(world.state._replace(lanes=None), inside))
+        if isinstance(kernel, str):
+            raise Untraceable(kernel)
+        self.kernel: TileKernel = kernel
+        self._late = {**self._sample, **{f"later_{n}": x.clone() for n, x in self._sample.items()}}
+        self._late |= {n: torch.zeros(many, self._count, dtype=dtype) for n in self._given}
+        self.after = RowFunction(self._after, self._late, many)
+        self.moving = [block_of(n) for n in kernel.program.moving]
+        self._by = [*self.moving, *(f"later_{n}" for n in self.moving), *self._given]
+        with torch.enable_grad():
+            outputs = self._after(**{n: x.clone().requires_grad_(n in self._by) for n, x in self._late.items()})
+        self.flowing = [n for n, x in outputs.items() if x.requires_grad]
+
+    def _before(self, **leaves: Tensor) -> dict[str, Tensor]:
+        """Return commands and the inputs of a step, and note which are normals."""
+        world, normals = world_of(leaves, self._world), self._drawn
+        command, passed, inputs = self._moves.commanded(
+            world, leaves.get("action"), normals or None, leaves.get("live")
+        )
+        self.inputs.update(inputs)
+        out = {} if command is None or passed is None else {"command": command, "given": passed}
+        for effect, value in inputs.items():
+            for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
+                if x is not None and x is normals.get(effect):
+                    self.normals[slot_name(effect, part)] = effect
+                elif x is not None:
+                    out[_plain(slot_name(effect, part))] = x
+        return out
+
+    def _after(self, **leaves: Tensor) -> dict[str, Tensor]:
+        """Return what is told of a step."""
+        then = world_of({n: x for n, x in leaves.items() if not n.startswith("later_")}, self._world)
+        now, command = world_of(leaves, self._world, "later_"), leaves.get("command")
+        accel = now.state.speed.new_zeros(len(now.state.speed), self._count) if command is None else command
+        return self._moves.told(then, accel, leaves.get("given"), now, command is not None)
 
     @cached_property
     def backward(self) -> tuple[RowFunction, RowFunction]:
         """The adjoints of what comes before and after. Untraceable where torch's derivative cannot be recorded."""
-        return self.back()
+        moving, many, sample = self.moving, self.many, self._sample
+        late_back = adjoint(self._after, self.flowing, self._by)
+
+        def later_first(**leaves: Tensor) -> dict[str, Tensor]:
+            gradients = late_back(**{n: x for n, x in leaves.items() if not n.startswith("seed_")})
+            ends = {f"end_{n}": summed(leaves[f"seed_{n}"], gradients.get(f"later_{n}")) for n in moving}
+            ends |= {f"direct_{n}": gradients[n] for n in moving if n in gradients}
+            return ends | {f"on_{n}": gradients[n] for n in _GIVEN if n in gradients}
+
+        outputs = {n: x for n, x in self._after(**self._late).items() if n in self.flowing}
+        seeds = {f"on_{n}": torch.zeros_like(x).contiguous() for n, x in outputs.items()}
+        seeds |= {f"seed_{n}": sample[n].clone() for n in moving}
+        after = RowFunction(later_first, {**self._late, **seeds}, many, apart=True)
+        numbers = [_plain(n) for n in self.kernel.numbers if n not in self.normals]
+        commands = [n for n in _GIVEN if f"on_{n}" in after.outs]
+        wide, narrow = (sample[moving[0]].new_zeros(many, n) for n in (sample[moving[0]].shape[-1], self._count))
+
+        def spread(**leaves: Tensor) -> dict[str, Tensor]:
+            return {n: x if n in _GIVEN else x.expand(wide.shape) for n, x in self._before(**leaves).items()}
+
+        early_back = adjoint(spread, [*numbers, *commands], [*moving, *(n for n in ("action",) if n in self._early)])
+
+        def earlier(**leaves: Tensor) -> dict[str, Tensor]:
+            gradients = early_back(**{n: x for n, x in leaves.items() if n.split("_")[0] not in ("carried", "direct")})
+            begins = {
+                f"begin_{n}": summed(summed(leaves[f"carried_{n}"], leaves.get(f"direct_{n}")), gradients.get(n))
+                for n in moving
+            }
+            return begins | ({"on_action": gradients["action"]} if "action" in gradients else {})
+
+        seeds = {f"on_{n}": wide.clone() for n in numbers} | {f"on_{n}": narrow.clone() for n in commands}
+        seeds |= {f"carried_{n}": sample[n].clone() for n in moving}
+        seeds |= {f"direct_{n}": sample[n].clone() for n in moving if f"direct_{n}" in after.outs}
+        return RowFunction(earlier, {**self._early, **seeds}, many, apart=True), after
 
 
 class Layout(NamedTuple):
@@ -97,38 +176,28 @@ class Moment:
     """The addresses of what the step's loops were given beside its worlds."""
 
 
-class _Table:
-    """The addresses that loops over rows are called with: what stays, what lies in the world, and what is given."""
+class RowTable:
+    """The addresses that loops over rows are called with: what stays, groups of arrays, and what is given by name."""
 
-    def __init__(self, loops: RowFunction, layout: Layout, pitch: int) -> None:
-        still = {**layout.still, **{f"later_{n}": x for n, x in layout.still.items()}}
+    def __init__(self, loops: RowFunction, still: Mapping[str, Array], groups: Sequence[Group]) -> None:
+        still = {**still, **{f"later_{n}": x for n, x in still.items()}}
         self._stays = loops.table(still)
-        self.given = {n: loops.place(n) for n in (*loops.needs, *loops.outs) if n not in still}
-        """Places of what is given with every call, by name."""
-        self._now, self._now_at = self._within(layout, pitch, "")
-        self._later, self._later_at = self._within(layout, pitch, "later_")
+        self._given = {n: loops.place(n) for n in (*loops.needs, *loops.outs) if n not in still}
+        self._groups = [self._within(*group) for group in groups]
 
-    def _within(self, layout: Layout, pitch: int, prefix: str) -> tuple[Array, Array]:
-        places = {i: self.given.pop(prefix + n) for i, n in enumerate(layout.blocks) if prefix + n in self.given}
+    def _within(self, prefix: str, names: Sequence[str], pitch: int) -> tuple[Array, Array]:
+        places = {i: self._given.pop(prefix + n) for i, n in enumerate(names) if prefix + n in self._given}
         return np.array(list(places.values()), np.int64), np.array(list(places), np.int64) * pitch
 
-    def filled(self, now: int, later: int, given: Mapping[str, int]) -> Array:
-        """Return the addresses for one call."""
-        cells = self._stays.copy()
-        cells[self._now] = self._now_at + now
-        cells[self._later] = self._later_at + later
-        for name, place in self.given.items():
+    def filled(self, given: Mapping[str, Any], *begins: Any) -> Array:
+        """Return the addresses for one call, or for some: where groups begin, and what is given, is one a call then."""
+        several = isinstance(begins[0], np.ndarray)
+        cells = np.repeat(self._stays[:, None], len(begins[0]), 1) if several else self._stays.copy()
+        for (places, offsets), begin in zip(self._groups, begins, strict=True):
+            cells[places] = (offsets[:, None] if several else offsets) + begin
+        for name, place in self._given.items():
             cells[place] = given[name]
-        return cells
-
-    def each(self, now: Array, later: Array, given: Mapping[str, Any]) -> Array:
-        """Return the addresses for some calls, of which the worlds' and what is given are one a call."""
-        cells = np.repeat(self._stays[None], len(now), 0)
-        cells[:, self._now] = self._now_at + now[:, None]
-        cells[:, self._later] = self._later_at + later[:, None]
-        for name, place in self.given.items():
-            cells[:, place] = given[name]
-        return cells
+        return cells.T.copy() if several else cells
 
 
 class _Room:
@@ -136,78 +205,45 @@ class _Room:
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]], types: Mapping[str, Any]) -> None:
         self._sizes: dict[Any, int] = {}
-        self._at: list[tuple[str, Any, int, int, tuple[int, ...]]] = []
+        self._at: list[tuple[str, Any, int, tuple[int, ...]]] = []
         for name, shape in shapes.items():
             kind = np.dtype(types[name])
-            begin, count = self._sizes.get(kind, 0), math.prod(shape)
-            self._at.append((name, kind, begin, count, shape))
-            self._sizes[kind] = begin + count
+            begin = self._sizes.get(kind, 0)
+            self._at.append((name, kind, begin * kind.itemsize, shape))
+            self._sizes[kind] = begin + math.prod(shape)
+
+    @classmethod
+    def of(cls, loops: RowFunction, rows: int) -> _Room:
+        """Return the arrays of what loops over rows return."""
+        return cls({n: (rows, *shape) for n, shape in loops.shapes.items()}, loops.types)
 
     def take(self, steps: int = 0) -> tuple[dict[str, Array], dict[str, int]]:
         """Return fresh arrays by name, with ``steps`` as their first dimension where there are any; and addresses."""
-        base = {kind: np.empty(size * max(steps, 1), kind) for kind, size in self._sizes.items()}
-        first = {kind: x.__array_interface__["data"][0] for kind, x in base.items()}
+        own = max(steps, 1)
+        memory = {kind: np.empty(size * own, kind) for kind, size in self._sizes.items()}
+        first = {kind: address(x) for kind, x in memory.items()}
         arrays, pointers = {}, {}
-        for name, kind, begin, count, shape in self._at:
-            own = max(steps, 1)
-            flat = base[kind][begin * own : (begin + count) * own]
-            arrays[name] = flat.reshape((steps, *shape) if steps else shape)
-            pointers[name] = first[kind] + begin * own * kind.itemsize
+        for name, kind, begin, shape in self._at:
+            arrays[name] = np.ndarray((steps, *shape) if steps else shape, kind, memory[kind], begin * own)
+            pointers[name] = first[kind] + begin * own
         return arrays, pointers
 
 
 class Laid:
-    """Tables and operands of a plan for the arrays of one layout."""
+    """The tables of a plan for the arrays of one layout."""
 
     def __init__(self, plan: Plan, layout: Layout) -> None:
-        recorded, self.layout, self._plan = plan.recorded, layout, plan
-        self.ask = _Table(recorded.before, layout, plan.pitch)
-        self.tell = _Table(recorded.after, layout, plan.pitch)
-        self.inputs: list[tuple[Array, Strides]] = []
-        self.given: dict[int, str] = {}
-        """Places of the kernel's inputs that are given with every call, by name."""
-        first = 2 * len(plan.kernel.program.states) + plan.fixed
-        for i, slot in enumerate((*plan.kernel.numbers, *plan.kernel.flags)):
-            source, name = self._input(slot)
-            self.inputs.append(source)
-            if name is not None:
-                self.given[first + i] = name
-
-    def _input(self, slot: str) -> tuple[tuple[Array, Strides], str | None]:
-        """Return where the kernel finds an input, and its name where that is given with every call."""
-        recorded, rows, size = self._plan.recorded, self._plan.rows, self._plan.size
-        empty = np.empty(0, self._plan.real)
-        if slot in recorded.normals:
-            return (empty, (rows * size, size, 1)), recorded.normals[slot]
-        name = _plain(slot)
-        other, width = recorded.before.same.get(name, (name, recorded.before.shapes.get(name)))
-        if width is not None:
-            wide = math.prod(width)
-            return (empty, (0, wide, 0 if wide < size else 1)), other
-        x = part_of(recorded.inputs, slot)
-        if x.dim() == 2 and x.shape[0] == recorded.many:
-            x = x[:1]
-        return operand(x[None], (rows,), size, 1), None
+        self.layout, self.plan = layout, plan
+        self.ask = RowTable(plan.recorded.before, layout.still, plan.lies)
+        self.tell = RowTable(plan.recorded.after, layout.still, plan.lies)
 
     @cached_property
-    def back(self) -> tuple[_Table, _Table]:
+    def back(self) -> tuple[RowTable, RowTable]:
         """The tables of the adjoints of what comes before and after."""
-        before, after = self._plan.recorded.backward
-        return _Table(before, self.layout, self._plan.pitch), _Table(after, self.layout, self._plan.pitch)
-
-    def bind(self, params: Params) -> Bound:
-        """Lay out what parameters give."""
-        plan = self._plan
-        kernel, task, state = plan.kernel, plan.task, plan.world.state
-        still = {n: self.layout.still.get(f"state_{n}") for n in ("length", "present")}
-        views = {n: torch.from_numpy(x).view(plan.rows, plan.size) for n, x in still.items() if x is not None}
-        state = state._replace(**views)  # type: ignore[arg-type]
-        program = kernel.program
-        values = [static_of(task.simulator, state, params, n) for n in (*program.statics, *program.parameters)]
-        operands = [operand(x.to(state.speed.dtype), (plan.rows,), plan.size) for x in values] + self.inputs
-        places = np.concatenate((np.zeros(2 * len(program.states), np.int64), addresses([a for a, _ in operands])))
-        strides = table([*(s for _, s in operands), (0, plan.size, 1)])
-        return Bound(self, params, program.parameters, [a for a, _ in operands], places, strides)
+        before, after = self.plan.recorded.backward
+        begins, seeds = ((prefix, self.layout.blocks, self.plan.pitch) for prefix in ("begin_", "seed_"))
+        still, lies = self.layout.still, self.plan.lies
+        return RowTable(before, still, (*lies, begins)), RowTable(after, still, (*lies, seeds))
 
 
 class Plan:
@@ -217,22 +253,22 @@ class Plan:
         Untraceable: For a task or a simulator that cannot be recorded.
     """
 
-    kind_of_laid = Laid
+    _drawn_by = 0
+    """Bytes from the normals of one step to the next, where the kernel does not count steps."""
 
     def __init__(
         self, moves: Moves, world: EnvState, layout: Layout, kind: tuple[bool, bool], draws: tuple[str, ...]
     ) -> None:
-        self.moves, task = moves, moves.task
-        recorded = self.recorded = _record(moves, world, kind, draws)
+        self.moves, self.task, self.world, self.layout = moves, moves.task, world, layout
+        recorded = self.recorded = Recorded(moves, world, kind, draws)
         self.kernel = kernel = recorded.kernel
-        self.task, self.world = task, world
         self.rows, self.size = rows, size = world.state.speed.shape
         self.real = real = np.dtype(np.float32 if world.state.speed.dtype == torch.float32 else np.float64)
         self.count = rows * size
         self.pitch = self.count * real.itemsize
-        self.between = _Room({n: (rows, *s) for n, s in recorded.before.shapes.items()}, recorded.before.types)
+        self.lies: tuple[Group, ...] = (("", layout.blocks, self.pitch), ("later_", layout.blocks, self.pitch))
+        self.between, self.told = (_Room.of(loops, rows) for loops in (recorded.before, recorded.after))
         self._reused = self.between.take()
-        self.told = _Room({n: (rows, *s) for n, s in recorded.after.shapes.items()}, recorded.after.types)
         self._same = [(n, other, (rows, *s)) for n, (other, s) in recorded.after.same.items()]
         self.constant = {n: np.repeat(x[None], rows, 0) for n, x in recorded.after.constants.items()}
         past = world.state.memory.get(PAST)
@@ -243,19 +279,14 @@ class Plan:
         self.groups = tiles.tiles(rows, along, wide, around) if along <= wide else rows
         self._one = tiles.tiles(rows, along, wide, around) == 1
         self.extent = np.array((self.slots, rows, along, wide, around))
-        self._small = rows * size < 2 * pool.GRAIN
         self.work = workspaces(kernel, self.slots, real)
         self.loops = (
             kernel.measures, kernel.forward(real.name), kernel.looks, kernel.recalls,
             kernel.read, kernel.constants[real.name], self.extent,
         )  # fmt: skip
-        states = [layout.blocks.index(_block(n)) for n in kernel.program.states]
+        states = [layout.blocks.index(block_of(n)) for n in kernel.program.states]
         self._states = np.array(states, np.int64) * self.pitch
         self._carried = [i for i, n in enumerate(layout.blocks) if i not in states]
-        program = kernel.program
-        self.fixed = len(program.statics) + len(program.parameters)
-        self.layout = layout
-        self._laid = self.kind_of_laid(self, layout)
         self._bound: Bound | None = None
         self._loaded: Bound | None = None
 
@@ -268,61 +299,36 @@ class Plan:
     def of(self, layout: Layout, params: Params) -> Bound:
         """Return what parameters give, laid out once for many steps."""
         bound = self._bound
-        if layout.version != self._laid.layout.version:
-            self._laid, bound = self.kind_of_laid(self, layout), None
-        if bound is None or bound.params is not params or bound.changed():
-            bound = self._bound = self._laid.bind(params)
+        if bound is None or layout.version != bound.laid.layout.version:
+            bound = self._bound = self._bind(Laid(self, layout), params)
+        elif bound.params is not params or bound.changed():
+            bound = self._bound = self._bind(bound.laid, params)
         return bound
+
+    def _bind(self, laid: Laid, params: Params) -> Bound:
+        """Lay out what parameters give."""
+        return Bound(self, laid, params)
 
     def run(self, moment: Moment, now: Tensor, later: Tensor, tape: bool) -> dict[str, Array]:
         """Do one step from blocks to blocks; return what is told. With ``tape`` what is between is kept for ``back``.
 
-        Untraceable where an effect of the user's own returned NaN.
+        Untraceable where an effect of the user's own returned NaN; Unordered, nothing changed, where torch must step.
         """
         bound = moment.bound
-        moment.now, moment.later = now.data_ptr(), later.data_ptr()
         assert bound is not None
+        moment.now, moment.later = now.data_ptr(), later.data_ptr()
         between, between_at = self.between.take() if tape else self._reused
         clock = np.empty_like(moment.clock)
-        pointers = self._given(moment, between, between_at, clock)
+        moment.held, moment.given = (between, clock), self._given(moment, between_at, clock)
         outputs, where = self.told.take()
-        where |= {n: pointers[n] for n in _GIVEN if n in pointers}
-        where["state_step"], where["later_state_step"] = pointers["state_step"], pointers["later_state_step"]
-        asks, tells = (
-            bound.laid.ask.filled(moment.now, moment.later, pointers),
-            bound.laid.tell.filled(moment.now, moment.later, where),
-        )
-        places = self._places(moment, between_at)
-        call = (moment.past, moment.newest, *self.loops, moment.at)
-        recorded = self.recorded
-        head = (recorded.before.call, asks, recorded.after.call, tells, moment.clock, clock, places, bound.strides)
-        threads = 1 if self._small else pool.count(self.count)
+        part = self._part(moment, now, later, clock, moment.given | where, tape)
+        threads = 1 if self.count < 2 * pool.GRAIN else pool.count(self.count)
         if threads == 1:
-            step_worlds(*head, *self.work, *call, self._one and self._loaded is bound, 0, self.groups)
+            part(0, self.groups, self.work, self._one and self._loaded is bound)
             self._loaded = bound
         else:
-
-            def part(begin: int, end: int) -> None:
-                step_worlds(*head, *workspaces(self.kernel, self.slots, self.real), *call, False, begin, end)
-
-            pool.split(part, self.groups, 1, threads)
-        for i in self._carried:
-            later[i].copy_(now[i])
-        return self._finished(later, outputs, clock, bound)
-
-    def _given(self, moment: Moment, between: Any, between_at: Mapping[str, int], clock: Array) -> dict[str, int]:
-        """Return the addresses of all that a step is given, and note them: its adjoint is given the same."""
-        pointers = {**between_at, "state_step": address(moment.clock), "later_state_step": address(clock)}
-        if moment.action is not None:
-            pointers["action"] = address(moment.action)
-        if moment.live is not None:
-            pointers["live"] = address(moment.live)
-        pointers |= {n: pointers[other] for n, (other, _) in self.recorded.before.same.items()}
-        moment.held, moment.given = (between, clock), pointers
-        return pointers
-
-    def _finished(self, later: Tensor, outputs: dict[str, Array], clock: Array, bound: Bound) -> dict[str, Array]:
-        """Return all that is told; Untraceable where an effect of the user's own returned NaN."""
+            new = self.kernel, self.slots, self.real
+            pool.split(lambda begin, end: part(begin, end, workspaces(*new), False), self.groups, 1, threads)
         if self.task.simulator.own and bool(later[bound.laid.layout.blocks.index("state_speed")].isnan().any()):
             raise Untraceable("an effect returned nan: the step itself tells which")
         outputs["clock"] = clock
@@ -332,28 +338,46 @@ class Plan:
             outputs[name] = value.copy()
         return outputs
 
-    def _places(self, moment: Moment, between: Mapping[str, int]) -> Array:
-        """Return the addresses of states now and later and of the kernel's operands."""
-        assert moment.bound is not None
-        states = len(self._states)
-        places = moment.bound.places.copy()
-        places[:states] = self._states + moment.now
-        places[states : 2 * states] = self._states + moment.later
-        for place, name in moment.bound.laid.given.items():
-            places[place] = between[name] if name in between else address((moment.normals or {})[name])
-        return places
+    def _given(self, moment: Moment, between_at: Mapping[str, int], clock: Array) -> dict[str, int]:
+        """Return the addresses of all that a step is given beside its worlds: its adjoint is given the same."""
+        pointers = {**between_at, "state_step": address(moment.clock), "later_state_step": address(clock)}
+        if moment.action is not None:
+            pointers["action"] = address(moment.action)
+        if moment.live is not None:
+            pointers["live"] = address(moment.live)
+        pointers |= {n: pointers[other] for n, (other, _) in self.recorded.before.same.items()}
+        for name, x in (moment.normals or {}).items():
+            pointers[name] = address(x) + moment.at * self._drawn_by
+        return pointers
 
-    def places_of(
-        self, bound: Bound, normals: Mapping[str, Array] | None, now: Array, later: Array, between: Mapping[str, Any]
-    ) -> Array:
-        """Return the addresses of states and operands of some steps, one row each."""
-        states = len(self._states)
-        places = np.repeat(bound.places[None], len(now), 0)
-        places[:, :states] = self._states + now[:, None]
-        places[:, states : 2 * states] = self._states + later[:, None]
-        for place, name in bound.laid.given.items():
-            places[:, place] = between[name] if name in between else address((normals or {})[name])
-        return places
+    def _part(
+        self, moment: Moment, now: Tensor, later: Tensor, clock: Array, pointers: Mapping[str, int], tape: bool
+    ) -> Callable[[int, int, Any, bool], None]:
+        """Return the function that steps some groups of tiles, in a workspace; ``kept`` as in ``advance``."""
+        bound, recorded = moment.bound, self.recorded
+        assert bound is not None
+        for i in self._carried:
+            later[i].copy_(now[i])
+        worlds = moment.now, moment.later
+        head = (
+            recorded.before.call, bound.laid.ask.filled(pointers, *worlds), recorded.after.call,
+            bound.laid.tell.filled(pointers, *worlds), moment.clock, clock, self.places_of(bound, pointers, *worlds),
+            bound.strides,
+        )  # fmt: skip
+
+        def part(begin: int, end: int, work: Any, kept: bool) -> None:
+            step_worlds(*head, *work, moment.past, moment.newest, *self.loops, moment.at, kept, begin, end)
+
+        return part
+
+    def places_of(self, bound: Bound, given: Mapping[str, Any], now: Any, later: Any) -> Array:
+        """Return the addresses of states now and later and of operands: of one step, or of some, one row each."""
+        several, count = isinstance(now, np.ndarray), len(self._states)
+        places, states = bound.operands(given, len(now) if several else 0), self._states
+        states = states[:, None] if several else states
+        places[:count] = states + now
+        places[count : 2 * count] = states + later
+        return places.T.copy() if several else places
 
     # -- backwards -----------------------------------------------------------------------------------------------
 
@@ -370,64 +394,52 @@ class Plan:
         ``on_told`` is what falls on ``flowing``, ``on_later`` on the blocks of the world Δt later and ``on_past`` on
         the past (slots · signals, vehicles; newest first); None is nothing.
         """
-        bound, room = moment.bound, self.scratch
-        assert bound is not None
-        asks, tells = bound.laid.back
-        on_now, on_action, pointers = self._seeded(moment, on_told, on_later, room)
-        on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
-        before, after = self.recorded.backward
-        signals = self.slots * self.kernel.signals
-        on_past = np.zeros((signals, self.count), self.real) if on_past is None else on_past
-        past = np.empty((signals, self.count), self.real)
-        retreat_worlds(
-            after.call, tells.filled(moment.now, moment.later, pointers),
-            before.call, asks.filled(moment.now, moment.later, pointers), self._places(moment, moment.given),
-            bound.strides, *room.work, moment.past, moment.newest, room.ends, room.begins, address(on_past),
-            address(past), address(on_parameters), room.inputs_at, *room.loops, moment.at, False, False, 0,
-            self.groups,
-        )  # fmt: skip
-        return on_now, on_action, on_parameters, past
-
-    def _seeded(
-        self, moment: Moment, on_told: Mapping[str, Tensor | None], on_later: Tensor | None, room: Scratch
-    ) -> tuple[Array, Array | None, dict[str, int]]:
-        """Return what falls on blocks and on actions, to be filled, and the addresses of all."""
-        assert moment.bound is not None
-        layout = moment.bound.laid.layout
-        on_now = np.zeros((len(layout.blocks), self.count), self.real)
+        room = self.scratch
+        on_now = np.zeros((len(self.layout.blocks), self.count), self.real)
         on_action = None if moment.action is None else np.zeros(moment.action.shape, self.real)
-        seeded, begun = room.zeros if on_later is None else on_later.data_ptr(), address(on_now)
-        pointers = {**room.there, **{f"on_{n}": room.zeros if x is None else x.data_ptr() for n, x in on_told.items()}}
-        for i, name in enumerate(layout.blocks):
-            step = i * self.pitch
-            pointers[f"seed_{name}"] = room.zeros if on_later is None else seeded + step
-            pointers[f"begin_{name}"] = begun + step
         if on_later is not None and self._carried:
-            later = on_later.numpy().reshape(on_now.shape)
-            for i in self._carried:
-                on_now[i] = later[i]
+            on_now[self._carried] = on_later.numpy().reshape(on_now.shape)[self._carried]
+        pointers = {**room.there, **{f"on_{n}": room.zeros if x is None else x.data_ptr() for n, x in on_told.items()}}
         pointers |= moment.given
         if on_action is not None:
             pointers["on_action"] = address(on_action)
-        return on_now, on_action, pointers
+        on_parameters = np.zeros((len(self.kernel.program.parameters), self.count), self.real)
+        on_past = np.zeros((self.slots * self.kernel.signals, self.count), self.real) if on_past is None else on_past
+        past = np.empty_like(on_past)
+        seeds = room.zeros if on_later is None else on_later.data_ptr()
+        self._retreat(moment, pointers, seeds, address(on_now), on_parameters, on_past, past)
+        return on_now, on_action, on_parameters, past
+
+    def _retreat(
+        self, moment: Moment, pointers: dict[str, int], seeds: int, on_now: int, on_parameters: Array, on_past: Array,
+        past: Array,
+    ) -> None:  # fmt: skip
+        """Run the loops of the adjoint, from seeds to what falls on worlds now, both blocks."""
+        bound, room, (before, after) = moment.bound, self.scratch, self.recorded.backward
+        assert bound is not None
+        asks, tells = bound.laid.back
+        worlds = moment.now, moment.later
+        retreat_worlds(
+            after.call, tells.filled(pointers, *worlds, seeds), before.call, asks.filled(pointers, *worlds, on_now),
+            self.places_of(bound, moment.given, *worlds), bound.strides, *room.work, moment.past, moment.newest,
+            room.ends, room.begins, address(on_past), address(past), address(on_parameters), address(room.on_inputs),
+            *room.loops, moment.at, False, False, 0, self.groups,
+        )  # fmt: skip
 
 
 class Scratch:
     """Memory and tables of the adjoint of a plan's steps: what lies between, used again at every step."""
 
     def __init__(self, plan: Plan) -> None:
-        kernel, real = plan.kernel, plan.real
-        moving = [_block(n) for n in kernel.program.moving]
+        kernel, real, moving = plan.kernel, plan.real, plan.recorded.moving
         named = [f"{kind}_{n}" for kind in ("end", "carried", "direct") for n in moving]
         shapes = {**dict.fromkeys(named, (plan.count,)), "on_command": (plan.count,), "on_given": (plan.count,)}
         self._made, self.there = _Room(shapes, dict.fromkeys(shapes, real)).take()
         self.on_inputs = np.zeros((len(kernel.numbers), plan.count), real)
-        self.inputs_at = address(self.on_inputs)
         self.there |= {f"on_{_plain(n)}": address(x) for n, x in zip(kernel.numbers, self.on_inputs, strict=True)}
         self.ends, self.begins = (np.array([self.there[f"{k}_{n}"] for n in moving]) for k in ("end", "carried"))
-        after = plan.recorded.after
-        most = max([plan.count, *(plan.rows * math.prod(s) for s in after.shapes.values())])
-        self._zeros = np.zeros(most, real)
+        wide = (len(plan.layout.blocks) * plan.size, *(math.prod(s) for s in plan.recorded.after.shapes.values()))
+        self._zeros = np.zeros(plan.rows * max(wide), real)
         self.zeros = address(self._zeros)
         work, past = workspaces(kernel, plan.slots, real)
         self.work = work, past, past.copy()
@@ -438,30 +450,70 @@ class Scratch:
 
 
 class Bound:
-    """What parameters give: the addresses of all operands, and which parameters these are."""
+    """What parameters give: the addresses of all operands, and which parameters these are.
 
-    def __init__(
-        self, laid: Laid, params: Params, names: tuple[str, ...], arrays: list[Array], places: Array, strides: Array
-    ) -> None:
-        self.laid = laid
-        self.params, self.places, self.strides = params, places, strides
-        self._arrays = arrays  # so that their addresses stay theirs
-        pairs = [name.split(".", 1) for name in names]
-        read = self._read(pairs)
-        self._watched = [(params[e], p, params[e][p], params[e][p]._version) for e, p in read]
-        self.wanted = [(i, params[e][p]) for i, (e, p) in enumerate(pairs) if params[e][p].requires_grad]
+    ``places`` are the addresses of states now and later and of operands; ``given`` says which of these are given with
+    every call, and their names.
+    """
+
+    def __init__(self, plan: Plan, laid: Laid, params: Params) -> None:
+        self.plan, self.laid, self.params = plan, laid, params
+        kernel, program = plan.kernel, plan.kernel.program
+        self._names, later = program.parameters, [f"later {name}" for name in program.states]
+        names = *program.states, *later, *program.statics, *program.parameters, *kernel.numbers, *kernel.flags
+        operands = [self._operand(name) for name in names]
+        self.given = {i: x for i, (x, _) in enumerate(operands) if isinstance(x, str)}
+        # Arrays are kept, so that their addresses stay theirs.
+        self._arrays: list[Any] = [None if isinstance(x, str) else x for x, _ in operands]
+        self.places = addresses(self._arrays)
+        self.strides = table([*(by for _, by in operands[2 * len(later) :]), (0, int(plan.extent[2]), 1)])
+        self._watched = [(own, p, x, x._version) for own in params.values() for p, x in own.items()]
+        pairs = enumerate(name.split(".", 1) for name in self._names)
+        self.wanted = [(i, params[e][p]) for i, (e, p) in pairs if params[e][p].requires_grad]
         """Parameters that require a gradient, with their numbers."""
-        self._names = [names[i] for i, _ in self.wanted]
 
-    def _read(self, pairs: list[list[str]]) -> list[list[str]]:
-        """Return the effects and parameters that steps read, given those of the kernel."""
-        return pairs
+    def _operand(self, name: str) -> tuple[Array | str | None, Strides]:
+        """Return an array or the name of what is given with every call, and its strides; None for states."""
+        if name.endswith(" now"):
+            return self._input(name)
+        states = self.plan.kernel.program.states
+        return (None, (0, 0, 0)) if name.removeprefix("later ") in states else self._static(name)
+
+    def _input(self, slot: str) -> tuple[Array | str, Strides]:
+        """Return an input, its name where it is given with every call, and its strides."""
+        plan, recorded = self.plan, self.plan.recorded
+        if slot in recorded.normals:
+            return recorded.normals[slot], (plan.rows * plan.size, plan.size, 1)
+        name = _plain(slot)
+        other, width = recorded.before.same.get(name, (name, recorded.before.shapes.get(name)))
+        if width is not None:
+            wide = math.prod(width)
+            return other, (0, wide, 0 if wide < plan.size else 1)
+        x = part_of(recorded.inputs, slot)
+        x = x[:1] if x.dim() == 2 and x.shape[0] == recorded.many else x
+        return operand(x[None], (plan.rows,), plan.size, 1)
+
+    def _static(self, name: str) -> tuple[Array, Strides]:
+        """Return a parameter, or what of the state no step changes, and its strides."""
+        plan, state = self.plan, self.plan.world.state
+        still = self.laid.layout.still.get(f"state_{name}")
+        if still is not None:
+            return still, (0, plan.size, 1)
+        x = static_of(plan.task.simulator, state, self.params, name)
+        return operand(x.to(state.speed.dtype), (plan.rows,), plan.size)
+
+    def operands(self, given: Mapping[str, Any], calls: int = 0) -> Array:
+        """Return the addresses by place, of one call, or of some in columns."""
+        places = np.repeat(self.places[:, None], calls, 1) if calls else self.places.copy()
+        for place, name in self.given.items():
+            places[place] = given[name]
+        return places
 
     def with_values(self, values: Sequence[Tensor]) -> dict[str, dict[str, Tensor]]:
         """Return the parameters with others in place of those that are ``wanted``."""
         params = {effect: dict(own) for effect, own in self.params.items()}
-        for name, x in zip(self._names, values, strict=True):
-            effect, parameter = name.split(".", 1)
+        for (i, _), x in zip(self.wanted, values, strict=True):
+            effect, parameter = self._names[i].split(".", 1)
             params[effect][parameter] = x
         return params
 
@@ -472,96 +524,6 @@ class Bound:
             if held[name] is not x or x._version != version:
                 return True
         return False
-
-
-def _record(moves: Moves, world: EnvState, kind: tuple[bool, bool], draws: tuple[str, ...]) -> Recorded:
-    """Record a step with or without actions, and with or without saying whose count (``kind`` as in ``Plan``)."""
-    idle, every = kind
-    task = moves.task
-    simulator = task.simulator if world.state.lanes is None else between(task.simulator)
-    size, count = world.state.speed.shape[-1], len(task.agents)
-    # A number of rows that is no other dimension tells rows apart from everything else.
-    many = next(p for p in _ROWS if p not in (size, count))
-    dtype = world.state.speed.dtype
-    sample = examples_of(world, many)
-    actions = {} if idle else {"action": torch.zeros(many, count * len(task.commands), dtype=dtype)}
-    if not (idle or every):
-        actions["live"] = torch.ones(many, count, dtype=torch.bool)
-    normals = {name: torch.zeros(many, size, dtype=dtype) for name in draws}
-    seen: dict[str, Any] = {}
-    slots: dict[str, str] = {}
-
-    def early(**leaves: Tensor) -> dict[str, Tensor]:
-        world_now = world_of(leaves, world)
-        command, passed, inputs = moves.commanded(world_now, leaves.get("action"), normals or None, leaves.get("live"))
-        seen.update(inputs)
-        out = {} if command is None or passed is None else {"command": command, "given": passed}
-        for effect, value in inputs.items():
-            for part, x in ({"": value} if isinstance(value, Tensor) else value._asdict()).items():
-                if x is not None and x is normals.get(effect):
-                    slots[slot_name(effect, part)] = effect
-                elif x is not None:
-                    out[_plain(slot_name(effect, part))] = x
-        return out
-
-    first = RowFunction(early, {**sample, **actions}, many)
-    inside = {effect: _without_lane(value) for effect, value in seen.items() if effect in simulator.by_name}
-    kernel = tile_kernel(simulator, Form.of(world.state._replace(lanes=None), inside))
-    if isinstance(kernel, str):
-        raise Untraceable(kernel)
-
-    def late(**leaves: Tensor) -> dict[str, Tensor]:
-        then = world_of({n: x for n, x in leaves.items() if not n.startswith("later_")}, world)
-        now, command = world_of(leaves, world, "later_"), leaves.get("command")
-        accel = now.state.speed.new_zeros(len(now.state.speed), count) if command is None else command
-        return moves.told(then, accel, leaves.get("given"), now, command is not None)
-
-    examples = {**sample, **{f"later_{n}": x.clone() for n, x in sample.items()}}
-    if not idle:
-        examples |= {n: torch.zeros(many, count, dtype=dtype) for n in _GIVEN}
-    last = RowFunction(late, examples, many)
-    moving = [_block(n) for n in kernel.program.moving]
-    numbers = [_plain(n) for n in kernel.numbers if n not in slots]
-    by = [*moving, *(f"later_{n}" for n in moving), *(_GIVEN if not idle else ())]
-    flowing = _flowing(late, examples, by)
-
-    def back() -> tuple[RowFunction, RowFunction]:
-        late_back = adjoint(late, flowing, by)
-
-        def later_first(**leaves: Tensor) -> dict[str, Tensor]:
-            gradients = late_back(**{n: x for n, x in leaves.items() if not n.startswith("seed_")})
-            ends = {f"end_{n}": _sum(leaves[f"seed_{n}"], gradients.get(f"later_{n}")) for n in moving}
-            ends |= {f"direct_{n}": gradients[n] for n in moving if n in gradients}
-            return ends | {f"on_{n}": gradients[n] for n in _GIVEN if n in gradients}
-
-        outputs = {n: x for n, x in late(**examples).items() if n in flowing}
-        seeds = {f"on_{n}": torch.zeros_like(x).contiguous() for n, x in outputs.items()}
-        seeds |= {f"seed_{n}": sample[n].clone() for n in moving}
-        after_back = RowFunction(later_first, {**examples, **seeds}, many, apart=True)
-        outs = after_back.outs
-        commands = [n for n in _GIVEN if f"on_{n}" in outs]
-
-        def wide(**leaves: Tensor) -> dict[str, Tensor]:
-            out = early(**leaves)
-            return {n: x if n in _GIVEN else x.expand(many, size) for n, x in out.items()}
-
-        early_back = adjoint(wide, [*numbers, *commands], [*moving, *(() if idle else ("action",))])
-
-        def earlier(**leaves: Tensor) -> dict[str, Tensor]:
-            gradients = early_back(**{n: x for n, x in leaves.items() if n.split("_")[0] not in ("carried", "direct")})
-            begins = {
-                f"begin_{n}": _sum(_sum(leaves[f"carried_{n}"], leaves.get(f"direct_{n}")), gradients.get(n))
-                for n in moving
-            }
-            return begins | ({"on_action": gradients["action"]} if "action" in gradients else {})
-
-        seeds = {f"on_{n}": torch.zeros(many, size, dtype=dtype) for n in numbers}
-        seeds |= {f"on_{n}": torch.zeros(many, count, dtype=dtype) for n in commands}
-        seeds |= {f"carried_{n}": sample[n].clone() for n in moving}
-        seeds |= {f"direct_{n}": sample[n].clone() for n in moving if f"direct_{n}" in outs}
-        return RowFunction(earlier, {**sample, **actions, **seeds}, many, apart=True), after_back
-
-    return Recorded(first, kernel, last, seen, slots, many, flowing, back)
 
 
 def examples_of(world: EnvState, many: int) -> dict[str, Tensor]:
@@ -575,15 +537,9 @@ def _without_lane(value: Any) -> Any:
     return value._replace(lane=None) if isinstance(value, Record) else value
 
 
-def _sum(x: Tensor, more: Tensor | None) -> Tensor:
+def summed(x: Tensor, more: Tensor | None) -> Tensor:
+    """Return a sum, with memory of its own; None is nothing."""
     return x.clone() if more is None else x + more
-
-
-def _flowing(function: Callable[..., Mapping[str, Tensor]], leaves: Mapping[str, Tensor], by: list[str]) -> list[str]:
-    """Return the outputs of a function through which a gradient flows to some of its leaves."""
-    with torch.enable_grad():
-        out = function(**{n: x.clone().requires_grad_(n in by) for n, x in leaves.items()})
-    return [n for n, x in out.items() if x.requires_grad]
 
 
 def named(world: EnvState) -> dict[str, Tensor]:
@@ -626,7 +582,7 @@ def address(x: Array | None) -> int:
     return x.__array_interface__["data"][0]  # type: ignore[no-any-return]
 
 
-def _block(state: str) -> str:
+def block_of(state: str) -> str:
     """Return the name of a kernel's state among the blocks of a world."""
     if state == "step":
         return "clock"

@@ -197,9 +197,10 @@ class Tape:
             return self.told[other].reshape(self.steps, self.plan.rows, *(shape or after.shapes[other]))
         return np.repeat(self.plan.constant[name][None], self.steps, 0)
 
-    def given(self, part: slice) -> dict[str, Any]:
+    def given(self, part: slice, normals: Mapping[str, Array] | None) -> dict[str, Any]:
         """Return the addresses of what steps are given beside their worlds."""
-        pointers: dict[str, Any] = {n: _each(x, part) for n, x in self.between.items()}
+        pointers: dict[str, Any] = {n: address(x) for n, x in (normals or {}).items()}
+        pointers |= {n: _each(x, part) for n, x in self.between.items()}
         pointers |= {n: pointers[o] for n, (o, _) in self.plan.recorded.before.same.items()}
         pointers |= {"action": _each(self.action, part), "state_step": _each(self.clocks, part)}
         return pointers | {"later_state_step": _each(self.later_clocks, part)}
@@ -213,17 +214,16 @@ class Tape:
             room = values.past.room() if values.past.slots else ahead
             part = slice(done, min(self.steps, done + ahead, done + room))
             bound = plan.of(values.layout, batch.episode_params())
-            pointers, now, later = self.given(part), self.now[part], self.later[part]
-            to = {n: _each(x, part) for n, x in self.told.items()}
-            to |= {n: pointers[n] for n in ("command", "given", "state_step", "later_state_step") if n in pointers}
+            pointers, worlds = self.given(part, normals), (self.now[part], self.later[part])
+            to = pointers | {n: _each(x, part) for n, x in self.told.items()}
             own = {"seen": _each(self.seen, part), "push": address(self.push), "action": pointers["action"]}
             own |= {"hidden": _each(self.hidden, part), "later": _each(self.hidden[1:], part)}
             own |= {n: address(x) for n, x in weights.items()}
             acts = _columns(self.driver.forward, own, part)
             tables = (
-                self.driver.forward.call, acts, plan.recorded.before.call, bound.laid.ask.each(now, later, pointers),
-                plan.recorded.after.call, bound.laid.tell.each(now, later, to), self.clocks[part],
-                self.later_clocks[part], plan.places_of(bound, normals, now, later, pointers),
+                self.driver.forward.call, acts, plan.recorded.before.call, bound.laid.ask.filled(pointers, *worlds),
+                plan.recorded.after.call, bound.laid.tell.filled(to, *worlds), self.clocks[part],
+                self.later_clocks[part], plan.places_of(bound, pointers, *worlds),
             )  # fmt: skip
             past = values.past
             count = window(
@@ -267,15 +267,12 @@ class Tape:
         carried = np.array([i for i, n in enumerate(plan.layout.blocks) if n.startswith("memory_") and i not in moving])
         for segment in reversed(self.segments):
             part = slice(segment.first, segment.last)
-            now, later, pointers = self.now[part], self.later[part], self.given(part)
+            worlds, pointers = (self.now[part], self.later[part]), self.given(part, segment.normals)
             side = np.arange(part.start, part.stop) % 2
             own = {**scratch.there, **{f"on_{n}": scratch.zeros for n in plan.recorded.flowing}, **pointers}
             own |= {"on_observation": address(on_observation), "on_whole_reward": _each(on_reward, part)}
             own["on_action"] = _each(acted, part)
-            for i, name in enumerate(plan.layout.blocks):
-                first = address(two) + i * plan.pitch
-                own[f"begin_{name}"] = first + side * two[0].nbytes
-                own[f"seed_{name}"] = first + (1 - side) * two[0].nbytes
+            begins, seeds = (address(two) + k * two[0].nbytes for k in (side, 1 - side))
             asks, tells = segment.bound.laid.back
             see = {"seen": _each(self.seen, part), "push": address(self.push), "on_action": own["on_action"]}
             see |= {n: address(x) for n, x in (*weights.items(), *sums.items())} | {"to_seen": address(looked)}
@@ -283,8 +280,8 @@ class Tape:
             acts = _columns(driver.backward, see, part)
             before, after = plan.recorded.backward
             window_back(
-                driver.backward.call, acts, before.call, asks.each(now, later, own), after.call,
-                tells.each(now, later, own), plan.places_of(segment.bound, segment.normals, now, later, pointers),
+                driver.backward.call, acts, before.call, asks.filled(own, *worlds, begins), after.call,
+                tells.filled(own, *worlds, seeds), plan.places_of(segment.bound, pointers, *worlds),
                 segment.bound.strides, *scratch.work, segment.past, segment.newest, scratch.ends, scratch.begins,
                 np.array([address(x) for x in pasts]), address(on_parameters), address(scratch.on_inputs),
                 *scratch.loops, segment.at, plan.groups, segment.first % 2, segment.last - segment.first,
