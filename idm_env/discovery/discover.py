@@ -30,6 +30,7 @@ from idm_env.discovery import (
     summary,
 )
 from idm_env.discovery import model as terms
+from idm_env.discovery.compare import compare
 from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
 from idm_env.discovery.model import Hypothesis, Term
 from idm_env.discovery.records import Records
@@ -37,7 +38,7 @@ from idm_env.discovery.result import Result
 from idm_env.discovery.search import Search
 from idm_env.discovery.selection import Decided, Round, decide
 from idm_env.discovery.solve import Problem, Solution
-from idm_env.discovery.verdict import Verdict
+from idm_env.discovery.verdict import Reason, Verdict, improves
 from idm_env.effects import (
     ALL,
     CANDIDATES,
@@ -146,28 +147,35 @@ def discover(
         raise ValueError(f"no candidate can be tried on these data ({why}). Name others, or leave out --effects.")
     fit_runs, test_runs = _split(prepared, lockbox, seed)
     rows = records.windows(prepared.of_runs(fit_runs))
-    options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
-    mark = storage.fingerprint(prepared.groups, prepared.runs, options, prepared.signals)
-    saved = storage.Store(None if out is None else out / storage.UNFINISHED / "explain", mark, resume)
-    problem = Problem(rows, search.first_noise(rows), calibrate.first_prior(law.declared))
     known_terms = tuple(_known_term(prepared, name) for name in known)
     own = [e for e in tried if e.kind not in PACKAGED or not _plain(e)]
     extra = [*own, *(terms.known_effect(term) for term in known_terms)]
-    bare = Hypothesis(known_terms, march.Catalogue.of(extra, prepared.period, law))
-    searching = Search(problem, names, located and effects is None, saved, progress, bare)
-    progress("null", 0, 0, law.name)
-    values = search.starting_values(bare)
-    null = searching.null(bare, judge.unweighed(rows.records, bare, values, problem.prior)[1], values)
-    decided = decide(searching, null, seed)
-    saved.remove()
-    progress("final check", 0, 0, "test set")
+    options = (list(map(repr, tried)), tuple(known), seed, located, lockbox, repr(law))
+    test = prepared.of_runs(test_runs) if test_runs else None
+    stores = []
+
+    def searched(bare: Hypothesis, part: str, whitened: bool | None = None) -> tuple[Evaluation, Decided]:
+        """Return what is found beyond a model, which is calibrated and judged as the null."""
+        mark = storage.fingerprint(prepared.groups, prepared.runs, (*options, part), prepared.signals)
+        stores.append(storage.Store(None if out is None else out / storage.UNFINISHED / part, mark, resume))
+        problem = Problem(rows, search.first_noise(rows), calibrate.first_prior(bare.catalogue.own))
+        others = [name for name in names if name not in bare.catalogue.personal]
+        searching = Search(problem, others, located and effects is None, stores[-1], progress, bare)
+        progress("null", 0, 0, bare.catalogue.base.title)
+        values = search.starting_values(bare)
+        null = searching.null(bare, judge.unweighed(rows.records, bare, values, problem.prior)[1], values)
+        decided = decide(searching, null, seed)
+        progress("final check", 0, 0, "test set")
+        return Evaluation(searching, decided.null, prepared, test, by == "driver", seed, whitened), decided
 
     def on_law(*state: Any) -> None:
         progress("other laws", *state)
 
-    test = prepared.of_runs(test_runs) if test_runs else None
-    evaluation = Evaluation(searching, decided.null, prepared, test, by == "driver", seed)
-    return _finish(trajectories, evaluation, decided, refused | searching.unplaced, by, on_law)
+    evaluation, decided = searched(Hypothesis(known_terms, march.Catalogue.of(extra, prepared.period, law)), "explain")
+    discovery = _finish(trajectories, evaluation, decided, refused, by, on_law, searched)
+    for store in stores:
+        store.remove()
+    return discovery
 
 
 # -- before the search -----------------------------------------------------------------------------------------------
@@ -272,19 +280,23 @@ def _profile(prepared: Records, column: str) -> tuple[float, float, list[float]]
 # -- after the search ------------------------------------------------------------------------------------------------
 
 
+Searched = Callable[[Hypothesis, str, bool | None], tuple[Evaluation, Decided]]
+
+
 def _finish(
     trajectories: Trajectories, evaluation: Evaluation, decided: Decided, refused: dict[str, str], by: str,
-    on_law: Callable[[int, int, str], None],
+    on_law: Callable[[int, int, str], None], searched: Searched,
 ) -> Discovery:  # fmt: skip
-    null, prepared, problem = decided.null, evaluation.records, evaluation.searching.problem
     judgement, last = judgement_of(evaluation, decided)
-    first, before = evaluation.of_null
+    before, of_laws = evaluation.of_null[1], evaluation
     laws: list[bases.Law] = []
     if before is not None:
-        laws = bases.compared(null.model, before, evaluation.against_null, evaluation.seed, on_law)
-        judgement = judgement.beside(bases.best_of(laws))
+        laws = bases.compared(decided.null.model, before, evaluation.against_null, evaluation.seed, on_law)
+        evaluation, decided, judgement, last = _on_the_best(evaluation, decided, judgement, last, laws, searched)
         if evaluation.adapt and judgement.of_all is not None:
-            judgement = judgement.split(fleet.found(laws, judgement.of_all, evaluation.among, evaluation.seed))
+            judgement = judgement.split(fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed))
+    null, prepared, problem = decided.null, evaluation.records, evaluation.searching.problem
+    first, before = evaluation.of_null
     final = judgement.compared if judgement.added and judgement.compared is not None else null
     everywhere = judge.windowed(prepared, problem, final)
     judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
@@ -300,26 +312,66 @@ def _finish(
         judgement = replace(judgement, ladder=ladder)
     of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
     result = summary.summarise(
-        trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor, refused, by,
+        trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor,
+        refused | evaluation.searching.unplaced, by,
         ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain),
     )  # fmt: skip
-    # Drivers who adapt are calibrated on parts of the held-out runs too.
-    fit = prepared if evaluation.adapt else problem.rows.records
-    seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fit.episodes])
-    shown = null if judgement.compared is None else judgement.compared
-    pairs = [(null, first), (shown, last)][: len(judgement.titles)]
-    if of_law is not None:
-        pairs.append((of_law, of_law))
-    parts = [(prepared, s, theta) for s, theta in pairs]
-    if judgement.fleet is not None:
-        for of_kind, mine in zip(judgement.fleet.laws, judgement.fleet.records, strict=True):
-            its = evaluation.calibrated_among(of_kind.model, mine)
-            parts.append((prepared.some(mine), its, its))
-    saved = [replace(corrected(part, s, theta.theta, by), fitted_on=seen) for part, s, theta in parts]
+    saved = _saved(trajectories, evaluation, judgement, of_laws, (first, last, of_law), by)
     models = dict(zip(judgement.names(), saved, strict=True))
+    shown = null if judgement.compared is None else judgement.compared
     return Discovery(
         result, models, prepared, null, shown, problem, decided.rounds, judgement, places.respond(problem, shown)
     )
+
+
+Found = tuple[Evaluation, Decided, Judgement, Solution]
+
+
+def _on_the_best(
+    evaluation: Evaluation, decided: Decided, judgement: Judgement, last: Solution, laws: list[bases.Law],
+    searched: Searched,
+) -> Found:  # fmt: skip
+    """Return what is found on the best law where that is another one, if it is better than all that was found before.
+
+    It has to hold by the rules of every addition, against its law, and against the law or IDM with what was added.
+    """
+    best, now = bases.best_of(laws), judgement.beside(bases.best_of(laws))
+    few = judgement.refusal is not None and judgement.refusal.reason is Reason.FEW_RUNS
+    if not best.against or few or not evaluation.adapt or now.of_all is None:
+        return evaluation, decided, now, last
+    # In a law's loop there is room for all candidates.
+    room = evaluation.searching.base.catalogue
+    effects = tuple((best.model.catalogue.by_name | room.by_name).values())
+    catalogue = replace(room, effects=effects, base=best.law, personal=best.own)
+    model = Hypothesis(best.model.terms, catalogue)
+    beyond, more = searched(model, "explain_law", best.errors.whitened)
+    other, its_last = judgement_of(beyond, more)
+    if other.added and other.after is not None and improves(compare(now.of_all, other.after, evaluation.seed)):
+        return beyond, more, replace(other, on=best, beneath=judgement), its_last
+    return evaluation, decided, replace(now, sought=True), last
+
+
+def _saved(
+    trajectories: Trajectories, evaluation: Evaluation, judgement: Judgement, of_laws: Evaluation,
+    drivers: tuple[Solution, Solution, Solution | None], by: str,
+) -> list[SavedModel]:  # fmt: skip
+    """Return the models in the order of ``Judgement.names``."""
+    (first, last, of_law), prepared = drivers, evaluation.records
+    # Drivers who adapt are calibrated on parts of the held-out runs too.
+    fit = prepared if evaluation.adapt else evaluation.searching.problem.rows.records
+    seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fit.episodes])
+    parts = [(prepared, evaluation.null, first)]
+    if judgement.compared is not None:
+        parts.append((prepared, judgement.compared, last))
+    if of_law is not None:
+        parts.append((prepared, of_law, of_law))
+    if judgement.beneath is not None:
+        parts.append((prepared, of_laws.null, of_laws.of_null[0]))
+    if judgement.fleet is not None:
+        for law, mine in zip(judgement.fleet.laws, judgement.fleet.records, strict=True):
+            its = of_laws.calibrated_among(law.model, mine)
+            parts.append((prepared.some(mine), its, its))
+    return [replace(corrected(part, s, theta.theta, by), fitted_on=seen) for part, s, theta in parts]
 
 
 def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:

@@ -15,6 +15,9 @@ from idm_env.discovery.records import Records, Rows, block_seconds, whole, windo
 from idm_env.discovery.solve import Population, Problem, Solution, cost_of, solve
 from idm_env.discovery.units import units
 
+STUCK = 5.0
+"""Times the median group's error (RMS) from which a fit is begun once more."""
+
 
 @dataclass(frozen=True, eq=False)
 class Judged:
@@ -106,7 +109,8 @@ def unweighed(
     """Return the problem of a calibration and its first fit: log θ [G, P] with a prior that hardly weighs anything.
 
     From two starts, the prior's centre and ``start`` [G, P]; every group keeps the better one. From ``start`` alone
-    where that is of a model already ``calibrated`` on these records.
+    where that is of a model already ``calibrated`` on these records. Groups whose errors are ``STUCK`` times the
+    median's begin once more, from the median of all: a law of many parameters may stop in a corner.
     """
     rows = (whole(records) if rows is None else rows).settled()
     frozen, empty = model.fixed(values), np.zeros(0)
@@ -116,8 +120,32 @@ def unweighed(
         solve(problem, frozen, x, empty, iterations=25, tolerance=1e-5)
         for x in ([] if calibrated else [centre]) + ([] if start is None else [start])
     ]
-    costs = np.stack([cost_of(problem, f.theta[None], f.linear.residual[None])[0] for f in fits])
-    return problem, np.where((costs.argmin(0) == 0)[:, None], fits[0].theta, fits[-1].theta)
+    costs = [_costs(problem, fit) for fit in fits]
+    theta, cost = fits[0].theta, costs[0]
+    if len(fits) > 1:
+        theta, cost = _better(theta, cost, fits[1].theta, costs[1])
+    samples = problem.per_group(rows.valid.sum(1))
+    each = cost / np.maximum(samples, 1)
+    stuck = (each > STUCK**2 * np.median(each[samples > 0])) & (samples > 0)
+    if stuck.any():
+        middle = np.broadcast_to(np.median(theta[samples > 0], axis=0), theta.shape)
+        some = problem.of_rows(stuck[rows.group])
+        again = solve(some, frozen, middle, empty, iterations=25, tolerance=1e-5)
+        theta, _ = _better(theta, cost, again.theta, np.where(stuck, _costs(some, again), np.inf))
+    return problem, theta
+
+
+def _costs(problem: Problem, s: Solution) -> np.ndarray:
+    """Return the cost of every group [G]."""
+    costs: np.ndarray = cost_of(problem, s.theta[None], s.linear.residual[None])[0]
+    return costs
+
+
+def _better(
+    theta: np.ndarray, cost: np.ndarray, other: np.ndarray, its_cost: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return log θ [G, P] and cost [G] of the fit that costs less, by group."""
+    return np.where((its_cost < cost)[:, None], other, theta), np.minimum(its_cost, cost)
 
 
 def weighed(problem: Problem, model: Hypothesis, values: np.ndarray, theta: np.ndarray) -> Solution:

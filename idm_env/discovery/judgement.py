@@ -47,6 +47,12 @@ class Judgement:
     """A law that predicts better than the null, and than what was added to it."""
     fleet: Kinds | None = None
     """Laws of several kinds of drivers, which predict better than one model for all."""
+    sought: bool = False
+    """Whether effects were sought on ``law``, too, and none held."""
+    on: bases.Law | None = None
+    """The law that the null is, where that was found to be better than the one that was to be completed."""
+    beneath: Judgement | None = None
+    """The judgement of the law that was to be completed, where the null is another one."""
     ladder: Ladder | None = None
     """What is left of predictions 5 s ahead, rung by rung, where every run is held out once."""
 
@@ -137,12 +143,15 @@ class Judgement:
         ``model.yaml`` is the one for all drivers that predicts best on the test set.
         """
         corrected = ["model_corrected.yaml"] if self.compared is not None else []
-        files = ["model.yaml", *corrected]
+        files = (
+            ["model.yaml", *corrected] if self.beneath is None else ["model_law.yaml", "model.yaml", "model_idm.yaml"]
+        )
         if self.law is not None:
             files = ["model_idm.yaml", *corrected, "model.yaml"]
-        elif self.compared is not None and self.corrected_is_best:
+        elif self.beneath is None and self.compared is not None and self.corrected_is_best:
             files = ["model_idm.yaml", "model.yaml"]
         titles = [*self.titles, *([self.law.title] if self.law is not None else [])]
+        titles += [] if self.beneath is None else [self.beneath.titles[0]]
         if self.fleet is not None:
             files += GROUPS[: len(self.fleet.laws)]
             each = zip(self.fleet.laws, self.fleet.counts, strict=True)
@@ -164,6 +173,8 @@ class Evaluation:
     test: Records | None
     adapt: bool
     seed: int
+    whitened: bool | None = None
+    """Which calibration predictions 5 s ahead have, where another model has said so (see ``crossed.crossed``)."""
 
     @cached_property
     def _fold(self) -> np.ndarray:
@@ -172,7 +183,7 @@ class Evaluation:
     @cached_property
     def of_null(self) -> Calibration:
         """Calibration of the null, which says how predictions 5 s ahead of every other model are calibrated."""
-        return self._judged(self.null, self.searching.problem, None)
+        return self._judged(self.null, self.searching.problem, self.whitened)
 
     @cached_property
     def _null_at_best(self) -> judge.Judged:

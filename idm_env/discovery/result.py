@@ -274,6 +274,19 @@ class LawErrors:
 
 
 @dataclass(frozen=True)
+class Completed:
+    """The law that effects were found on, where that is better than the one asked for, and all errors to the latter's.
+
+    ``against`` compares the law with what was added to it.
+    """
+
+    base: str
+    title: str
+    own: list[str]
+    against: dict[str, Against]
+
+
+@dataclass(frozen=True)
 class Kind:
     """Drivers (run/vehicle) who follow one law: its name, the values of the column that tell them, and their errors.
 
@@ -328,4 +341,5 @@ class Result:
     prior: Weight
     ceilings: Ceilings
     bases: list[LawErrors]
+    completed: Completed | None
     fleet: Fleet | None

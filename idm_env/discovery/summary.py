@@ -8,7 +8,7 @@ import numpy as np
 
 from idm_env.data import Trajectories, noise_sigma
 from idm_env.discovery import bases, crossed, fleet, judge, result, words
-from idm_env.discovery.compare import DRAWS, unit_of
+from idm_env.discovery.compare import DRAWS, Comparison, compare, unit_of
 from idm_env.discovery.judgement import Evaluation, Judgement
 from idm_env.discovery.ladder import Ladder
 from idm_env.discovery.march import CURVE
@@ -58,8 +58,10 @@ def summarise(
         verdict, [f.clause for f in added], refusal, judged.tried, errors, judged.shared, others, strengths, law
     )
     after = judged.after if judged.added else before
-    sentence = " ".join(filter(None, (*_of_laws(judged, laws, drivers[2]), sentence)))
-    weight = decided.null_in_closed_loop
+    sentence = " ".join(
+        filter(None, (*_of_laws(judged, laws, drivers[0] if judged.on is not None else drivers[2]), sentence))
+    )
+    weight, beyond = decided.null_in_closed_loop, _against_first(judged)
     return result.Result(
         schema=result.SCHEMA,
         verdict=verdict.value,
@@ -67,6 +69,7 @@ def summarise(
         sentence=sentence,
         details=[
             *words.details(verdict, added, nearest, 1.0 - float(np.exp(-first.smooth_gain))),
+            *([words.beyond(judged.titles[-1], judged.beneath.titles[0], beyond)] if judged.beneath else []),
             *words.agreement(judged.ladder, first.leading),
             *words.excluded(verdict, strengths),
             *words.cautions(data.at_bounds, data.drivers),
@@ -103,15 +106,33 @@ def summarise(
         ),
         ceilings=ceilings,
         bases=bases.rows(laws),
+        completed=_completed(judged, beyond),
         fleet=None if judged.fleet is None else fleet.told(judged.fleet),
     )  # fmt: skip
+
+
+def _against_first(judged: Judgement) -> dict[str, Comparison]:
+    """Return how a better law with what was added to it compares with the law that was to be completed, if there is."""
+    if judged.beneath is None or judged.beneath.before is None or judged.after is None:
+        return {}
+    return compare(judged.beneath.before, judged.after, judged.seed)
+
+
+def _completed(judged: Judgement, against: dict[str, Comparison]) -> result.Completed | None:
+    if judged.on is None:
+        return None
+    return result.Completed(judged.on.law.kind, judged.on.title, list(judged.on.own), bases.against_rows(against))
 
 
 def _of_laws(judged: Judgement, laws: Sequence[bases.Law], drivers: Solution | None) -> list[str]:
     """Return what is said of laws before effects; ``drivers`` are the parameters of one that is better."""
     null, best = judged.null.model.catalogue.base.title, judged.fleet or judged.law
     sentences = [] if judged.fleet is None else [words.fleet_first(judged.fleet)]
-    sentences += [] if judged.law is None else [words.law_first(judged.law, null, drivers)]
+    if judged.on is not None and judged.beneath is not None:
+        sentences.append(words.law_first(judged.on, judged.beneath.titles[0], drivers, "what it lacks follows"))
+    if judged.law is not None:
+        note = "no effect added to it holds" if judged.sought else ""
+        sentences.append(words.law_first(judged.law, null, drivers, note))
     chosen, name = (
         (judged.of_all, judged.titles[-1 if judged.added else 0]) if best is None else (best.errors, best.title)
     )

@@ -368,22 +368,33 @@ def _any(values: Sequence[str]) -> str:
 
 
 def _changes(against: Mapping[str, Comparison]) -> str:
-    """Say which errors fall beyond chance, and which do not."""
-    better = [
-        f"{ERRORS[key][0]} {percent(c.ratio)} (95 %: {percent(c.low)} to {percent(c.high)})"
-        for key, c in against.items() if c.outcome is ErrorChange.BETTER
-    ]  # fmt: skip
+    """Say which errors fall beyond chance, be it pooled or of the mean follower, and which do not."""
+    better = []
+    for key, c in against.items():
+        if c.outcome is ErrorChange.BETTER:
+            (ratio, low, high), follower = (
+                ((c.ratio, c.low, c.high), "") if c.high < 1.0 else (c.driver, " of the mean driver")
+            )
+            better.append(f"{ERRORS[key][0]}{follower} {percent(ratio)} (95 %: {percent(low)} to {percent(high)})")
     same = [ERRORS[key][0] for key, c in against.items() if c.outcome is ErrorChange.SAME]
     return ", ".join(better) + (f"; {' and '.join(same)} the same beyond chance" if same else "")
 
 
-def law_first(law: Law, null: str, drivers: Solution | None = None) -> str:
-    """Say that another law predicts better than the null, and in what; ``drivers`` are its parameters."""
-    note = f"what it lacks: explain --base {law.law.kind}"
+def law_first(law: Law, null: str, drivers: Solution | None = None, note: str = "") -> str:
+    """Say that another law predicts better than the null, and in what; ``drivers`` are its parameters.
+
+    What was found of effects on it is a ``note``.
+    """
     if law.own and drivers is not None:
-        note = f"median driver and 10 to 90 %: {', '.join(_of_drivers(drivers))}"
+        note = f"median driver and 10 to 90 %: {', '.join(_of_drivers(drivers))}{f'; {note}' if note else ''}"
+    note = note or f"what it lacks: explain --base {law.law.kind}"
     title = f"{law.title[:1].upper()}{law.title[1:]}"
     return f"{title} predicts better than {null} calibrated alike: {_changes(law.against)} ({note})."
+
+
+def beyond(model: str, null: str, against: Mapping[str, Comparison]) -> str:
+    """Say what a better law with what was added to it does, against the law that was to be completed."""
+    return f"Against {null}, {model}: {_changes(against)}."
 
 
 def by_use(uses: Sequence[Use], chosen: str) -> str:

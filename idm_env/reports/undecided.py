@@ -17,7 +17,16 @@ FOUND = "found_effect.py"
 """An effect in a state that has no name."""
 GROUPS = tuple(f"model_group_{number}.yaml" for number in range(1, 9))
 """Laws of several kinds of drivers."""
-EXPLAINED = ("report.json", "report.html", "model.yaml", "model_idm.yaml", "model_corrected.yaml", *GROUPS, FOUND)
+EXPLAINED = (
+    "report.json",
+    "report.html",
+    "model.yaml",
+    "model_idm.yaml",
+    "model_law.yaml",
+    "model_corrected.yaml",
+    *GROUPS,
+    FOUND,
+)
 """What ``explain`` writes."""
 
 
@@ -32,7 +41,7 @@ def write(trajectories: Trajectories, cure: str, out: Path, inputs: Iterable[Pat
         "known": [], "helps": {}, "ladder": None, "interval": None, "models": {}, "partial": None, "candidates": [],
         "shared": None,
         "error": {"held_out_runs": [], "held_out_drivers": [], "before": None, "after": None}, "excluded": [],
-        "parameters": [], "data": trajectories.summary(), "prior": None, "bases": [], "fleet": None,
+        "parameters": [], "data": trajectories.summary(), "prior": None, "bases": [], "completed": None, "fleet": None,
         "versions": page.versions(),
     }  # fmt: skip
     cards = [

@@ -28,8 +28,9 @@ def kinds(monkeypatch: pytest.MonkeyPatch) -> Mixing:
     def of(linear: np.ndarray) -> None:
         def accel(view, seen, drivers, on):  # type: ignore[no-untyped-def]
             gap, speed, lead_speed = seen
-            follow = 0.3 * (gap - drivers.min_gap - speed * drivers.time_gap) + 0.6 * (lead_speed - speed)
-            wanted = np.minimum(follow, 0.4 * (drivers.desired_speed - speed))
+            time_gap, top = hidden._adapted(view, drivers, on)
+            follow = 0.3 * (gap - drivers.min_gap - speed * time_gap) + 0.6 * (lead_speed - speed)
+            wanted = np.minimum(follow, 0.4 * (top - speed))
             law = np.clip(wanted, -2.0 * drivers.comfort_decel, drivers.max_accel)
             return np.where(linear, law, idm(view, seen, drivers, on))
 

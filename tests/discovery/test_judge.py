@@ -11,11 +11,13 @@ import pytest
 from idm_env.data import Trajectories, episodes, synthetic
 from idm_env.discovery import crossed, discover, judge
 from idm_env.discovery.calibrate import first_prior
+from idm_env.discovery.march import Catalogue
 from idm_env.discovery.model import Hypothesis
 from idm_env.discovery.records import Records, gather, whole, windows
 from idm_env.discovery.search import first_noise
 from idm_env.discovery.verdict import HOLDS
-from idm_env.effects import BASES
+from idm_env.effects import BASES, base_named
+from tests.discovery.conftest import Mixing
 
 POSITION = 14
 
@@ -92,6 +94,14 @@ def test_null_addition_and_other_laws_are_judged_by_one_procedure(monkeypatch: p
         row = rows[(model.catalogue.base.kind, *model.catalogue.personal)]
         far = all(errors[key] > HOLDS * null_m[key] for key in ("gap_rmse_m", "horizon_rmse_m"))
         assert row["fitted_to_what_is_judged"] == far == (model not in models)
+
+
+def test_a_driver_whose_fit_stops_in_a_corner_begins_anew(kinds: Mixing) -> None:
+    """Two of sixteen linear controllers erred by 4 m under their own law, whose nine parameters had stopped short."""
+    kinds(np.ones((8, 2), bool))
+    records = gather(list(episodes(synthetic.generate(33, runs=8, followers=2, seconds=90.0)[0], smooth=True)))
+    model = Hypothesis((), Catalogue((), base_named("constant_time_gap"), located=False))
+    assert crossed.at_best(records, model, np.zeros(0))[0].gap_rmse.max() < 0.3
 
 
 @pytest.mark.parametrize("every", [10, 20])
