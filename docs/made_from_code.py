@@ -23,7 +23,10 @@ MODULES = {
     "tasks": ("Tasks", ("tasks",)),
     "data": ("Read and generate data", ("data", "data.episode", "data.synthetic", "model_file")),
     "fitting": ("Calibrate", ("fitting.fit", "fitting.job", "fitting.options")),
-    "discovery": ("Find what a model lacks", ("discovery.discover", "discovery.sets", "drift.forecast")),
+    "discovery": (
+        "Find what a model lacks",
+        ("discovery.discover", "discovery.finish", "discovery.sets", "drift.forecast"),
+    ),
     "trajectories": ("Filter, reconstruct, predict", ("trajectories.files", "prediction.files")),
     "work": (
         "Long work, pictures and reports",

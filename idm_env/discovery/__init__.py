@@ -8,7 +8,8 @@ from __future__ import annotations
 from idm_env.extras import needed
 
 with needed("explaining"):
-    from idm_env.discovery.discover import Discovery, discover
+    from idm_env.discovery.discover import discover
+    from idm_env.discovery.finish import Discovery
     from idm_env.discovery.write import write_report
 
 __all__ = ["Discovery", "discover", "write_report"]

@@ -47,8 +47,8 @@ class Judgement:
     """A law that predicts better than the null, and than what was added to it."""
     fleet: Kinds | None = None
     """Laws of several kinds of drivers, which predict better than one model for all."""
-    sought: bool = False
-    """Whether effects were sought on ``law``, too, and none held."""
+    sought: Judgement | None = None
+    """What was found on ``law``, where that did not hold."""
     on: bases.Law | None = None
     """The law that the null is, where that was found to be better than the one that was to be completed."""
     beneath: Judgement | None = None

@@ -9,7 +9,7 @@ import math
 from pathlib import Path
 
 from idm_env.discovery import pictures, words
-from idm_env.discovery.discover import Discovery
+from idm_env.discovery.finish import Discovery
 from idm_env.discovery.result import Against, Change, Result
 from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE
 from idm_env.discovery.selection import LEAST_GAIN, LEAST_SHARE

@@ -15,7 +15,7 @@ from idm_env.discovery import words
 from idm_env.effects.free import FEATURES
 
 if TYPE_CHECKING:
-    from idm_env.discovery.discover import Discovery
+    from idm_env.discovery.finish import Discovery
     from idm_env.discovery.judge import Judged
     from idm_env.discovery.selection import Round
 

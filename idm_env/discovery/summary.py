@@ -131,7 +131,7 @@ def _of_laws(judged: Judgement, laws: Sequence[bases.Law], drivers: Solution | N
     if judged.on is not None and judged.beneath is not None:
         sentences.append(words.law_first(judged.on, judged.beneath.titles[0], drivers, "what it lacks follows"))
     if judged.law is not None:
-        note = "no effect added to it holds" if judged.sought else ""
+        note = "" if judged.sought is None else words.none_holds(judged.sought.refusal, judged.sought.tried)
         sentences.append(words.law_first(judged.law, null, drivers, note))
     chosen, name = (
         (judged.of_all, judged.titles[-1 if judged.added else 0]) if best is None else (best.errors, best.title)

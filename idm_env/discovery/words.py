@@ -392,6 +392,12 @@ def law_first(law: Law, null: str, drivers: Solution | None = None, note: str = 
     return f"{title} predicts better than {null} calibrated alike: {_changes(law.against)} ({note})."
 
 
+def none_holds(refusal: Refusal | None, tried: str) -> str:
+    """Say that no effect holds on a better law, and why."""
+    why = reason(refusal, tried) or f"with {tried} no error falls beyond chance against the best of all"
+    return f"no effect added to it holds: {why}"
+
+
 def beyond(model: str, null: str, against: Mapping[str, Comparison]) -> str:
     """Say what a better law with what was added to it does, against the law that was to be completed."""
     return f"Against {null}, {model}: {_changes(against)}."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from idm_env.discovery.discover import Discovery
+from idm_env.discovery.finish import Discovery
 from idm_env.jobs.storage import results, write_json
 from idm_env.model_file import save_model
 from idm_env.reports.undecided import EXPLAINED, FOUND

@@ -106,7 +106,7 @@ def test_linear_controllers_have_their_law_and_what_it_lacks(effect: str | None,
     kinds(np.ones((8, 2), bool))
     data = synthetic.generate(33, runs=8, followers=2, seconds=90.0, effect=effect)[0]
     found = discover(data, effects=["speed_time_gap"])
-    first = found.report["sentence"].split("(what it lacks follows)" if effect else "(no effect added to it holds)")
+    first = found.report["sentence"].split("(what it lacks follows)" if effect else "(no effect added to it holds: ")
     assert len(first) == 2 and first[0].startswith("Linear constant time gap predicts better than IDM")
     laws = [next(iter(model.effects)).name for model in found.models.values()]
     if effect:

@@ -1,0 +1,213 @@
+"""From what a search decided to a discovery: judged on the test set, beside other laws, told, and saved as models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from idm_env.data import Trajectories
+from idm_env.data.fingerprint import fitted_on
+from idm_env.discovery import (
+    bases,
+    ceilings,
+    fleet,
+    found,
+    judge,
+    places,
+    replica,
+    shared,
+    summary,
+)
+from idm_env.discovery import model as terms
+from idm_env.discovery.compare import compare
+from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
+from idm_env.discovery.model import Hypothesis
+from idm_env.discovery.records import Records
+from idm_env.discovery.result import Result
+from idm_env.discovery.selection import Decided, Round
+from idm_env.discovery.solve import Problem, Solution
+from idm_env.discovery.verdict import Reason, Verdict, improves
+from idm_env.effects import (
+    Brakes,
+)  # fmt: skip
+from idm_env.jobs import storage
+from idm_env.model_file import Model as SavedModel
+
+
+@dataclass(eq=False)
+class Discovery:
+    """What is said, models by the name of their file, and what the pictures are drawn from.
+
+    ``final`` has what was added or, where nothing was, what came nearest; ``judgement`` compares it with ``null``.
+    """
+
+    result: Result
+    models: dict[str, SavedModel]
+    records: Records
+    null: Solution
+    final: Solution
+    problem: Problem
+    rounds: list[Round]
+    judgement: Judgement
+    responses: places.Responses
+
+    @property
+    def verdict(self) -> Verdict:
+        """What is concluded."""
+        return Verdict(self.result.verdict)
+
+    @cached_property
+    def report(self) -> dict[str, Any]:
+        """The content of ``report.json``."""
+        content: dict[str, Any] = storage.plain(self.result)
+        return content
+
+    @property
+    def found_effect(self) -> str:
+        """What was found in a state of the driver and has no name, as the text of a file with effects; "" for none."""
+        estimates = {f.label: f.parameters for f in self.result.found}
+        added = [(term, estimates[term.label]) for term in self.judgement.terms if term.label in estimates]
+        return found.source(added, self.result.sentence)
+
+    @property
+    def model(self) -> SavedModel:
+        """The model that predicts best of those compared on the test set."""
+        return self.models["model.yaml"]
+
+
+Searched = Callable[[Hypothesis, str, bool | None], tuple[Evaluation, Decided]]
+
+
+def finished(
+    trajectories: Trajectories, evaluation: Evaluation, decided: Decided, refused: dict[str, str], by: str,
+    on_law: Callable[[int, int, str], None], searched: Searched,
+) -> Discovery:  # fmt: skip
+    """Return what is said of what was decided.
+
+    Args:
+        trajectories: The data.
+        evaluation: How models are calibrated and judged.
+        decided: What the search says.
+        refused: Why candidates could not be tested, by name.
+        by: Who shares parameters.
+        on_law: Called before each law that is compared, with its number, how many there are, and its title.
+        searched: Searches effects beyond another model, with a name for what it keeps.
+    """
+    judgement, last = judgement_of(evaluation, decided)
+    before, of_laws = evaluation.of_null[1], evaluation
+    laws: list[bases.Law] = []
+    if before is not None:
+        laws = bases.compared(decided.null.model, before, evaluation.against_null, evaluation.seed, on_law)
+        evaluation, decided, judgement, last = _on_the_best(evaluation, decided, judgement, last, laws, searched)
+        if evaluation.adapt and judgement.of_all is not None:
+            judgement = judgement.split(fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed))
+    null, prepared, problem = decided.null, evaluation.records, evaluation.searching.problem
+    first, before = evaluation.of_null
+    final = judgement.compared if judgement.added and judgement.compared is not None else null
+    everywhere = judge.windowed(prepared, problem, final)
+    judgement = replace(judgement, shared=shared.find(places.respond(*everywhere), evaluation.seed))
+    scored = prepared if evaluation.test is None else evaluation.test
+    floor = ceilings.floor(scored, ceilings.drift(trajectories))
+    if evaluation.adapt and before is not None:
+        pooled = evaluation.judged(null, pooled=True)[1]
+        ladder = judgement.climbed(prepared, pooled, floor["horizon_rmse_m"])
+        if not (judgement.added or judgement.law or judgement.fleet):
+            leading = decided.rounds[0].leading
+            agreements = replica.agreement(*everywhere, floor["horizon_rmse_m"], evaluation.seed, leading)
+            ladder = replace(ladder, agreement=agreements[0], leading=None if leading is None else agreements[1])
+        judgement = replace(judgement, ladder=ladder)
+    of_law = None if judgement.law is None else evaluation.calibrated(judgement.law.model, null.values)[0]
+    result = summary.summarise(
+        trajectories, evaluation, decided, judgement, laws, (first, last, of_law), floor,
+        refused | evaluation.searching.unplaced, by,
+        ceilings.ceilings_of(decided.null_in_closed_loop, scored, null, decided.rounds[0].smooth_gain),
+    )  # fmt: skip
+    saved = _saved(trajectories, evaluation, judgement, of_laws, (first, last, of_law), by)
+    models = dict(zip(judgement.names(), saved, strict=True))
+    shown = null if judgement.compared is None else judgement.compared
+    return Discovery(
+        result, models, prepared, null, shown, problem, decided.rounds, judgement, places.respond(problem, shown)
+    )
+
+
+Found = tuple[Evaluation, Decided, Judgement, Solution]
+
+
+def _on_the_best(
+    evaluation: Evaluation, decided: Decided, judgement: Judgement, last: Solution, laws: list[bases.Law],
+    searched: Searched,
+) -> Found:  # fmt: skip
+    """Return what is found on the best law where that is another one, if it is better than all that was found before.
+
+    It has to hold by the rules of every addition, against its law, and against the law or IDM with what was added.
+    """
+    best, now = bases.best_of(laws), judgement.beside(bases.best_of(laws))
+    few = judgement.refusal is not None and judgement.refusal.reason is Reason.FEW_RUNS
+    if not best.against or few or not evaluation.adapt or now.of_all is None:
+        return evaluation, decided, now, last
+    # In a law's loop there is room for all candidates.
+    room = evaluation.searching.base.catalogue
+    effects = tuple((best.model.catalogue.by_name | room.by_name).values())
+    catalogue = replace(room, effects=effects, base=best.law, personal=best.own)
+    model = Hypothesis(best.model.terms, catalogue)
+    beyond, more = searched(model, "explain_law", best.errors.whitened)
+    other, its_last = judgement_of(beyond, more)
+    if other.added and other.after is not None and improves(compare(now.of_all, other.after, evaluation.seed)):
+        return beyond, more, replace(other, on=best, beneath=judgement), its_last
+    return evaluation, decided, replace(now, sought=other), last
+
+
+def _saved(
+    trajectories: Trajectories, evaluation: Evaluation, judgement: Judgement, of_laws: Evaluation,
+    drivers: tuple[Solution, Solution, Solution | None], by: str,
+) -> list[SavedModel]:  # fmt: skip
+    """Return the models in the order of ``Judgement.names``."""
+    (first, last, of_law), prepared = drivers, evaluation.records
+    # Drivers who adapt are calibrated on parts of the held-out runs too.
+    fit = prepared if evaluation.adapt else evaluation.searching.problem.rows.records
+    seen = fitted_on(trajectories, [(e.run_id, e.vehicle_id) for e in fit.episodes])
+    parts = [(prepared, evaluation.null, first)]
+    if judgement.compared is not None:
+        parts.append((prepared, judgement.compared, last))
+    if of_law is not None:
+        parts.append((prepared, of_law, of_law))
+    if judgement.beneath is not None:
+        parts.append((prepared, of_laws.null, of_laws.of_null[0]))
+    if judgement.fleet is not None:
+        for law, mine in zip(judgement.fleet.laws, judgement.fleet.records, strict=True):
+            its = of_laws.calibrated_among(law.model, mine)
+            parts.append((prepared.some(mine), its, its))
+    return [replace(corrected(part, s, theta.theta, by), fitted_on=seen) for part, s, theta in parts]
+
+
+def corrected(prepared: Records, final: Solution, theta: np.ndarray, by: str) -> SavedModel:
+    """Return the corrected model as it is saved: effects, shared parameters, the median driver and every driver.
+
+    ``theta`` [G, P] is log θ of all groups, of which those of ``prepared`` are saved.
+    """
+    added, numbers = terms.effects_of(final.model, final.values)
+    # Effects that adapt a driver are chained as in discovery's loop.
+    added.sort(key=lambda e: e.rank if e.hook == "adapt" else 0)
+    seen = np.unique(prepared.group)
+    middle = np.exp(np.median(theta[seen], axis=0))
+    law = final.model.catalogue.base
+
+    def bounded(values: np.ndarray) -> dict[str, dict[str, float]]:
+        by_effect: dict[str, dict[str, float]] = {}
+        for v, (name, p) in zip(values, final.model.catalogue.of_driver, strict=True):
+            by_effect.setdefault(name, {})[p.name] = float(np.clip(v, p.low, p.high))
+        return by_effect
+
+    drivers = {prepared.groups[group]: bounded(np.exp(theta[group])) for group in seen}
+    return SavedModel(
+        effects=(law, *added, Brakes()),
+        parameters={**numbers, **bounded(middle)},
+        dt=prepared.dt,
+        integration="midpoint",
+        drivers=drivers if by != "all" else {},
+        by=by,
+    )
