@@ -31,7 +31,7 @@ TRUE = {
     "brake_light": ("gain", 1.0), "asymmetry": ("strength", 1.0), "power_limit": ("power", 1.0),
     "drag": ("coefficient", 1.0), "speed_dependent_gap": ("extra_gap", 1.0), "memory": ("strength", 1.0),
     "speed_time_gap": ("slope", 1.0), "set_point_asymmetry": ("strength", 1.0), "relaxation": ("strength", 1.0),
-    "gap_stiffness": ("stiffness", 1.0),
+    "leader_trend": ("factor", 1.0), "gap_stiffness": ("stiffness", 1.0),
     "follower": ("gain", 1.0), "dead_zone": ("threshold", 1.0), "action_point": ("threshold", 1.0),
     "speed_zone": ("factor", 1.0), "regime_shift": ("strength", 1.0), "lateral": ("gain", 1.0),
     "curve_speed": ("lateral_accel", 1.0),
@@ -193,7 +193,10 @@ def oracle(found: Any, truth: Any) -> float | None:
             values += [strength, hidden.SHIFT_TIME_S]
         else:
             term = terms.simple(name)
-            times = {"memory": [hidden.MEMORY_TIME_S], "relaxation": [hidden.RELAXATION_TIME_S]}
+            times = {
+                "memory": [hidden.MEMORY_TIME_S], "relaxation": [hidden.RELAXATION_TIME_S],
+                "leader_trend": [hidden.TREND_TIME_S],
+            }  # fmt: skip
             values += [TRUE[name][1] * strength, *times.get(name, [])]
         model = model.adding(term)
     fold = crossed.folds_of(found.records.runs, (), 0)

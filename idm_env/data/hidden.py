@@ -18,6 +18,8 @@ SHIFT_TIME_S = 100.0
 REFERENCE_SPEED = 20.0
 SIGN_WIDTH = 0.3
 RELAXATION_TIME_S = 15.0
+TREND_TIME_S = 6.0
+TREND_MPS = 3.0
 DIPS_M = (500.0, 1000.0, 1400.0, 2000.0, 2600.0)
 BENDS_PER_M = {400.0: 1 / 80, 900.0: -1 / 120, 1500.0: 1 / 60, 2100.0: -1 / 90, 2700.0: 1 / 70}
 """Where bends are, and their curvature, to the left positive."""
@@ -59,6 +61,7 @@ EFFECTS: dict[str, HiddenStrength] = {
     "gap_stiffness": HiddenStrength("w", 0.5, 0.7),
     "speed_profile": HiddenStrength("depth", 0.6, 0.4),
     "curve_speed": HiddenStrength("mps2", 2.0, 3.0),
+    "leader_trend": HiddenStrength("kappa", 0.75, 0.87),
 }
 """Every effect of the catalogue. ``gap_bias`` changes the measured gap, not the motion."""
 
@@ -91,6 +94,7 @@ class View:
     memory: np.ndarray
     lead_accel: np.ndarray
     habit: np.ndarray
+    lead_level: np.ndarray
 
 
 def slope(position: np.ndarray, steepest: float) -> np.ndarray:
@@ -184,6 +188,8 @@ def _adapted(view: View, drivers: Drivers, on: dict[str, float]) -> tuple[np.nda
         time_gap = time_gap * (1 + on["set_point_asymmetry"] * branch)
     if "relaxation" in on:
         time_gap = time_gap * (1 + on["relaxation"] * (view.habit - 1))
+    if "leader_trend" in on:
+        time_gap = time_gap * on["leader_trend"] ** np.clip((view.lead_speed - view.lead_level) / TREND_MPS, -2.0, 2.0)
     if "speed_zone" in on:
         inside = (view.position > ZONE_M[0]) & (view.position < ZONE_M[1])
         top = np.where(inside, on["speed_zone"] * top, top)

@@ -76,13 +76,13 @@ class Platoon:
         return out
 
     def _start(self) -> np.ndarray:
-        """Return the state [5, runs, followers]: position, speed, lagged acceleration, memory of speed and of gap."""
+        """Return the state [6, runs, followers]: position, speed, lagged acceleration; memories of speed, gap, leader."""
         speed = np.broadcast_to(self.leader.speed[0][:, None], self.drivers.time_gap.shape)
         desired = self.drivers.min_gap + speed * self.drivers.time_gap
         gap = desired / np.sqrt(1 - np.minimum(speed / self.drivers.desired_speed, 0.95) ** 4)
         position = self.leader.position[0][:, None] - np.cumsum(gap + self.lengths[:, :-1], axis=1)
         zero = np.zeros_like(speed)
-        return np.stack([position, speed, zero, speed / self.drivers.desired_speed, 1.0 + zero])
+        return np.stack([position, speed, zero, speed / self.drivers.desired_speed, 1.0 + zero, speed])
 
     def _rates(self, k: int, last: int, state: np.ndarray) -> np.ndarray:
         """Return the time derivative of the state at fine step k; what drivers saw is recorded up to step `known`."""
@@ -99,6 +99,7 @@ class Platoon:
         rates[2] = (accel - state[2]) / self.on["lag"] if "lag" in self.on else 0.0
         rates[3] = (state[1] / self.drivers.desired_speed - state[3]) / hidden.MEMORY_TIME_S
         rates[4] = (hidden.habit_of(view.gap, view.speed, self.drivers) - state[4]) / hidden.RELAXATION_TIME_S
+        rates[5] = (view.lead_speed - state[5]) / hidden.TREND_TIME_S
         return rates
 
     def _chained(self, k: int, accel: np.ndarray, speed: np.ndarray, lagged: np.ndarray) -> np.ndarray:
@@ -146,6 +147,7 @@ class Platoon:
             # What the vehicle ahead did a fine step ago: what it does now depends on what it sees now.
             lead_accel=np.concatenate([self.leader.accel[k][:, None], self._held[:, :-1]], axis=1),
             habit=state[4],
+            lead_level=state[5],
         )
 
     def _nearest(self, k: int, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

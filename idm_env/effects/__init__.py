@@ -24,7 +24,7 @@ from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
 from idm_env.effects.registry import entered, imported, is_candidate, lives, read
 from idm_env.effects.road_rules import Destination, LaneClosure, Signal, SpeedLimit
 from idm_env.effects.surroundings import Drag, Grade
-from idm_env.effects.time_gaps import GapStiffness, Relaxation, SetPointAsymmetry, SpeedTimeGap
+from idm_env.effects.time_gaps import GapStiffness, LeaderTrend, Relaxation, SetPointAsymmetry, SpeedTimeGap
 from idm_env.validation import nearest, shown
 
 ALL: dict[str, type[Effect]] = {
@@ -52,6 +52,7 @@ ALL: dict[str, type[Effect]] = {
         SpeedTimeGap,
         SetPointAsymmetry,
         Relaxation,
+        LeaderTrend,
         GapStiffness,
         LongMemory,
         Follower,
@@ -97,6 +98,7 @@ CANDIDATES: tuple[str, ...] = (
     "speed_time_gap",
     "set_point_asymmetry",
     "relaxation",
+    "leader_trend",
     "gap_stiffness",
     "memory",
     "follower",
@@ -232,6 +234,7 @@ __all__ = [
     "LaneCommand",
     "Lateral",
     "LeaderAcceleration",
+    "LeaderTrend",
     "LongMemory",
     "MandatoryChange",
     "Mobil",

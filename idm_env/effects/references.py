@@ -84,6 +84,10 @@ YEO_2009 = (
     "Yeo, H., Skabardonis, A. (2009). Understanding stop-and-go traffic in view of asymmetric traffic theory. "
     "Transportation and Traffic Theory 2009: Golden Jubilee, 99–115. Springer. doi:10.1007/978-1-4419-0820-9_6"
 )
+ZHANG_2005 = (
+    "Zhang, H. M., Kim, T. (2005). A car-following theory for multiphase vehicular traffic flow. Transportation "
+    "Research Part B 39(5), 385–399. doi:10.1016/j.trb.2004.06.005"
+)
 ZHOU_2005 = (
     "Zhou, J., Peng, H. (2005). Range policy of adaptive cruise control vehicles for improved flow stability and "
     "string stability. IEEE Transactions on Intelligent Transportation Systems 6(2), 229–237. "

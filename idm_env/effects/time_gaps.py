@@ -1,4 +1,4 @@
-"""How a driver's desired gap varies: with speed, the leader's acceleration, habit, the gap itself (hook ``adapt``)."""
+"""How a driver's desired gap varies: with speed, what the leader does and did, habit, the gap (hook ``adapt``)."""
 
 from __future__ import annotations
 
@@ -139,6 +139,58 @@ class Relaxation(Effect):
         level = scene.memory[self.name]
         own = driver.time_gap / (1.0 + p["strength"] * (level - 1.0))
         return level + (self._relative_gap(scene, driver, own) - level) * -torch.expm1(-scene.dt / p["memory_time"])
+
+
+@dataclass(frozen=True)
+class LeaderTrend(Effect):
+    """Another time gap behind a leader who has become faster than behind one who has become slower: ``T → T κ^x``.
+
+    ::
+
+        x = (v_l − m)/(3 m/s) between −2 and 2,   τ dm/dt = v_l − m
+
+    m is the memory of the leader's speed v_l, and starts at it. A response to the leader's past: the two branches of
+    ``SetPointAsymmetry`` as a matter of degree, which are left again with the time constant τ. Drivers in phases of
+    acceleration, braking and coasting keep different time gaps (Zhang and Kim 2005, Transp. Res. B 39, 385).
+    """
+
+    kind: ClassVar[str] = "leader_trend"
+    sources: ClassVar[tuple[str, ...]] = (references.ZHANG_2005, references.YEO_2009)
+    rank: ClassVar[int] = 2
+    title: ClassVar[str] = "time gap by the leader's trend"
+    equation: ClassVar[str] = "T → T κ^x, x = (v_lead − m) / (3 m/s), τ dm/dt = v_lead − m"
+    wording: ClassVar[tuple[str, str]] = (
+        "drivers keep shorter time gaps behind a leader who has become faster than behind one who has become slower, "
+        "where {law} keeps one",
+        "drivers keep longer time gaps behind a leader who has become faster than behind one who has become slower, "
+        "where {law} keeps one",
+    )
+    looks_like: ClassVar[tuple[str, ...]] = ("set_point_asymmetry", "leader_acceleration", "relaxation")
+    told_by: ClassVar[str] = (
+        "leaders that change their speed within 5 s and then hold it for half a minute tell a time gap that comes back "
+        "from answers to the acceleration, which end with it"
+    )
+    acts_on: ClassVar[str] = "time_gap"
+    per_driver: ClassVar[bool] = True
+    declared: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("factor", "κ", "1", 0.8, 0.2, 5.0, null=1.0, starts=(0.9,)),
+        Parameter("memory_time", "τ", "s", 5.0, 0.5, 60.0, role="shape", starts=(3.0, 10.0)),
+    )
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return m = v_l."""
+        return scene.leader.speed
+
+    def adapt(self, driver: Driver, scene: Scene, p: P) -> Driver:
+        """Return the driver with the time gap in force."""
+        change = (scene.leader.speed - scene.memory[self.name]) * (1.0 / 3.0)
+        trend = change.clamp(-2.0, 2.0) * scene.leader.present
+        return driver._replace(time_gap=driver.time_gap * p["factor"] ** trend)
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Relax m towards the leader's speed."""
+        level = scene.memory[self.name]
+        return level + (scene.leader.speed - level) * -torch.expm1(-scene.dt / p["memory_time"])
 
 
 @dataclass(frozen=True)

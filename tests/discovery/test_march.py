@@ -31,6 +31,7 @@ STRENGTHS = {
     "asymmetry": (0.3,), "power_limit": (9.0,), "drag": (6e-4,), "speed_dependent_gap": (4.0,), "memory": (0.7, 40.0),
     "follower": (0.15,), "dead_zone": (0.002,), "action_point": (0.3,), "lateral": (0.1,), "gap_bias": (1.2,),
     "speed_time_gap": (-0.3,), "set_point_asymmetry": (0.2,), "relaxation": (0.6, 12.0), "gap_stiffness": (0.6,),
+    "leader_trend": (0.6, 5.0),
 }  # fmt: skip
 
 
