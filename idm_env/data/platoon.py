@@ -76,7 +76,7 @@ class Platoon:
         return out
 
     def _start(self) -> np.ndarray:
-        """Return the state [6, runs, followers]: position, speed, lagged acceleration; memories of speed, gap, leader."""
+        """Return the state [6, runs, followers]: position, speed, lagged acceleration, three memories (see `View`)."""
         speed = np.broadcast_to(self.leader.speed[0][:, None], self.drivers.time_gap.shape)
         desired = self.drivers.min_gap + speed * self.drivers.time_gap
         gap = desired / np.sqrt(1 - np.minimum(speed / self.drivers.desired_speed, 0.95) ** 4)

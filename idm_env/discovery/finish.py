@@ -101,7 +101,9 @@ def finished(
     before, of_laws = evaluation.of_null[1], evaluation
     laws: list[bases.Law] = []
     if before is not None:
-        laws = bases.compared(decided.null.model, before, evaluation.against_null, evaluation.seed, on_law)
+        laws = bases.compared(
+            decided.null.model, before, evaluation.against_null, evaluation.nearest, evaluation.seed, on_law
+        )
         evaluation, decided, judgement, last = _on_the_best(evaluation, decided, judgement, last, laws, searched)
         if evaluation.adapt and judgement.of_all is not None:
             judgement = judgement.split(fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed))

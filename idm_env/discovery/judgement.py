@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -175,6 +176,8 @@ class Evaluation:
     seed: int
     whitened: bool | None = None
     """Which calibration predictions 5 s ahead have, where another model has said so (see ``crossed.crossed``)."""
+    bests: dict[int, tuple[judge.Judged, np.ndarray, Hypothesis]] = field(default_factory=dict)
+    """What ``_at_best`` has said, by id of the model, which is held here so that it stays its."""
 
     @cached_property
     def _fold(self) -> np.ndarray:
@@ -226,12 +229,28 @@ class Evaluation:
             assert errors is not None
             return errors, before
         of_null = self._null_at_best
-        at_best, theta = crossed.at_best(self.records, model, self.null.values)
+        at_best, theta = self._at_best(model)
         own = bool(model.catalogue.personal)
         if bases.is_far(at_best, of_null, own) and (own or not is_worth(at_best, of_null)):
             return at_best, of_null
         values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
         return self._crossed(model, values, theta, before.whitened), before
+
+    def _at_best(self, model: Hypothesis) -> tuple[judge.Judged, np.ndarray]:
+        """Return ``crossed.at_best`` of another law, done once."""
+        if id(model) not in self.bests:
+            self.bests[id(model)] = (*crossed.at_best(self.records, model, self.null.values), model)
+        return self.bests[id(model)][:2]
+
+    def nearest(self, models: Sequence[Hypothesis]) -> Hypothesis:
+        """Return of models with strengths of the drivers' own the one that is nearest to the very data.
+
+        That is the null's, the first, where drivers do not adapt, and where it hardly predicts better than the null.
+        """
+        first = models[0]
+        if not self.adapt or bases.is_far(self._at_best(first)[0], self._null_at_best, has_null=True):
+            return first
+        return min(models, key=lambda model: bases.distance(self._at_best(model)[0]))
 
     def among(self, model: Hypothesis, wanted: np.ndarray) -> judge.Judged:
         """Return the errors of a law for the drivers of the records ``wanted`` [records], its population."""

@@ -36,11 +36,22 @@ def test_a_pair_that_cancels_is_named() -> None:
     assert found["error"]["after"]["gap_rmse_m"] < 0.5 * found["error"]["before"]["gap_rmse_m"]
 
 
+def test_an_answer_to_the_leaders_past_is_none_to_his_acceleration() -> None:
+    data, truth = synthetic.generate(98002, effect="leader_trend", strength="half", runs=8, followers=2, seconds=120.0)
+    alike = ["leader_acceleration", "set_point_asymmetry", "relaxation"]
+    found = discover(data, effects=["leader_trend", *alike], located=False).report
+    assert [f["effect"] for f in found["found"]] == ["leader_trend"]
+    factor, tau = (found["found"][0]["parameters"][name]["estimate"] for name in ("factor", "memory_time"))
+    assert factor == pytest.approx(truth.effects["leader_trend"], rel=0.02) and tau == pytest.approx(6.0, rel=0.1)
+    assert found["error"]["after"]["gap_rmse_m"] < 0.3 * found["error"]["before"]["gap_rmse_m"]
+
+
 def test_what_no_candidate_explains_is_said_to_be_there() -> None:
     data, _ = synthetic.generate(21, effect="leader_acceleration", runs=12, followers=2, seconds=120.0)
     found = discover(data, effects=["drag", "memory"])
     assert found.verdict == "unexplained"
-    assert found.report["found"] == [] and "no candidate explains" in found.report["sentence"]
+    # Strengths of the drivers' own take part of it, as a law, and are not said to be the cause.
+    assert found.report["found"] == [] and "No effect added to IDM predicts as well" in found.report["sentence"]
 
 
 def test_an_effect_without_a_name_is_located() -> None:

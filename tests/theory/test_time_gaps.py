@@ -45,6 +45,39 @@ def test_two_branches(lead_accel: float, factor: float) -> None:
     assert abs(got) < 1e-4
 
 
+@pytest.mark.parametrize(
+    ("change", "lasts", "exponent"), [(1.5, 0.0, 0.5), (-1.5, 5.0, -0.5 / math.e), (9.0, 0.0, 2.0)]
+)
+def test_a_time_gap_by_the_leaders_trend(change: float, lasts: float, exponent: float) -> None:
+    """T κ^x just after the leader's speed has changed by 3 x m/s, and so with x e^(−t/τ) when he holds it."""
+    kappa, tau, speed = 0.6, 5.0, 15.0
+    simulator = Simulator(Lane(), (IDM(), make("leader_trend"), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    params["leader_trend"] |= {
+        "factor": torch.tensor(kappa, dtype=DTYPE),
+        "memory_time": torch.tensor(tau, dtype=DTYPE),
+    }
+    gap = equilibrium(T * kappa**exponent, speed)
+    both = torch.tensor([speed, speed], dtype=DTYPE)
+    state = simulator.state(torch.tensor([0.0, -5.0 - gap], dtype=DTYPE), both, params)
+    memory = torch.full_like(both, speed - change * math.exp(-lasts / tau))
+    assert abs(float(simulator.acceleration(state._replace(memory={"leader_trend": memory}), {}, params)[1])) < 1e-12
+
+
+def test_the_leaders_trend_fades_with_its_own_time() -> None:
+    """Behind a leader who holds another speed than that remembered, the memory comes to it as e^(−t/τ)."""
+    simulator = Simulator(Lane(), (IDM(), make("leader_trend"), Replay(), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    both, steps = torch.tensor([15.0, 15.0], dtype=DTYPE), 50
+    state = simulator.state(torch.tensor([0.0, -40.0], dtype=DTYPE), both, params)
+    ahead = 1.5 * torch.arange(1, steps + 1, dtype=DTYPE)[:, None].expand(steps, 2)
+    same = torch.full((steps, 2), 15.0, dtype=DTYPE)
+    record = Record(ahead, same, 0 * same, torch.tensor([True, False]).expand(steps, 2))
+    begun = state._replace(memory={"leader_trend": both - 2.0})
+    end, _ = simulator.rollout(begun, {"replay": record}, params, steps)
+    assert float(end.memory["leader_trend"][1]) == pytest.approx(15.0 - 2.0 * math.exp(-1.0), abs=1e-9)
+
+
 def test_a_driver_returns_from_a_gap_that_he_is_used_to_in_the_time_of_relaxation() -> None:
     """m − 1 decays with τ/(1 − β h), where h = vT/(s0 + vT) is the share of the gap that the time gap makes.
 
