@@ -2,7 +2,7 @@
 
 A driver's own noise knows nothing of another's. Where the vehicles of a run miss the model together, the cause is
 theirs together: weather, a closed lane, a sensor's clock. (If they do so in most runs, the model lacks something, and
-no run is special.)
+no run is special.) What leaders' motion foretells by other runs is an answer to the leader, and no cause of a run.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from scipy.stats import norm as normal
 
 from idm_env.discovery.places import Responses, scan
+from idm_env.discovery.records import Rows
 
 TURNS = 199
 ALPHA = 0.002
@@ -22,6 +23,10 @@ out."""
 LARGEST = 6.0
 """A residual counts at most so much: one vehicle's emergency is nobody else's."""
 FEWEST_RUNS = 4
+LAG_S = 10.0
+"""How long ago what a leader did may still be answered to."""
+RIDGES = (0.003, 0.03, 0.3)
+"""Weights of the prior of coefficients of scaled features, in units of the number of windows."""
 USUAL = 1.0
 """Score of the other runs, in the median and in units of chance, above which all miss the model and none is special."""
 
@@ -45,8 +50,10 @@ def find(responses: Responses, seed: int) -> Shared | None:
     residuals. Chance: each vehicle's residuals turned by a random time, which keeps what lasts in a driver, and, as
     vehicles behind each other are unsteady at the same times (all move, or all stand), no less than the root of the
     sum of these products squared; p of a normal score, times the number of runs. The interval is the one of time in
-    which an added acceleration explains most of that run, drivers re-calibrated.
+    which an added acceleration explains most of that run, drivers re-calibrated. Residuals are those ``beyond`` what
+    the leaders' motion foretells.
     """
+    responses = replace(responses, residual=beyond(responses.residual, leaders(responses.rows), responses.rows.run))
     rows, records = responses.rows, responses.rows.records
     number = np.round(records.column("time")[rows.start] / (rows.steps * records.dt)).astype(int)
     random = np.random.default_rng(seed)
@@ -71,6 +78,40 @@ def find(responses: Responses, seed: int) -> Shared | None:
     if stretch is None:
         return None
     return Shared(records.runs[run], stretch.begin, stretch.end, stretch.amount, int(vehicles[run]), p_value)
+
+
+def leaders(rows: Rows) -> np.ndarray:
+    """Return what each window's leader did [R, features]: accelerations, brakings and changes of speed at every lag.
+
+    Lags are whole seconds from the window's end to ``LAG_S`` before its begin.
+    """
+    records = rows.records
+    second, end = max(1, round(1.0 / records.dt)), rows.start + rows.steps - 1
+    back = second * np.arange(round(LAG_S) + rows.steps // second + 1)
+    sample = np.maximum(end[:, None] - back, records.bounds[rows.record][:, None])
+    accel, speed = records.column("lead_accel")[sample], records.column("lead_speed")
+    return np.concatenate([accel, np.minimum(accel, 0.0), speed[sample] - speed[end][:, None]], axis=1)
+
+
+def beyond(residual: np.ndarray, features: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Return residuals [R, m] less what a ridge on features [R, F], fitted to the other runs [R], foresees of them.
+
+    Its weight is the one that leaves least; where none leaves less than the residuals themselves, these stand.
+    """
+    clipped = np.clip(residual, -LARGEST, LARGEST)
+    scaled = (features - features.mean(0)) / (features.std(0) + 1e-9)
+    masks = [run == number for number in np.unique(run)]
+    parts = [(mine, scaled[mine].T @ scaled[mine], scaled[mine].T @ clipped[mine]) for mine in masks]
+    matrix, vector = (np.sum([part[i] for part in parts], axis=0) for i in (1, 2))
+    best, least = residual, float((clipped**2).sum())
+    for weight in RIDGES:
+        prior, foreseen = weight * len(run) * np.eye(scaled.shape[1]), np.zeros_like(residual)
+        for mine, own, cross in parts:
+            foreseen[mine] = scaled[mine] @ np.linalg.solve(matrix - own + prior, vector - cross)
+        left = float(((clipped - foreseen) ** 2).sum())
+        if left < least:
+            best, least = residual - foreseen, left
+    return best
 
 
 def _tables(responses: Responses, run: int, number: np.ndarray) -> np.ndarray:

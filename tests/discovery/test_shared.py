@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from idm_env.discovery.shared import standing_out
+from idm_env.discovery.shared import beyond, standing_out
 
 
 def _runs(number: int, unsteady: float) -> list[np.ndarray]:
@@ -29,3 +29,18 @@ def test_what_is_shared_stands_out() -> None:
     for table in _runs(20, 3.0):
         table[:, 10:17] += 3.0 * random.choice([-1.0, 1.0], table[:, 10:17].shape[1:])
         assert standing_out(table, random) > 3.5
+
+
+@pytest.mark.parametrize("of_leader", [True, False])
+def test_what_all_answer_to_in_the_leader_is_no_cause_of_a_run(of_leader: bool) -> None:
+    """An answer to the leader, who moves most in run 3, goes; a disturbance of that run stays (located: 3.5)."""
+    random, runs, count = np.random.default_rng(1), 10, 33
+    moves = random.standard_normal((runs, count, 5)) * np.where(np.arange(runs) == 3, 3.0, 1.0)[:, None, None]
+    shared = moves @ random.standard_normal((5, 12)) * 0.3 if of_leader else np.zeros((runs, count, 12))
+    if not of_leader:
+        shared[3, 10:17] = 2.0
+    residual = shared[:, None] + random.standard_normal((runs, 3, count, 12))
+    features = np.repeat(moves[:, None], 3, axis=1).reshape(-1, 5)
+    left = beyond(residual.reshape(-1, 12), features, np.repeat(np.arange(runs), 3 * count)).reshape(residual.shape)
+    before, after = (standing_out(table[3], np.random.default_rng(0)) for table in (residual, left))
+    assert before > 3.0 and (after < 3.0 if of_leader else after > 3.0)
