@@ -52,7 +52,8 @@ class Law(NamedTuple):
         title = self.law.title or self.law.kind
         if not self.own:
             return title
-        return f"{title} with every driver's own {' and '.join(ALL[name].title for name in self.own)}"
+        *others, last = (ALL[name].title for name in self.own)
+        return f"{title} with every driver's own {', '.join(others)}{' and ' if others else ''}{last}"
 
     @property
     def is_better(self) -> bool:
