@@ -145,11 +145,14 @@ def _on_the_best(
 ) -> Found:  # fmt: skip
     """Return what is found on the best law where that is another one, if it is better than all that was found before.
 
-    It has to hold by the rules of every addition, against its law, and against the law or IDM with what was added.
+    It has to hold by the rules of every addition, against its law, and against the law or IDM with what was added. On a
+    law that errs more than IDM with what was added, nothing is sought.
     """
     best, now = bases.best_of(laws), judgement.beside(bases.best_of(laws))
     few = judgement.refusal is not None and judgement.refusal.reason is Reason.FEW_RUNS
     if not best.against or few or not evaluation.adapt or now.of_all is None:
+        return evaluation, decided, now, last
+    if now.added and improves(compare(best.errors, now.of_all, evaluation.seed)):
         return evaluation, decided, now, last
     # In a law's loop there is room for all candidates.
     room = evaluation.searching.base.catalogue
