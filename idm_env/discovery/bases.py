@@ -110,7 +110,8 @@ def is_far(law: Judged, null: Judged, has_null: bool = False) -> bool:
     """Tell whether a law is so far from better than the null that it needs no cross-fitting.
 
     Each is fitted to the very data that are judged. A law errs by more than ``HOLDS`` more in all of ``SCREENED``; one
-    that ``has_null`` in it, with more parameters of the drivers' own, does not predict better 5 s ahead by ``OWN``.
+    that ``has_null`` in it, with more parameters of the drivers' own, does not predict better 5 s ahead by ``OWN`` than
+    ``null``, or than it with what was added.
     """
     errors, others = law.summary(), null.summary()
     if has_null:

@@ -4,24 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from idm_env.data import Trajectories
 from idm_env.data.fingerprint import fitted_on
-from idm_env.discovery import (
-    bases,
-    ceilings,
-    fleet,
-    found,
-    judge,
-    places,
-    replica,
-    shared,
-    summary,
-)
+from idm_env.discovery import bases, ceilings, fleet, found, judge, places, replica, shared, summary
 from idm_env.discovery import model as terms
 from idm_env.discovery.compare import compare
 from idm_env.discovery.judgement import Evaluation, Judgement, judgement_of
@@ -31,9 +21,7 @@ from idm_env.discovery.result import Result
 from idm_env.discovery.selection import Decided, Round
 from idm_env.discovery.solve import Problem, Solution
 from idm_env.discovery.verdict import Reason, Verdict, improves
-from idm_env.effects import (
-    Brakes,
-)  # fmt: skip
+from idm_env.effects import Brakes
 from idm_env.jobs import storage
 from idm_env.model_file import Model as SavedModel
 
@@ -101,9 +89,11 @@ def finished(
     before, of_laws = evaluation.of_null[1], evaluation
     laws: list[bases.Law] = []
     if before is not None:
+        reached = evaluation.reached(judgement.compared if judgement.added else None, last)
         laws = bases.compared(
-            decided.null.model, before, evaluation.against_null, evaluation.nearest, evaluation.seed, on_law
-        )
+            decided.null.model, before, partial(evaluation.against_null, reached=reached),
+            partial(evaluation.nearest, reached=reached), evaluation.seed, on_law,
+        )  # fmt: skip
         evaluation, decided, judgement, last = _on_the_best(evaluation, decided, judgement, last, laws, searched)
         if evaluation.adapt and judgement.of_all is not None:
             judgement = judgement.split(fleet.found(laws, judgement.of_all, of_laws.among, evaluation.seed))

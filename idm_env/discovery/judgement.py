@@ -220,7 +220,18 @@ class Evaluation:
         before = self.of_null[1]
         return self._judged(s, problem or self.searching.problem, None if before is None else before.whitened, pooled)
 
-    def against_null(self, model: Hypothesis) -> tuple[judge.Judged, judge.Judged]:
+    def reached(self, added: Solution | None, drivers: Solution) -> judge.Judged | None:
+        """Return the errors on the very data of the model ``added``, or else of the null, that own strengths must beat.
+
+        ``drivers`` have the parameters beside it. None where drivers do not adapt.
+        """
+        if not self.adapt:
+            return None
+        if added is None:
+            return self._null_at_best
+        return crossed.at_best(self.records, added.model, added.values, drivers.theta)[0]
+
+    def against_null(self, model: Hypothesis, reached: judge.Judged | None = None) -> tuple[judge.Judged, judge.Judged]:
         """Return the errors of another law, and those of the null that they are compared with (see ``bases``)."""
         before = self.of_null[1]
         assert before is not None
@@ -230,8 +241,11 @@ class Evaluation:
             return errors, before
         of_null = self._null_at_best
         at_best, theta = self._at_best(model)
-        own = bool(model.catalogue.personal)
-        if bases.is_far(at_best, of_null, own) and (own or not is_worth(at_best, of_null)):
+        if model.catalogue.personal:
+            is_far = bases.is_far(at_best, reached or of_null, has_null=True)
+        else:
+            is_far = bases.is_far(at_best, of_null) and not is_worth(at_best, of_null)
+        if is_far:
             return at_best, of_null
         values = crossed.values_of(self.searching.problem, self.null, self.records.runs, self._fold)
         return self._crossed(model, values, theta, before.whitened), before
@@ -242,13 +256,14 @@ class Evaluation:
             self.bests[id(model)] = (*crossed.at_best(self.records, model, self.null.values), model)
         return self.bests[id(model)][:2]
 
-    def nearest(self, models: Sequence[Hypothesis]) -> Hypothesis:
+    def nearest(self, models: Sequence[Hypothesis], reached: judge.Judged | None) -> Hypothesis:
         """Return of models with strengths of the drivers' own the one that is nearest to the very data.
 
-        That is the null's, the first, where drivers do not adapt, and where it hardly predicts better than the null.
+        That is the null's, the first, where drivers do not adapt, and where it hardly predicts better than what is
+        ``reached`` without.
         """
         first = models[0]
-        if not self.adapt or bases.is_far(self._at_best(first)[0], self._null_at_best, has_null=True):
+        if reached is None or bases.is_far(self._at_best(first)[0], reached, has_null=True):
             return first
         return min(models, key=lambda model: bases.distance(self._at_best(model)[0]))
 

@@ -123,13 +123,18 @@ def test_linear_controllers_have_their_law_and_what_it_lacks(effect: str | None,
         assert found.model.effects[0].name == "constant_time_gap"
 
 
-@pytest.mark.parametrize(("ahead", "chosen"), [((0.94, 0.9, 0.8), "third"), ((0.96, 0.9, 0.8), "first")])
-def test_of_laws_with_own_strengths_the_nearest_is_cross_fitted(ahead: tuple[float, ...], chosen: str) -> None:
-    """None but the null's, if that hardly predicts the very data better than the null."""
+@pytest.mark.parametrize(
+    ("ahead", "reached", "chosen"),
+    [((0.94, 0.9, 0.8), 1.0, "third"), ((0.96, 0.9, 0.8), 1.0, "first"), ((0.94, 0.9, 0.8), 0.95, "first")],
+)
+def test_of_laws_with_own_strengths_the_nearest_is_cross_fitted(
+    ahead: tuple[float, ...], reached: float, chosen: str
+) -> None:
+    """None but the null's, if that hardly predicts the very data better than what is reached without."""
 
     def errors(x: float) -> Judged:
         return cast(Judged, SimpleNamespace(summary=partial(dict, gap_rmse_m=1.0, horizon_rmse_m=x)))
 
     best = {name: (errors(x), None) for name, x in zip(("first", "second", "third"), ahead, strict=True)}
-    evaluation = SimpleNamespace(adapt=True, _at_best=best.get, _null_at_best=errors(1.0))
-    assert Evaluation.nearest(cast(Evaluation, evaluation), cast(Any, list(best))) == chosen
+    evaluation = cast(Evaluation, SimpleNamespace(_at_best=best.get))
+    assert Evaluation.nearest(evaluation, cast(Any, list(best)), errors(reached)) == chosen
