@@ -7,7 +7,7 @@ an effect could add: structure, named or not.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,15 +16,23 @@ from scipy.stats import t as student
 
 from idm_env.discovery.judge import Judged
 from idm_env.discovery.records import Records, Rows, windows
+from idm_env.discovery.ridge import FEATURES, Ridge, Smooth, by_group, units, weights
 
-FEATURES = 200
-"""Random features of the smooth ceiling, or an eighth of the windows where these are few."""
-RIDGES = (1e-2, 1e-1, 1.0, 10.0, 100.0)
-"""Weights of the ridge per window, of which other runs choose."""
-FOLDS = 5
-FURTHEST = 3.0
-"""A coordinate counts at most so many standard deviations: beyond what was seen nothing is added."""
 PAST_S = (1.0, 3.0)
+COORDINATES: tuple[tuple[str, str, Callable[[np.ndarray], np.ndarray]], ...] = (
+    ("speed", "m/s", np.positive),
+    ("gap / (speed + 2 m/s)", "s", np.exp),
+    ("the same, to the driver's mean", "1", np.exp),
+    ("closing speed", "m/s", np.positive),
+    ("leader's acceleration", "m/s²", np.positive),
+    ("gap", "m", np.expm1),
+    ("leader's gain of speed in 1 s", "m/s", np.positive),
+    ("leader's gain of speed in 2.5 s", "m/s", np.positive),
+    ("leader's gain of speed in 5 s", "m/s", np.positive),
+)
+"""What the scene is told by, with units, and what turns a column of it back into these."""
+SCENES, POINTS = 200, 9
+"""How many scenes are averaged, and at how many places."""
 STRUCTURED = 0.02
 """Share of the squared error that a smooth function of the scene takes, beside drift, from which it is structure.
 
@@ -51,6 +59,22 @@ class Agreement:
 
 
 @dataclass(frozen=True)
+class Dependence:
+    """Mean of what the smooth function of the scene predicts (m) with ``coordinate`` set to each of ``at``.
+
+    All else is as it was in each scene. Effects are simulated less measured gaps 5 s ahead, beside drift: above 0 the
+    model falls behind the measured vehicle. ``low_m`` to ``high_m`` is the 95 % interval, a jackknife over runs' parts.
+    """
+
+    coordinate: str
+    unit: str
+    at: list[float]
+    effect_m: list[float]
+    low_m: list[float]
+    high_m: list[float]
+
+
+@dataclass(frozen=True)
 class Ladder:
     """Errors 5 s ahead (m) by rung, the squared error's parts, and the share that is structure with its 95 % interval.
 
@@ -64,6 +88,7 @@ class Ladder:
     others: dict[str, dict[str, float]]
     """By rung, where it has them: the gap's error in closed-loop simulation, 10 s ahead, and the CRPS 5 s ahead (m)."""
 
+    dependences: tuple[Dependence, ...] = ()
     agreement: Agreement | None = None
     """Of what a smooth function of the scene takes, where nothing was added."""
     leading: Agreement | None = None
@@ -98,11 +123,11 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
     rows = windows(records)
     error = models[last].ahead
     drift, scene, past = _drift(rows, error), _scene(rows), _past(rows)
-    rest = error - corrected(rows, error, drift, None, seed)
+    rest = error - Ridge.fit(rows, error, drift).predicted
     left = {
         "drift followed": rest,
-        "smooth function of the scene": rest - corrected(rows, rest, scene[:, :0], scene, seed),
-        "smooth function of scene and past": rest - corrected(rows, rest, scene[:, :0], np.hstack([scene, past]), seed),
+        "smooth function of the scene": rest - _smooth(rows, rest, scene, seed, FEATURES),
+        "smooth function of scene and past": rest - _smooth(rows, rest, np.hstack([scene, past]), seed, FEATURES),
     }
     rungs = {name: _rmse(judged.ahead) for name, judged in models.items()}
     rungs |= {name: _rmse(what) for name, what in left.items()} | {"sensors alone": floor_m}
@@ -125,7 +150,8 @@ def climb(records: Records, models: Mapping[str, Judged], own: str, last: str, f
         "ten_s_m": {name: _rmse(judged.further) for name, judged in models.items() if len(judged.further)},
         "crps_m": {name: _crps(rows, what) for name, what in ahead.items()},
     }
-    return Ladder(rungs, {name: parts[name] for name in order} | {"not foreseen": room}, structure, others)
+    parts = {name: parts[name] for name in order} | {"not foreseen": room}
+    return Ladder(rungs, parts, structure, others, dependences(rows, error, seed))
 
 
 def _crps(rows: Rows, error: np.ndarray) -> float:
@@ -146,62 +172,38 @@ def _crps(rows: Rows, error: np.ndarray) -> float:
 
 def structure(rows: Rows, error: np.ndarray, seed: int, features: int) -> tuple[float, float, float]:
     """Return the share of squared errors [W] that a smooth function of the scene takes beside drift, and interval."""
-    scene = _scene(rows)
-    rest = error - corrected(rows, error, _drift(rows, error), None, seed)
-    return _share(rows, rest, rest - corrected(rows, rest, scene[:, :0], scene, seed, features), error)
+    rest = error - Ridge.fit(rows, error, _drift(rows, error)).predicted
+    return _share(rows, rest, rest - _smooth(rows, rest, _scene(rows), seed, features), error)
 
 
-def corrected(
-    rows: Rows, error: np.ndarray, plain: np.ndarray, smooth: np.ndarray | None, seed: int, features: int = FEATURES
-) -> np.ndarray:
-    """Return the errors [W] that a ridge on ``plain`` and random features of ``smooth`` predicts, runs left out."""
-    basis = plain
-    if smooth is not None:
-        scaled = np.clip((smooth - smooth.mean(0)) / (smooth.std(0) + 1e-9), -FURTHEST, FURTHEST)
-        count = int(np.clip(len(rows) // 8, 20, features))
-        random = np.random.default_rng(seed)
-        turned = scaled @ (random.standard_normal((scaled.shape[1], count)) / np.sqrt(scaled.shape[1]))
-        waves = np.cos(turned + random.uniform(0.0, 2.0 * np.pi, count))
-        basis = np.hstack([plain, scaled, waves])
-    basis = np.hstack([np.ones((len(rows), 1)), basis])
-    basis[:, 1:] = (basis[:, 1:] - basis[:, 1:].mean(0)) / (basis[:, 1:].std(0) + 1e-9)
-    weight = _weight(rows, error)
-    unit = rows.run if len(np.unique(rows.run)) >= FOLDS else rows.group
-    fold = np.searchsorted(np.unique(unit), unit) % FOLDS
-    correction = np.zeros(len(rows))
-    for k in np.unique(fold):
-        mine, inner = fold == k, (fold + k) % FOLDS % 2 == 0
-        first, second = ~mine & inner, ~mine & ~inner
-        loss = np.zeros(len(RIDGES))
-        for one, other in ((first, second), (second, first)):
-            predicted = basis[other] @ _ridges(basis[one], error[one], weight[one])
-            loss += ((error[other, None] - predicted) ** 2 * weight[other, None]).sum(0)
-        correction[mine] = basis[mine] @ _ridges(basis[~mine], error[~mine], weight[~mine])[:, loss.argmin()]
-    return correction
+def _smooth(rows: Rows, error: np.ndarray, points: np.ndarray, seed: int, features: int) -> np.ndarray:
+    """Return the errors [W] that a smooth function of ``points`` [W, C] predicts, runs left out."""
+    return Ridge.fit(rows, error, Smooth.of(points, seed, features)(points)).predicted
 
 
-def _ridges(basis: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return coefficients [features, ridges]."""
-    value, vector = np.linalg.eigh((basis * weight[:, None]).T @ basis)
-    push = vector.T @ (basis.T @ (weight * error))
-    scale = value[:, None] + np.array(RIDGES) * weight.sum() + 1e-12  # of no windows nothing is predicted
-    result: np.ndarray = vector @ (push[:, None] / scale)
-    return result
+def dependences(rows: Rows, error: np.ndarray, seed: int) -> tuple[Dependence, ...]:
+    """Return what a smooth function of the scene tells of errors [W] over each coordinate; of one driver nothing.
 
-
-def _weight(rows: Rows, error: np.ndarray) -> np.ndarray:
-    """Return what a window counts: one over its driver's mean square plus the usual one."""
-    square = _by_group(rows, error**2)
-    usual = max(float(np.median(square)), 1e-9)
-    weight: np.ndarray = usual / (square + usual)
-    return weight
-
-
-def _by_group(rows: Rows, values: np.ndarray) -> np.ndarray:
-    """Return the mean over the driver's windows of every window."""
-    count = np.bincount(rows.group)
-    result: np.ndarray = (np.bincount(rows.group, values) / np.maximum(count, 1))[rows.group]
-    return result
+    Drift is fitted at the same time: what it took before would look like what goes with it in the scene.
+    """
+    scene, drift = _scene(rows), _drift(rows, error)
+    smooth, ends = Smooth.of(scene, seed), np.quantile(scene, (0.05, 0.95), axis=0)
+    ridge = Ridge.fit(rows, error, np.hstack([drift, smooth(scene)]))
+    usual = np.broadcast_to(ridge.middle[: drift.shape[1]], (POINTS, drift.shape[1]))
+    folds = ridge.coefficients.shape[1]
+    if folds < 2:
+        return ()
+    curves, some, wide = [], scene[:: len(scene) // SCENES + 1], student.ppf(0.975, folds - 1) * np.sqrt(folds - 1)
+    for column, (name, unit, back) in enumerate(COORDINATES):
+        points = np.repeat(some[None], POINTS, axis=0)
+        points[:, :, column] = (grid := np.linspace(ends[0, column], ends[1, column], POINTS))[:, None]
+        mean = smooth(points.reshape(-1, scene.shape[1])).reshape(POINTS, len(some), -1).mean(1)
+        each = ridge.at(np.hstack([usual, mean]))
+        effect, width = each.mean(1), wide * each.std(1)
+        curves.append(
+            Dependence(name, unit, *(x.tolist() for x in (back(grid), effect, effect - width, effect + width)))
+        )
+    return tuple(curves)
 
 
 def _drift(rows: Rows, error: np.ndarray) -> np.ndarray:
@@ -219,14 +221,14 @@ def _drift(rows: Rows, error: np.ndarray) -> np.ndarray:
 
 
 def _scene(rows: Rows) -> np.ndarray:
-    """Return the scene where a window begins [W, 9]: its state, the driver's usual gap, and the leader's next 5 s."""
+    """Return the scene where a window begins [W, 9]: ``COORDINATES`` before they are turned back."""
     records, begin = rows.records, rows.start
     speed, gap, leader = records.speed[begin], records.gap[begin], records.column("lead_speed")
     headway = np.log(np.maximum(gap, 0.5) / (np.maximum(speed, 0.0) + 2.0))
     # A window that is not whole may end behind the last record.
     later = [np.minimum(begin + round(share * rows.steps), len(leader) - 1) for share in (0.2, 0.5, 1.0)]
     ahead = [leader[sample] - leader[begin] for sample in later]
-    usual = headway - _by_group(rows, headway)
+    usual = headway - by_group(rows, headway)
     return np.stack([speed, headway, usual, speed - leader[begin], records.column("lead_accel")[begin],
                      np.log1p(gap.clip(0)), *ahead], axis=1)  # fmt: skip
 
@@ -244,9 +246,9 @@ def _past(rows: Rows) -> np.ndarray:
 def _share(rows: Rows, before: np.ndarray, after: np.ndarray, whole: np.ndarray) -> tuple[float, float, float]:
     """Return the share of the squared error ``whole`` that goes from ``before`` to ``after``, with its 95 % interval.
 
-    Every driver counts by ``_weight``; the interval is Student's t over runs, or over drivers of few runs.
+    Every driver counts by ``ridge.weights``; the interval is Student's t over runs, or over drivers of few runs.
     """
-    weight, unit = _weight(rows, whole), rows.run if len(np.unique(rows.run)) >= FOLDS else rows.group
+    weight, unit = weights(rows, whole), units(rows)
     gained, total = weight * (before**2 - after**2), weight * whole**2
     share = float(gained.sum() / total.sum())
     each = np.bincount(unit, gained - share * total)[np.unique(unit)]

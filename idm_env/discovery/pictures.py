@@ -17,6 +17,7 @@ from idm_env.effects.free import FEATURES
 if TYPE_CHECKING:
     from idm_env.discovery.finish import Discovery
     from idm_env.discovery.judge import Judged
+    from idm_env.discovery.result import Rungs
     from idm_env.discovery.selection import Round
 
 BEFORE, AFTER, TRUTH, GREY = "#c0392b", "#1f6fb2", "#222222", "#9aa5b1"
@@ -150,6 +151,20 @@ def curves(d: Discovery) -> Figure | None:
         axis.axhline(0, color=TRUTH, lw=0.5)
         axis.set_xlabel(term.coordinate)
         axis.set_ylabel(f"{term.what}" + ("" if knots[0].unit == "1" else f" ({knots[0].unit})"))
+    return figure
+
+
+def dependences(ladder: Rungs | None) -> Figure | None:
+    """Mean of what the smooth function of the scene takes off, over each coordinate."""
+    if ladder is None or not ladder.dependences:
+        return None
+    figure, axes = plt.subplots(3, 3, layout="constrained", figsize=(9.0, 6.2), sharey=True)
+    for axis, curve in zip(axes.ravel(), ladder.dependences, strict=True):
+        axis.plot(curve.at, curve.effect_m, color=AFTER, marker=".")
+        axis.fill_between(curve.at, curve.low_m, curve.high_m, color=AFTER, alpha=0.15)
+        axis.axhline(0, color=TRUTH, lw=0.5)
+        axis.set_xlabel(curve.coordinate + ("" if curve.unit == "1" else f" ({curve.unit})"))
+    figure.supylabel("simulated less measured gap (m)", fontsize=9)
     return figure
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from idm_env.discovery.ladder import Agreement
+from idm_env.discovery.ladder import Agreement, Dependence
 from idm_env.discovery.shared import Shared
 
 SCHEMA = 3
@@ -112,6 +112,7 @@ class Rungs:
     crps_m: Errors
     parts: dict[str, float]
     structure: Share
+    dependences: Sequence[Dependence]
     agreement: Agreement | None = None
     leading: Agreement | None = None
 

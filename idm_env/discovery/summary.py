@@ -190,7 +190,7 @@ def _strengths(first: Round, problem: Problem, reached: Bar) -> dict[str, Streng
 def _rungs(ladder: Ladder) -> result.Rungs:
     return result.Rungs(
         ladder.rungs, **ladder.others, parts=ladder.parts, structure=result.Share(*ladder.structure),
-        agreement=ladder.agreement, leading=ladder.leading,
+        dependences=ladder.dependences, agreement=ladder.agreement, leading=ladder.leading,
     )  # fmt: skip
 
 

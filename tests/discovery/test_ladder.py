@@ -39,9 +39,13 @@ def noise(records: Records, carry: float) -> np.ndarray:
 
 def closing(records: Records) -> np.ndarray:
     """Return the part of a closing speed above 0.5 m/s where windows begin."""
-    rows = windows(records)
-    speed, lead = (records.signals[rows.start, c] for c in (15, 1))
-    return np.maximum(speed - lead - 0.5, 0.0)
+    return np.maximum(at_starts(records) - 0.5, 0.0)
+
+
+def at_starts(records: Records) -> np.ndarray:
+    """Return closing speeds where windows begin."""
+    speed, lead = (records.signals[windows(records).start, c] for c in (15, 1))
+    return np.asarray(speed - lead)
 
 
 @pytest.mark.parametrize("carry", [0.0, 0.6])
@@ -67,6 +71,26 @@ def test_what_the_scene_tells_is_structure(records: Records) -> None:
     found = climbed(records, noise(records, 0.3) + part)
     assert found.unnamed and 0.2 < found.structure[0] < 0.6
     assert found.parts["structure without a name"] == pytest.approx(found.structure[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("slope", [0.0, 1.5, -1.5])
+def test_dependences_show_over_what_the_structure_runs(records: Records, slope: float) -> None:
+    """A planted bend over closing speeds has its sign and most of its size; its interval and other curves hold."""
+    told = climbed(records, noise(records, 0.3) + slope * closing(records)).dependences
+    assert [(d.coordinate, d.unit) for d in told] == [(name, unit) for name, unit, _ in ladder.COORDINATES]
+    rise = {d.coordinate: d.effect_m[-1] - d.effect_m[0] for d in told}
+    mine = next(d for d in told if d.coordinate == "closing speed")
+    at, effect, low, high = (np.array(x) for x in (mine.at, mine.effect_m, mine.low_m, mine.high_m))
+    assert at[[0, -1]] == pytest.approx(np.quantile(at_starts(records), (0.05, 0.95)))
+    if not slope:
+        assert all(min(d.high_m) > 0.0 > max(d.low_m) for d in told)
+        return
+    planted = slope * np.maximum(at - 0.5, 0.0)
+    assert 0.75 < rise["closing speed"] / planted[-1] < 1.1
+    assert all(abs(rise[d.coordinate]) < 0.35 * abs(planted[-1]) for d in told if d is not mine)
+    assert (low[-1] > 0.0) if slope > 0.0 else (high[-1] < 0.0)
+    steepness = np.diff(effect) / np.diff(at)
+    assert abs(steepness[-1]) > 2.0 * abs(steepness[0])
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

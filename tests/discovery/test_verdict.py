@@ -12,8 +12,9 @@ import polars as pl
 import pytest
 
 from idm_env.data import Trajectories, episodes, synthetic
-from idm_env.discovery import Discovery, bases, compare, crossed, discover, judge, page, verdict, words, write_report
+from idm_env.discovery import Discovery, bases, compare, crossed, discover, judge, verdict, words, write_report
 from idm_env.discovery import model as terms
+from idm_env.discovery import page as pages
 from idm_env.discovery.bases import Law, best_of
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.compare import ERRORS, Comparison, ErrorChange
@@ -231,6 +232,10 @@ def test_a_finding_tells_what_it_does_for_every_error(lag: Discovery, tmp_path: 
     first = page[: page.index("How sure is that")]
     assert report["sentence"].split(" (")[0] in first and first.count('class="light better"') == 3
     assert first.count("<img") == 1 and "<table" not in first
+    gap = report["helps"]["gap_rmse_m"]
+    trimmed = " → ".join(pages.number(gap[f"trimmed_{which}"]) for which in ("before", "after"))
+    assert f'data-label="nine in ten followers">{trimmed}</td>' in page
+    assert len(report["ladder"]["dependences"]) == 9 and "Above zero the model falls behind" in page
 
 
 def test_what_data_do_not_tell_apart_is_one_of() -> None:
@@ -351,7 +356,7 @@ def test_what_is_not_compared_has_cards_all_the_same() -> None:
     for said, common, names in (("cannot_tell", None, ["Runs", "What to do"]),
                                    ("located", shared, ["Runs", "Where", "How much"])):  # fmt: skip
         result = SimpleNamespace(verdict=said, data=data, shared=common, error=error, helps={})
-        cards = page.cards(result, "IDM")  # type: ignore[arg-type]
+        cards = pages.cards(result, "IDM")  # type: ignore[arg-type]
         assert [name for name, _, _ in cards] == [*names, "Gap in free simulation, IDM"]
         assert all(card for _, _, card in cards) and "2 m on the test set" in cards[-1][2]
     assert cards[1][2] == "run a, 10 to 20 s, 3 followers"
