@@ -70,8 +70,10 @@ def timed(part: tuple[str, Path, dict[str, Any]], _: OnProgress = silent) -> dic
 
 def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
     report = found.report
-    drivers, law = report["error"]["held_out_drivers"], found.judgement.law
+    drivers, law = report["error"]["held_out_drivers"], found.judgement.fleet or found.judgement.law
     helps = found.judgement.errors if law is None else law.against
+    kinds = report["fleet"] or {"kinds": []}
+    by_kind = ", ".join(f"{kind['title']} of {len(kind['drivers'])}" for kind in kinds["kinds"])
     return {
         "case": name,
         "drivers": report["data"]["drivers"],
@@ -90,7 +92,7 @@ def row(name: str, found: Discovery, cpu_s: float) -> dict[str, Any]:
         "known": report["known"],
         "why": report["reason"],
         "partial": report["partial"],
-        "law": None if law is None else law.title,
+        "law": by_kind or (None if law is None else law.title),
         "helps": {key: (c.outcome.value, c.ratio, c.low, c.high) for key, c in helps.items()},
         "ceilings": report["ceilings"],
         "before": report["error"]["before"],
