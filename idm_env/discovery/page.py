@@ -14,7 +14,7 @@ from idm_env.discovery.result import Against, Change, Result
 from idm_env.discovery.score import ALPHA, CLOSED_LOOP_SHARE
 from idm_env.discovery.selection import LEAST_GAIN, LEAST_SHARE
 from idm_env.discovery.units import ENOUGH_RUNS, MANY_RUNS
-from idm_env.discovery.verdict import HOLDS, Verdict
+from idm_env.discovery.verdict import HOLDS, Reason, Verdict
 from idm_env.discovery.words import percent as change
 from idm_env.reports import page as pages
 
@@ -34,7 +34,7 @@ def write(path: Path, d: Discovery) -> None:
     r, judgement, law = d.result, d.judgement, d.null.model.catalogue.base.title
     before = r.error.before
     pages.write_page(
-        path, TITLES[d.verdict].format(law=law), template=Path(__file__).with_name("report.html"),
+        path, _title(r).format(law=law), template=Path(__file__).with_name("report.html"),
         filters={
             "number": number, "percent": percent, "change": change, "changes": changes, "ends": _ends,
             "plain": words.plain, "amount": words.amount,
@@ -52,6 +52,21 @@ def write(path: Path, d: Discovery) -> None:
             "holds": f"{HOLDS - 1.0:.0%}",
         },
     )  # fmt: skip
+
+
+def _title(r: Result) -> str:
+    if r.fleet is not None:
+        return "Drivers follow several laws here"
+    return TITLES[Verdict(r.verdict)] if _better(r) is None else "Another law predicts better than {law} here"
+
+
+def _better(r: Result) -> dict[str, Against] | None:
+    """Return how the errors of what goes before every effect compare: of laws by kind of driver, or of a better law."""
+    if r.fleet is not None:
+        return r.fleet.against
+    if r.reason != Reason.LAW.value:
+        return None
+    return next((base.against for base in r.bases if base.title == r.models["model.yaml"]), None)
 
 
 def _is_finite(x: float | None) -> bool:
@@ -81,6 +96,11 @@ def _ends(interval: tuple[float | None, float | None]) -> str:
 
 def cards(r: Result, law: str) -> list[tuple[str, str, str]]:
     """Return the first screen's cards: how each error changed or, where nothing is compared, what is known instead."""
+    if (better := _better(r)) is not None:
+        return [
+            (words.ERRORS[key][0].capitalize(), a.verdict, f"{change(a.ratio)} ({changes(a, ' to ')})")
+            for key, a in better.items()
+        ]
     if r.helps:
         return [
             (

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from idm_env.data import synthetic
-from idm_env.discovery import discover, write_report
+from idm_env.discovery import discover, page, write_report
 from idm_env.discovery.bases import is_far
 from idm_env.discovery.calibrate import first_prior
 from idm_env.discovery.judge import Judged
@@ -91,15 +91,15 @@ def test_effects_are_sought_on_the_law_of_the_data_too(tmp_path: Path) -> None:
     names = {name: {e.name for e in model.effects} - {"brakes"} for name, model in saved.items()}
     completed = {"idm", "leader_acceleration"}
     assert names == {"model.yaml": completed, "model_law.yaml": {"idm"}, "model_idm.yaml": {"iidm"}}
-    page = paths["report.html"].read_text()
+    text = paths["report.html"].read_text()
     # Errors of the very data that a law is fitted to stand beside the null's of the same kind.
-    table = page[page.index("Other laws on the same runs") :]
+    table = text[text.index("Other laws on the same runs") :]
     for row in (row for row in rows[1:] if row["fitted_to_what_is_judged"]):
         cell = table[table.index(f">{row['title']}</td>") :].split("<td", 2)[1].split(">")[1]
         law, null = map(float, re.findall(r"[\d.]+", cell))
         assert law / null == pytest.approx(row["against"]["gap_rmse_m"]["ratio"], rel=0.01), row["title"]
     assert report["sentence"].startswith("IDM predicts better than improved IDM") and report["reason"] is None
-    assert "which IDM does not see" in report["sentence"] and "Against improved IDM, IDM with" in page
+    assert "which IDM does not see" in report["sentence"] and "Against improved IDM, IDM with" in text
 
 
 @pytest.mark.parametrize("effect", ["speed_time_gap", None])
@@ -121,6 +121,7 @@ def test_linear_controllers_have_their_law_and_what_it_lacks(effect: str | None,
     else:
         assert found.report["reason"] == "law" and found.report["completed"] is None
         assert found.model.effects[0].name == "constant_time_gap"
+        assert page.cards(found.result, "IDM")[0][1] == "better", "the first screen is of the law"
 
 
 @pytest.mark.parametrize(

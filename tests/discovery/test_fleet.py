@@ -123,6 +123,7 @@ def test_a_mixed_file_has_a_law_for_each_kind_of_driver(column: str, kinds: Mixi
     saved = {name: load_model(paths[name]) for name in ("model.yaml", "model_group_1.yaml", "model_group_2.yaml")}
     assert [model.effects[0].name for model in saved.values()] == ["idm", "idm", "constant_time_gap"]
     assert [len(model.drivers) for model in saved.values()] == [16, *count]
-    assert "Drivers of several kinds" in paths["report.html"].read_text()
+    page = paths["report.html"].read_text()
+    assert "Drivers of several kinds" in page and "Drivers follow several laws here" in page
     write_report(replace(found, models={"model.yaml": found.model}), tmp_path)
     assert [path.name for path in tmp_path.glob("*.yaml")] == ["model.yaml"], "models of kinds do not stay"

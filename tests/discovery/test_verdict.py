@@ -355,7 +355,7 @@ def test_what_is_not_compared_has_cards_all_the_same() -> None:
     shared = Shared("a", 10.0, 20.0, -0.4, 3, 0.001)
     for said, common, names in (("cannot_tell", None, ["Runs", "What to do"]),
                                    ("located", shared, ["Runs", "Where", "How much"])):  # fmt: skip
-        result = SimpleNamespace(verdict=said, data=data, shared=common, error=error, helps={})
+        result = SimpleNamespace(verdict=said, data=data, shared=common, error=error, helps={}, fleet=None, reason=None)
         cards = pages.cards(result, "IDM")  # type: ignore[arg-type]
         assert [name for name, _, _ in cards] == [*names, "Gap in free simulation, IDM"]
         assert all(card for _, _, card in cards) and "2 m on the test set" in cards[-1][2]
