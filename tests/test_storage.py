@@ -254,6 +254,41 @@ def test_a_folder_that_is_not_ours_is_never_emptied(tmp_path: Path) -> None:
     assert (folder / "thesis.txt").read_text() == "years of work"
 
 
+@pytest.mark.parametrize("link", ["idm-env-unfinished", "idm-env-unfinished/fit", "idm-env-unfinished/fit/spool"])
+def test_what_a_link_leads_to_is_never_emptied(tmp_path: Path, link: str) -> None:
+    """Not even where it leads to work that an interrupted run left, of this run or of another."""
+    theirs, out = tmp_path / "theirs", tmp_path / "out"
+    storage.Store(theirs / "fit", "a run", False).put_json("1", 1)
+    storage.Store(out / storage.UNFINISHED / "fit", "a run", False)
+    if (out / link).exists():
+        shutil.rmtree(out / link)
+    (out / link).symlink_to(theirs if link.endswith("unfinished") else theirs / "fit")
+    before = content(theirs)
+    for resume in (False, True):
+        with pytest.raises(ValueError, match="is a link, and what it leads to is nobody's to remove"):
+            storage.Store(out / storage.UNFINISHED / "fit", "a run", resume)
+    assert content(theirs) == before
+
+
+def test_a_folder_of_results_is_no_store_to_be_emptied(tmp_path: Path) -> None:
+    """Its run.json is ours, too, but bears no fingerprint of a run."""
+    with storage.results(tmp_path, NAMES) as folder:
+        storage.write_text(folder / NAMES[0], "{}")
+    before = content(tmp_path)
+    with pytest.raises(ValueError, match=r"run\.json is broken or missing"):
+        storage.Store(tmp_path, "a run", False)
+    assert content(tmp_path) == before
+
+
+def test_a_place_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    for place in ("file/below.xml", "new/" + 300 * "x"):
+        with pytest.raises(ValueError, match=r"cannot be written \(.+\)\. Give --sumo another place\.$"):
+            storage.refuse_unwritable(tmp_path / place, "--sumo")
+    storage.refuse_unwritable(tmp_path / "new" / "types.xml", "--sumo")
+    assert content(tmp_path) == {"file": b"x"} and not (tmp_path / "new").exists()
+
+
 def test_a_store_that_is_killed_while_it_is_made_or_removed_is_still_ours(tmp_path: Path, monkeypatch) -> None:
     folder = tmp_path / storage.UNFINISHED / "fit"
     folder.mkdir(parents=True)

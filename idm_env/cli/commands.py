@@ -162,6 +162,7 @@ def plot(
     written = [out, *([out.with_suffix(".html")] if html else [])]
     for path in written:
         storage.not_an_input(path, [source])
+        storage.refuse_unwritable(path, "--out")
     if html and written[1].exists() and 'id="diagram"' not in written[1].read_text(errors="replace"):
         raise ValueError(f"{written[1]} was not written by idm-env plot. Move it, or give --out another name.")
     repairs: tuple[Any, ...] = ()

@@ -12,6 +12,7 @@ from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TRACK, taken_as_miss
 LARGEST_ID = 2.0**53
 """Floats tell whole numbers apart below this only."""
 NO_LEADER = ("", "0", "-1", "nan", "none", "null", "na")
+_DATE = r"^(?<day>\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?) ?(?<zone>[Zz]|[+-]\d\d(?::?\d\d)?)?$"
 MISSING_WORDS = ("", "na", "n/a", "nan", "null", "none", "-", "inf", "-inf", "+inf", "infinity", "-infinity")
 
 
@@ -96,16 +97,16 @@ def parsed(frame: pl.DataFrame, name: str, source: str) -> pl.DataFrame:
     if column.dtype.is_numeric():
         return frame
     _single(column, source)
-    if column.dtype in (pl.Null, pl.Boolean):
+    if column.dtype == pl.Null:
         return frame.with_columns(column.cast(pl.Float64))
     if column.dtype.is_temporal():
         whole = column.cast(pl.Datetime("us")) if column.dtype == pl.Date else column
         ticks = {"ns": 1e9, "us": 1e6, "ms": 1e3}[getattr(whole.dtype, "time_unit", None) or "ns"]
         return frame.with_columns((whole.to_physical().cast(pl.Float64) / ticks).alias(name))
-    text = column.cast(pl.String).str.strip_chars()
+    text = column.cast(pl.String).str.strip_chars()  # of a Boolean "true", which is no number
     value = text.cast(pl.Float64, strict=False)
     if name == "time_s":
-        value = pl.select(pl.coalesce(value, _of_day(text), _of_date(text)).alias(name))[name]
+        value = pl.select(pl.coalesce(value, _of_day(text), _of_date(text, source)).alias(name))[name]
     wrong = value.is_null() & text.is_not_null() & ~text.str.to_lowercase().is_in(MISSING_WORDS)
     if wrong.any():
         row = int(wrong.arg_true()[0])
@@ -121,10 +122,26 @@ def _of_day(text: pl.Series) -> pl.Series:
     return 3600 * hours + 60 * minutes + seconds
 
 
-def _of_date(text: pl.Series) -> pl.Series:
-    """Return the seconds since 1970 of dates such as 2024-05-01 12:30:05.2; null for others."""
-    plain = text.str.replace("T", " ").str.strip_chars_end("Z")
-    return plain.str.to_datetime("%Y-%m-%d %H:%M:%S%.f", strict=False, time_unit="us").to_physical() / 1e6
+def _of_date(text: pl.Series, source: str) -> pl.Series:
+    """Return the seconds since 1970 of dates such as 2024-05-01 12:30:05.2 or …+02:00; null for others.
+
+    DataError where some have an offset from UTC and others none: these are of an unknown zone.
+    """
+    parts = text.str.extract_groups(_DATE).struct.unnest()
+    day, zone = parts["day"].str.replace("T", " "), parts["zone"]
+    seconds = day.str.to_datetime("%Y-%m-%d %H:%M:%S%.f", strict=False, time_unit="us").to_physical() / 1e6
+    if zone.null_count() == len(zone):
+        return seconds
+    bare = seconds.is_not_null() & zone.is_null()
+    if bare.any():
+        row = int(bare.arg_true()[0])
+        raise DataError(
+            f"{source}: {text.name} = {text[row]!r} in row {row + 1} has no offset from UTC, and other rows have one; "
+            "write all times with it, or none."
+        )
+    number = zone.str.replace(":", "").str.replace("(?i)Z", "+0000").str.pad_end(5, "0").cast(pl.Int64, strict=False)
+    minutes = number.abs() // 100 * 60 + number.abs() % 100
+    return seconds - 60.0 * minutes * number.sign()
 
 
 def without_empty(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:

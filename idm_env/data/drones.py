@@ -125,7 +125,7 @@ def i24(path: Path) -> Read:
     """
     try:
         documents = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path.name} is no JSON ({str(error)[:80]}); is it complete?") from None
     parts, broken = [], 0
     for document in documents if isinstance(documents, list) else [documents]:

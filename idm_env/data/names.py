@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import polars as pl
 
@@ -46,19 +48,24 @@ Columns = Mapping[str, str] | str | None
 
 def pairs(columns: Columns) -> tuple[tuple[str, str], ...]:
     """Return what is asked for as pairs of a tidy name and the text behind it. DataError for what names no column."""
+    entries: list[tuple[Any, ...]]
     if isinstance(columns, str):
         entries = [tuple(part.strip() for part in text.split("=", 1)) for text in columns.split(",")]
     else:
-        entries = list((columns or {}).items())
+        entries = list((columns or {}).items()) if isinstance(columns, Mapping | None) else [()]
     columns_by_name: dict[str, str] = {}
     for pair in entries:
-        if len(pair) != 2 or not all(pair):
-            raise DataError(f"columns = {columns!r} is no list such as time_s=t,vehicle_id=car,position_m=x[ft].")
+        if len(pair) != 2 or not all(isinstance(text, str) and text for text in pair):
+            text = str(columns)[:200]
+            raise DataError(f"columns = {text!r} is no text such as time_s=t,vehicle_id=car,position_m=x[ft].")
         name = SHORT.get(str(pair[0]), str(pair[0]))
         if name not in SHORT.values():
             guess = nearest(name, [*SHORT, *SHORT.values()])
             cure = f"did you mean {guess!r}?" if guess else f"use one of {listed(TIDY, 20)}."
             raise DataError(f"columns: {name!r} is no column that is read; {cure}")
+        if name in columns_by_name:
+            both = f"{columns_by_name[name]!r} and {pair[1]!r}"
+            raise DataError(f"columns: {name} is given twice, as {both}; leave one of them out.")
         columns_by_name[name] = str(pair[1])
     return tuple(columns_by_name.items())
 
@@ -84,7 +91,7 @@ def place(name: str, text: str, columns: list[str], source: str) -> tuple[str, f
     factor = UNITS.get(name, {}).get(unit)
     if factor is None and name in UNITS:
         factor = float(unit) if re.fullmatch(r"\d*\.?\d+(e-?\d+)?", unit) else None
-    if not factor:
+    if not factor or not math.isfinite(factor):
         known_units = f"use one of {', '.join(UNITS[name])}, or a factor" if name in UNITS else "leave it out"
         raise DataError(f"{source}: {name} = {text} has the unit {unit!r}; {known_units}.")
     return column, factor
@@ -105,7 +112,20 @@ def renamed(frame: pl.DataFrame, columns: Columns, source: str) -> tuple[pl.Data
             table = parsed(table, name, source).with_columns(pl.col(name).cast(pl.Float64) * factor)
         text = f"Column {column!r} was read as {name}" + (f" (× {factor:.6g})." if factor is not None else ".")
         repairs.append(Repair("column named", 1, text))
-    return table.drop(taken.difference(name for name, _ in pairs(columns))), repairs
+    left = taken.difference(name for name, _ in pairs(columns))
+    return pl.DataFrame([table[name] for name in table.columns if name not in left]), repairs
+
+
+def without_patterns(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the frame without names that polars reads as patterns: ``*`` is called ``column *``, counted."""
+    names = {
+        name: f"column {name}" for name in frame.columns if name == "*" or re.fullmatch(r"\^.*\$", name, re.DOTALL)
+    }
+    if not names:
+        return frame, []
+    table = pl.DataFrame([column.alias(names.get(column.name, column.name)) for column in frame])
+    words = f"columns have names that read as patterns ({listed(names)}); each is called 'column …' with its name."
+    return table, [Repair("column named", len(names), f"{len(names)} {words}")]
 
 
 def check_columns(columns: list[str], source: str) -> None:

@@ -6,7 +6,7 @@ import polars as pl
 
 from idm_env.data import clean, clock, directions, leaders, schema, speeds, units
 from idm_env.data.errors import DataError, Repair
-from idm_env.data.names import check_columns
+from idm_env.data.names import check_columns, without_patterns
 
 
 def rows(
@@ -17,10 +17,11 @@ def rows(
     ``filled`` counts them. DataError for what cannot be used.
     """
     check_columns(frame.columns, source)
+    frame, literal = without_patterns(frame)
     frame, repairs = clean.numbers(clean.identifiers(frame, source), source)
     filled.add(frame)
     frame, lost = clean.without_empty(_with_ring(frame, ring_length, source), source)
-    return frame, [*repairs, *lost]
+    return frame, [*literal, *repairs, *lost]
 
 
 def measured(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:

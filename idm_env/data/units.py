@@ -11,6 +11,8 @@ from idm_env.data.schema import HIGHEST_SPEED_MPS, LONGEST_LENGTH_M, LOWEST_SPEE
 
 LONGEST_MEDIAN_LENGTH_M = 12.0
 LONGEST_STEP_S = 2.0
+MOVED_M, MOVED_S = 0.5, 1.0
+"""A vehicle moves whose positions differ by more (m) over about so long (s): the noise of standing ones is less."""
 FOOT = 3.281
 # speed_mps divided by the change of position_m over the change of time_s, if one of the three is in another unit
 _MISTAKES = (
@@ -29,7 +31,8 @@ def check(frame: pl.DataFrame, source: str, longest_step: float = LONGEST_STEP_S
     ``longest_step`` (s) is what samples may be apart: more for tracks that are meant to be sparse.
 
     Speeds are checked where the file gives them; a speed that is a fixed multiple of the change of position is the
-    surest sign of a wrong unit, so that it is looked for first.
+    surest sign of a wrong unit, so that it is looked for first. Who moves is told by positions, never by the speed
+    that is checked.
     """
     step = frame.select(pl.col("time_s").diff().over(TRACK).median()).item()
     if "speed_mps" in frame.columns:
@@ -62,20 +65,24 @@ def _high_speed(frame: pl.DataFrame) -> float | None:
 
 
 def _check_ratio(frame: pl.DataFrame, source: str, step: float | None) -> None:
-    if step is None:
+    if not step:
         return
-    change = pl.col("position_m").diff().over(TRACK) / pl.col("time_s").diff().over(TRACK)
-    speed = (pl.col("speed_mps") + pl.col("speed_mps").shift(1).over(TRACK)) / 2
-    moving = (pl.col("time_s").diff().over(TRACK) <= 2.5 * step) & (speed.abs() > 2.0)
-    pairs = frame.select(change.alias("change"), speed.alias("speed"), moving.alias("moving"))
-    pairs = pairs.filter(pl.col("moving") & pl.col("change").is_finite())
+    lag = max(1, round(MOVED_S / step)) if step < MOVED_S else 1
+    seconds = pl.col("time_s").diff(lag).over(TRACK)
+    moved = pl.col("position_m").diff(lag).over(TRACK)
+    speed = (pl.col("speed_mps") + pl.col("speed_mps").shift(lag).over(TRACK)) / 2
+    moves = (moved.abs() > MOVED_M) & (seconds <= 2.5 * lag * step)
+    pairs = frame.select((moved / seconds).alias("change"), speed.alias("speed"), moves.alias("moves"))
+    pairs = pairs.filter(pl.col("moves") & pl.col("change").is_finite() & pl.col("speed").is_not_null())
     if pairs.height < 20:
         return
     low, ratio, high = (pairs.select((pl.col("speed") / pl.col("change")).quantile(q)).item() for q in (0.4, 0.5, 0.6))
     if 0.75 <= ratio <= 1.33:
         return
-    if ratio <= 0:
+    if ratio < 0:
         raise DataError(f"{source}: speed_mps is negative while position_m rises; change its sign.")
+    if ratio == 0:
+        raise DataError(f"{source}: speed_mps is 0 while position_m rises; fill it, or remove the column.")
     factor, cure = min(_MISTAKES, key=lambda mistake: abs(math.log(ratio / mistake[0])))
     if abs(ratio / factor - 1) < 0.1:
         raise DataError(f"{source}: speed_mps is {ratio:.3g} times the change of position_m per second; {cure}.")

@@ -11,6 +11,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from idm_env.validation import shown
+
 
 def rising(name: str, knots: tuple[float, ...], profile: tuple[float, ...] | None = None) -> None:
     """Raise ValueError for knots that do not rise, or a profile of another length."""
@@ -38,9 +40,11 @@ def window(x: Tensor, begin: Tensor, end: Tensor, width: float) -> Tensor:
 def interpolate(x: Tensor, knots: tuple[float, ...], values: list[Tensor], period: float | None = None) -> Tensor:
     """Piecewise linear through (knot, value), constant beyond the ends, or periodic.
 
-    ``values`` broadcast against ``x``; knots must rise. The sum runs over hats, so it is linear in the values and has a
-    derivative with respect to x between knots.
+    ``values`` broadcast against ``x``. The sum runs over hats, so it is linear in the values and has a derivative with
+    respect to x between knots. ValueError for knots that do not rise, and for another number of values.
     """
+    if len(knots) != len(values) or any(b <= a for a, b in pairwise(knots)):
+        raise ValueError(f"{len(values)} heights at knots {shown(knots)}: knots must rise, one for every height.")
     if period is not None:
         first, last = knots[0], knots[-1]
         knots = (last - period, *knots, first + period)

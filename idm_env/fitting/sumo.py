@@ -9,7 +9,7 @@ from xml.sax.saxutils import quoteattr
 import torch
 
 from idm_env.effects import IDM
-from idm_env.jobs.storage import write_text
+from idm_env.jobs.storage import refuse_unwritable, write_text
 from idm_env.model_file import Model
 
 _MARK = "<!-- Written by idm-env fit. -->"
@@ -28,6 +28,7 @@ def refuse(path: Path, base: str) -> None:
         )
     if path.exists() and not (path.is_file() and _MARK in path.read_text(errors="replace")):
         raise ValueError(f"{path} was not written by idm-env fit. Move it, or give --sumo another name.")
+    refuse_unwritable(path, "--sumo")
 
 
 def write(path: Path, model: Model) -> None:
@@ -42,7 +43,8 @@ def write(path: Path, model: Model) -> None:
     for driver in (None, *model.drivers):
         values = model.params(driver, dtype=torch.float64)[law.name]
         parameters = {"exponent": law.exponent, **{name: float(x) for name, x in values.items()}}
-        name = stem = re.sub(r"[\s|\\'\";,:<>&]", "_", driver or "median")
+        printable = "".join(sign if sign.isprintable() else "_" for sign in driver or "median")
+        name = stem = re.sub(r"[\s|\\'\";,:<>&]", "_", printable)
         number = 1
         while name in taken:
             number += 1

@@ -161,6 +161,24 @@ def not_an_input(output: Path, inputs: Iterable[Path | str | None]) -> None:
             raise ValueError(f"{source} is an input, and {output} would overwrite it. Give --out another place.")
 
 
+def refuse_unwritable(path: Path, option: str) -> None:
+    """Raise ValueError where no file can be made at ``path``, which is tried; nothing of that is left."""
+    new = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path.with_name(f".{path.name}{_PART}-try"), Path.touch)
+        path.with_name(f".{path.name}{_PART}-try").unlink()
+    except (OSError, ValueError) as error:
+        if full(error):
+            raise
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ValueError(f"{path} cannot be written ({reason}). Give {option} another place.") from None
+    finally:
+        for folder in new:
+            with suppress(OSError):
+                folder.rmdir()
+
+
 @contextmanager
 def results(out: str | Path, names: Sequence[str], inputs: Iterable[Path | str | None] = ()) -> Iterator[Path]:
     """Give ``out`` as a folder that exists, into which the files ``names`` may be written while this lasts.
@@ -300,7 +318,8 @@ class Store:
     """What an interrupted run goes on with: contents by key, and files of the run's own under ``folder``.
 
     The folder belongs to one run, told by the fingerprint of its data and options in its ``run.json``. Without
-    ``resume`` it is emptied, but only if that ``run.json`` is ours. ``folder`` None keeps everything in memory only.
+    ``resume`` it is emptied, but only if that ``run.json`` is a store's, and nothing on the way there is a link.
+    ``folder`` None keeps everything in memory only.
 
     Raises:
         ValueError: In one line, for a folder of another run, one that is not ours, and broken files.
@@ -311,9 +330,10 @@ class Store:
         self._memory: dict[str, bytes] = {}
         if folder is None:
             return
+        _refuse_links(folder)
         if folder.is_dir() and any(_PART not in path.name for path in folder.iterdir()):
             mark = _mark(folder)
-            if mark is None:
+            if mark is None or not isinstance(mark.get("fingerprint"), str):
                 raise ValueError(
                     f"{folder / MARK} is broken or missing, so that nothing there is known to be {_OWNER}'s. Delete "
                     f"{folder} to start afresh, or give --out another folder."
@@ -361,7 +381,8 @@ class Store:
 
     def remove(self) -> None:
         """Remove everything: the run has ended."""
-        if self.folder is not None and _mark(self.folder) is not None:
+        if self.folder is not None and "fingerprint" in (_mark(self.folder) or {}):
+            _refuse_links(self.folder)
             _remove(self.folder)
             if self.folder.parent.name == UNFINISHED:
                 with suppress(OSError):  # another command has left something there
@@ -381,6 +402,14 @@ class Store:
             return reader(self._memory[key]) if key in self._memory else None
         path = self.folder / f"{key}.kept"
         return read(path, lambda p: reader(_unsealed(p)), AFRESH) if path.exists() else None
+
+
+def _refuse_links(folder: Path) -> None:
+    """Raise ValueError where a store's folder, one in it, or the one of unfinished work around it, is a link."""
+    around = [folder.parent] if folder.parent.name == UNFINISHED else []
+    for path in [*around, folder, *(folder.iterdir() if folder.is_dir() and not folder.is_symlink() else ())]:
+        if path.is_symlink():
+            raise ValueError(f"{path} is a link, and what it leads to is nobody's to remove. Remove the link.")
 
 
 def _remove(folder: Path) -> None:

@@ -62,7 +62,11 @@ def _columns(source: Any) -> dict[str, list[Any]]:
         if not Path(source).is_file():
             raise ValueError(f"trips = {shown(str(source))} is not a file. Give the path of a CSV file, or rows.")
         try:
-            source = list(csv.DictReader(Path(source).read_text(encoding="utf-8").splitlines()))
+            table = csv.DictReader(Path(source).read_text(encoding="utf-8").splitlines())
+            header = list(table.fieldnames or ())
+            if twice := next((name for name in header if header.count(name) > 1), None):
+                raise ValueError(f"trips = {shown(str(source))}: column {shown(twice)} is there twice. Remove one.")
+            source = list(table)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"trips = {shown(str(source))} is not CSV in UTF-8: {error}. Save it as such.") from None
     if isinstance(source, Sequence) and not isinstance(source, str):

@@ -57,6 +57,12 @@ def _gap(factor: float) -> pl.Expr:
     return pl.when(pl.col("leader_id").is_not_null()).then(16.0 * factor + 0.1 * pl.col("time_s").sin())
 
 
+def _date(zone: str) -> pl.Expr:
+    return pl.format("2024-05-01T12:30:{}{}", (pl.col("time_s") + 10).round(1).cast(pl.String), pl.lit(zone)).alias(
+        "time_s"
+    )
+
+
 JITTER = RNG.uniform(-0.02, 0.02, PLATOON.height)
 
 TABLES: dict[str, tuple[pl.DataFrame, str]] = {
@@ -104,6 +110,12 @@ TABLES: dict[str, tuple[pl.DataFrame, str]] = {
     "feet per second": (_wrong(speed_mps=3.28084), "feet per second"),
     "miles per hour": (_wrong(speed_mps=2.23694), "miles per hour"),
     "negative speeds": (_wrong(speed_mps=-1.0), "speed_mps is negative"),
+    "speeds are 0": (PLATOON.with_columns(speed_mps=pl.lit(0)), "speed_mps is 0 while position_m rises"),
+    "speeds are 1": (PLATOON.with_columns(speed_mps=pl.lit(1)), "times the change of position_m per second"),
+    "speeds are true": (PLATOON.with_columns(speed_mps=pl.lit(True)), "speed_mps = 'true' in row 1 is not a number"),
+    "speeds are a 14th": (_wrong(speed_mps=1 / 14), "speed_mps is 0.0715 times the change"),
+    "positions are true": (PLATOON.with_columns(position_m=pl.lit(True)), "position_m = 'true' in row 1"),
+    "lanes are true": (PLATOON.with_columns(lane=pl.lit(True)), "lane = 'true' in row 1"),
     "positions in feet": (_wrong(position_m=3.28084), "position_m looks like feet"),
     "lengths in feet": (_wrong(length_m=3.28084), "the median length_m is 13.1"),
     "frames": (_wrong(time_s=10.0), "frames"),
@@ -140,7 +152,14 @@ TABLES: dict[str, tuple[pl.DataFrame, str]] = {
     "a row is missing": (PLATOON.filter(pl.int_range(pl.len()) != 150), READ),
     "a second is missing": (PLATOON.filter(~pl.int_range(pl.len()).is_between(150, 159)), READ),
     "1 % of rows are missing": (NO_LEADERS.filter(pl.Series(RNG.random(PLATOON.height) > 0.01)), READ),
+    "dates with an offset": (PLATOON.with_columns(_date("+02:00")), READ),
+    "dates in UTC": (PLATOON.with_columns(_date("Z")), READ),
+    "dates with and without an offset": (
+        PLATOON.with_columns(pl.when(pl.col("vehicle_id") > 1).then(_date("Z")).otherwise(_date("")).alias("time_s")),
+        "in row 1 has no offset from UTC, and other rows have one",
+    ),
     # columns
+    "names that are patterns": (PLATOON.with_columns(pl.lit(1).alias("*"), pl.lit("x").alias("^.*$")), READ),
     "a column is missing": (PLATOON.drop("time_s"), "column 'time_s' is missing"),
     "a column is misspelt": (PLATOON.rename({"leader_id": "leaderid"}), "'leader_id' is missing and 'leaderid'"),
     "other columns": (pl.DataFrame({"a": [1], "b": [2]}), "no known layout has the columns a, b"),

@@ -98,6 +98,12 @@ def test_what_is_no_file_of_the_layout_is_one_line(tmp_path: Path) -> None:
     pl.read_csv(tmp_path / "h.csv").drop("width").write_csv(tmp_path / "w.csv")
     (tmp_path / "x.json").write_text('[{"a": 1}]')
     (tmp_path / "y.json").write_text("[")
-    for name, told in (("w.csv", "'width' is missing"), ("x.json", "no document has _id"), ("y.json", "is no JSON")):
+    (tmp_path / "z.json").write_text(200_000 * "[")
+    for name, told in (
+        ("w.csv", "'width' is missing"),
+        ("x.json", "no document has _id"),
+        ("y.json", "is no JSON"),
+        ("z.json", "is no JSON"),
+    ):
         with pytest.raises(DataError, match=told):
             load(tmp_path / name)

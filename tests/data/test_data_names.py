@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +37,37 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "foreign.csv"
 
 
+@pytest.mark.parametrize(
+    ("columns", "rule"),
+    [
+        (["time_s=t"], "is no text such as"),
+        ({"time_s": 3}, "is no text such as"),
+        (7, "is no text such as"),
+        ("time_s=t,time=x", "time_s is given twice, as 't' and 'x'"),
+        ("position_m=x[1e999]", "has the unit '1e999'"),
+        ("position_m=x[1e-999]", "has the unit '1e-999'"),
+    ],
+)
+def test_columns_that_say_nothing_are_one_line(path: Path, columns: object, rule: str) -> None:
+    with pytest.raises(DataError, match=re.escape(rule)) as caught:
+        load(path, columns=columns)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_a_column_called_as_a_pattern_is_a_column(tmp_path: Path) -> None:
+    platoon().rename({"position_m": "^.*$", "length_m": "*"}).write_csv(tmp_path / "a.csv")
+    found = load(tmp_path / "a.csv", columns="position_m=^.*$,length_m=*")
+    alike(tracks(found), EXPECTED)
+    assert (found.table["length_m"] == 4.0).all()
+
+
+@pytest.mark.parametrize(("zone", "hours"), [("", 0), ("Z", 0), ("+02:00", -2), ("-0230", 2.5), ("+05", -5)])
+def test_times_with_an_offset_are_of_one_clock(zone: str, hours: float) -> None:
+    moment = pl.format("2024-05-01T12:30:{}{}", (pl.col("time_s") + 10).round(1).cast(pl.String), pl.lit(zone))
+    found = Trajectories.from_frame(platoon().with_columns(time_s=moment)).table["time_s"][0]
+    assert found == 1714566610.0 + 3600 * hours
+
+
 @pytest.mark.parametrize("columns", [TEXT, OTHERS])
 def test_columns_are_read_under_their_names_and_in_their_units(path: Path, columns: object) -> None:
     before = path.read_bytes()
@@ -63,8 +95,8 @@ def test_a_folder_takes_them(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("columns", "told"),
     [
-        ("time_s", "is no list such as time_s=t"),
-        ("time_s=t,", "is no list such as time_s=t"),
+        ("time_s", "is no text such as time_s=t"),
+        ("time_s=t,", "is no text such as time_s=t"),
         ("tmie=t", "'tmie' is no column that is read; did you mean 'time'?"),
         ("time_s=tt,vehicle=car,position=x", "there is no column 'tt' for time_s"),
         ("time_s=t,vehicle=cars,position=x", "did you mean 'car'?"),

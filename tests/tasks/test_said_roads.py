@@ -147,6 +147,13 @@ def test_a_destination_behind_the_entry_is_one_line(monkeypatch: pytest.MonkeyPa
         make_task("open_highway", on_ramp=[700.0, 800.0], trips=rows)
 
 
+def test_two_columns_of_one_name_are_refused(tmp_path: Path) -> None:
+    """The last of them must not win."""
+    (tmp_path / "trips.csv").write_text("depart,lane,lane\n1.0,0,1\n")
+    with pytest.raises(ValueError, match=r"trips\.csv': column 'lane' is there twice\. Remove one\.$"):
+        make_task("merge", trips=str(tmp_path / "trips.csv"))
+
+
 @pytest.mark.parametrize("says", BAD)
 def test_what_cannot_be_is_one_line_with_its_name(says: str) -> None:
     """Before anything starts."""

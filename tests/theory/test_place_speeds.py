@@ -9,6 +9,7 @@ import torch
 
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
+from idm_env.effects.places import interpolate
 from idm_env.roads import Lane
 from idm_env.simulator import Simulator
 
@@ -55,3 +56,11 @@ def test_profiles_that_are_none_are_refused() -> None:
         CurveSpeed(knots=(0.0, 1.0), profile=(0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="at least two rising positions"):
         SpeedProfile(knots=(5.0, 1.0))
+
+
+def test_as_many_heights_as_knots_that_rise() -> None:
+    """In one line: whoever edits a file of a found effect counts wrong."""
+    height = torch.tensor(0.0)
+    for knots in ((0.0, 1.0), (0.0, 2.0, 1.0)):
+        with pytest.raises(ValueError, match=r"^3 heights at knots \(.*\): knots must rise, one for every height\.$"):
+            interpolate(height, knots, [height] * 3)
