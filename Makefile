@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DATA ?=
 OUT ?= out/demo
+PYTEST ?=
 
 .PHONY: setup demo test test-gymnasium test-lowest rllib lint bench docs clean
 
@@ -24,7 +25,7 @@ demo: $(VENV)/.data
 	$(BIN)/idm-env demo $(if $(DATA),--data '$(DATA)') --out '$(OUT)'
 
 test: setup
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 $(PYTEST)
 
 # What meets Gymnasium's own code, on the version that RLlib pins: that one alone, before the one of .venv.
 GYMNASIUM := build/gymnasium-1.2.2

@@ -9,12 +9,6 @@ later) loads no plug-ins: a process that has not imported this package, such as 
 from __future__ import annotations
 
 import importlib
-import os
-import signal
-import sys
-import warnings
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from idm_env import backends
@@ -37,13 +31,6 @@ _LAZY = {
     "Control": "idm_env.effects",
     "Replay": "idm_env.effects",
 }
-
-_MOVED = {
-    "config": "model_file", "diagrams": "reports.diagrams", "executor": "jobs.executor", "keep": "jobs.storage",
-    "parts": "jobs.shards", "population": "multilane.demand", "progress": "jobs.progress",
-    "report": "reports.page", "trust": "jobs.trust",
-}  # fmt: skip
-"""Modules that documents of 0.1 named, and where they are now; the old names work for one version."""
 
 _TASKS = (
     "follow", "platoon", "replay", "ring", "highway", "open_highway", "merge", "bottleneck", "replay_lanes", "approach",
@@ -76,32 +63,6 @@ if TYPE_CHECKING:
     from idm_env.types import Command, Record, State
 
 
-class _Moved(ModuleType):
-    """A module under the name that it had: what is taken from it comes with a warning from where it is now."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # asked by importlib and inspect
-            raise AttributeError(name)
-        now = f"idm_env.{_MOVED[self.__name__.rpartition('.')[2]]}"
-        value = getattr(importlib.import_module(now), name)
-        warnings.warn(f"{self.__name__} has moved. Import {name} from {now}.", DeprecationWarning, stacklevel=2)
-        return value
-
-
-def _end(number: int, frame: object) -> None:
-    shown = b"\x1b[?25h" if os.isatty(2) else b""  # bars hide the cursor
-    os.write(2, shown + b"interrupted.\n")
-    os._exit(130)
-
-
-def _end_quietly() -> None:
-    """Let Ctrl-C end the command ``idm-env`` in one line while imports run; ``cli`` takes over when work begins."""
-    name = sys.argv[0] if sys.argv else ""  # "-m" while python -m looks for its module
-    command = Path(name).stem == "idm-env" or (name == "-m" and "idm_env" in sys.orig_argv)
-    if command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _end)
-
-
 def _task_id(task: str) -> str:
     """Return the Gymnasium id of a task: ``open_highway`` is ``DiffIDM/OpenHighway-v0``."""
     return f"DiffIDM/{task.title().replace('_', '')}-v0"
@@ -131,9 +92,7 @@ def _register() -> None:
         )
 
 
-_end_quietly()
 _register()
-sys.modules.update({name: _Moved(name) for name in (f"idm_env.{old}" for old in _MOVED)})
 backends.enter("idm_env.kernels.dispatch:rollout")
 
 
@@ -142,8 +101,6 @@ def __getattr__(name: str) -> Any:
         return getattr(importlib.import_module(_LAZY[name]), name)
     if name == "plot":
         return importlib.import_module("idm_env.plot")
-    if name in _MOVED:
-        return sys.modules[f"idm_env.{name}"]
     raise AttributeError(f"module 'idm_env' has no attribute '{name}'")
 
 

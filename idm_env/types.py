@@ -15,7 +15,6 @@ Nobody there
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -155,12 +154,6 @@ class State(NamedTuple):
     present: Tensor | None
     memory: Memory
     lanes: LaneState | None = None
-
-    @property
-    def links(self) -> LaneState | None:
-        """``lanes`` by its old name, for one version: with a DeprecationWarning."""
-        warnings.warn("State.links is called State.lanes now.", DeprecationWarning, stacklevel=2)
-        return self.lanes
 
     @property
     def clock(self) -> Tensor:

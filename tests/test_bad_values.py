@@ -400,7 +400,7 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(data: Path, tmp_path: Pat
     running = subprocess.Popen([sys.executable, *map(str, given)], stderr=subprocess.PIPE, text=True)
     assert running.stderr is not None
     for line in running.stderr:
-        if line.split()[-1] == "signal":  # the first thing that the package imports: nothing of ours has begun yet
+        if line.split()[-1] == "idm_env.cli":  # the first import of the command itself
             break
     time.sleep(seconds)
     os.kill(running.pid, signal.SIGINT)

@@ -89,8 +89,8 @@ def test_ctrl_c_while_modules_are_imported_shows_the_cursor_again(
     """Bars hide it, and nothing but this runs after them."""
     said: list[bytes] = []
     codes: list[int] = []
-    monkeypatch.setattr(idm_env.os, "isatty", lambda to: watched)
-    monkeypatch.setattr(idm_env.os, "write", lambda to, words: said.append(words))
-    monkeypatch.setattr(idm_env.os, "_exit", codes.append)
-    idm_env._end(2, None)
+    monkeypatch.setattr(idm_env.cli.os, "isatty", lambda to: watched)
+    monkeypatch.setattr(idm_env.cli.os, "write", lambda to, words: said.append(words))
+    monkeypatch.setattr(idm_env.cli.os, "_exit", codes.append)
+    idm_env.cli.end_at_once(2, None)
     assert codes == [130] and said == [(b"\x1b[?25h" if watched else b"") + b"interrupted.\n"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import re
 import subprocess
 import sys
@@ -212,31 +211,6 @@ def test_a_state_passes_few_hands_in_a_step(several: bool, most: int) -> None:
             sys.setprofile(None)
         longest = max(longest, list(returned), key=len)
     assert len(longest) == most, longest
-
-
-def test_the_old_name_of_a_state_s_lanes_is_warned_of() -> None:
-    """For one version documents' ``state.links`` is ``state.lanes``."""
-    import torch
-
-    from idm_env import IDM, Lanes, Simulator
-
-    simulator = Simulator(Lanes(2), (IDM(),))
-    place = torch.tensor([30.0, 0.0])
-    state = simulator.state(place, torch.full_like(place, 9.0), simulator.defaults(), lane=1)
-    with pytest.warns(DeprecationWarning, match="State.lanes"):
-        assert state.links is state.lanes and state.links.changed.sum() == 0
-
-
-@pytest.mark.parametrize("name", sorted(idm_env._MOVED))
-def test_a_module_that_documents_named_is_still_found(name: str) -> None:
-    """Under its old name, with a warning that has the new one."""
-
-    now = importlib.import_module(f"idm_env.{idm_env._MOVED[name]}")
-    old = importlib.import_module(f"idm_env.{name}")
-    public = next(each for each, value in vars(now).items() if getattr(value, "__module__", "") == now.__name__)
-    with pytest.warns(DeprecationWarning, match=re.escape(now.__name__)):
-        assert getattr(old, public) is getattr(now, public)
-    assert getattr(idm_env, name) is old and not hasattr(old, "__path__")
 
 
 def test_the_reference_has_a_page_of_modules_that_there_are() -> None:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, NoReturn
 
 import idm_env
 from idm_env import validation
-from idm_env.cli import answers, refusals
+from idm_env.cli import answers, end_at_once, refusals
 from idm_env.cli.answers import console
 from idm_env.cli.options import (
     OUT,
@@ -83,7 +83,7 @@ _stopped: list[int] = []
 
 def _work_begins() -> None:
     """Make Ctrl-C an exception, so that what is done is kept; while modules are imported it could crash them."""
-    if signal.getsignal(signal.SIGINT) is idm_env._end:
+    if signal.getsignal(signal.SIGINT) is end_at_once:
         signal.signal(signal.SIGINT, _stop)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import warnings
 from typing import TYPE_CHECKING, Any
 
 from idm_env.extras import needed
@@ -38,16 +37,7 @@ __all__ = [
 ]
 
 
-_RENAMED = {"Motion": SmoothMotion, "Record": VehicleRecord}
-"""Public classes under the names that they had; these work for one version."""
-
-
 def __getattr__(name: str) -> Any:
-    if name in _RENAMED:
-        now = _RENAMED[name]
-        message = f"idm_env.data.{name} is called {now.__name__}. Import that."
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
-        return now
     if name == "synthetic":  # a second of scipy, which those who read files do not wait for
         return importlib.import_module("idm_env.data.synthetic")
     raise AttributeError(f"module 'idm_env.data' has no attribute '{name}'")

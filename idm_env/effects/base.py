@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
@@ -134,12 +133,6 @@ class Effect:
                 raise TypeError(
                     f"effect {cls.__name__}: {promise} = {value!r} is none of {', '.join(map(repr, get_args(kinds)))}."
                 )
-        if "changes" in vars(cls):
-            message = (
-                f"effect {cls.__name__}: `changes` is called `acts_on` now. Rename it; the old name goes with 0.2."
-            )
-            warnings.warn(message, DeprecationWarning, stacklevel=2)
-            cls.acts_on = vars(cls)["changes"]
         # Not inherited: a subclass has another equation, and what its parent promised of his is not known of it.
         cls.adds = vars(cls).get("adds", cls.hook in ("adapt", "accelerate", "limit"))
         cls.own = not cls.__module__.startswith("idm_env.")

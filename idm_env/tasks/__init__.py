@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -38,18 +37,6 @@ TASKS: dict[str, type[Task]] = {
         ApproachTask,
     )
 }
-
-
-_RENAMED = {"World": EnvState, "Pay": RewardRange}
-"""Classes by the names that they had; those work for one version."""
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _RENAMED:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    now = _RENAMED[name]
-    warnings.warn(f"{name} is called {now.__name__} now.", DeprecationWarning, stacklevel=2)
-    return now
 
 
 def make_task(task: str = "ring", *, trusted: bool = False, **choices: Any) -> Task:

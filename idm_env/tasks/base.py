@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import abc
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -36,12 +35,6 @@ from idm_env.validation import shown
 
 _NORMALS_AT_ONCE = 1 << 16
 _MOST_STEPS = 1_000_000_000
-
-
-_RENAMED = {
-    "own_pay": "own_reward_range", "earned": "own_reward", "told": "info", "driven": "episode_params",
-    "wishes": "with_lane_commands",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -207,14 +200,6 @@ class Task(abc.ABC):
     def steps(self) -> int:
         """The most steps of Δt of an episode; without a limit those of a usual one."""
         return self.usual_steps if self.horizon is None else self.horizon * self.held
-
-    def __init_subclass__(cls, **keywords: Any) -> None:
-        """Take methods by the names that they had; those work for one version."""
-        super().__init_subclass__(**keywords)
-        for old, now in _RENAMED.items():
-            if old in vars(cls):
-                warnings.warn(f"{cls.__name__}.{old} is called {now} now.", DeprecationWarning, stacklevel=2)
-                setattr(cls, now, vars(cls)[old])
 
     @property
     @abc.abstractmethod

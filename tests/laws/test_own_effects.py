@@ -177,9 +177,3 @@ def test_a_null_outside_the_bounds_is_refused(null: float) -> None:
 def test_constants_that_are_no_numbers_are_printed_as_such(value: float) -> None:
     """``nan`` is no name in a printed file."""
     assert np.array_equal(eval(constant_text(Graph().constant(value).label)), value, equal_nan=True)
-
-
-def test_the_former_name_of_what_an_effect_acts_on_still_works() -> None:
-    with pytest.warns(DeprecationWarning, match="`changes` is called `acts_on` now"):
-        cls = type("Old", (Effect,), {"changes": "gap", "accelerate": lambda self, scene, driver, p: scene.speed})
-    assert cls.acts_on == "gap"

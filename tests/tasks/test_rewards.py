@@ -114,24 +114,3 @@ def test_a_cost_of_ones_own_replaces_the_lawful_one():
     gap[0, 3] = -0.1
     touched = world._replace(state=world.state._replace(gap=gap))
     assert float(task.rewards(world, torch.zeros(1, 1, dtype=torch.float64), touched)) == -50.0
-
-
-def test_a_task_of_ones_own_with_the_words_of_before_still_works():
-    """With a warning for each; so do the classes."""
-    with pytest.warns(DeprecationWarning, match="RewardRange"):
-        from idm_env.tasks import Pay
-
-    with pytest.warns(DeprecationWarning) as told:
-
-        class Old(TASKS["follow"]):
-            @property
-            def own_pay(self):
-                return Pay(-3.0, 2.0)
-
-            def earned(self, before, command, after):
-                return 0.0 * self.pick(after.state.speed)
-
-    assert {"Old.own_pay is called own_reward_range now.", "Old.earned is called own_reward now."} == {
-        str(each.message) for each in told
-    }
-    assert Old().own_reward_range == (-3.0, 2.0) and Old.own_reward is Old.earned
