@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+import tokenize
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from datetime import date
@@ -64,13 +65,20 @@ FORBIDDEN = {
 OUTSIDE = {"gymnasium": {"envs", "wrappers", "__init__"}, "pettingzoo": {"envs"}, "stable_baselines3": {"envs"}}
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Return the tree of a file, read once."""
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports(path: Path, typing: bool = False) -> set[str]:
     """Return the modules that a file imports, wherever in it; those that only a type checker reads if ``typing``.
 
     Of ``from package import module`` that is the module, since whoever imports a module runs its packages anyway.
     """
     names = set()
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     unread = set() if typing else {
         each
         for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
@@ -92,20 +100,20 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 MODULES = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in FILES}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_point_one_way(path: Path) -> None:
-    """As the design's layout says; gymnasium, pettingzoo and stable-baselines3 only at the faces."""
+def misplaced(path: Path) -> set[str]:
+    """Return what a file imports and may not."""
     mine = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
     found = imports(path)
     names = {name.removeprefix("idm_env.") for name in found if name.startswith("idm_env.")}
-    parts = {name.split(".")[0] for name in names} - {mine}
+    wrong = {name for name in names if name.split(".")[0] in FORBIDDEN.get(mine, set()) - {mine}}
     if mine in ALLOWED:
-        allowed = ALLOWED[mine] | {mine}
-        assert not {name for name in names if not {name, name.split(".")[0]} & allowed}
-    assert not parts & FORBIDDEN.get(mine, set())
-    for library, allowed in OUTSIDE.items():
-        if any(name.split(".")[0] == library for name in found):
-            assert mine in allowed, f"{library} belongs to {allowed}"
+        wrong |= {name for name in names if not {name, name.split(".")[0]} & (ALLOWED[mine] | {mine})}
+    return wrong | {name for name in found if mine not in OUTSIDE.get(name.split(".")[0], {mine})}
+
+
+def test_imports_point_one_way() -> None:
+    """As the design's layout says; gymnasium, pettingzoo and stable-baselines3 only at the faces."""
+    assert {str(path.relative_to(PACKAGE)): wrong for path in FILES if (wrong := misplaced(path))} == {}
 
 
 def part_of(name: str) -> str:
@@ -128,17 +136,73 @@ def circles() -> set[frozenset[str]]:
     """Return the pairs of files that import each other by way of others, what only a type checker reads included."""
     below = {name: (imports(path, typing=True) & MODULES.keys()) - {name} for name, path in MODULES.items()}
 
-    def reached(name: str) -> set[str]:
+    @cache
+    def reached(name: str) -> frozenset[str]:
         seen: set[str] = set()
         ahead = list(below[name])
         while ahead:
             if (other := ahead.pop()) not in seen:
                 seen.add(other)
                 ahead += below[other]
-        return seen
+        return frozenset(seen)
 
-    all_of = {name: reached(name) for name in below}
-    return {frozenset((a, b)) for a in below for b in all_of[a] if a != b and a in all_of[b]}
+    return {frozenset((a, b)) for a in below for b in reached(a) if a != b and a in reached(b)}
+
+
+def floors(part: str) -> int:
+    """Return how many files of a package stand on each other at the most: the longest chain of imports within it."""
+    mine = {name: path for name, path in MODULES.items() if part_of(name) == part}
+
+    @cache
+    def height(name: str) -> int:
+        return 1 + max((height(other) for other in (imports(mine[name]) & mine.keys()) - {name}), default=0)
+
+    return max(map(height, mine))
+
+
+def high_packages() -> set[str]:
+    """Return the packages of more than twelve floors, each with its number."""
+    high = {part: floors(part) for part in {part_of(name) for name in MODULES}}
+    return {f"{part}: {count}" for part, count in high.items() if count > 12}
+
+
+def functions_of_many_parameters() -> set[str]:
+    """Return the functions of more than twenty parameters, each with their number."""
+    return {
+        f"{path.relative_to(PACKAGE)} {node.name}: {count}"
+        for path in FILES
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.FunctionDef)
+        and (count := sum(isinstance(each, ast.arg) for each in ast.walk(node.args))) > 20
+    }
+
+
+def file_names_twice() -> set[str]:
+    """Return the names of files that several packages have."""
+    names = Counter(path.name for path in FILES)
+    return {name for name, count in names.items() if count > 1 and name != "__init__.py"}
+
+
+def set_by_hand() -> list[str]:
+    """Return the places of code that the formatter leaves alone, once for each."""
+    return [str(path.relative_to(PACKAGE)) for path in FILES for _ in range(path.read_text().count("# fmt: skip"))]
+
+
+def lines_of_code() -> range:
+    """Return a range as long as the package has lines of code: no docstrings, comments and blank lines."""
+    return range(sum(map(code_lines, FILES)))
+
+
+def code_lines(path: Path) -> int:
+    """Return the lines of a file that have code on them."""
+    documents: set[int] = set()
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node, clean=False):
+            documents |= set(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+    silent = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+    with path.open("rb") as file:
+        tokens = [token for token in tokenize.tokenize(file.readline) if token.type not in silent]
+    return len({line for token in tokens[1:] for line in range(token.start[0], token.end[0] + 1)} - documents)
 
 
 def classes_named_twice() -> set[str]:
@@ -146,7 +210,7 @@ def classes_named_twice() -> set[str]:
     names = Counter(
         node.name
         for path in FILES
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     return {name for name, count in names.items() if count > 1}
@@ -165,14 +229,19 @@ def top_level() -> set[str]:
         (arrows, 176),
         (circles, 0),
         (classes_named_twice, 7),
+        (lines_of_code, 36200),
+        (functions_of_many_parameters, 21),
+        (high_packages, 1),
+        (file_names_twice, 25),
+        (set_by_hand, 376),
     ],
-    ids=["top level", "packages and top level", "arrows", "files of circles in pairs", "class names twice"],
+    ids=lambda x: getattr(x, "__name__", None),
 )
 def test_the_package_fits_into_one_head(count: Callable[[], Collection[object]], most: int) -> None:
     """What has to be kept in mind is counted; a bound may be lowered, and not raised."""
     found = count()
     print(f"{len(found)} (at most {most})")
-    assert len(found) <= most, sorted(map(str, found))
+    assert len(found) <= most, sorted(map(str, found))[:1000]
 
 
 @pytest.mark.parametrize(("several", "most"), [(False, 3), (True, 13)], ids=["one lane", "several lanes"])
@@ -239,9 +308,10 @@ def test_the_simulator_does_not_know_the_model(name: str) -> None:
     assert "IDM" not in text.replace("Add IDM() or drop one", "") and "idm" not in text
 
 
+@cache
 def words_of(path: Path) -> set[str]:
     """Return what a file's code names: classes, and the words of its strings, docstrings left out."""
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     documents = {
         node.body[0].value
         for node in ast.walk(tree)
@@ -263,43 +333,44 @@ WITHOUT_EFFECTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("path", WITHOUT_EFFECTS, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_what_runs_effects_knows_none_of_them(path: Path) -> None:
+def test_what_runs_effects_knows_none_of_them() -> None:
     """So every effect, and one that the package has never seen, is stepped, compiled and differentiated alike."""
     from idm_env.effects import ALL
 
     # ``second_leader`` is also a field of every scene, ``follower`` of links.
     names = ({*ALL, *(cls.__name__ for cls in ALL.values())}) - {"second_leader", "follower"}
-    assert not words_of(path) & names
+    assert {path: known for path in WITHOUT_EFFECTS if (known := words_of(path) & names)} == {}
 
 
-@pytest.mark.parametrize("path", sorted((PACKAGE / "fitting").glob("*.py")), ids=lambda p: p.name)
-def test_fitting_knows_no_candidate_by_name(path: Path) -> None:
+def test_fitting_knows_no_candidate_by_name() -> None:
     """What is fitted comes from the effects' own parameters."""
     from idm_env.effects import ALL, CANDIDATES
 
     allowed = {"batch.py": {"second_leader", "lateral"}}  # inputs and neighbours that it cannot give
     names = {*CANDIDATES, *(ALL[name].__name__ for name in CANDIDATES)}
-    assert not words_of(path) & names - allowed.get(path.name, set())
+    files = sorted((PACKAGE / "fitting").glob("*.py"))
+    assert {p: known for p in files if (known := words_of(p) & names - allowed.get(p.name, set()))} == {}
 
 
-@pytest.mark.parametrize("path", sorted((PACKAGE / "discovery").glob("*.py")), ids=lambda p: p.name)
-def test_discovery_knows_no_effect_by_name(path: Path) -> None:
+def test_discovery_knows_no_effect_by_name() -> None:
     """What is known of an effect stands beside its equation."""
     from idm_env.effects import CANDIDATES
 
-    assert not words_of(path) & set(CANDIDATES)
+    files = sorted((PACKAGE / "discovery").glob("*.py"))
+    assert {path: known for path in files if (known := words_of(path) & set(CANDIDATES))} == {}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_a_path_is_never_taken_for_a_pattern(path: Path) -> None:
-    """polars reads ab.csv where a[b].csv is asked for, unless it is told that a path is a path."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in {
-            f"pl.{verb}_{kind}" for verb in ("read", "scan") for kind in ("csv", "parquet", "ipc", "ndjson")
-        }:
-            told = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
-            assert told.get("glob") == "False", f"line {node.lineno} without glob=False"
+def test_a_path_is_never_taken_for_a_pattern() -> None:
+    """polars reads ab.csv where a[b].csv is asked for, unless ``glob=False`` tells it that a path is a path."""
+    readers = {f"pl.{verb}_{kind}" for verb in ("read", "scan") for kind in ("csv", "parquet", "ipc", "ndjson")}
+    calls = [
+        (path, node)
+        for path in FILES
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and ast.unparse(node.func) in readers
+    ]
+    careless = [(path, node.lineno) for path, node in calls if "glob=False" not in ast.unparse(node)]
+    assert len(calls) > 5 and not careless, careless
 
 
 def named_in(cls: type) -> set[str]:
@@ -313,12 +384,12 @@ def named_in(cls: type) -> set[str]:
 
 
 def test_what_is_added_to_the_package_is_named_in_few_of_its_files() -> None:
-    """An effect in one, a task in two: its class where tasks are listed, its name where ids are registered."""
+    """An effect in none, a task in two: its class where tasks are listed, its name where ids are registered."""
     from idm_env.effects import ALL, CANDIDATES
     from idm_env.tasks import TASKS
 
     for name in CANDIDATES:
-        assert named_in(ALL[name]) == {"effects/__init__.py"}, name
+        assert named_in(ALL[name]) == set(), name
     assert {*TASKS} == {*idm_env._TASKS}
     for task in TASKS.values():
         heirs = {str(Path(sys.modules[cls.__module__].__file__ or "").relative_to(PACKAGE)) for cls in TASKS.values()
@@ -356,10 +427,9 @@ PRIVATE = (
 """Of libraries; numba documents those two for extensions of its own."""
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_private_ground_of_libraries_stands_in_one_file(path: Path) -> None:
+def test_private_ground_of_libraries_stands_in_one_file() -> None:
     """So that a new version of a library breaks one file, which says why it stands there, and what was tried."""
-    assert bool(re.search(PRIVATE, path.read_text(), re.MULTILINE)) == (path.name == "compat.py")
+    assert [p.name for p in FILES if re.search(PRIVATE, p.read_text(), re.MULTILINE)] == ["compat.py"]
 
 
 def test_importing_the_package_imports_no_torch_and_registers_the_environment() -> None:
@@ -377,14 +447,14 @@ def test_the_suite_has_one_profile_of_hypothesis() -> None:
     assert whole is not None and whole.deadline is None
     assert HealthCheck.too_slow in whole.suppress_health_check
     tests = [path for path in sorted((ROOT / "tests").rglob("*.py")) if path.name != "conftest.py"]
-    own = [keyword.arg for path in tests for node in ast.walk(ast.parse(path.read_text()))
+    own = [keyword.arg for path in tests for node in ast.walk(parsed(path))
            if isinstance(node, ast.Call) for keyword in node.keywords]  # fmt: skip
     assert len(own) > 1000 and not {"deadline", "suppress_health_check"} & set(own)
 
 
 def contracts() -> Iterator[tuple[str, ast.FunctionDef, str]]:
     """Yield every public function with its place and all that is said of it: by itself, its classes and its module."""
-    trees = {path: ast.parse(path.read_text()) for path in FILES}
+    trees = {path: parsed(path) for path in FILES}
     classes = {node.name: node for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef)}
 
     def lineage(cls: ast.ClassDef) -> Iterator[ast.ClassDef]:
@@ -450,7 +520,7 @@ NO_NOUN = r"alone|asked|at|beside|drawn|found|given|kept|known|made|of|said|ther
 
 def bindings(path: Path) -> Iterator[str]:
     """Yield what functions bind, once for each around it; parameters of public ones are keywords that users know."""
-    for function in ast.walk(ast.parse(path.read_text())):
+    for function in ast.walk(parsed(path)):
         if isinstance(function, (ast.FunctionDef, ast.Lambda)):
             names = {n.id for n in ast.walk(function) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
             if isinstance(function, ast.Lambda) or function.name.startswith("_"):

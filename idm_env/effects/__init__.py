@@ -1,6 +1,6 @@
-"""The catalogue of effects: one entry in ``ALL`` makes an effect tested by every law, documented and accepted in YAML.
+"""The catalogue of effects: a class in one of these files is tested by every law, documented and accepted in YAML.
 
-``CANDIDATES`` are what discovery tries. ``register`` enters effects of one's own.
+``ALL`` has all by name, ``CANDIDATES`` are what discovery tries. ``register`` enters effects of one's own.
 """
 
 from __future__ import annotations
@@ -9,110 +9,43 @@ import sys
 from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from idm_env.effects.actions import Control, Replay
-from idm_env.effects.adaptation import LongMemory, RegimeShift, SpeedDependentGap, SpeedZone
+from idm_env.effects.actions import *
+from idm_env.effects.adaptation import *
 from idm_env.effects.base import CarFollowing, Effect
-from idm_env.effects.bases import FVDM, IIDM, ConstantTimeGap, Gipps, IDMPlus
-from idm_env.effects.free import Curve, DriverCurve
-from idm_env.effects.idm import IDM
-from idm_env.effects.lane_changes import GapAcceptance, LaneCommand, MandatoryChange, Mobil
-from idm_env.effects.limits import ActionPoint, Asymmetry, Brakes, Lag, PowerLimit, Traction, unspoken
-from idm_env.effects.neighbours import BrakeLight, Courtesy, Follower, Lateral, LeaderAcceleration, SecondLeader
-from idm_env.effects.noise import DRIFTS, AccelNoise, Noise, PerceptionNoise, Wander
-from idm_env.effects.perception import ClosingGain, DeadZone, Delay, GapBias, ImaginedLeader
-from idm_env.effects.place_speeds import CurveSpeed, SpeedProfile
+from idm_env.effects.bases import *
+from idm_env.effects.free import *
+from idm_env.effects.idm import *
+from idm_env.effects.lane_changes import *
+from idm_env.effects.limits import *
+from idm_env.effects.neighbours import *
+from idm_env.effects.noise import *
+from idm_env.effects.perception import *
+from idm_env.effects.place_speeds import *
 from idm_env.effects.registry import entered, imported, is_candidate, lives, read
-from idm_env.effects.road_rules import Destination, LaneClosure, Signal, SpeedLimit
-from idm_env.effects.surroundings import Drag, Grade
-from idm_env.effects.time_gaps import GapStiffness, LeaderTrend, Relaxation, SetPointAsymmetry, SpeedTimeGap
+from idm_env.effects.road_rules import *
+from idm_env.effects.surroundings import *
+from idm_env.effects.time_gaps import *
 from idm_env.validation import nearest, shown
 
+_FILES = (
+    "idm bases limits actions perception neighbours surroundings adaptation time_gaps place_speeds noise free "
+    "road_rules lane_changes"
+)
 ALL: dict[str, type[Effect]] = {
     effect.kind: effect
-    for effect in (
-        IDM,
-        IDMPlus,
-        IIDM,
-        FVDM,
-        Gipps,
-        ConstantTimeGap,
-        Brakes,
-        Traction,
-        Control,
-        Replay,
-        Delay,
-        Lag,
-        SecondLeader,
-        LeaderAcceleration,
-        BrakeLight,
-        Asymmetry,
-        PowerLimit,
-        Drag,
-        SpeedDependentGap,
-        SpeedTimeGap,
-        SetPointAsymmetry,
-        Relaxation,
-        LeaderTrend,
-        GapStiffness,
-        LongMemory,
-        Follower,
-        DeadZone,
-        ActionPoint,
-        Grade,
-        SpeedZone,
-        SpeedProfile,
-        CurveSpeed,
-        RegimeShift,
-        Lateral,
-        Courtesy,
-        ClosingGain,
-        GapBias,
-        ImaginedLeader,
-        Noise,
-        AccelNoise,
-        Wander,
-        PerceptionNoise,
-        Curve,
-        DriverCurve,
-        SpeedLimit,
-        LaneClosure,
-        Signal,
-        Mobil,
-        MandatoryChange,
-        GapAcceptance,
-        LaneCommand,
-        Destination,
-    )
+    for file in _FILES.split()
+    for effect in vars(sys.modules[f"{__name__}.{file}"]).values()
+    if isinstance(effect, type) and issubclass(effect, Effect) and effect.__module__ == f"{__name__}.{file}"
+    if effect.kind
 }
+"""Effects by name, in the order of their files."""
 
-CANDIDATES: tuple[str, ...] = (
-    "delay",
-    "lag",
-    "second_leader",
-    "leader_acceleration",
-    "brake_light",
-    "asymmetry",
-    "power_limit",
-    "drag",
-    "speed_dependent_gap",
-    "speed_time_gap",
-    "set_point_asymmetry",
-    "relaxation",
-    "leader_trend",
-    "gap_stiffness",
-    "memory",
-    "follower",
-    "dead_zone",
-    "action_point",
-    "grade",
-    "speed_zone",
-    "speed_profile",
-    "curve_speed",
-    "regime_shift",
-    "lateral",
-    "gap_bias",
+CANDIDATES: tuple[str, ...] = tuple(
+    name
+    for name, effect in ALL.items()
+    if is_candidate(effect) and any(effect.wording) and not effect.draws and effect.sought != "never"
 )
-"""Effects that discovery may add to a model, by name."""
+"""Effects that discovery may add to a model, by name: whatever a report has words for and that is no noise."""
 
 
 BASES: tuple[str, ...] = tuple(name for name, effect in ALL.items() if issubclass(effect, CarFollowing))
@@ -196,70 +129,6 @@ def _fits(value: object, hint: Any) -> bool:
 
 
 __all__ = [
-    "ALL",
-    "BASES",
-    "CANDIDATES",
-    "DRIFTS",
-    "FVDM",
-    "IDM",
-    "IIDM",
-    "AccelNoise",
-    "ActionPoint",
-    "Asymmetry",
-    "BrakeLight",
-    "Brakes",
-    "CarFollowing",
-    "ClosingGain",
-    "ConstantTimeGap",
-    "Control",
-    "Courtesy",
-    "Curve",
-    "CurveSpeed",
-    "DeadZone",
-    "Delay",
-    "Destination",
-    "Drag",
-    "DriverCurve",
-    "Effect",
-    "Follower",
-    "GapAcceptance",
-    "GapBias",
-    "GapStiffness",
-    "Gipps",
-    "Grade",
-    "IDMPlus",
-    "ImaginedLeader",
-    "Lag",
-    "LaneClosure",
-    "LaneCommand",
-    "Lateral",
-    "LeaderAcceleration",
-    "LeaderTrend",
-    "LongMemory",
-    "MandatoryChange",
-    "Mobil",
-    "Noise",
-    "PerceptionNoise",
-    "PowerLimit",
-    "RegimeShift",
-    "Relaxation",
-    "Replay",
-    "SecondLeader",
-    "SetPointAsymmetry",
-    "Signal",
-    "SpeedDependentGap",
-    "SpeedLimit",
-    "SpeedProfile",
-    "SpeedTimeGap",
-    "SpeedZone",
-    "Traction",
-    "Wander",
-    "base_named",
-    "candidates",
-    "describe",
-    "imported",
-    "make",
-    "named",
-    "register",
-    "unspoken",
-]
+    "ALL", "BASES", "CANDIDATES", "DRIFTS", "CarFollowing", "Effect", "base_named", "candidates", "describe",
+    "imported", "make", "named", "register", "unspoken", *(effect.__name__ for effect in ALL.values()),
+]  # fmt: skip

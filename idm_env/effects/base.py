@@ -20,9 +20,9 @@ from idm_env.types import Driver, Mark, Motion, Scene, Wish
 Hook = Literal["perceive", "adapt", "accelerate", "limit", "place", "change"]
 HOOKS: tuple[Hook, ...] = ("perceive", "adapt", "accelerate", "limit", "place", "change")
 
-Sought = Literal["anywhere", "profile", "interval", "step", "given"]
+Sought = Literal["anywhere", "profile", "interval", "step", "given", "never"]
 """What a search has to find beside a strength: nothing, a curve over places, an interval of places, a moment; nothing,
-because a column of the file gives the profile."""
+because a column of the file gives the profile; or that no search tries the effect by itself."""
 Neighbour = Literal["leader", "second leader", "vehicle behind", "vehicle in an adjacent lane"]
 """Whom a record must show for the effect to be seen in it."""
 

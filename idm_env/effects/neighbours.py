@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from idm_env.effects import references
-from idm_env.effects.base import Effect, Neighbour, P
+from idm_env.effects.base import Effect, Neighbour, P, Sought
 from idm_env.effects.idm import interaction
 from idm_env.parameters import Parameter
 from idm_env.types import Adjacent, Driver, Scene
@@ -151,6 +151,7 @@ class Courtesy(Effect):
     """
 
     kind: ClassVar[str] = "courtesy"
+    sought: ClassVar[Sought] = "never"
     sources: ClassVar[tuple[str, ...]] = (references.SCHAKEL_2012,)
     adds: ClassVar[bool] = True  # a weight below 0 keeps others out
     title: ClassVar[str] = "courtesy"

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 
 from idm_env.effects import references
-from idm_env.effects.base import Effect, P
+from idm_env.effects.base import Effect, P, Sought
 from idm_env.parameters import Parameter
 from idm_env.types import Imagined, Neighbour, Scene
 
@@ -97,6 +97,7 @@ class ClosingGain(Effect):
     """
 
     kind: ClassVar[str] = "closing_gain"
+    sought: ClassVar[Sought] = "never"
     sources: ClassVar[tuple[str, ...]] = (references.MILANES_2014,)
     title: ClassVar[str] = "gain on the closing speed"
     equation: ClassVar[str] = "Δv is seen as k Δv"
