@@ -137,7 +137,8 @@ class Signal(Effect):
         red where (t − φ) mod C ≥ C − r;   who is before the line x_s and can stop, v² ≤ 2 b_m (x_s − x), stops there:
         A += −a max(0, (s*/s)²_line − (s*/s)²_leader),   that of somebody who stands at the line
 
-    Amber is in b_m: who would have to brake harder drives on. Absent at r = 0.
+    Amber is in b_m: who would have to brake harder drives on. Who has begun to stop does so until it is green, however
+    late he brakes: that is his memory, 1 or 0. Absent at r = 0.
     """
 
     kind: ClassVar[str] = "signal"
@@ -163,12 +164,24 @@ class Signal(Effect):
         place, red = float(p["place"]), bool(self.phase(torch.tensor(time), p)[1])
         return (Mark(None, place, place, red),) if p["red"] > 0 else ()
 
-    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
-        """Return what drivers brake for somebody who stands at the line while it is red (m/s²)."""
+    def _stops(self, scene: Scene, p: P) -> Tensor:
+        """Return who stops at the line (bool, ``[..., n]``)."""
         _, red = self.phase(scene.time, p)
         way = p["place"] - scene.position
-        can = (way >= 0) & (scene.speed * scene.speed <= 2.0 * p["most_decel"] * way)
-        return _before(torch.where(red & can, way, FAR), scene, driver)
+        can = scene.speed * scene.speed <= 2.0 * p["most_decel"] * way
+        return red & (way >= 0) & (can | (scene.memory[self.name] > 0.5))
+
+    def accelerate(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return what drivers brake for somebody who stands at the line while it is red (m/s²)."""
+        return _before(torch.where(self._stops(scene, p), p["place"] - scene.position, FAR), scene, driver)
+
+    def initial_memory(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return 0: nobody has begun to stop."""
+        return torch.zeros_like(scene.speed)
+
+    def remember(self, scene: Scene, driver: Driver, p: P) -> Tensor:
+        """Return 1 for who stops, otherwise 0."""
+        return torch.where(self._stops(scene, p), 1.0, 0.0).to(scene.speed.dtype)
 
 
 @dataclass(frozen=True)

@@ -128,6 +128,46 @@ def test_a_signal_stops_who_can_stop_and_lets_go_in_green() -> None:
     assert bool((state.position[state.present > 0] > 400.0).all()) if state.present is not None else False
 
 
+def before_a_signal(most_decel: float, cycle: float, red: float) -> tuple[Simulator, Params, Tensor]:
+    """Return drivers of every kind, each alone on a road with a signal at 400 m: v0 from 5 to 40 m/s, a, b."""
+    simulator = Simulator(Lanes(1), (IDM(), Signal(), Brakes()))
+    params = simulator.defaults(dtype=DTYPE)
+    grid = torch.cartesian_prod(*(torch.tensor(x, dtype=DTYPE) for x in (
+        (5.0, 10.0, 15.0, 20.0, 30.0, 40.0), (0.5, 1.5, 2.6, 4.0), (0.5, 2.0, 4.0, 6.0, 9.0)
+    )))  # fmt: skip
+    params["idm"] |= dict(zip(("desired_speed", "max_accel", "comfort_decel"), grid.T.unsqueeze(-1), strict=True))
+    for name, value in {"place": 400.0, "most_decel": most_decel, "cycle": cycle, "red": red}.items():
+        params["signal"][name] = torch.tensor(value, dtype=DTYPE)
+    return simulator, params, grid[:, :1]
+
+
+@pytest.mark.parametrize("most_decel", [0.5, 3.0, 9.0])
+def test_who_has_begun_to_stop_at_a_signal_does(most_decel: float) -> None:
+    """At a light that is always red every driver who can stop where he begins stands before the line, and stays."""
+    simulator, params, speed = before_a_signal(most_decel, 60.0, 60.0)
+    start = simulator.state(torch.zeros_like(speed), speed, params, lane=0)
+    able = speed.square() <= 2.0 * most_decel * 400.0
+    end, kept = simulator.rollout(start, {}, params, 2000)
+    stands = (end.speed < 0.05) & (end.position < 400.0) & (end.position > 390.0)
+    assert bool((kept.position.amax(0) < 400.0)[able].all()) and bool(stands[able].all())
+    assert bool((end.position > 400.0)[~able].all())
+
+
+def test_nobody_who_could_not_stop_hesitates_before_a_signal() -> None:
+    """When it turns red at 10 s those who would have to brake harder than b_m cross at their speed, all others stop."""
+    simulator, params, speed = before_a_signal(3.0, 1000.0, 990.0)
+    place = 400.0 - 10.0 * speed - torch.linspace(0.5, 300.0, 60, dtype=DTYPE)  # where it turns red
+    grid = {name: x.repeat(1, 60).reshape(-1, 1) for name, x in params["idm"].items() if x.dim()}
+    params["idm"] |= grid
+    position, speed = place.reshape(-1, 1), speed.repeat(1, 60).reshape(-1, 1)
+    _, kept = simulator.rollout(simulator.state(position, speed, params, lane=0), {}, params, 600)
+    at_red = kept.position[99]
+    can = speed.square() <= 2.0 * 3.0 * (400.0 - at_red)
+    crosses = kept.position[-1] > 400.0
+    assert bool((crosses != can).all()) and 0 < int(can.sum()) < len(can)
+    assert bool((kept.speed[99:, ~can] > 0.99 * speed[~can]).all())
+
+
 def test_drivers_leave_where_they_want_to() -> None:
     """Whose destination is the exit leaves on lane 0, everybody else on the others."""
     simulator, state, params = begun(Destination(), per_hour=500.0)
