@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,7 +31,7 @@ from idm_env.tasks.features import FEATURES, AgentView, Feature, ObservedFeature
 from idm_env.tasks.random import Draw
 from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, Weighted, weighted
 from idm_env.tasks.types import Bounds, Ended, EnvState, Features, RewardRange
-from idm_env.types import Command, Inputs, Params, State
+from idm_env.types import Command, Inputs, Params, State, mapped
 from idm_env.validation import shown
 
 _NORMALS_AT_ONCE = 1 << 16
@@ -385,14 +386,29 @@ class Task(abc.ABC):
         who = self.who(draw)
         params = self.episode_params(who, params)
         world = self.begin(draw, params)
-        world = self._unsteady(world._replace(episode={**world.episode, **who}), draw)
+        world = begun = self._unsteady(world._replace(episode={**world.episode, **who}), draw)
         speed = world.state.speed
         block = max(16, _NORMALS_AT_ONCE // max(speed.numel(), 1))
         for first in range(0, self.warmup, block):
             steps = min(block, self.warmup - first)
             inputs = {**self._idle(world, steps), **self.normals(draw, world.state.step, steps, speed.dtype)}
             world = world._replace(state=self.simulator.rollout(world.state, inputs, params, steps, keep=None)[0])
-        return world
+        if not self.warmup:
+            return world
+        touched = world.state.gap <= 0
+        if world.state.present is not None:
+            touched = touched & (world.state.present > 0)
+        return self._without_warm_up(world, begun, touched.any(-1)) if bool(touched.any()) else world
+
+    def _without_warm_up(self, world: EnvState, begun: EnvState, rows: Tensor) -> EnvState:
+        """Return the worlds, those rows as they begin (bool, ``(environments,)``); warn, because drivers collided."""
+        warnings.warn(
+            f"drivers of task '{self.name}' ran into each other in its warm-up of {self.warmup} steps: such episodes "
+            "begin without it. Take calmer drivers, more room for each, or warmup=0.",
+            stacklevel=2,
+        )
+        begun = begun._replace(state=begun.state._replace(step=torch.zeros_like(begun.state.step)))
+        return mapped(lambda x, y: torch.where(rows.view(-1, *[1] * (x.dim() - 1)), y, x), world, begun)
 
     def who(self, draw: Draw) -> dict[str, Tensor]:
         """Return which of the drivers every vehicle is in these episodes, and where in their ranges parameters are."""

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from idm_env.effects import IDM, Brakes, Control, Courtesy, Effect, GapAcceptance, MandatoryChange, Mobil
+from idm_env.effects import IDM, Brakes, Control, Courtesy, Effect, GapAcceptance, LaneClosure, MandatoryChange, Mobil
 from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
 from idm_env.roads import Lanes
@@ -22,6 +22,7 @@ from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
 from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, lengths, loops_of, rules_of, with_classes
+from idm_env.tasks.starting_places import with_room
 from idm_env.tasks.trip_table import TripTable, read, spread
 from idm_env.tasks.trip_table import table as made
 from idm_env.types import ENTRY_SPEED, Params, State, Trips
@@ -76,7 +77,7 @@ class OpenLanesTask(LanesTask):
 
     Headways at the entries are random: half of the mean, and an exponential half. Slots make their trips again and
     again in that order, so arrivals repeat after ``vehicles / inflow``. An episode begins with free traffic up to
-    ``filled``. Whoever finds no room at his entry waits and is counted (``multilane.demand.counts``).
+    ``filled``. Whoever finds no room there, or at his entry, waits and is counted (``multilane.demand.counts``).
 
     An agent is the vehicle of a slot: it appears when its trip begins and ends with it. With PettingZoo every trip is
     an agent of its own; the joint face tells by ``info["present"]`` who is there. Commands are accelerations, held for
@@ -299,25 +300,36 @@ class OpenLanesTask(LanesTask):
         )  # fmt: skip
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
-        """Return free traffic up to ``filled``, and everybody else waiting."""
+        """Return free traffic up to ``filled``, and everybody else, and whoever has no room, waiting."""
         like = self.like(params)
         trips = self._trips(draw, like.dtype)
-        inside = trips.departs < 0
         begins = self.road.at_lane(trips.lane, trips.departs, "begins")
-        place = torch.where(inside, begins - trips.departs * self.entry_speed, begins)
-        inside = inside & (place < self.filled)
+        place = begins - trips.departs * self.entry_speed
+        inside = (trips.departs < 0) & (place < self.filled)
         length = self.constant("lengths", self._lengths, like.device, like.dtype)
+        driver = self.simulator.base.driver(dict(params[self.simulator.base.name]))
+        place = with_room(place, inside, trips.lane, length, trips.speed, driver, self._open_until(trips.lane, begins))
+        inside = inside & (place >= begins)
         state = self.simulator.state(
             torch.where(inside, place, begins), trips.speed, params, length=length,
             present=inside.to(like.dtype), lane=trips.lane,
             step=torch.full((len(place),), -self.warmup, device=like.device),
         )  # fmt: skip
         assert state.lanes is not None
-        free = self.simulator.base.driver(dict(params[self.simulator.base.name])).desired_speed.detach()
+        free = driver.desired_speed.detach()
         return EnvState(
             state._replace(lanes=state.lanes._replace(trips=trips._replace(entered=inside.long()))),
             {"free_speed": free.to(place.dtype).expand_as(place).contiguous()},
         )
+
+    def _open_until(self, lane: Tensor, like: Tensor) -> Tensor:
+        """Return up to where one can drive on a lane when an episode begins (m)."""
+        ends = self.road.closed_at(lane, like)
+        rows = (row for rule in self.rules if isinstance(rule, LaneClosure) for row in rule.closures)
+        for k, begin, _, since, until in rows:
+            if since <= 0.0 < until:
+                ends = torch.where(lane == int(k), ends.clamp_max(begin), ends)
+        return ends
 
     def _lengths(self) -> list[float]:
         return lengths(self.kinds, self._classes, self.vehicle_length)
