@@ -19,7 +19,7 @@ import tyro
 from benchmarks import command
 from idm_env.data import load
 from idm_env.tasks import make_task
-from idm_env.wrappers import FittingEnv, ParameterFitting
+from idm_env.wrappers import ParameterFitting
 
 TOLERANCE = 1.01
 MOST_EVALUATIONS = 3000
@@ -46,7 +46,7 @@ class Meter:
             raise StopIteration
 
 
-def adam(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) -> None:
+def adam(problem: ParameterFitting, meter: Meter, seed: int) -> None:
     optimiser = torch.optim.Adam(problem.parameters(), lr=0.1)
     while True:
         optimiser.zero_grad()
@@ -56,25 +56,28 @@ def adam(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) ->
         optimiser.step()
 
 
-def levenberg(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) -> None:
+def levenberg(problem: ParameterFitting, meter: Meter, seed: int) -> None:
     tangents = 1.0 + len(problem.free)
     problem.fit(starts=1, on_progress=lambda phase, step, most, rmse: meter.add(rmse, tangents))
 
 
-def guesses(env: FittingEnv, meter: Meter) -> Callable[[np.ndarray], float]:
-    def judge(action: np.ndarray) -> float:
-        env.reset()
-        error = -env.step(np.asarray(action, np.float32))[1]
+def guesses(problem: ParameterFitting, meter: Meter) -> Callable[[np.ndarray], float]:
+    """Return the error of guesses: every free parameter, scaled from its bounds to [−1, 1]."""
+    low, high = (x.numpy() for x in problem.problem.bounds)
+
+    def judge(guess: np.ndarray) -> float:
+        with torch.no_grad():
+            error = float(problem.root_mean_squared_error(low + 0.5 * (np.clip(guess, -1.0, 1.0) + 1.0) * (high - low)))
         meter.add(error, 1.0)
         return error
 
     return judge
 
 
-def cma(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) -> None:
+def cma(problem: ParameterFitting, meter: Meter, seed: int) -> None:
     import cma as library
 
-    judge = guesses(env, meter)
+    judge = guesses(problem, meter)
     search = library.CMAEvolutionStrategy(
         np.zeros(len(problem.free)), 0.5, {"bounds": [-1.0, 1.0], "seed": seed + 1, "verbose": -9}
     )
@@ -83,15 +86,15 @@ def cma(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) -> 
         search.tell(guesses_of_turn, [judge(x) for x in guesses_of_turn])
 
 
-def evolution(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) -> None:
+def evolution(problem: ParameterFitting, meter: Meter, seed: int) -> None:
     from scipy.optimize import differential_evolution
 
     limits = [(-1.0, 1.0)] * len(problem.free)
-    differential_evolution(guesses(env, meter), limits, rng=seed, tol=0.0, maxiter=10**6, polish=False)
+    differential_evolution(guesses(problem, meter), limits, rng=seed, tol=0.0, maxiter=10**6, polish=False)
 
 
-def random_search(problem: ParameterFitting, env: FittingEnv, meter: Meter, seed: int) -> None:
-    judge, generator = guesses(env, meter), np.random.default_rng(seed)
+def random_search(problem: ParameterFitting, meter: Meter, seed: int) -> None:
+    judge, generator = guesses(problem, meter), np.random.default_rng(seed)
     while True:
         judge(generator.uniform(-1.0, 1.0, len(problem.free)))
 
@@ -115,7 +118,6 @@ def main(file: tyro.conf.Positional[Path], seeds: int = 3) -> None:
     torch.set_num_threads(1)
     measured = load(file).where("in_manifest=true").where("split=train")
     task = make_task("ring")
-    env = FittingEnv(measured)
     best = ParameterFitting(task, measured)
     best.fit(starts=4)
     with torch.no_grad():
@@ -132,7 +134,7 @@ def main(file: tyro.conf.Positional[Path], seeds: int = 3) -> None:
             meter = Meter(problem.vehicle_steps, target)
             reached = False
             try:
-                method(problem, env, meter, seed)
+                method(problem, meter, seed)
             except ReachedError:
                 reached = True
             except (StopIteration, RuntimeError):

@@ -1,9 +1,8 @@
 """Differentiable, vectorised lanes of Intelligent-Driver-Model vehicles, and a closed loop with measured traffic.
 
 Public names are loaded when first used, so ``import idm_env`` is quick and imports no torch; it registers the
-Gymnasium ids ``DiffIDM-v0``, one more for each task (``DiffIDM/Ring-v0``) and ``DiffIDM-Fit-v0``. Gymnasium (1.1 and
-later) loads no plug-ins: a process that has not imported this package, such as a remote worker, finds them as
-``"idm_env:DiffIDM-v0"``.
+Gymnasium ids ``DiffIDM-v0`` and one more for each task (``DiffIDM/Ring-v0``). Gymnasium (1.1 and later) loads no
+plug-ins: a process that has not imported this package, such as a remote worker, finds them as ``"idm_env:DiffIDM-v0"``.
 """
 
 from __future__ import annotations
@@ -83,13 +82,6 @@ def _register() -> None:
                 # The checker's wrapper costs more than a step; tests run the full checker instead.
                 disable_env_checker=True,
             )
-    if "DiffIDM-Fit-v0" not in registry:
-        register(
-            id="DiffIDM-Fit-v0",
-            entry_point="idm_env.wrappers.fitting_env:FittingEnv",
-            max_episode_steps=1,
-            disable_env_checker=True,
-        )
 
 
 _register()

@@ -173,7 +173,6 @@ WAYS: dict[str, Callable[[Planted], object]] = {
     ),
     "vector": lambda p: gym.make_vec("DiffIDM-v0", num_envs=2, config=str(p.environment)),
     "parallel": lambda p: parallel_env(config=str(p.environment)),
-    "fitting": lambda p: gym.make("DiffIDM-Fit-v0", trajectories=str(p.data()), effects=str(p.model)),
     "simulate": command("simulate", "DATA", "--model", "FILE"),
     "effects": command("effects", "FILE"),
     "cite": command("effects", "FILE", "--cite"),

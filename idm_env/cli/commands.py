@@ -186,15 +186,12 @@ def plot(
         title = f"{source.name}{more}" if len(largest) > 1 else f"{source.name}: {largest[0].title}{more}"
         out.parent.mkdir(parents=True, exist_ok=True)
         figure = diagrams.figure_of(largest, title)
-        numbers = fonts.legible(figure)
+        fonts.legible(figure)
         storage.write(out, figure.savefig)
         if html:
             diagrams.write_html(out.with_suffix(".html"), largest, title)
     if more:
         console.print(f"Drawn: {more[2:]}; more with --panels.", highlight=False)
-    if numbers:
-        unreadable = ", ".join(f"{number}: {word}" for number, word in numbers.items())
-        console.print(f"No font here has these names: {unreadable}.", soft_wrap=True, highlight=False)
     if source.suffix not in (".yaml", ".yml"):
         console.print(account((r.kind, r.count) for r in repairs), soft_wrap=True, highlight=False)
     for path in written:

@@ -18,7 +18,6 @@ from idm_env.data import DataError, Episode
 from idm_env.fitting.batch import Batch
 from idm_env.fitting.prior import Prior
 from idm_env.fitting.solver import Box, Normal
-from idm_env.fitting.tangent import TangentStep, linearised_rollout
 from idm_env.kernels import dispatch
 from idm_env.parameters import Parameter, catalogue, nearest, replaced
 from idm_env.simulator import Simulator
@@ -135,11 +134,17 @@ class Problem:
 
     def simulate(self, values: dict[str, Tensor]) -> Simulated:
         """Roll the drivers out behind their measured leaders; ``values`` are [..., rows] by parameter name."""
+        if self._compiled is None:
+            return self._rollout(values)
+        params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
+        return Simulated(
+            *self._compiled.simulate(self.batch.start(self.simulator, params), params, self.batch.substeps)
+        )
+
+    def _rollout(self, values: dict[str, Tensor]) -> Simulated:
         _, driver = self.batch.columns(self.simulator)
         params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
         state = self.batch.start(self.simulator, params)
-        if self._compiled is not None:
-            return Simulated(*self._compiled.simulate(state, params, self.batch.substeps))
 
         def keep(now: State) -> tuple[Tensor, Tensor]:
             return now.gap[..., driver], now.speed[..., driver]
@@ -257,10 +262,6 @@ class Problem:
             state = self.batch.start(self.simulator, params)
         return state, params, tuple(values), compiled.start_by(state, values)
 
-    @cached_property
-    def _tangent(self) -> TangentStep:
-        return TangentStep(self.simulator)
-
     def linearise(self, own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
         """Return the residual [T, ..., rows] and its Jacobian [T, P+Q, ..., rows], by forward-mode differentiation.
 
@@ -272,26 +273,20 @@ class Problem:
                 state, params, names, self.batch.substeps, start_by=start_by
             )
             return self.residual(Simulated(gap, speed)), self._weigh(gap_by, speed_by)
-        _, driver = self.batch.columns(self.simulator)
         values = self.rows(own, shared)
-        params = self.params({name: value.unsqueeze(-1) for name, value in values.items()})
-        directions = {
-            name: torch.zeros(len(values), *value.shape, 1, dtype=value.dtype) for name, value in values.items()
-        }
-        for i, direction in enumerate(directions.values()):
-            direction[i] = 1.0
-        samples, along = linearised_rollout(
-            self._tangent,
-            lambda p: self.batch.start(self.simulator, p),
-            self._inputs,
-            params,
-            directions,
-            self.batch.steps,
-            lambda state: (state.gap[..., driver], state.speed[..., driver]),
-        )
-        every = self.batch.substeps
-        samples, along = ([x[every - 1 :: every] for x in both] for both in (samples, along))
-        return self.residual(Simulated(*samples)), self._weigh(*along)
+        point = torch.stack(list(values.values()))
+        one = torch.eye(len(point), dtype=point.dtype).reshape(2 * [len(point)] + [1] * (point.dim() - 1))
+
+        def simulated(point: Tensor) -> Simulated:
+            return self._rollout(dict(zip(values, point, strict=True)))
+
+        def along(direction: Tensor) -> tuple[Simulated, Simulated]:
+            samples, tangents = torch.func.jvp(simulated, (point,), (direction,))[:2]
+            return samples, tangents
+
+        directions = one.expand(-1, *point.shape)
+        samples, (gap_by, speed_by) = torch.func.vmap(along, out_dims=(None, 1))(directions)  # type: ignore[arg-type]
+        return self.residual(samples), self._weigh(gap_by, speed_by)
 
 
 def group_of(episodes: Sequence[Episode], by: str) -> tuple[Tensor, tuple[str, ...]]:

@@ -58,13 +58,6 @@ def rollout(
     """Return what ``Simulator.rollout`` returns, by a kernel; None where there is none for this call."""
     if not simulator.kernels:
         return None
-    short = not (inputs or every or keep)
-    if short and surroundings() is None:
-        from idm_env.kernels import repeated
-
-        after = repeated.again(simulator, state, params, steps)
-        if after is not None:
-            return after, None
     kernel = found(simulator, state, inputs, params)
     if isinstance(kernel, str):
         return None
@@ -75,10 +68,7 @@ def rollout(
     from idm_env.kernels import lanes
 
     block = min(every or lanes.BLOCK, 4 * lanes.BLOCK)
-    plan, sources = lanes.planned(kernel, simulator, state, inputs, params, steps, block, keep)
-    if short:
-        repeated.keep(plan)
-    return lanes.run(plan, sources)
+    return lanes.run(*lanes.planned(kernel, simulator, state, inputs, params, steps, block, keep))
 
 
 def refusal(simulator: Simulator, state: State, inputs: Inputs, params: Params) -> str | None:

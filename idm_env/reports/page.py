@@ -146,11 +146,8 @@ def picture(figure: Figure, caption: str, narrow: Figure | None = None) -> Block
     """
     from idm_env.reports.fonts import legible
 
-    numbers = legible(figure)
-    if narrow is not None:
-        numbers = legible(narrow, numbers)
-    if numbers:
-        caption += " " + ", ".join(f"{number}: {word}" for number, word in numbers.items()) + "."
+    for each in (figure, narrow) if narrow is not None else (figure,):
+        legible(each)
     return Block("figure", caption, _encoded(figure), narrow="" if narrow is None else _encoded(narrow))
 
 

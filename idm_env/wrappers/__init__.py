@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from idm_env.wrappers.fitting import ParameterFitting
-from idm_env.wrappers.fitting_env import FittingEnv
 from idm_env.wrappers.statistics import (
     NormalizeObservation,
     RecordEpisodeStatistics,
@@ -12,7 +11,6 @@ from idm_env.wrappers.statistics import (
 )
 
 __all__ = [
-    "FittingEnv",
     "NormalizeObservation",
     "ParameterFitting",
     "RecordEpisodeStatistics",

@@ -34,7 +34,6 @@ class ParameterFitting:
     ``parameters()`` are leaf tensors on the real line behind the parameters' bounds, the same ones for good, so that an
     optimiser stays connected; ``mean_squared_error()`` and ``root_mean_squared_error()`` are differentiable in them, or
     in values that are given; ``fit()`` is the foundation's search; ``apply()`` puts the values into the environment.
-    ``DiffIDM-Fit-v0`` is this as a Gymnasium environment.
 
     Args:
         env: An environment of this package (any face, wrapped or not), or a task.

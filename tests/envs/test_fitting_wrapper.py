@@ -1,11 +1,9 @@
 """Environments as fitting problems: hidden parameters come back by gradients, by the fit, and by guesses."""
 
 import gymnasium as gym
-import numpy as np
 import polars as pl
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env
 
 import idm_env  # noqa: F401
 from idm_env.data import Trajectories
@@ -133,39 +131,9 @@ def test_effects_of_the_environment_are_part_of_the_problem(recording):
     assert all(float(leaf.grad.abs()) > 0 for leaf in fitting.parameters())
 
 
-def test_the_gymnasium_environment(recording):
-    env = gym.make("DiffIDM-Fit-v0", trajectories=recording, free=FREE, bounds={"idm.time_gap": [0.4, 2.4]}, warmup=1)
-    check_env(env.unwrapped, skip_render_check=True)
-    _, info = env.reset(seed=0)
-    assert info["parameters"] == pytest.approx(dict(zip(FREE, env.unwrapped.values(np.zeros(3)), strict=True)))
-    assert info["bounds"]["idm.time_gap"] == (0.4, 2.4)
-    inner = env.unwrapped
-    best = np.array([1.4, 1.1, 2.6])
-    action = (2.0 * (best - inner.low) / (inner.high - inner.low) - 1.0).astype(np.float32)
-    np.testing.assert_allclose(inner.values(action), best, rtol=1e-5)
-    assert inner.values(np.zeros(3))[0] == pytest.approx(1.4)
-    _, good, terminated, _, info = env.step(action)
-    assert terminated
-    assert info["parameters"] == pytest.approx(dict(zip(FREE, best, strict=True)), rel=1e-5)
-    assert info["root_mean_squared_error"] == -good
-    env.reset()
-    bad = env.step(np.full(3, 0.5, np.float32))[1]
-    assert bad < good < 0.0
-    assert good > -0.05
-
-
-@pytest.mark.parametrize(
-    ("keywords", "words"),
-    [
-        ({}, "needs a file"),
-        ({"free": ["idm.time_gab"]}, "Did you mean 'idm.time_gap'"),
-        ({"bounds": {"idm.exponent": [1, 2]}}, "not free"),
-    ],
-)
-def test_bad_choices_are_errors(recording, keywords, words):
-    given = {} if not keywords else {"trajectories": recording}
-    with pytest.raises(ValueError, match=words):
-        gym.make("DiffIDM-Fit-v0", **given, **keywords)
+def test_a_parameter_that_there_is_not_is_an_error(recording):
+    with pytest.raises(ValueError, match=r"Did you mean 'idm.time_gap'"):
+        ParameterFitting(gym.make("DiffIDM-v0", warmup=1), recording, free=["idm.time_gab"])
 
 
 def test_what_is_no_environment_of_ours_is_an_error(recording):

@@ -152,23 +152,12 @@ def test_a_call_leaves_the_states_of_earlier_calls_alone():
         assert all(torch.equal(getattr(one, name), x) for name, x in zip(MOVING, copy, strict=True))
 
 
-def test_what_is_kept_between_calls_goes_with_its_simulator():
-    from idm_env.kernels import repeated
-
-    simulator, state, params = plain()
-    before = set(repeated._kept)
-    simulator.advance(state, {}, params)
-    (key,) = set(repeated._kept) - before
-    del simulator
-    assert key not in repeated._kept
-
-
 def test_a_step_that_is_switched_off_is_not_compiled(monkeypatch):
     simulator, state, params = plain()
     simulator.advance(state, {}, params)
-    from idm_env.kernels import repeated
+    from idm_env.kernels import lanes
 
-    monkeypatch.setattr(repeated, "again", lambda *call: pytest.fail("a compiled step ran"))
+    monkeypatch.setattr(lanes, "planned", lambda *call: pytest.fail("a compiled step ran"))
     with dispatch.off():
         simulator.advance(state, {}, params)
     monkeypatch.setenv("IDM_ENV_KERNELS", "0")
