@@ -7,8 +7,11 @@ from dataclasses import dataclass, field
 import polars as pl
 
 from idm_env.data.errors import DataError, Repair, listed, repaired
-from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TRACK, taken_as_missing
+from idm_env.data.schema import LARGEST, NUMBERS, REQUIRED, TRACK, of_run, taken_as_missing
 
+LANES_OF_A_ROAD = 100
+HIDDEN_S = 2.0
+"""A vehicle without a position is still about where it was for so long (s)."""
 LARGEST_ID = 2.0**53
 """Floats tell whole numbers apart below this only."""
 NO_LEADER = ("", "0", "-1", "nan", "none", "null", "na")
@@ -56,12 +59,13 @@ def _single(column: pl.Series, source: str) -> None:
         raise DataError(f"{source}: {column.name} holds a {kind} in every row; write one value per row.")
 
 
-def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+def numbers(frame: pl.DataFrame, source: str, labels: dict[str, int]) -> tuple[pl.DataFrame, list[Repair]]:
     """Return the frame with its numeric columns as Float64 and everything not finite as null, counted.
 
-    A number beyond `LARGEST` is as little a measurement as an infinite one. DataError for a lane between two lanes.
+    A number beyond `LARGEST` is as little a measurement as an infinite one. Lanes that are texts are numbered, as
+    ``labels`` says, which grows by those that it does not have. DataError for a lane between two lanes.
     """
-    repairs: list[Repair] = []
+    frame, repairs = numbered(frame, labels)
     for name in [*NUMBERS, "lane"]:
         if name in frame.columns and not frame[name].dtype.is_numeric():
             frame = parsed(frame, name, source)
@@ -85,6 +89,28 @@ def numbers(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair
         frame, done = taken_as_missing(frame, name, finite, "not finite", words)
         repairs += done
     return frame, repairs
+
+
+def numbered(frame: pl.DataFrame, labels: dict[str, int]) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return the frame with lanes that are texts, such as ``E0_1``, as numbers: 1 apart where only the last one is."""
+    if "lane" not in frame.columns or frame["lane"].dtype not in (pl.String, pl.Categorical, pl.Enum):
+        return frame, []
+    text = frame["lane"].cast(pl.String).str.strip_chars()
+    lanes = text.filter(~text.str.to_lowercase().is_in(MISSING_WORDS)).unique(maintain_order=True)
+    if not labels and lanes.cast(pl.Float64, strict=False).null_count() == 0:
+        return frame, []
+    new = 0
+    roads = {label.rpartition("_")[0]: number // LANES_OF_A_ROAD for label, number in labels.items()}
+    for label in lanes.drop_nulls():
+        if label not in labels:
+            road, _, index = label.rpartition("_")
+            is_of_road = bool(road) and index.isdecimal() and int(index) < LANES_OF_A_ROAD
+            number = roads.setdefault(road if is_of_road else label, len(roads) + 1)
+            labels[label] = number * LANES_OF_A_ROAD + (int(index) if is_of_road else 0)
+            new += 1
+    lane = text.replace_strict(labels, default=None, return_dtype=pl.Int64).alias("lane")
+    words = f"lanes are texts ({listed(labels, 3)}) and were numbered."
+    return frame.with_columns(lane), repaired("lane numbered", new, words)
 
 
 def parsed(frame: pl.DataFrame, name: str, source: str) -> pl.DataFrame:
@@ -166,11 +192,15 @@ def check_runs(nowhere: pl.DataFrame, source: str) -> None:
 
 @dataclass
 class Filled:
-    """How many rows a file has, over all its pieces, and in how many each column that every row needs is filled."""
+    """How many rows a file has, over all its pieces, and in how many each column that every row needs is filled.
+
+    ``lanes`` has the numbers of lanes that are texts.
+    """
 
     rows: int = 0
     whole: int = 0
     filled: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REQUIRED, 0))
+    lanes: dict[str, int] = field(default_factory=dict)
 
     def add(self, frame: pl.DataFrame) -> None:
         """Count the rows of one more piece."""
@@ -254,6 +284,31 @@ def single_holes(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
         repairs += repaired("interpolated", frame[name].null_count() - filled.null_count(), words)
         frame = frame.with_columns(filled)
     return frame, repairs
+
+
+def hidden(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows without a position of vehicles that are known to be there, with about where they are.
+
+    That is between the positions before and after, or at the nearest, no more than ``HIDDEN_S`` away from it.
+    """
+    keep = [name for name in (*TRACK, "time_s", "position_m", "lane", "ring_length_m") if name in frame.columns]
+    if not frame["position_m"].null_count():
+        return frame.select(keep).clear()
+    position, time = pl.col("position_m"), pl.col("time_s")
+    sure = pl.when(position.is_not_null()).then(time)
+    near = pl.min_horizontal(time - sure.forward_fill().over(TRACK), sure.backward_fill().over(TRACK) - time)
+    about = position.interpolate().forward_fill().backward_fill().over(TRACK)
+    rows = frame.with_columns(about, position.is_null().alias("is_hidden"), near.alias("near"))
+    return rows.filter(pl.col("is_hidden") & (pl.col("near") <= HIDDEN_S)).select(keep)
+
+
+def on_clock(rows: pl.DataFrame, frame: pl.DataFrame, steps: dict[str, float]) -> pl.DataFrame:
+    """Return ``hidden`` rows with the ``step`` of the clock of their runs, which those of ``frame`` have."""
+    if not rows.height:
+        return rows.with_columns(pl.lit(None, pl.Int64).alias("step"))
+    starts = frame.group_by("run_id").agg((pl.col("time_s") - pl.col("step") * of_run(steps)).first().alias("start"))
+    step = ((pl.col("time_s") - pl.col("start")) / of_run(steps)).round().cast(pl.Int64)
+    return rows.join(starts, on="run_id", how="inner").with_columns(step.alias("step")).drop("start")
 
 
 def without_position(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:

@@ -120,13 +120,17 @@ def gaps(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
     Raises:
         DataError: If most leaders are behind their followers, or gaps and positions are in different units.
     """
-    joined = headways(frame, source)
-    gap = pl.when(pl.col("gap_measured")).then(pl.col("gap_m")).otherwise(pl.col("headway") - pl.col("lead_length"))
-    gap = pl.when(pl.col("leader_id").is_not_null()).then(gap)
-    joined = joined.with_columns(gap.alias("gap_m")).drop("lead_position", "lead_length", "headway")
+    joined = gap_of(headways(frame, source))
     count = joined.filter(~pl.col("gap_measured") & pl.col("gap_m").is_not_null()).height
     words = "gaps were taken from the positions and lengths of the two vehicles, as gap_m is absent."
     return joined, repaired("gap from positions", count, words)
+
+
+def gap_of(joined: pl.DataFrame) -> pl.DataFrame:
+    """Return what ``headways`` gives with the gap in force in gap_m, and without what it was taken from."""
+    gap = pl.when(pl.col("gap_measured")).then(pl.col("gap_m")).otherwise(pl.col("headway") - pl.col("lead_length"))
+    gap = pl.when(pl.col("leader_id").is_not_null()).then(gap)
+    return joined.with_columns(gap.alias("gap_m")).drop("lead_position", "lead_length", "headway")
 
 
 def headways(frame: pl.DataFrame, source: str) -> pl.DataFrame:

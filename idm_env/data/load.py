@@ -14,7 +14,7 @@ import polars as pl
 
 from idm_env.data import drones, folder, ngsim, openacc, tidy, ultra_av
 from idm_env.data.errors import DataError, Repair, listed, missing_column, nearest
-from idm_env.data.names import Columns, check_columns, renamed
+from idm_env.data.names import Columns, check_columns, renamed, unread
 from idm_env.data.schema import TIDY
 from idm_env.data.trajectories import Trajectories, parted
 
@@ -52,6 +52,8 @@ def load(
     """
     frame, repairs = read(path, layout=layout, columns=columns)
     path = Path(path)
+    if any(repair.kind == drones.NO_LEADERS for repair in repairs):
+        raise DataError(f"{path.name}: pNEUMA has no leaders, so that nobody follows anybody; filter takes it.")
     try:
         return Trajectories.from_frame(frame, source=path.name, ring_length=ring_length, place=place, repairs=repairs)
     except pl.exceptions.PolarsError as error:
@@ -228,7 +230,8 @@ def _plain_layout(
         return drones.CSV[drone_layout](table, source)
     if layout == "auto":
         tidy.check(table.columns, source)
-    return tidy.read(table)
+    frame, repairs = tidy.read(table)
+    return frame, [*repairs, *unread(frame.columns)]
 
 
 def _once(table: pl.DataFrame, source: str) -> pl.DataFrame:

@@ -6,7 +6,6 @@ import math
 import re
 import shlex
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import polars as pl
@@ -46,19 +45,24 @@ Columns = Mapping[str, str] | str | None
 """``"time_s=t,position_m=x[ft]"``, or the same as a mapping from the tidy name to the file's."""
 
 
+def entries(columns: Columns) -> list[tuple[str, str]]:
+    """Return what is asked for as names and the texts behind them. DataError for what names no column."""
+    items: list[tuple[Any, ...]]
+    if isinstance(columns, str):
+        items = [tuple(part.strip() for part in text.split("=", 1)) for text in columns.split(",")]
+    else:
+        items = list((columns or {}).items()) if isinstance(columns, Mapping | None) else [()]
+    if not all(len(item) == 2 and all(isinstance(text, str) and text for text in item) for item in items):
+        text = str(columns)[:200]
+        raise DataError(f"columns = {text!r} is no text such as time_s=t,vehicle_id=car,position_m=x[ft].")
+    return [(name, text) for name, text in items]
+
+
 def pairs(columns: Columns) -> tuple[tuple[str, str], ...]:
     """Return what is asked for as pairs of a tidy name and the text behind it. DataError for what names no column."""
-    entries: list[tuple[Any, ...]]
-    if isinstance(columns, str):
-        entries = [tuple(part.strip() for part in text.split("=", 1)) for text in columns.split(",")]
-    else:
-        entries = list((columns or {}).items()) if isinstance(columns, Mapping | None) else [()]
     columns_by_name: dict[str, str] = {}
-    for pair in entries:
-        if len(pair) != 2 or not all(isinstance(text, str) and text for text in pair):
-            text = str(columns)[:200]
-            raise DataError(f"columns = {text!r} is no text such as time_s=t,vehicle_id=car,position_m=x[ft].")
-        name = SHORT.get(str(pair[0]), str(pair[0]))
+    for pair in entries(columns):
+        name = SHORT.get(pair[0], pair[0])
         if name not in SHORT.values():
             guess = nearest(name, [*SHORT, *SHORT.values()])
             cure = f"did you mean {guess!r}?" if guess else f"use one of {listed(TIDY, 20)}."
@@ -66,7 +70,7 @@ def pairs(columns: Columns) -> tuple[tuple[str, str], ...]:
         if name in columns_by_name:
             both = f"{columns_by_name[name]!r} and {pair[1]!r}"
             raise DataError(f"columns: {name} is given twice, as {both}; leave one of them out.")
-        columns_by_name[name] = str(pair[1])
+        columns_by_name[name] = pair[1]
     return tuple(columns_by_name.items())
 
 
@@ -143,24 +147,64 @@ def check_columns(columns: list[str], source: str) -> None:
 
 
 def guessed(columns: list[str]) -> str:
-    """Return the option ``--columns`` that a header may need; ``?`` where nothing fits."""
+    """Return the option ``--columns`` that a header may need, and what to know of it; ``?`` where nothing fits.
+
+    One of two coordinates is never proposed as a position along the road, nor a frame as a time without its rate.
+    """
     guesses: dict[str, str] = {}
+    remarks = []
+    plane = is_plane(columns)
     for name, pattern in GUESSES.items():
         if name in columns:
             continue
-        here = next(filter(None, map(partial(_like, name, pattern), columns)), None)
-        if here and here not in guesses.values():
-            guesses[name] = here
+        likely = [guess for column in columns if (guess := _like(name, pattern, column))]
+        if plane and name in ("position_m", "speed_mps"):
+            likely = [guess for guess in likely if not re.match(r"(?i)(local_?|v|pos_?|vel_?)?[xy](?![a-z])", guess)]
+        if likely and likely[0] not in guesses.values():
+            guesses[name] = likely[0]
         elif name in REQUIRED:
             guesses[name] = "?"
+    if plane and guesses.get("position_m") == "?":
+        remarks.append(". x and y are two coordinates: position_m is the way along the road, and lane a number")
+    frame = next((column for column in columns if re.fullmatch(r"(?i)frame_?(id|no|nr|number)?", column)), None)
+    if frame is not None and guesses.get("time_s") == "?":
+        guesses["time_s"] = f"{frame}[0.04]"
+        remarks.append(f". {frame} counts pictures: [0.04] is right for 25 a second, else give 1/rate")
     option = ",".join(f"{name}={column}" for name, column in guesses.items())
-    return f"--columns {shlex.quote(option)}"
+    return f"--columns {shlex.quote(option)}{''.join(remarks)}"
+
+
+def is_plane(columns: list[str]) -> bool:
+    """Tell whether a header has the two coordinates of a plane: x and y, as they are or as ``x_m``, ``xCenter``."""
+    noise = r"[\[(].*|(?<=[xy])_?m$|[^a-z]|pos(ition)?|utm|local|center"
+    return {"x", "y"} <= {re.sub(noise, "", column.lower()) for column in columns}
+
+
+def unread(columns: list[str]) -> list[Repair]:
+    """Return what is to be said of columns under other names that look like tidy ones which are not there."""
+    looks: dict[str, str] = {}
+    for name, pattern in GUESSES.items():
+        others = [c for c in columns if name not in columns and c not in (*TIDY, *looks) and _like(name, pattern, c)]
+        looks |= dict.fromkeys(others[:1], name)
+    listing = ", ".join(f"{column} (like {name})" for column, name in looks.items())
+    words = f"columns were not read, and look like some that are: {listing}. Name them with --columns if they are."
+    return [Repair("columns not read", len(looks), f"{len(looks)} {words}")] if looks else []
+
+
+def unit_in(column: str, name: str) -> str | None:
+    """Return the unit that the name of a column ends with, if it is one for ``name`` that is not its own."""
+    plain = _plain(column)
+    unit = next((u for u in UNITS.get(name, {}) if plain.endswith(f"_{u}")), None)
+    return unit if unit and UNITS[name][unit] != 1.0 else None
+
+
+def _plain(column: str) -> str:
+    return re.sub(r"\W+", "_", re.sub(r"\s*[\[(].*[\])]\s*$", "", column).lower()).strip("_")
 
 
 def _like(name: str, pattern: str, column: str) -> str | None:
     """Return a column with its unit, if it may be what ``name`` wants."""
-    bare = re.sub(r"\s*[\[(].*[\])]\s*$", "", column)
-    plain = re.sub(r"\W+", "_", bare.lower()).strip("_")
+    plain = _plain(column)
     unit = next((u for u in UNITS.get(name, {}) if plain.endswith(f"_{u}")), None)
     stem = plain.removesuffix(f"_{unit}") if unit else plain
     if not stem or not re.fullmatch(pattern, stem):

@@ -27,13 +27,20 @@ _NUMBERS = (
     "v_vel",
     "lane_id",
 )
+_ALIASES = (
+    "v_length=veh_len v_length=v_len v_length=veh_length v_vel=veh_velocity v_vel=veh_vel v_vel=v_velocity "
+    "v_acc=vehicle_acc v_class=veh_class total_frames=tot_frames global_time=epoch_ms preceding=preceding_veh "
+    "preceding=preceding_vehicle lane_id=lane lane_id=lane_identification section_id=section int_id=intersection"
+)
+ALIASES = {other: name for name, other in (pair.split("=") for pair in _ALIASES.split())}
+"""Names of the motorways' files, by those of the arterials' (Lankershim, Peachtree) and of copies."""
 _OTHERS = {"v_class": "vehicle_class", "direction": "direction", "section_id": "section", "int_id": "intersection"}
 
 
 def matches(columns: list[str]) -> bool:
     """Say whether the header is NGSIM's."""
-    names = {_plain(name) for name in columns}
-    return "local_y" in names and bool({"frame_id", "global_time"} & names)
+    plain = {_plain(name) for name in columns}
+    return "local_y" in plain and bool({"frame_id", "global_time"} & plain)
 
 
 def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list[Repair]]:
@@ -42,7 +49,11 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
     Raises:
         DataError: If a column that is needed is missing, or identifiers are floats too large to be told apart.
     """
-    frame = frame.rename({name: _plain(name) for name in frame.columns})
+    plain = [_plain(name) for name in frame.columns]
+    if twice := next((name for name in plain if plain.count(name) > 1), None):
+        both = " and ".join(repr(name) for name in frame.columns if _plain(name) == twice)
+        raise DataError(f"{source}: columns {both} are both NGSIM's {twice}; remove one of them.")
+    frame = frame.rename(dict(zip(frame.columns, plain, strict=True)))
     for name in ("vehicle_id", "local_y"):
         if name not in frame.columns:
             raise missing_column(name, frame.columns, source)
@@ -66,7 +77,8 @@ def read(frame: pl.DataFrame, source: str = "table") -> tuple[pl.DataFrame, list
 
 
 def _plain(name: str) -> str:
-    return name.strip().lower().replace(" ", "_")
+    plain = name.strip().lower().replace(" ", "_")
+    return ALIASES.get(plain, plain)
 
 
 def _number(frame: pl.DataFrame, name: str, source: str) -> pl.Expr:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from idm_env.data import clean, clock, directions, leaders, schema, speeds, units
+from idm_env.data import clean, clock, directions, leaders, plausible, schema, speeds, units
 from idm_env.data.errors import DataError, Repair
 from idm_env.data.names import check_columns, without_patterns
 
@@ -18,16 +18,19 @@ def rows(
     """
     check_columns(frame.columns, source)
     frame, literal = without_patterns(frame)
-    frame, repairs = clean.numbers(clean.identifiers(frame, source), source)
+    frame, repairs = clean.numbers(clean.identifiers(frame, source), source, filled.lanes)
     filled.add(frame)
     frame, lost = clean.without_empty(_with_ring(frame, ring_length, source), source)
     return frame, [*literal, *repairs, *lost]
 
 
-def measured(frame: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
-    """Return whole vehicles, sorted, by the rules for what was measured of each: lengths, laps, single speeds."""
+def measured(frame: pl.DataFrame, jumps: plausible.Jumps) -> tuple[pl.DataFrame, list[Repair]]:
+    """Return whole vehicles, sorted, by the rules for what was measured of each: lengths, laps, jumps, single speeds.
+
+    ``jumps`` counts those of the file.
+    """
     done: list[Repair] = []
-    for rule in (units.implausible, speeds.unwrapped, speeds.lengths):
+    for rule in (units.implausible, speeds.unwrapped, jumps.rule, speeds.lengths):
         frame, repairs = rule(frame)
         done += repairs
     return frame, done
@@ -56,20 +59,27 @@ def prepare(
     done += sorted_
     clean.check_recordings(twice, count, source)
     units.check(frame, source)
-    frame = then(measured(frame))
+    jumps = plausible.Jumps()
+    frame = then(measured(frame, jumps))
+    jumps.check(source)
+    frame = jumps.with_leaders(frame)
     frame = then(clean.single_holes(frame))
+    hidden = clean.hidden(frame)
     frame = then(clean.without_position(frame))
     steps = clock.steps_of(clock.paces(frame), frame["run_id"].unique(), source)
     frame = then(clock.regularise(frame, steps))
     frame = then(speeds.complete(frame, steps))
-    frame = then(leaders.steady(then(_led(_with_lane(frame), source))))
+    frame = then(leaders.steady(then(_led(_with_lane(frame), source, clean.on_clock(hidden, frame, steps)))))
     frame = then(leaders.gaps(frame, source))
+    overlaps = plausible.Overlaps()
+    overlaps.add(frame)
+    overlaps.check(source)
     if frame["leader_id"].null_count() == frame.height:
         raise DataError(f"{source}: nobody follows anybody; two vehicles must share a run and a lane at one time.")
     return schema.check(_arranged(frame), source), steps, done
 
 
-def _led(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
+def _led(frame: pl.DataFrame, source: str, hidden: pl.DataFrame) -> tuple[pl.DataFrame, list[Repair]]:
     if "leader_id" in frame.columns:
         frame, counts = leaders.named_leaders(frame, frame)
         if (counts["state"] == "none").all():
@@ -78,7 +88,10 @@ def _led(frame: pl.DataFrame, source: str) -> tuple[pl.DataFrame, list[Repair]]:
                 "column to have leaders derived from lane and position."
             )
         return frame, leaders.named(counts, source)
-    frame = leaders.derive(frame.with_columns(leaders.in_lane(pl.col("lane").is_not_null().any().over("run_id"))))
+    everybody = pl.concat([frame, hidden], how="diagonal").with_columns(
+        leaders.in_lane(pl.col("lane").is_not_null().any().over("run_id"))
+    )
+    frame = leaders.derive(everybody).head(frame.height)  # who is there without a position is still ahead of somebody
     followers = frame.filter(pl.col("leader_id").is_not_null()).select(schema.TRACK).n_unique()
     return frame.drop("in_lane"), [leaders.derived(followers, frame["lane"].null_count() < frame.height)]
 

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 import polars as pl
 
-from idm_env.data import Repair, clean, clock, directions, leaders, prepare, units
+from idm_env.data import Repair, clean, clock, directions, leaders, plausible, prepare, units
 from idm_env.data.errors import Counted, repaired
 from idm_env.data.load import batches
 from idm_env.data.names import Columns
@@ -150,12 +150,15 @@ class Spool:
         number = index.select(*TRACK, "number", "chunk")
         buckets = self._partition(files, "vehicles", pl.col("chunk") // per_bucket, number)
         paces, twice, unsorted = [], [], int(index["backward"].sum())
+        self._jumps = plausible.Jumps()
         for chunk in range(self.chunks):
             parts = buckets.get(chunk // per_bucket, [])
             rows = pl.scan_parquet(parts, glob=False, missing_columns="insert", extra_columns="ignore")
             frame, repairs, moved = clean.ordered(rows.filter(pl.col("chunk") == chunk).collect())
             self._counted.add([repair for repair in repairs if repair.kind != "time not increasing"])
-            frame, repairs = prepare.measured(frame)
+            frame, repairs = prepare.measured(frame, self._jumps)
+            frame, lost = clean.without_position(frame)
+            repairs += lost
             self._counted.add(repairs)
             paces.append(clock.paces(frame))
             twice.append(moved)
@@ -166,6 +169,7 @@ class Spool:
         clean.check_recordings(pl.concat(twice), int(index["rows"].sum()), self.source)
         units.check(clean.ordered(self._sample)[0], self.source, longest_step=LONGEST_STEP_S)
         del self._sample
+        self._jumps.check(self.source)
         _remove(part for parts in buckets.values() for part in parts)
         return clock.steps_of(pl.concat(paces), index["run_id"].unique(), self.source)
 
@@ -175,10 +179,11 @@ class Spool:
         laned = dict(index.group_by("run_id").agg(pl.col("lane").is_not_null().any()).rows())
         named: list[pl.DataFrame] = []
         files = []
+        vehicles, overlaps = self._jumps.vehicles(index), plausible.Overlaps()
         for chunk in range(self.chunks):
             frame = pl.read_parquet(self.shelf.path(chunk), glob=False)
             if "leader_id" in frame.columns:
-                frame, counts = leaders.named_leaders(frame, index)
+                frame, counts = leaders.named_leaders(self._jumps.with_leaders(frame), vehicles)
                 named.append(counts)
             ticks, _ = clock.regularise(frame, steps, starts, BRIDGED_S)
             files.append(self.folder / f"ticks-{chunk:05d}.parquet")
@@ -196,11 +201,12 @@ class Spool:
                 lane = pl.col("run_id").replace_strict(laned, return_dtype=pl.Boolean)
                 frame = frame if "lane" in frame.columns else frame.with_columns(pl.lit(None, pl.Int64).alias("lane"))
                 frame = leaders.derive(frame.with_columns(leaders.in_lane(lane)))
-            if not files:
-                leaders.headways(frame, self.source)  # refuses what is the wrong way round
+            headways = leaders.headways(frame, self.source)  # refuses what is the wrong way round
+            overlaps.add(leaders.gap_of(headways))
             files.append(self.folder / f"led-{bucket:05d}.parquet")
             storage.write(files[-1], frame.select(*TRACK, "chunk", "step", "leader_id").write_parquet)
             _remove(parts)
+        overlaps.check(self.source)
         by_chunk = self._partition(files, "led", pl.col("chunk"))
         followers = 0
         for chunk, parts in by_chunk.items():

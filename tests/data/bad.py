@@ -74,7 +74,7 @@ TABLES: dict[str, tuple[pl.DataFrame, str]] = {
     "one vehicle, and it falls": (BARE.filter(pl.col("vehicle_id") == 1).with_columns(position_m=FALLING), "falls"),
     "both directions": (_both_ways(), READ),
     "both directions in one lane": (_both_ways().with_columns(lane=pl.lit(1)), READ),
-    "laps that end before they began": (_laps(False), READ),
+    "laps without a ring": (_laps(False), "position_m falls in 2 of 2 tracks"),
     "a ring": (_laps(True), READ),
     "a ring of no length": (_laps(True).with_columns(ring_length_m=pl.lit(-3.0)), "ring_length_m holds values"),
     # runs and identifiers
@@ -121,7 +121,7 @@ TABLES: dict[str, tuple[pl.DataFrame, str]] = {
     "frames": (_wrong(time_s=10.0), "frames"),
     "milliseconds": (_wrong(time_s=1000.0), "milliseconds"),
     "milliseconds without speeds": (_wrong(time_s=1000.0).drop("speed_mps"), "milliseconds"),
-    "microsteps": (_wrong(time_s=1e-3).drop("speed_mps"), "1 % of speeds exceed"),
+    "microsteps": (_wrong(time_s=1e-3).drop("speed_mps"), "position_m changes by more than"),
     "gaps in feet": (PLATOON.with_columns(gap_m=_gap(3.281)), "gap_m looks like feet"),
     "positions in feet, gaps in metres": (
         PLATOON.with_columns(pl.col("position_m") * 3.281, gap_m=_gap(16.5 / 16), length_m=11.5).drop("speed_mps"),

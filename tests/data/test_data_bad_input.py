@@ -244,7 +244,7 @@ def test_files_that_cannot_be_read(tmp_path) -> None:
     (tmp_path / "truncated.csv.gz").write_bytes(b"\x1f\x8b\x08\x00rubbish")
     (tmp_path / "empty.csv").write_bytes(b"")
     (tmp_path / "header.csv").write_text("vehicle_id,time_s,position_m\n")
-    (tmp_path / "table.xlsx").write_text("x")
+    (tmp_path / "table.doc").write_text("x")
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     (tmp_path / "spelled.csv").write_text("Vehicle ID,Time [s],Position (m)\n1,0.1,2.5\n")
     (tmp_path / "binary.csv").write_bytes(bytes(range(256)) * 4)
@@ -256,7 +256,7 @@ def test_files_that_cannot_be_read(tmp_path) -> None:
     assert "cannot be read" in message(tmp_path / "truncated.csv.gz")
     assert "is empty" in message(tmp_path / "empty.csv")
     assert "no rows" in message(tmp_path / "header.csv")
-    assert "unknown extension" in message(tmp_path / "table.xlsx")
+    assert "unknown extension" in message(tmp_path / "table.doc")
     assert "no known layout" in message(tmp_path / "other.csv")
     assert "--columns 'vehicle_id=Vehicle ID,time_s=Time [s],position_m=Position (m)'" in message(
         tmp_path / "spelled.csv"

@@ -81,13 +81,13 @@ def test_pneuma_gives_tracks(tmp_path: Path) -> None:
     """One vehicle per line, degrees and km/h; broken lines are counted."""
     latitude = 37.98 + np.degrees(WAY / 6_371_000.0)
     cells = np.stack([latitude, np.full(STEPS, 23.73), SPEED * 3.6, TIME * 0, TIME * 0, TIME], 1).ravel()
-    line = "1; Car; 300.0; 70.0; " + "; ".join(f"{x:.9f}" for x in cells) + ";"
+    line = f"1; Car; {WAY[-1]:.2f}; 70.0; " + "; ".join(f"{x:.9f}" for x in cells) + ";"
     head = "track_id; type; traveled_d; avg_speed; lat; lon; speed; lon_acc; lat_acc; time\n"
     (tmp_path / "p.csv").write_text(head + line + "\n2; Bus; 1; 2; 37.9; 23.7\n")
     table, repairs = read(tmp_path / "p.csv")
     assert np.abs(table["position_m"].to_numpy() - WAY).max() < 0.05
     assert np.abs(table["speed_mps"].to_numpy() - SPEED).max() < 1e-6
-    assert {r.kind: r.count for r in repairs} == {"length assumed": 1, "broken line": 1}
+    assert {r.kind: r.count for r in repairs} == {"length assumed": 1, "broken line": 1, "no leaders": 1}
     with pytest.raises(DataError, match="nobody follows anybody"):
         load(tmp_path / "p.csv")
 

@@ -1,0 +1,245 @@
+"""What practitioners bring, made small: read as it is meant, or refused with the cure that helps; never wrongly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from idm_env.data import DataError, Trajectories, load
+from idm_env.data.load import read
+from idm_env.trajectories.spool import Spool
+from tests.data.tables import kinds
+from tests.test_commands_read_alike import alike, tracks
+
+TIMES = np.arange(6.0)
+WAY = 10.0 * TIMES + 0.2 * TIMES**2
+SPEED = 10.0 + 0.4 * TIMES
+STARTS = (200.0, 170.0, 140.0)
+
+
+def table(starts: tuple[float, ...] = STARTS) -> pl.DataFrame:
+    """Vehicles 0, 1, 2 in one lane, 30 m apart."""
+    parts = [
+        pl.DataFrame({"vehicle_id": n, "time_s": TIMES, "position_m": start + WAY, "lane": 1})
+        for n, start in enumerate(starts)
+    ]
+    return pl.concat(parts)
+
+
+def text(mark: str = ",", **options: Any) -> str:
+    return table().write_csv(separator=mark, **options)
+
+
+def moved(vehicle: int, since: float, by: float) -> pl.DataFrame:
+    late = (pl.col("vehicle_id") == vehicle) & (pl.col("time_s") >= since)
+    return table().with_columns(
+        pl.when(late).then(pl.col("position_m") + by).otherwise("position_m").alias("position_m")
+    )
+
+
+def leaders(found: Trajectories) -> set[tuple[str, str | None]]:
+    return set(found.table.select("vehicle_id", "leader_id").rows())
+
+
+CHAIN = {("0", None), ("1", "0"), ("2", "1")}
+
+
+def as_tracks(path: Path, tmp_path: Path, columns: str | None = None) -> Any:
+    return tracks(Spool(path, tmp_path / "spool", "auto", 2, columns=columns))
+
+
+def read_alike(path: Path, tmp_path: Path, columns: str | None = None) -> Trajectories:
+    """Return what is read of a file, which commands that read it piece by piece read likewise."""
+    before = path.read_bytes()
+    found = load(path, columns=columns)
+    alike(tracks(found), as_tracks(path, tmp_path, columns))
+    assert path.read_bytes() == before
+    return found
+
+
+def refused(path: Path, tmp_path: Path, columns: str | None = None) -> str:
+    """Return the one line with which a file is refused, whole and piece by piece."""
+    told = []
+    for reader in (lambda: load(path, columns=columns), lambda: as_tracks(path, tmp_path, columns)):
+        with pytest.raises(DataError) as caught:
+            reader()
+        told.append(str(caught.value))
+    assert told[0] == told[1] and "\n" not in told[0]
+    return told[0]
+
+
+@pytest.mark.parametrize("rows", [[8], [8, 9], [6], [11], [0, 8, 16]])
+@pytest.mark.parametrize("value", [-9999.0, 9999.0, -1.0, 1e6])
+def test_a_number_that_stands_for_no_value_is_no_position(rows: list[int], value: float, tmp_path: Path) -> None:
+    numbers = pl.int_range(pl.len()).is_in(rows)
+    spoilt = table().with_columns(pl.when(numbers).then(value).otherwise("position_m").alias("position_m"))
+    spoilt.write_csv(tmp_path / "a.csv")
+    found = load(tmp_path / "a.csv")
+    assert kinds(found.repairs)["position jumps"] == len(rows)
+    assert found.table["position_m"].is_between(139.0, 256.0).all()
+    assert found.table["gap_m"].drop_nulls().is_between(24.0, 27.0).all()
+    assert leaders(found) <= {*CHAIN, ("1", None), ("2", None), ("2", "0")}
+
+
+def test_an_identifier_that_is_used_again_is_two_tracks(tmp_path: Path) -> None:
+    moved(1, 3.0, 400.0).write_csv(tmp_path / "a.csv")
+    found = read_alike(tmp_path / "a.csv", tmp_path)
+    assert kinds(found.repairs)["track split"] == 1
+    assert leaders(found) == {("0", None), ("0", "1.1"), ("1", "0"), ("1.1", None), ("2", "0"), ("2", "1")}
+
+
+def test_leaders_that_a_file_names_are_those_of_the_time(tmp_path: Path) -> None:
+    leader = pl.when(pl.col("vehicle_id") > 0).then(pl.col("vehicle_id") - 1)
+    moved(1, 3.0, 25.0).filter(pl.col("vehicle_id") < 3).with_columns(leader_id=leader).write_csv(tmp_path / "a.csv")
+    found = read_alike(tmp_path / "a.csv", tmp_path)
+    assert {("2", "1"), ("2", "1.1")} <= leaders(found)
+
+
+@pytest.mark.parametrize("fall", [210.0, 20.0])
+def test_positions_that_begin_anew_are_asked_about(fall: float, tmp_path: Path) -> None:
+    """Along an edge, or on a lap: of some tracks it is told, of one it is counted."""
+    pl.concat(
+        [moved(0, 1.0, -fall).filter(pl.col("vehicle_id") == 0), moved(1, 4.0, -fall).filter(pl.col("vehicle_id") > 0)]
+    ).write_csv(tmp_path / "a.csv")
+    told = refused(tmp_path / "a.csv", tmp_path)
+    assert "position_m falls in 2 of 3 tracks (vehicle 0 of run 0 at t = 1 s" in told and "--ring-length" in told
+    moved(1, 3.0, -fall).write_csv(tmp_path / "b.csv")
+    assert kinds(load(tmp_path / "b.csv").repairs)["track split"] == 1
+
+
+def test_rows_of_many_cars_under_one_name_are_refused(tmp_path: Path) -> None:
+    rows = pl.concat([table(tuple(900.0 - 30 * n for n in range(60)))])
+    mixed = rows.with_columns(pl.col("vehicle_id").shuffle(seed=1)).unique(
+        ["vehicle_id", "time_s"], maintain_order=True
+    )
+    mixed.write_csv(tmp_path / "a.csv")
+    assert "is vehicle_id of one vehicle each?" in refused(tmp_path / "a.csv", tmp_path)
+
+
+def test_bodies_in_one_place_are_asked_about(tmp_path: Path) -> None:
+    """The second lane of a file whose lane is not named."""
+    beside = table((197.0, 166.0)).with_columns(pl.col("vehicle_id") + 3)
+    pl.concat([table(), beside]).drop("lane").write_csv(tmp_path / "a.csv")
+    told = refused(tmp_path / "a.csv", tmp_path)
+    assert told.endswith("overlap in 12 of 24 rows: is a lane missing, or is position_m one of two coordinates?")
+
+
+def test_no_measured_file_is_alarmed_about(measured: Callable[[str], Path]) -> None:
+    names = [
+        "highsim_i75_lanes.parquet", "ngsim_i80_lanes.parquet", "ngsim_i80_pairs.parquet", "ngsim_i80_rawlike.csv.gz",
+        "openacc_astazero.parquet", "openacc_zalazone.parquet", "opencf_test_pairs.parquet", "tgsim_pairs.parquet",
+        "transfollower_ngsim_pairs.parquet",
+    ]  # fmt: skip
+    for name in names:
+        assert not kinds(load(measured(name)).repairs).keys() & {"position jumps", "track split"}, name
+
+
+FCD = pl.DataFrame({
+    "timestep_time": np.repeat(TIMES, 3), "vehicle_id": ["f.0", "f.1", "f.2"] * 6,
+    "vehicle_x": np.repeat(0.8 * WAY, 3), "vehicle_y": np.repeat(0.6 * WAY, 3), "vehicle_speed": np.repeat(SPEED, 3),
+    "vehicle_pos": np.repeat(WAY, 3) + np.tile([200.0, 197.0, 165.0], 6), "vehicle_lane": ["E0_0", "E0_1", "E0_0"] * 6,
+})  # fmt: skip
+NAMED = "time_s=timestep_time,vehicle_id=vehicle_id,position_m=vehicle_pos,speed_mps=vehicle_speed"
+
+
+ARTERIAL = [
+    "Vehicle_ID",
+    "Frame_ID",
+    "Tot_Frames",
+    "Epoch_ms",
+    "Local_X",
+    "Local_Y",
+    "Global_X",
+    "Global_Y",
+    "Veh_Len",
+    "Veh_Wid",
+    "Veh_Class",
+    "Veh_Velocity",
+    "Vehicle_Acc",
+    "Lane_ID",
+    "Org_Zone",
+    "Dest_Zone",
+    "Intersection",
+    "Section",
+    "Direction",
+    "Movement",
+    "Preceding_Veh",
+    "Following_Veh",
+    "Spacing",
+    "Headway",
+]
+
+
+def ngsim(lengths: tuple[float, ...], columns: int) -> list[list[float]]:
+    """Rows of vehicles 1, 2, 3 in feet and frames; columns by the original files' order."""
+    rows = []
+    for n, (start, length) in enumerate(zip(STARTS, lengths, strict=True)):
+        for time, way, speed in zip(TIMES, WAY, SPEED, strict=True):
+            ids = [n + 1, 10 + 10 * time, 60, 1163033200 + 1000 * time]
+            head = [*ids, 6.0, (start + way) / 0.3048, 1.0, 1.0, length, 7, 2, speed / 0.3048, 1.3, 1]
+            tail = [n, 0, 0, 0]
+            rows.append([*head, *([101, 201, 0, 2, 2, 1] if columns == 24 else []), *tail])
+    return rows
+
+
+def test_names_of_the_arterials_of_ngsim_are_read(tmp_path: Path) -> None:
+    rows = ngsim((40.0, 14.0, 14.0), 24)
+    pl.DataFrame(rows, schema=ARTERIAL, orient="row").with_columns(
+        pl.col("Vehicle_ID", "Frame_ID", "Lane_ID", "Preceding_Veh").cast(pl.Int64)
+    ).write_csv(tmp_path / "a.csv")
+    found = read_alike(tmp_path / "a.csv", tmp_path)
+    assert sorted(set(found.table["length_m"].round(2))) == [4.27, 12.19]
+    gaps = found.table.filter(pl.col("time_s") == 1.0)["gap_m"]
+    assert gaps[1] == pytest.approx(30 - 12.19, abs=0.02) and gaps[2] == pytest.approx(25.73, abs=0.02)
+    assert "leaders derived" not in kinds(found.repairs)
+
+
+def on_a_plane(path: Path, names: tuple[str, ...] = ("track_id", "x", "y", "psi_rad")) -> pl.DataFrame:
+    """Two vehicles on a road at 30°, 35 m apart, and one on a road at 75°."""
+    parts = []
+    for n, (angle, start) in enumerate(((30.0, 200.0), (30.0, 165.0), (75.0, 10.0))):
+        a = np.radians(angle)
+        parts.append(pl.DataFrame({
+            names[0]: n + 1, "frame_id": 1 + 10 * TIMES.astype(int), "timestamp_ms": 100 + (1000 * TIMES).astype(int),
+            "agent_type": "car", names[1]: (start + WAY) * np.cos(a), names[2]: (start + WAY) * np.sin(a),
+            "vx": SPEED * np.cos(a), "vy": SPEED * np.sin(a), names[3]: a, "length": 4.8, "width": 1.8,
+        }))  # fmt: skip
+    pl.concat(parts).write_csv(path)
+    return pl.concat(parts)
+
+
+def test_a_cure_never_names_one_of_two_coordinates_nor_a_frame_without_a_rate(tmp_path: Path) -> None:
+    on_a_plane(tmp_path / "a.csv", ("track_id", "x", "y", "yaw"))
+    told = refused(tmp_path / "a.csv", tmp_path)
+    assert "position_m=?" in told and "x and y are two coordinates" in told and "position_m=x" not in told
+    pl.DataFrame({"car": [1, 1], "frame": [1, 2], "s": [0.0, 1.0]}).write_csv(tmp_path / "b.csv")
+    told = refused(tmp_path / "b.csv", tmp_path)
+    assert "time_s=frame[0.04]" in told and "give 1/rate" in told
+
+
+def test_a_slow_way_of_pneuma_is_that_of_its_speeds(tmp_path: Path) -> None:
+    """At 2 m/s and 45°, in degrees of six decimals, between which distances add up to 17 % more."""
+    time = np.arange(0, 6.0, 0.04)
+    degree = np.degrees(2.0 * time / 6_371_000.0 * np.sqrt(0.5))
+    points = zip(37.977 + degree, 23.737 + degree / np.cos(np.radians(37.977)), time, strict=True)
+    line = "; ".join(f"{a:.6f}; {b:.6f}; 7.2000; 0.0; 0.0; {t:.6f}" for a, b, t in points)
+    head = "track_id; type; traveled_d; avg_speed; lat; lon; speed; lon_acc; lat_acc; time\n"
+    (tmp_path / "a.csv").write_text(f"{head}1; Car; 11.92; 7.200000; {line};\n")
+    found, _ = read(tmp_path / "a.csv")
+    assert found["position_m"].max() == pytest.approx(11.92, rel=0.02)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match=r"pNEUMA has no leaders, .*; filter takes it\.$"):
+        load(tmp_path / "a.csv")
+
+
+def test_lanes_that_are_labels_are_lanes(tmp_path: Path) -> None:
+    FCD.write_csv(tmp_path / "a.csv", separator=";")
+    found = read_alike(tmp_path / "a.csv", tmp_path, f"{NAMED},lane=vehicle_lane")
+    assert leaders(found) == {("f.0", None), ("f.1", None), ("f.2", "f.0")}
+    assert np.allclose(found.table["gap_m"].drop_nulls(), 30.5)
+    told = refused(tmp_path / "a.csv", tmp_path, NAMED)
+    assert "vehicles overlap in 6 of 12 rows: is a lane missing" in told
