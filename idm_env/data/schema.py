@@ -87,7 +87,7 @@ def spans(joined: np.ndarray, usable: np.ndarray) -> list[tuple[int, int]]:
 
 def taken_as_missing(
     frame: pl.DataFrame, name: str, good: pl.Series, kind: str, words: str
-) -> tuple[pl.DataFrame, list[Repair]]:  # fmt: skip
+) -> tuple[pl.DataFrame, list[Repair]]:
     """Return a table without the values of a column that are not good [rows], and how many these were."""
     count = frame.height - int(good.sum())
     done = repaired(kind, count, f"values of {name} {words} taken as missing.")

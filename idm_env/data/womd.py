@@ -122,7 +122,7 @@ def _agent(item: dict[str, Any], number: int) -> Agent:
     length, width = float(_last(item.get("length", 4.5))), float(_last(item.get("width", 2.0)))
     return Agent(
         int(item.get("id", number)), str(item["type"]).lower(), length, width, position, heading, velocity, valid
-    )  # fmt: skip
+    )
 
 
 def _last(value: Any) -> Any:

@@ -38,7 +38,7 @@ from idm_env.effects import (
     make,
     named,
     register,
-)  # fmt: skip
+)
 from idm_env.jobs import storage
 from idm_env.jobs.progress import OnProgress, silent
 from idm_env.validation import nearest

@@ -272,9 +272,7 @@ def first_screen(d: Discovery, size: tuple[float, float] = (9.0, 4.0)) -> Figure
     follower = typical(d)
     if follower is None:
         return None
-    figure, (above, below) = plt.subplots(
-        2, 1, figsize=size, sharex=True, height_ratios=(3, 2), layout="constrained"
-    )  # fmt: skip
+    figure, (above, below) = plt.subplots(2, 1, figsize=size, sharex=True, height_ratios=(3, 2), layout="constrained")
     handles = []
     for i, (name, judged, colour, style) in enumerate(named(d)):
         time, measured, simulated = _trace(judged, follower)

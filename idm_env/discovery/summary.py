@@ -303,9 +303,8 @@ def _known(final: Solution, intervals: np.ndarray, base: int) -> list[result.Giv
 
 def _candidates(rounds: Sequence[Round], refused: dict[str, str]) -> list[result.Candidate]:
     rows = [
-        _candidate(number, this, int(i))
-        for number, this in enumerate(rounds, 1) for i in np.argsort(-this.tested.gain)
-    ]  # fmt: skip
+        _candidate(number, this, int(i)) for number, this in enumerate(rounds, 1) for i in np.argsort(-this.tested.gain)
+    ]
     return rows + [
         result.Candidate(0, None, name, True, None, None, (None, None), None, {}, {}, reason)
         for name, reason in refused.items()
@@ -394,9 +393,7 @@ def _data(
         smallest_p_value=smallest_p(units(rows.records).run),
         windows=len(rows),
         gap_noise_m=float(np.median([noise_sigma(e.gap_m) for e in prepared.episodes])),
-        residual_autocorrelation=float(
-            np.mean(residual[:, 1:] * residual[:, :-1]) / max(np.mean(residual**2), 1e-12)
-        ),
+        residual_autocorrelation=float(np.mean(residual[:, 1:] * residual[:, :-1]) / max(np.mean(residual**2), 1e-12)),
         share_standing=float(standing.mean()),
         share_free=float((free & ~standing).mean()),
         share_approaching=float((~free & (closing > 1.0) & ~standing).mean()),
@@ -405,7 +402,7 @@ def _data(
         unexplained_gain=[float(r.left.mean()) for r in rounds],
         horizon_s=rows.steps * prepared.dt,
         lap_m=prepared.period or None,
-    )  # fmt: skip
+    )
 
 
 def at_bounds(solution: Solution) -> dict[str, int]:

@@ -33,14 +33,14 @@ ERRORS = {
 CHANGES = {
     "acceleration": ("vehicles accelerate less", "vehicles accelerate more", "acceleration", "+ c"),
     "time_gap": ("drivers keep shorter time gaps", "drivers keep longer time gaps", "time gap", "T → T (1 + k)"),
-    "desired_speed": (
-        "drivers want to go slower", "drivers want to go faster", "desired speed", "v0 → v0 (1 + k)"
-    ),
+    "desired_speed": ("drivers want to go slower", "drivers want to go faster", "desired speed", "v0 → v0 (1 + k)"),
     "accel_and_decel": (
-        "drivers accelerate and brake softer", "drivers accelerate and brake harder", "acceleration and braking",
+        "drivers accelerate and brake softer",
+        "drivers accelerate and brake harder",
+        "acceleration and braking",
         "a → a (1 + k), b → b (1 + k)",
     ),
-}  # fmt: skip
+}
 """Of what can be located without a name: what drivers do with less and more of it, its noun, and its equation."""
 ALONG = {
     "position": "place", "time": "time", "speed": "speed", "gap": "gap", "closing_speed": "closing speed",
@@ -163,7 +163,7 @@ def reason(refusal: Refusal | None, tried: str = "", law: str = "IDM") -> str:
             "and no candidate does"
         ),
         Reason.LAW: f"another law predicts better than all that was added to {law}",
-    }[refusal.reason]  # fmt: skip
+    }[refusal.reason]
 
 
 def headline(

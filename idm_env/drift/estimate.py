@@ -83,9 +83,7 @@ class DriftSettings:
     def unpacked(self, x: np.ndarray) -> DriftSettings:
         """Return settings from such logarithms."""
         k, y = len(self.sigma), np.exp(x)
-        return replace(
-            self, sigma=y[:k], memory_time=y[k : 2 * k], noise=y[2 * k : -1], jitter=float(y[-1])
-        )  # fmt: skip
+        return replace(self, sigma=y[:k], memory_time=y[k : 2 * k], noise=y[2 * k : -1], jitter=float(y[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,9 +233,7 @@ def estimate(
         settings = _maximised(around, settings, limits)
         on_progress("drift", number + 1, rounds, around(settings))
         path = _path(around, settings)
-    return Estimate(
-        drivers, settings, _names(drivers), _errors(around, settings, limits), around(settings), path
-    )  # fmt: skip
+    return Estimate(drivers, settings, _names(drivers), _errors(around, settings, limits), around(settings), path)
 
 
 def _names(drivers: MeasuredDrivers) -> tuple[str, ...]:
@@ -291,7 +287,7 @@ def predicted(path: Path, settings: DriftSettings, dt: float, mean: np.ndarray, 
     unsure[1:] = np.sqrt(settings.sigma**2 + decay**2 * (np.maximum(variance, 0.0) - settings.sigma**2))
     return replace(
         path, gap=np.maximum(mean[..., 0], 0.2), speed=np.maximum(mean[..., 1], 0.0), level=level, unsure=unsure
-    )  # fmt: skip
+    )
 
 
 def _errors(around: Likelihood, settings: DriftSettings, limits: np.ndarray) -> np.ndarray:

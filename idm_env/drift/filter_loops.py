@@ -91,7 +91,7 @@ def update(m, p, i, y, r2, gain):
 @compiled
 def likelihood(
     length, measured_gap, measured_speed, to, by_state, by_level, gap, speed, level, decay, sigma, noise, jitter, skip
-):  # fmt: skip
+):
     """Return the log-likelihood of every row; innovations of the first ``skip`` samples do not count."""
     rows, k = gap.shape[1], decay.shape[0]
     d = 2 + k
@@ -127,7 +127,7 @@ def begin(m, p, gap, speed, sigma, noise):
 @compiled
 def smooth(
     length, measured_gap, measured_speed, to, by_state, by_level, gap, speed, level, decay, sigma, noise, jitter
-):  # fmt: skip
+):
     """Return filtered means and covariances [T, rows, d(, d)] and smoothed means [T, rows, d].
 
     The modified Bryson–Frazier recursion: adjoints of the innovations, backwards, need no inverse.

@@ -78,7 +78,7 @@ class _Sort:
 def _estimated(sort: _Sort, progress: OnProgress) -> dict[str, Tensor]:
     return estimate(
         sort.simulator, sort.smooth, IDM_NAMES, usual(IDM_NAMES), measured=sort.measured, noise=sort.noise
-    ).numbers()  # fmt: skip
+    ).numbers()
 
 
 def tell(

@@ -116,9 +116,7 @@ class MeasuredDrivers:
             with torch.no_grad():
                 moves = (torch.tensor(off), -torch.tensor(off))
                 ends = [[*level[:slot], level[slot] + move, *level[slot + 1 :]] for move in moves]
-                high, low = (
-                    np.stack([x.numpy() for x in self._stepped(path, gap, speed, end)], -1) for end in ends
-                )  # fmt: skip
+                high, low = (np.stack([x.numpy() for x in self._stepped(path, gap, speed, end)], -1) for end in ends)
             to += (high + low - 2.0 * middle) / 6.0
             slope = (high - low) / (2.0 * np.maximum(off, NARROW))[..., None]
             by_level[..., slot] = np.where(off[..., None] > NARROW, slope, by_level[..., slot])

@@ -206,9 +206,7 @@ class GapAcceptance(Effect):
             return torch.where(desire > 0, safe, -COMMANDED)
 
         sure, desires = none + COMMANDED, (wished(left), wished(right))
-        return Wish(
-            none, none, sure, sure, None, None, despite(left, desires[0]), despite(right, desires[1]), *desires
-        )  # fmt: skip
+        return Wish(none, none, sure, sure, None, None, despite(left, desires[0]), despite(right, desires[1]), *desires)
 
 
 @dataclass(frozen=True)

@@ -194,10 +194,10 @@ def blocks(estimates: Estimates, rows: Sequence[dict[str, Any]], shares: list[di
 def _row(estimates: Estimates, row: dict[str, Any]) -> dict[str, Any]:
     name = row["group"] if "group" in row else f"{row['run_id']}/{row['vehicle_id']}"
     shown: dict[str, Any] = {
-        "driver": name, "episodes": row["episodes"], "gap RMSE (m)": page.Cell(
-            f"{row['gap_rmse_m']:.2f}", row["gap_rmse_m"]
-        ),
-    }  # fmt: skip
+        "driver": name,
+        "episodes": row["episodes"],
+        "gap RMSE (m)": page.Cell(f"{row['gap_rmse_m']:.2f}", row["gap_rmse_m"]),
+    }
     on, doubtful = (row["bounds"] or "").split(), (row["not_identified"] or "").split()
     for name, p in zip(estimates.names, estimates.parameters, strict=True):
         value, spread = row[name], row[f"{name}_error"]

@@ -182,9 +182,7 @@ def _levenberg(
         own, shared = fleet.own[0].expand(len(problem.groups), -1), fleet.shared[0]
     if starts > 1 and not problem.shared:
         several = _spread(problem, own, starts, seed)
-        first = _phase(
-            "starts", problem, several, shared.expand(starts, -1), min(10, iterations), saved, on_progress
-        )  # fmt: skip
+        first = _phase("starts", problem, several, shared.expand(starts, -1), min(10, iterations), saved, on_progress)
         best = first[1].cost.argmin(0)
         own = first[0].own[best, torch.arange(len(best))]
     progress, _ = _phase("final", problem, own[None], shared[None], iterations, saved, on_progress)

@@ -201,7 +201,7 @@ class Problem:
         start = batch.start(self.simulator, self.params({}))
         return drivers.prepared(
             self.simulator, start, {n: x[:, :, vehicles] for n, x in records.items()}, self._inputs, driver
-        )  # fmt: skip
+        )
 
     @property
     def _compiled(self) -> BehindRecord | None:

@@ -217,9 +217,7 @@ def _apart(
 
 def _own_tried(now: Normal, progress: Progress, box: Box) -> Tensor:
     count = progress.own.shape[-1]
-    return _tried(
-        progress.own, now.gradient[..., :count], now.hessian[..., :count, :count], progress.damping, box
-    )  # fmt: skip
+    return _tried(progress.own, now.gradient[..., :count], now.hessian[..., :count, :count], progress.damping, box)
 
 
 def _redamped(damping: Tensor, better: Tensor) -> Tensor:

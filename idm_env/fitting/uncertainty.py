@@ -29,7 +29,7 @@ class Uncertainty(NamedTuple):
 
 def estimate_row(
     name: str, p: Parameter, estimate: Tensor, error: Tensor, at_bound: Tensor, identified: Tensor
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Return one parameter's row of a table: estimate [], standard error [], 95 % interval, and what is doubtful."""
     middle, half = float(estimate), 1.96 * float(error)
     return {
@@ -112,9 +112,7 @@ def integration_error(problem: Problem, own: Tensor, shared: Tensor) -> Tensor:
     substeps = problem.batch.substeps
     other, scale = (substeps // 2, 1.0) if substeps > 1 else (2, 2.0)
     batch = Batch.of(problem.batch.episodes, dtype=problem.batch.gap.dtype, substeps=other)
-    coarse = dataclasses.replace(
-        problem, batch=batch, simulator=dataclasses.replace(problem.simulator, dt=batch.step)
-    )  # fmt: skip
+    coarse = dataclasses.replace(problem, batch=batch, simulator=dataclasses.replace(problem.simulator, dt=batch.step))
     fine, rough = (normal(p, own[None], shared[None]) for p in (problem, coarse))
     value = torch.cat((own, shared.expand(len(own), -1)), dim=-1)
     low, high = problem.bounds

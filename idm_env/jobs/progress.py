@@ -40,7 +40,7 @@ class _Bars:
     """Bars on a terminal."""
 
     def __init__(self, console: Console) -> None:
-        from rich.progress import (  # fmt: skip
+        from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
             Progress,

@@ -154,7 +154,7 @@ def _fitted(cases: Sequence[tuple[Second, DriverHypothesis]]) -> tuple[np.ndarra
     episodes = [_episode(i, second, h) for i, (second, h) in enumerate(cases)]
     result = fit(
         episodes, objective="speed", loss="mse", prior=Prior(centre, deviation, noise), iterations=12, substeps=1
-    )  # fmt: skip
+    )
     own = result.own
     covariance = result.uncertainty.covariance / (own[:, :, None] * own[:, None, :])
     factor = torch.linalg.cholesky(covariance + 1e-10 * torch.eye(len(NAMES), dtype=torch.float64))

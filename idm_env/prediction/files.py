@@ -179,7 +179,7 @@ def _notes(scenario: Scenario) -> list[str]:
 
 def _agent(
     scene: MapScene, index: int, methods: Sequence[str], left_out: list[dict[str, str]]
-) -> dict[str, Prediction] | None:  # fmt: skip
+) -> dict[str, Prediction] | None:
     """Predict one agent by every method; None, and counted, where it cannot be."""
     try:
         return {name: METHODS[name](scene, index) for name in methods}
@@ -198,9 +198,7 @@ def case_of(scenario: Scenario, prediction: Prediction) -> Case:
     truth[:ahead], heading[:ahead], valid[:ahead] = agent.position[later], agent.heading[later], agent.valid[later]
     speed = np.hypot(*agent.velocity[now:].T)
     shape = shape_of(agent.position[now:], agent.heading[now:], speed, agent.valid[now:])
-    return Case(
-        prediction.futures, prediction.confidence, truth, heading, valid, float(speed[0]), shape, agent.kind
-    )  # fmt: skip
+    return Case(prediction.futures, prediction.confidence, truth, heading, valid, float(speed[0]), shape, agent.kind)
 
 
 def _rows(scenario: Scenario, prediction: Prediction) -> pl.DataFrame:
@@ -232,9 +230,7 @@ def _report(parts: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], list[page.
     names = list(scores[0][1]) if scores else [OURS]
 
     def rows(scene: str | None = None, kind: str | None = None) -> list[dict[str, Any]]:
-        chosen = [
-            item for where, item in scores if scene in (None, where) and kind in (None, item[OURS].kind)
-        ]  # fmt: skip
+        chosen = [item for where, item in scores if scene in (None, where) and kind in (None, item[OURS].kind)]
         return [{"method": name, **summary([item[name] for item in chosen])} for name in names]
 
     def with_intervals() -> list[dict[str, Any]]:

@@ -82,9 +82,7 @@ def hits(case: Case, seconds: int) -> np.ndarray | None:
     return np.asarray((np.abs(across) <= lateral) & (np.abs(along) <= longitudinal))
 
 
-def shape_of(
-    position: np.ndarray, heading: np.ndarray, speed: np.ndarray, valid: np.ndarray
-) -> str:  # fmt: skip
+def shape_of(position: np.ndarray, heading: np.ndarray, speed: np.ndarray, valid: np.ndarray) -> str:
     """Return the shape of a true trajectory from its present (index 0) to its last valid step."""
     steps = np.flatnonzero(valid)
     if len(steps) == 0 or steps[-1] == 0:

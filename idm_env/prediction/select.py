@@ -10,9 +10,7 @@ MOST = 6
 MOST_SAMPLES = 320
 
 
-def select(
-    futures: np.ndarray, weight: np.ndarray, speed: float, most: int = MOST
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def select(futures: np.ndarray, weight: np.ndarray, speed: float, most: int = MOST) -> tuple[np.ndarray, np.ndarray]:
     """Return up to six futures [F, S, 2] and their confidences [F] from samples [N, S, 2].
 
     The first sample is always among them, so that nobody is predicted worse than by it. Then greedy: each choice lowers
@@ -37,9 +35,7 @@ def select(
     return chances(futures, weight, futures[chosen], speed)
 
 
-def chances(
-    samples: np.ndarray, weight: np.ndarray, chosen: np.ndarray, speed: float
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def chances(samples: np.ndarray, weight: np.ndarray, chosen: np.ndarray, speed: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the chosen futures [F, S, 2] (m) in the order of their confidence, and the confidences [F].
 
     ``samples`` [N, S, 2] (m) have the weights [N]; ``speed`` (m/s) sets the size of the box.

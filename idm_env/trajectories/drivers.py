@@ -76,9 +76,7 @@ def fit_drivers(
     if not episodes:
         return None, []
     simulator, fixed = Options(model=model).simulator()
-    result = fit(
-        episodes, by="driver", simulator=simulator, fixed=fixed, loss="mse", starts=1, iterations=iterations
-    )  # fmt: skip
+    result = fit(episodes, by="driver", simulator=simulator, fixed=fixed, loss="mse", starts=1, iterations=iterations)
     return result, episodes
 
 

@@ -273,14 +273,10 @@ def _any_track(spool: Spool, bridge: float | None) -> list[tuple[np.ndarray, np.
 
 def _reaches(filtered: Filtered, tracks: Sequence[TrackPiece]) -> bool:
     """Tell whether an earlier track is still there when some of these begin."""
-    return any(
-        filtered.track.run_id == t.run_id and filtered.motion.time_s[-1] >= t.time_s[0] for t in tracks
-    )  # fmt: skip
+    return any(filtered.track.run_id == t.run_id and filtered.motion.time_s[-1] >= t.time_s[0] for t in tracks)
 
 
-def _report(
-    spool: Spool, parts: Sequence[dict[str, Any]], settings: FilterSettings, plan: FilePlan
-) -> dict[str, Any]:  # fmt: skip
+def _report(spool: Spool, parts: Sequence[dict[str, Any]], settings: FilterSettings, plan: FilePlan) -> dict[str, Any]:
     """Return the report of all parts."""
     tallies: dict[str, Tally] = {}
     totals = dict.fromkeys(("overlaps", "new_overlaps", "calibration_seconds"), 0.0)

@@ -107,9 +107,7 @@ def recipe(
         for track, clock in zip(tracks, clocks, strict=True)
     ]
     smoothed = _smoothed(observed, noise, options)
-    around = Neighbourhood(
-        [*tracks, *(f.track for f in before)], [*clocks, *(f.motion.time_s for f in before)]
-    )  # fmt: skip
+    around = Neighbourhood([*tracks, *(f.track for f in before)], [*clocks, *(f.motion.time_s for f in before)])
     meetings = list(around.meetings())
     fixed = [f.motion.position_m for f in before]
     driven = _driven(smoothed, dt, options)

@@ -153,7 +153,7 @@ def before_and_after(track: TrackPiece, motion: RegularMotion) -> Figure:
         thin = float(np.median(np.abs(change))) > 4.0
         axes[2].plot(
             middle[:-1] + step[1:] / 2, change, color=BEFORE, lw=0.4 if thin else 1.0, alpha=0.5 if thin else 1.0
-        )  # fmt: skip
+        )
     axes[2].plot(clock, motion.accel_mps2, color=AFTER, lw=1.5)
     low, high = min(-4.0, motion.accel_mps2.min() - 1), max(4.0, motion.accel_mps2.max() + 1)
     axes[2].set(ylabel="acceleration (m/s²)", xlabel="time (s)", ylim=(low, high))

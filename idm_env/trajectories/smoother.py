@@ -115,7 +115,7 @@ class TrackObservations:
         looks = np.concatenate([self.look, look])
         return TrackObservations(
             self.steps, self.dt, self.origin, every[order], looks[order], values[order], measured[order]
-        )  # fmt: skip
+        )
 
 
 @dataclass(eq=False)
@@ -158,9 +158,7 @@ def smooth(observed: TrackObservations, noise: PositionNoise, options: SmootherO
             observed = observed.bounded(steps, which, np.full(len(steps), value))
         mean, cov, push = _fitted(observed, noise, options, push)
     sigma = np.sqrt(np.maximum(np.einsum("kii->ki", cov)[:, :3], 0.0))
-    return Smoothed(
-        mean[:, 0] + observed.origin, mean[:, 1], mean[:, 2], sigma, log_likelihood(observed, noise)
-    )  # fmt: skip
+    return Smoothed(mean[:, 0] + observed.origin, mean[:, 1], mean[:, 2], sigma, log_likelihood(observed, noise))
 
 
 def _broken(mean: np.ndarray, options: SmootherOptions) -> list[tuple[np.ndarray, int, float]]:

@@ -121,9 +121,7 @@ def smooth(ticks, look, value, variance, start, spread, dt, keep, fade, push, dr
         if k == 0:
             ahead_mean[0], ahead_cov[0] = start, spread
         else:
-            _predict(
-                mean[k - 1], cov[k - 1], dt, keep, fade, push[k - 1], drift, ahead_mean[k], ahead_cov[k], part
-            )  # fmt: skip
+            _predict(mean[k - 1], cov[k - 1], dt, keep, fade, push[k - 1], drift, ahead_mean[k], ahead_cov[k], part)
         mean[k], cov[k] = ahead_mean[k], ahead_cov[k]
         while o < len(ticks) and ticks[o] == k:
             total += _update(mean[k], cov[k], look[o], value[o], variance[o], along)

@@ -113,7 +113,7 @@ class Spool:
 
     def _read(
         self, path: str | Path, layout: str, ring_length: float | None, columns: Columns
-    ) -> tuple[list[Path], pl.DataFrame]:  # fmt: skip
+    ) -> tuple[list[Path], pl.DataFrame]:
         """Write the pieces of a file and return them, with an index of its vehicles in their order."""
         files: list[Path] = []
         parts: list[pl.DataFrame] = []
