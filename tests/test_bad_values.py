@@ -84,6 +84,14 @@ USES: dict[str, tuple[object, ...]] = {
 }
 
 
+ASKED = "exits when it is asked"
+PAIRS = [
+    *zip(ENDINGS, USES, strict=True),
+    *((ASKED, use) for use in ("fit --lane-changes", "simulate --model", "effects --cite", "plot")),
+]
+"""Every ending and every use once: all are read in one place; and, of one that reading does not meet, what differs."""
+
+
 @pytest.fixture
 def no_trust(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whom a test trusts is gone after it."""
@@ -91,8 +99,7 @@ def no_trust(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_trust")
-@pytest.mark.parametrize("use", USES)
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize(("ending", "use"), PAIRS)
 def test_a_file_of_effects_that_ends_the_process_is_one_line(data: Path, tmp_path: Path, ending: str, use: str) -> None:
     file, model, environment = (tmp_path / name for name in ("mine.py", "model.yaml", "environment.yaml"))
     file.write_text(ENDINGS[ending])
@@ -106,13 +113,11 @@ def test_a_file_of_effects_that_ends_the_process_is_one_line(data: Path, tmp_pat
         "OUT.png": tmp_path / "a.png",
     }
     words = [paths.get(str(word), word) for word in USES[use]]
-    if ending == "exits when it is asked" and words[0] == "effects":
+    if ending == ASKED and words[0] == "effects":
         assert typed(*words).returncode == 0  # it is not asked
         return
     line = refused(*words, *(() if {"--out", "--cite"} & set(words) else ("--out", tmp_path / "out")))
-    if (
-        ending == "exits when it is asked" and "--lane-changes" in words
-    ):  # these data have one lane, which is told before
+    if ending == ASKED and "--lane-changes" in words:  # these data have one lane, which is told before
         assert "no driver has a lane beside his own" in line
     else:
         assert "mine.py" in line or "odd" in line or "ended from within (SystemExit: 0)" in line

@@ -1,5 +1,7 @@
 """On a GPU everything is as on the CPU: steps, gradients, rollouts, environments. Skipped where there is none."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -34,15 +36,16 @@ def outcome(effect, device):
     return [x.detach().cpu() for x in kept], [None if g is None else g.cpu() for g in found]
 
 
-@pytest.mark.parametrize("effect", MEMBERS, ids=label)
-def test_every_effect_is_the_same_on_a_gpu(effect):
-    here, there = outcome(effect, "cpu"), outcome(effect, "cuda")
-    for mine, other in zip(here[0], there[0], strict=True):
-        torch.testing.assert_close(other, mine, rtol=1e-10, atol=1e-9)
-    for mine, other in zip(here[1], there[1], strict=True):
-        assert (mine is None) == (other is None)
-        if mine is not None:
-            torch.testing.assert_close(other, mine, rtol=1e-8, atol=1e-9)
+def test_every_effect_is_the_same_on_a_gpu():
+    for effect in MEMBERS:
+        here, there = outcome(effect, "cpu"), outcome(effect, "cuda")
+        said = partial("{}: {}".format, label(effect))
+        for mine, other in zip(here[0], there[0], strict=True):
+            torch.testing.assert_close(other, mine, rtol=1e-10, atol=1e-9, msg=said)
+        for mine, other in zip(here[1], there[1], strict=True):
+            assert (mine is None) == (other is None), label(effect)
+            if mine is not None:
+                torch.testing.assert_close(other, mine, rtol=1e-8, atol=1e-9, msg=said)
 
 
 @pytest.mark.parametrize("task", ["ring", "follow", "platoon"])
