@@ -133,13 +133,23 @@ def _faces(name: str) -> list[str]:
         "## Action", "",
         f"Per agent: {actions} in [−1, 1]; −1 and 1 command {low:g} and {high:g} m/s².", "",
         "## Reward", "",
-        f"A step without a crash pays between {task.reward_range.low:g} and {task.reward_range.high:g}. A crash costs "
-        f"{task.cost_of_crash:g} by default.", "",
+        *_rewards(task), "",
         *_returns(name),
         "## Ends", "",
         f"An episode is terminated where vehicles touch, and truncated after {task.horizon} steps of "
         f"{task.step_time:g} s.", "",
     ]  # fmt: skip
+
+
+def _rewards(task: Any) -> list[str]:
+    """Return the terms of a task's rewards, with the bounds of a step."""
+    from idm_env.tasks.reward_terms import Weighted
+
+    lines = ["| `reward=` | a step pays | sum of |", "| --- | --- | --- |"]
+    for name, terms in task.own_rewards.items():
+        low, high = Weighted(tuple(terms.items())).reward_range
+        lines.append(f"| `{name}` | {low:g} to {high:g} | {', '.join(f'{w:g} `{t.name}`' for t, w in terms.items())} |")
+    return [*lines, "", "A crash ends the episode, and pays nothing more."]
 
 
 def _space(space: Any) -> str:

@@ -82,9 +82,12 @@ def _held(before: Outcome, after: Outcome, over: Any) -> Outcome:
 
     both = before.whole.reward + after.whole.reward
     total = after._replace(reward=before.reward + after.reward, whole=after.whole._replace(reward=both))
+    if "rewards" in after.details:
+        parts = before.details["rewards"] + after.details["rewards"]
+        total = total._replace(details={**after.details, "rewards": parts})
     if not bool(over.any()):
         return total
-    details = {name: kept(x, after.details[name]) for name, x in before.details.items()}
+    details = {name: kept(x, total.details[name]) for name, x in before.details.items()}
     seen, reward, ended, cut = map(kept, before[:4], total[:4])
     return Outcome(seen, reward, ended, cut, Whole(*map(kept, before.whole, total.whole)), details)
 

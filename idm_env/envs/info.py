@@ -9,6 +9,9 @@
     Whether the failsafe cut each command (bool).
 ``crash``, ``crash_reason``
     Whether the episode ended in a crash (bool), and, only then, who touched whom (a text).
+``rewards``
+    What each term of the reward paid in this step, ``(agents, terms)``: their sum over terms is the reward of an agent.
+    ``env.unwrapped.task.reward_names`` are the terms' names; ``crash`` is the price of a crash, where it has one.
 ``vehicle_id``
     Recorded ids of the agents' vehicles (``Ids``, a tuple of texts), in ``reset`` too; only in tasks that replay a
     recording.

@@ -6,6 +6,7 @@ Shapes: rows are environments: states ``[rows, n]``, actions and commands ``[row
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any
 
 import torch
@@ -76,7 +77,10 @@ class Moves:
         details = self._details(after, command if commanded else None, given, terminated)
         if self._limit is not None:
             truncated = truncated | (after.state.step >= self._limit).unsqueeze(-1)
-        reward = task.rewards(before, command, after, terminated)
+        parts = task.reward_parts(before, command, after, terminated)
+        reward = reduce(torch.add, parts.values())
+        if "rewards" in self._info:
+            details["rewards"] = torch.stack(tuple(parts.values()), -1).detach()
         if len(task.agents) == 1:
             ends, cut = terminated[..., 0], truncated[..., 0]
         else:

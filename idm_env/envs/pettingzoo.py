@@ -166,7 +166,10 @@ class parallel_env(Pictures, ParallelEnv[str, np.ndarray, np.ndarray]):  # noqa:
 
     def _info(self, i: int, outcome: Outcome) -> dict[str, Any]:
         """Return what ``idm_env.envs.info`` says of a step, as numbers of one agent."""
-        info: dict[str, Any] = {name: value[0, i].item() for name, value in outcome.details.items()}
+        info: dict[str, Any] = {
+            name: value[0, i].copy() if name == "rewards" else value[0, i].item()
+            for name, value in outcome.details.items()
+        }
         if info.get("crash"):
             info["crash_reason"] = self.batch.crash_reason(0, i if self.task.shares > 1 else None)
         return info | self._begun(i)

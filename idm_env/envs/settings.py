@@ -21,7 +21,7 @@ OUTPUTS = ("numpy", "torch")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 RENDER_MODES = ("rgb_array", "human")
 INFO = (
-    "accel", "command", "failsafe", "crash", "vehicle_id", "lane_changes", "lane_refusals", "present",
+    "accel", "command", "failsafe", "crash", "rewards", "vehicle_id", "lane_changes", "lane_refusals", "present",
     "queued", "inside", "outflow", "ramp", "standing", "co2", "travel",
     "stops",
 )  # fmt: skip

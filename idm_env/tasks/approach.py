@@ -13,11 +13,12 @@ from torch import Tensor
 from idm_env.effects import IDM, Brakes, Effect, Signal
 from idm_env.metrics import fuel
 from idm_env.roads import Lanes
-from idm_env.tasks.base import EnvState, RewardRange
+from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import Range, in_ranges
 from idm_env.tasks.features import AgentView, Feature
 from idm_env.tasks.open_lanes import OpenLanesTask
 from idm_env.tasks.random import Draw
+from idm_env.tasks.reward_terms import RewardTerm, Transition
 from idm_env.types import Params, State, Trips
 
 LINE, LENGTH = 500.0, 600.0
@@ -59,8 +60,9 @@ class ApproachTask(OpenLanesTask):
     Who comes, goes and acts is as in the other open tasks.
 
     Observation: as there; before the nearest vehicles the way to the signal (m), 1 if it is red, and the time to its
-    next change (s). Reward, the same for all agents: minus the delay of all in this step, and minus what all burn (mL,
-    Kamal's fuel) times ``fuel_weight``: ``−Δt (Σ (1 − min(v/v0, 1)) + queued + w Σ F)``.
+    next change (s). Reward, the same for all agents: ``0.5 Σ min(v/v0, 1)/(n + queued) + 0.5/(1 + F/F_0)``, F the mean
+    fuel rate on the road (Kamal's), F_0 = 1 mL/s. ``reward="delay"``: minus the delay of all in this step, and minus
+    what all burn (mL) times ``fuel_weight``: ``−t (Σ (1 − min(v/v0, 1)) + queued + w Σ F)``.
 
     Args:
         lanes_count: Number of lanes, from 1 to 3.
@@ -162,9 +164,19 @@ class ApproachTask(OpenLanesTask):
         )
 
     @property
-    def own_reward_range(self) -> RewardRange:
-        """At most everybody who is due stands, and burns all that can be burnt."""
-        return RewardRange(-self._most * self.simulator.dt * (1.0 + self.fuel_weight * _MOST_FUEL), 0.0)
+    def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
+        """``unit``; and minus delay and fuel."""
+        most = self._most * (1.0 + self.fuel_weight * _MOST_FUEL)
+        economy = RewardTerm("economy", "1/(1 + F/F_0)", "", 0.0, 1.0, self._economy, shared=True)
+        delay = RewardTerm("delay", "Σ (1 − min(v/v0, 1)) + queued + w Σ F", "vehicles", 0.0, most, self._delay, True)
+        (pace,) = super().own_rewards["unit"]
+        return {"unit": {pace: 0.5, economy: 0.5}, "delay": {delay: -self.step_time}}
+
+    def _economy(self, step: Transition) -> Tensor:
+        """Return ``1/(1 + F/F_0)``, F the mean fuel rate of all on the road, F_0 = 1 mL/s."""
+        state = step.after.state
+        assert state.present is not None
+        return 1.0 / (1.0 + (self.burnt(state) / state.present.sum(-1).clamp_min(1.0)).unsqueeze(-1))
 
     def burnt(self, state: State) -> Tensor:
         """Return what all on the road burn (mL/s)."""

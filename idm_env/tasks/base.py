@@ -2,7 +2,7 @@
 
 A task knows nothing of Gymnasium, of automatic resets or of where gradients are cut; agents that differentiate
 through a rollout call it directly. Everything random comes in: as keys (``Draw``) at reset and as normals at every
-step. A crash is worse than any survival: see ``idm_env.tasks.crash``.
+step. A crash ends an episode, and with it what was in store: see ``idm_env.tasks.crash``.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, ClassVar
 
 import numpy as np
@@ -80,10 +80,11 @@ class Task(abc.ABC):
             SI units (m, m/s). Both are clipped to ``bounds``. ``{"features": ["speed", "gap"], "vehicles": 3}`` takes
             these of ``idm_env.tasks.FEATURES``, of the agent and of the two vehicles ahead of it; ``"scaling": "raw"``
             may stand beside. A feature of one's own is a ``Feature``, or ``"my_file.py:my_feature"``.
-        reward: Weights of ``idm_env.tasks.REWARD_TERMS`` in place of the task's own reward: ``{"speed": 0.2, "effort":
-            -4.0}``. A term of one's own is ``"my_file.py:my_term"``, or a ``RewardTerm`` as a key.
-        crash_cost: What a crash costs; None is the smallest that makes it worse than any survival
-            (``idm_env.tasks.crash``).
+        reward: Name of one of the task's rewards; None is the first, ``"unit"``, which pays 0 to 1 a step. Or weights
+            of ``idm_env.tasks.REWARD_TERMS``: ``{"speed": 0.2, "effort": -4.0}``, where a term of one's own is
+            ``"my_file.py:my_term"``, or a ``RewardTerm`` as a key. All are means over the time of a step.
+        crash_cost: Price of a crash; None is 0, or for rewards that can be negative the smallest that makes a crash
+            worse than any survival (``idm_env.tasks.crash``).
 
     Raises:
         ValueError: In one line, with value, rule and cure.
@@ -108,7 +109,7 @@ class Task(abc.ABC):
     hold: float | None = None
     max_episode_steps: int | None = None
     observation: str | Mapping[str, Any] = "scaled"
-    reward: Mapping[Any, float] | None = None
+    reward: str | Mapping[Any, float] | None = None
     crash_cost: float | None = None
 
     name: ClassVar[str]
@@ -204,25 +205,33 @@ class Task(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def own_reward_range(self) -> RewardRange:
-        """The lowest (at most 0) and the highest (at least 0) of the task's own reward, without a crash."""
+    def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
+        """The task's rewards by name, each as weights of terms; the first, ``"unit"``, lies in [0, 1]."""
 
     @cached_property
+    def weighted(self) -> Weighted:
+        """The reward of an agent."""
+        return weighted(
+            self.reward, self.own_rewards, lambda x, where: one_declared(x, RewardTerm, REWARD_TERMS, where), self.held
+        )
+
+    @property
+    def reward_names(self) -> tuple[str, ...]:
+        """Names of the terms of the reward, as ``info["rewards"]`` has them."""
+        names = tuple(term.name for term, _ in self.weighted.terms)
+        return (*names, "crash") if self.cost_of_crash else names
+
+    @property
     def reward_range(self) -> RewardRange:
-        """The lowest (at most 0) and the highest (at least 0) reward of a Δt without a crash."""
-        return self.own_reward_range if self.weighted is None else self.weighted.reward_range
-
-    @cached_property
-    def weighted(self) -> Weighted | None:
-        """The sum that ``reward`` asks for, None for the task's own reward."""
-        return weighted(self.reward, lambda x, where: one_declared(x, RewardTerm, REWARD_TERMS, where))
+        """The lowest (at most 0) and the highest (at least 0) reward of a step without a crash."""
+        return self.weighted.reward_range
 
     @cached_property
     def cost_of_crash(self) -> float:
-        """What an agent pays for a crash: ``crash_cost``, or the smallest that makes it worse than any survival."""
+        """Price of a crash: ``crash_cost``, or what makes it worse than any survival (``idm_env.tasks.crash``)."""
         if self.crash_cost is not None:
             return self.crash_cost
-        return self.shares * lawful_cost(self.reward_range, self.steps)
+        return self.shares * lawful_cost(self.reward_range, -(-self.steps // self.held))
 
     @property
     def shares(self) -> int:
@@ -553,32 +562,27 @@ class Task(abc.ABC):
         seen = [x.feature.read(views[x.ahead]) for x in self.observed]
         return self.clip(seen if self._observation[1] is None else [self.there(world.state, x) for x in seen])
 
-    @abc.abstractmethod
-    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
-        """Return the task's own rewards of a step without a crash, within ``own_reward_range``, shape ``(…, agents)``.
-
-        ``command`` in m/s².
-        """
-
     def there(self, state: State, x: Tensor) -> Tensor:
         """Return what belongs to the agents, shape ``(…, agents)``, 0 for those who are not on the road."""
         return x if state.present is None else torch.where(self.pick(state.present) > 0, x, torch.zeros_like(x))
 
-    def rewards(self, before: EnvState, command: Tensor, after: EnvState, crashed: Tensor | None = None) -> Tensor:
-        """Return the rewards of a step, shape ``(…, agents)``, or ``−cost_of_crash``.
+    def reward_parts(
+        self, before: EnvState, command: Tensor, after: EnvState, crashed: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Return what each term of the reward pays for a Δt, ``(…, agents)``, and the price of a crash as ``crash``.
 
         ``command`` in m/s², which costs nothing where an agent is not on the road; ``crashed``, where the caller has it
-        already, is ``self.crashed(after)``.
+        already, is ``self.crashed(after)``. A crash pays nothing but its price.
         """
         command = self.there(after.state, command)
         crashed = self.crashed(after) if crashed is None else crashed
-        return torch.where(crashed, -self.cost_of_crash, self.paid(before, command, after))
+        parts = self.weighted.parts(Transition(self, before, command, after))
+        parts = {name: torch.where(crashed, 0.0, x) for name, x in parts.items()}
+        return parts | {"crash": -self.cost_of_crash * crashed.to(command.dtype)} if self.cost_of_crash else parts
 
-    def paid(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
-        """Return the rewards of a step without a crash: the task's own, or what ``reward`` asks for."""
-        if self.weighted is None:
-            return self.own_reward(before, command, after)
-        return self.weighted(Transition(self, before, command, after))
+    def rewards(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
+        """Return the rewards of a Δt: the sum of ``reward_parts``, ``(…, agents)``."""
+        return reduce(torch.add, self.reward_parts(before, command, after).values())
 
     def crashed(self, world: EnvState) -> Tensor:
         """Return whose episodes end in a crash: those of all, where any two vehicles have touched (a gap ≤ 0)."""

@@ -10,7 +10,18 @@ from typing import Any, NamedTuple
 from idm_env.model_file import nested
 from idm_env.validation import at_least, finite, shown, whole
 
-__all__ = ["KeywordError", "Range", "agents_of", "at_least", "in_ranges", "limits_of", "ranges", "span", "whole"]
+__all__ = [
+    "KeywordError",
+    "Range",
+    "agents_of",
+    "at_least",
+    "in_ranges",
+    "limits_of",
+    "only_with",
+    "ranges",
+    "span",
+    "whole",
+]
 
 _WEAKEST, _STRONGEST = 1e-3, 100.0
 
@@ -61,6 +72,17 @@ def in_ranges(task: Any) -> None:
             raise ValueError(f"{field.name} = {shown(value)} must be True or False.")
         if field.name in by_name and not (value is None and field.default is None):
             by_name[field.name].check(field.name, value)
+
+
+def only_with(task: Any, reward: str, names: Sequence[str]) -> None:
+    """Raise ValueError for keywords that differ from their defaults and weigh terms of another reward than is paid."""
+    default = {field.name: field.default for field in dataclasses.fields(task)}
+    for name in names:
+        if getattr(task, name) != default[name] and task.reward != reward:
+            raise ValueError(
+                f"{name} = {shown(getattr(task, name))} weighs a term of reward = '{reward}', and reward = "
+                f"{shown(task.reward)}. Give reward='{reward}', or leave {name} out."
+            )
 
 
 class KeywordError(TypeError, ValueError):

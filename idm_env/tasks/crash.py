@@ -1,12 +1,12 @@
-"""A crash is worse than any survival: the law of rewards, what it takes to keep it, and the words for a crash.
+"""What a crash costs, and the words for it.
 
-A step's reward without a crash is in a task's ``reward_range``, [low, high] with low ≤ 0 ≤ high. The step in which a
-vehicle touches another pays ``−crash_cost`` instead, ``N (high − low) + 1`` by default, N being the most steps of an
-episode. So the return of an episode that ends in a crash, less than ``N high − crash_cost < N low``, lies below that of
-every episode that does not; and from any moment on, with any discount, going on pays more than crashing.
+The step in which a vehicle touches another ends the episode and pays nothing. Rewards in [0, 1] need no more: what is
+in store is never negative, so no crash pays, from wherever one is, with any discount. With γ < 1 a crash then costs at
+most 1/(1 − γ), 100 at γ = 0.99.
 
-It is a large number beside the rewards of a step, and must be: the returns of survivals alone may differ by as much.
-Algorithms that learn values should normalise rewards (``VecNormalize``), or take a smaller ``crash_cost`` of their own.
+Rewards that can be negative are a reason to crash. Under one in [low, high] with low < 0 a crash pays ``−crash_cost``,
+``N (high − low) + 1`` by default, N being the most steps of an episode: its return, less than ``N low``, lies below
+that of every survival. Algorithms that learn values should then normalise rewards (``VecNormalize``).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from idm_env.tasks.types import NOBODY, RewardRange
 
 
 def lawful_cost(pay: RewardRange, steps: int) -> float:
-    """Return the cost that makes a crash worse than any survival of at most ``steps`` steps."""
-    return steps * (pay.high - pay.low) + 1.0
+    """Return the least price that makes a crash worse than any survival of at most ``steps`` steps; 0 in [0, 1]."""
+    return steps * (pay.high - pay.low) + 1.0 if pay.low < 0.0 else 0.0
 
 
 def floored(reward: Tensor, knee: float, low: float) -> Tensor:

@@ -13,12 +13,13 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Ended, EnvState, RewardRange
-from idm_env.tasks.checks import Range
+from idm_env.tasks.base import Ended, EnvState
+from idm_env.tasks.checks import Range, only_with
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import FEATURES, Feature, feature
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import BehindHeadTask, Leaders, made_up_leader, recorded_leaders, starts
+from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, headway, headway_penalty
 from idm_env.types import Params
 from idm_env.validation import one_of
 
@@ -27,23 +28,10 @@ SEEN = (feature("speed", 40.0, 0.0, 100.0), feature("lead_speed", 40.0, 0.0, 100
 """What an agent behind a record observes, here and in ``replay``: speeds up to 100 m/s, gaps up to 1000 m."""
 KNEE, LOWEST, HIGHEST = -2.0, -4.0, 1.0
 """Reward from which it saturates, and what it never leaves without ``lag_weight``."""
-_NEAREST, _FARTHEST, _SHORTEST = 7.0, 120.0, 1.0
 _CLOSING = 20.0
 """Difference of speeds (m/s) up to which losing or gaining ground counts."""
 _GALLONS_PER_HOUR = 0.951
 """1 mL/s in US gallons per hour."""
-
-
-def headway_penalty(gap: Tensor, speed: Tensor) -> Tensor:
-    """Return 0 … 1, elementwise: how far a gap (m) is below 7 m, above 120 m, or a time gap below 1 s.
-
-    The source takes 1 at any violation. Here it rises over 1 m, 10 m and 0.2 s, so that it has a gradient; a deeper
-    violation counts 1 as in the source.
-    """
-    near = _NEAREST - gap
-    far = (gap - _FARTHEST) / 10.0
-    short = (_SHORTEST - metrics.time_gap(gap, speed)) / 0.2
-    return torch.maximum(torch.maximum(near, far), short).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,20 +43,20 @@ class FollowTask(BehindHeadTask):
     1, s0 = 2, everybody in equilibrium at the start.
 
     Observation, per agent: ``v/40, v_lead/40, gap/100`` (m/s and m; raw: without the scales).
-    Reward, per agent: ``1 − w fuel − 0.002 u² − 2 p``; w is ``fuel_weight``, 0.1 in the source, fuel the mean rate of
-    the agent and everybody behind it (US gallons per hour; the source's own energy model is not public, ``fuel_model``
-    stands in), u its command (m/s²), p in [0, 1] the violation of headways: gap below 7 m or above 120 m, time gap
-    below 1 s; less ``lag_weight`` times what the agent is slower than its leader (m/s, within ±20): over an episode
-    that is the ground that it has lost, as long as no step saturates. Below −2 it saturates towards −4 (``floored``).
-    Terminated where vehicles touch, which pays ``−crash_cost`` instead: 5001 by default, more with ``lag_weight``, so
-    that a crash is worse than any survival (``idm_env.tasks.crash``); the source takes 50. Truncated at the end of the
-    record, and after ``max_episode_steps``: 1000, or what the longest record has.
+    Reward, per agent: ``h (0.3 + 0.4/(1 + ⟨A²⟩/A_0²) + 0.3/(1 + F/F_0))``; h is 1 from 7 m and 1 s to 60 m, and falls
+    to 0 at 6 m, 0.8 s and 120 m; ⟨A²⟩ and F are the mean squared acceleration and fuel rate of the agent and
+    everybody behind it, A_0 = 0.5 m/s², F_0 = 1 mL/s. ``reward="source"``: ``1 − w fuel − 0.002 u² − 2 p``; w is
+    ``fuel_weight``, 0.1 in the source, fuel in US gallons per hour (its own energy model is not public,
+    ``fuel_model`` stands in), u in m/s²; less ``lag_weight`` times what the agent is slower than its leader (m/s,
+    within ±20). Below −2 it saturates towards −4 (``floored``). The source's price of a crash is ``crash_cost=50``.
+    Terminated where vehicles touch, truncated at the end of the record, and after ``max_episode_steps``: 1000, or
+    what the longest record has.
 
     Args:
         fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
-        fuel_weight: Reward per US gallon per hour: with 0.1 hardly anything is gained by saving.
-        lag_weight: Reward per m/s that an agent is slower than its leader; 0 leaves it out. Saving fuel by falling back
-            then costs what it takes from others.
+        fuel_weight: Of ``reward="source"``, per US gallon per hour: with 0.1 hardly anything is gained by saving.
+        lag_weight: Of ``reward="source"``, per m/s that an agent is slower than its leader; 0 leaves it out. Saving
+            fuel by falling back then costs what it takes from others.
         leader: A trajectory file; every leader that somebody follows in it may be drawn. None is the project's own
             made-up trace.
     """
@@ -91,6 +79,7 @@ class FollowTask(BehindHeadTask):
     def __post_init__(self) -> None:
         one_of("fuel_model", self.fuel_model, metrics.FUELS)
         super().__post_init__()
+        only_with(self, "source", ("fuel_weight", "lag_weight"))
         longest = self._longest
         if (self.max_episode_steps or 0) > longest:
             raise ValueError(
@@ -120,9 +109,12 @@ class FollowTask(BehindHeadTask):
         return SEEN
 
     @property
-    def own_reward_range(self) -> RewardRange:
-        """From −4 to 1, more where an agent may catch up."""
-        return RewardRange(LOWEST, HIGHEST + _CLOSING * self.lag_weight)
+    def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
+        """``unit``, and the source's."""
+        smooth = RewardTerm("smooth", "h/(1 + ⟨A²⟩/A_0²)", "", 0.0, 1.0, self._smooth)
+        economy = RewardTerm("economy", "h/(1 + F/F_0)", "", 0.0, 1.0, self._economy)
+        source = RewardTerm("source", "", "", LOWEST, HIGHEST + _CLOSING * self.lag_weight, self._source)
+        return {"unit": {REWARD_TERMS["headway"]: 0.3, smooth: 0.4, economy: 0.3}, "source": {source: 1.0}}
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return a queue in equilibrium behind a drawn stretch of a drawn leader."""
@@ -134,16 +126,30 @@ class FollowTask(BehindHeadTask):
         motion = self.constant("motion", self.leaders.motion, step.device, dtype)
         return motion[episode["trace"], (episode["start"] + step).clamp(0, motion.shape[1] - 1)]
 
-    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
-        """Return ``1 − w fuel − 0.002 u² − 2 p − l clip(v_lead − v, ±20)``, saturated below −2."""
-        state = after.state
-        fuel = metrics.fuel(state.speed, state.accel, self.fuel_model) * _GALLONS_PER_HOUR
+    def _behind(self, x: Tensor) -> Tensor:
+        """Return the mean of ``x``, ``(…, vehicles)``, over each agent and everybody behind it."""
         # Running means from the back: of every vehicle and those behind it.
-        count = self.constant("count", list(range(self.vehicles, 0, -1)), fuel.device, fuel.dtype)
-        behind = fuel.flip(-1).cumsum(-1).flip(-1) / count
+        count = self.constant("count", list(range(self.vehicles, 0, -1)), x.device, x.dtype)
+        return self.pick(x.flip(-1).cumsum(-1).flip(-1) / count)
+
+    def _fuel(self, step: Transition) -> Tensor:
+        """Return the mean fuel rate (mL/s) of each agent and everybody behind it."""
+        return self._behind(metrics.fuel(step.after.state.speed, step.after.state.accel, self.fuel_model))
+
+    def _smooth(self, step: Transition) -> Tensor:
+        """Return ``h/(1 + ⟨A²⟩/A_0²)``, h the headway's term, A_0 = 0.5 m/s²."""
+        return headway(step) / (1.0 + self._behind(step.after.state.accel.square()) / 0.25)
+
+    def _economy(self, step: Transition) -> Tensor:
+        """Return ``h/(1 + F/F_0)``, h the headway's term, F_0 = 1 mL/s."""
+        return headway(step) / (1.0 + self._fuel(step))
+
+    def _source(self, step: Transition) -> Tensor:
+        """Return ``1 − w fuel − 0.002 u² − 2 p − l clip(v_lead − v, ±20)``, saturated below −2."""
+        state, command = step.after.state, step.command
         gap, speed = self.pick(state.gap), self.pick(state.speed)
-        penalty = headway_penalty(gap, speed)
-        reward = 1.0 - self.fuel_weight * self.pick(behind) - 0.002 * command * command - 2.0 * penalty
+        fuel, penalty = self._fuel(step) * _GALLONS_PER_HOUR, headway_penalty(gap, speed)
+        reward = 1.0 - self.fuel_weight * fuel - 0.002 * command * command - 2.0 * penalty
         if self.lag_weight:
             lag = self.lead_speed(state) - speed
             reward = reward - self.lag_weight * lag.clamp(-_CLOSING, _CLOSING)

@@ -16,6 +16,7 @@ from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import Range
 from idm_env.tasks.lanes import FASTEST, LanesTask
 from idm_env.tasks.random import Draw
+from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
 from idm_env.types import Params
 
 _PLACE_STREAM = 31
@@ -33,8 +34,8 @@ class HighwayTask(LanesTask):
     Observation, per agent, as HighwayEnv's kinematics: own speed and lane; then, of each of the ``seen`` nearest
     vehicles in any lane, nearest first: 1 if there is one within 200 m, how far ahead it is (m; negative behind), how
     many lanes to the left, and its speed relative to the own one (m/s). Scales: 20 m/s, one lane, 100 m, 10 m/s.
-    Reward, per agent: ``v/40 − 0.1 (u/u_max)²``, v its speed (at most 40 m/s) and u its command. Terminated where
-    vehicles touch, which pays ``−crash_cost`` instead (``idm_env.tasks.crash``). Cut off after 3000 steps.
+    Reward, per agent: ``0.9 v/40 + 0.1 (1 − (u/u_max)²)``, v its speed (at most 40 m/s) and u its command. Terminated
+    where vehicles touch. Cut off after 3000 steps.
 
     Args:
         lanes_count: Number of lanes.
@@ -94,8 +95,15 @@ class HighwayTask(LanesTask):
         """Return differences of positions (m) as distances round the ring, the shorter way."""
         return (ahead + 0.5 * self.length).remainder(self.length) - 0.5 * self.length
 
-    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
-        """Return ``v/40 − 0.1 (u/u_max)²``."""
-        speed = self.pick(after.state.speed).clamp_max(FASTEST) / FASTEST
-        hardest = max(abs(limit) for limit in self.command_limits)
-        return speed - 0.1 * (command / hardest).square().clamp_max(1.0)
+    @property
+    def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
+        """``unit``."""
+        return {"unit": {PACE: 0.9, REWARD_TERMS["ease"]: 0.1}}
+
+
+def pace(step: Transition) -> Tensor:
+    """Return ``min(v, 40 m/s)/40 m/s``."""
+    return step.task.pick(step.after.state.speed).clamp_max(FASTEST) / FASTEST
+
+
+PACE = RewardTerm("pace", "min(v, 40 m/s)/40 m/s", "", 0.0, 1.0, pace)

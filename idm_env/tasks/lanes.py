@@ -13,7 +13,7 @@ from torch import Tensor
 
 from idm_env.effects import Control, Effect, LaneCommand
 from idm_env.roads import Lanes
-from idm_env.tasks.base import EnvState, RewardRange, Task
+from idm_env.tasks.base import EnvState, Task
 from idm_env.tasks.checks import Range
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.random import Draw
@@ -174,11 +174,6 @@ class LanesTask(Task):
             for i, (name, unit, scale, low, high) in enumerate(each)
         )
         return (*self.features_of_self, *nearby)
-
-    @property
-    def own_reward_range(self) -> RewardRange:
-        """Rewards of a step lie between −0.1 and 1."""
-        return RewardRange(-0.1, 1.0)
 
     def apart(self, ahead: Tensor) -> Tensor:
         """Return differences of positions (m) as distances on this road."""

@@ -16,11 +16,12 @@ from idm_env.effects import IDM, Brakes, Control, Courtesy, Effect, GapAcceptanc
 from idm_env.metrics import CO2, fuel
 from idm_env.multilane import demand
 from idm_env.roads import Lanes
-from idm_env.tasks.base import EnvState, RewardRange
+from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import FLOW, Range, at_least
 from idm_env.tasks.features import AgentView, Feature, feature
 from idm_env.tasks.lanes import LanesTask
 from idm_env.tasks.random import Draw
+from idm_env.tasks.reward_terms import RewardTerm, Transition
 from idm_env.tasks.said_roads import STANDS, DriverClass, Loop, classes_of, lengths, loops_of, rules_of, with_classes
 from idm_env.tasks.starting_places import with_room
 from idm_env.tasks.trip_table import TripTable, read, spread
@@ -89,10 +90,11 @@ class OpenLanesTask(LanesTask):
 
     Observation, per agent: own speed, lane, 1 if it is on the road, how far its lane goes on (m, at most 500), its
     place (m), how far it is to the next end of any lane (m, at most 500) and how many lanes to the left that is; then
-    the nearest vehicles as in ``highway``. Reward, the same for all agents: minus the delay of all in this step
-    (vehicle-seconds), ``−Δt (Σ (1 − min(v/v0, 1)) + queued)``, so that its sum is the total delay against free travel
-    at every driver's v0. Terminated where vehicles touch, or an agent drives over the end of a lane, which pays
-    ``−crash_cost`` instead (``idm_env.tasks.crash``). Cut off after 600 s.
+    the nearest vehicles as in ``highway``.
+    Reward, the same for all agents: ``Σ min(v/v0, 1)/(n + queued)``, the mean of speeds over desired ones, of all on
+    the road and, as 0, of those who wait. ``reward="delay"``: minus the delay of all in this step (vehicle-seconds),
+    ``−t (Σ (1 − min(v/v0, 1)) + queued)``, so that its sum is the total delay against free travel at every driver's
+    v0. Terminated where vehicles touch, or an agent drives over the end of a lane. Cut off after 600 s.
 
     Args:
         entry_speed: Speed at which vehicles ask to enter (m/s).
@@ -388,20 +390,33 @@ class OpenLanesTask(LanesTask):
         return 2.0 * self.vehicles + sum(self.inflows.values()) * seconds / 3600.0
 
     @property
-    def own_reward_range(self) -> RewardRange:
-        """At most everybody who is due stands."""
-        return RewardRange(-self._most * self.simulator.dt, 0.0)
+    def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
+        """``unit``, and minus the delay."""
+        pace = RewardTerm("pace", "Σ min(v/v0, 1)/(n + queued)", "", 0.0, 1.0, self._pace, shared=True)
+        delay = RewardTerm("delay", "Σ (1 − min(v/v0, 1)) + queued", "vehicles", 0.0, self._most, self._delay, True)
+        return {"unit": {pace: 1.0}, "delay": {delay: -self.step_time}}
 
-    def delay(self, world: EnvState) -> Tensor:
+    def _pace(self, step: Transition) -> Tensor:
+        """Return ``Σ min(v/v0, 1)/(n + queued)``: the mean of speeds over desired ones, 0 in a queue."""
+        state = step.after.state
+        assert state.present is not None
+        due = state.present.sum(-1) + demand.counts(self.simulator, state).queued
+        return 1.0 - (self.lost(step.after) / due.clamp_min(1.0)).unsqueeze(-1)
+
+    def _delay(self, step: Transition) -> Tensor:
+        """Return what ``delay`` does (vehicles)."""
+        return self.delay(step.after).unsqueeze(-1)
+
+    def lost(self, world: EnvState) -> Tensor:
         """Return how many vehicles' time is lost: ``Σ (1 − min(v/v0, 1))`` of those on the road, and all in a queue."""
         state = world.state
         assert state.present is not None
         lost = 1.0 - (state.speed / world.episode["free_speed"]).clamp_max(1.0)
         return (lost * state.present).sum(-1) + demand.counts(self.simulator, state).queued
 
-    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
-        """Return minus the delay of all in this step (vehicle-seconds)."""
-        return (-self.simulator.dt * self.delay(after)).unsqueeze(-1).expand(-1, len(self.agents))
+    def delay(self, world: EnvState) -> Tensor:
+        """Return what is lost in a moment (vehicles)."""
+        return self.lost(world)
 
     def crashed(self, world: EnvState) -> Tensor:
         """Return whose episodes end in a crash: of all, where vehicles touch or one drives over the end of its lane."""

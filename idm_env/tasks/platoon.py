@@ -13,12 +13,13 @@ from torch import Tensor
 
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import EnvState, RewardRange
+from idm_env.tasks.base import EnvState
 from idm_env.tasks.checks import Range, at_least, span
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import FEATURES, AgentView, Feature, feature, speed
 from idm_env.tasks.random import Draw
 from idm_env.tasks.recorded import BehindHeadTask
+from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition, headway
 from idm_env.types import Params
 
 _WAVE_STREAM = 21
@@ -36,12 +37,12 @@ class PlatoonTask(BehindHeadTask):
     speeds.
 
     Observation, per agent: ``v/30, (v_lead − v)/10, gap/100, (v − v̄)/10`` (m/s and m; raw: without the scales).
-    Reward, per agent: ``−((v_i − v̄)² + (v_last − v̄)²) / (2 A²) − 0.1 u² − 2 max(0, 1 − time gap / 0.8 s)
-    − max(0, time gap / 4 s − 1)``, A the disturbance, u its command (m/s²): the usual quadratic costs of speed and
-    effort, and bounds on the time gap so that nobody hides far behind. The humans (a = 0.6, b = 1.5, T = 1, s0 = 2,
-    v0 = 30) amplify waves of 40–90 s at 10 m/s, by a quarter over ten vehicles. Below −4 the reward saturates towards
-    −8 (``floored``). Terminated where vehicles touch, which pays ``−crash_cost`` instead: 24 001 by default, so that a
-    crash is worse than any survival (``idm_env.tasks.crash``). Cut off after 3000 steps.
+    Reward, per agent: ``h (0.3 + 0.4/(1 + ((v_last − v̄)/A)²) + 0.3/(1 + ((v_i − v̄)/A)²))``, A the disturbance, h as
+    in ``follow``. ``reward="quadratic"``: ``−((v_i − v̄)² + (v_last − v̄)²) / (2 A²) − 0.1 u² − 2 max(0, 1 − time
+    gap / 0.8 s) − max(0, time gap / 4 s − 1)``, saturated from −4 towards −8 (``floored``): the usual costs, and
+    bounds on the time gap so that nobody hides far behind. The humans (a = 0.6, b = 1.5, T = 1, s0 = 2, v0 = 30)
+    amplify waves of 40–90 s at 10 m/s, by a quarter over ten vehicles. Terminated where vehicles touch. Cut off
+    after 3000 steps.
 
     Args:
         speed: Mean speed v̄ of the head (m/s).
@@ -79,9 +80,13 @@ class PlatoonTask(BehindHeadTask):
         return own, FEATURES["relative_speed"], FEATURES["gap"], deviation
 
     @property
-    def own_reward_range(self) -> RewardRange:
-        """Costs only."""
-        return RewardRange(_LOWEST, 0.0)
+    def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
+        """``unit``, and the quadratic costs."""
+        own = RewardTerm("steady", "h/(1 + (Δv_i/A)²)", "", 0.0, 1.0, self._steady)
+        last = RewardTerm("last", "h/(1 + (Δv_last/A)²)", "", 0.0, 1.0, self._last)
+        quadratic = RewardTerm("quadratic", "", "", _LOWEST, 0.0, self._quadratic)
+        unit = {last: 0.4, own: 0.3, REWARD_TERMS["headway"]: 0.3}
+        return {"unit": unit, "quadratic": {quadratic: 1.0}}
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return a platoon in equilibrium at v̄, with drawn waves ahead of it."""
@@ -111,9 +116,17 @@ class PlatoonTask(BehindHeadTask):
         accel = (amplitude * (-frequency * angle.sin() + 0.1 * start * fade)).sum(-1)
         return torch.stack((position, speed, accel), dim=-1)
 
-    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
+    def _steady(self, step: Transition) -> Tensor:
+        """Return ``h/(1 + ((v_i − v̄)/A)²)``, h the headway's term."""
+        return headway(step) / (1.0 + ((self.pick(step.after.state.speed) - self.speed) / self.disturbance).square())
+
+    def _last(self, step: Transition) -> Tensor:
+        """Return ``h/(1 + ((v_last − v̄)/A)²)``, h the headway's term."""
+        return headway(step) / (1.0 + ((step.after.state.speed[..., -1:] - self.speed) / self.disturbance).square())
+
+    def _quadratic(self, step: Transition) -> Tensor:
         """Return minus the quadratic costs of speed and effort, and of time gaps out of bounds."""
-        state = after.state
+        state, command = step.after.state, step.command
         speed, last = self.pick(state.speed), state.speed[..., -1:]
         off, off_last = speed - self.speed, last - self.speed
         time_gap = self.pick(state.gap) / speed.clamp_min(1.0)

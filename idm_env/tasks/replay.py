@@ -14,19 +14,19 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Control, Effect, Replay
 from idm_env.roads import Lane, Road
-from idm_env.tasks.base import Ended, EnvState, RewardRange, Task
+from idm_env.tasks.base import Ended, EnvState, Task
 from idm_env.tasks.checks import count_of, in_ranges
 from idm_env.tasks.crash import floored
 from idm_env.tasks.features import Feature
-from idm_env.tasks.follow import HIGHEST, KNEE, LOWEST, SEEN, headway_penalty
+from idm_env.tasks.follow import HIGHEST, KNEE, LOWEST, SEEN
 from idm_env.tasks.random import Draw
+from idm_env.tasks.reward_terms import RewardTerm, Transition, headway_penalty
 from idm_env.tasks.scenes import Scene, made_up_scene, recorded_scene
 from idm_env.tasks.types import NOBODY
 from idm_env.types import Inputs, Params, Record
-from idm_env.validation import nearest, one_of, shown
+from idm_env.validation import nearest, shown
 
 HORIZON = 300
-REWARDS = ("imitation", "follow")
 _START_STREAM = 31
 _FARTHEST = -10.0
 
@@ -40,13 +40,11 @@ class ReplayTask(Task):
 
     Observation, per agent: ``v/40, v_lead/40, gap/100`` (m/s and m; raw: without the scales; a missing leader: the own
     speed, gap 1000 m).
-    Reward, per agent: ``"imitation"``: ``−|x − x_record|/10``; ``"follow"``: ``1 − fuel/10 − 0.002 u² − 2 p``, the
-    terms of task ``follow`` with the agent's own fuel. Below −5 and −2 they saturate towards −10 and −4 (``floored``).
-    An agent whose vehicle is not there observes and gets zeros.
+    Reward, per agent: ``1/(1 + |x − x_record|/10 m)``. ``reward="imitation"`` pays ``−|x − x_record|/10``, saturated
+    from −5 towards −10; ``reward="source"`` that of ``follow``, ``1 − fuel/10 − 0.002 u² − 2 p``, with the agent's own
+    fuel. An agent whose vehicle is not there observes and gets zeros.
     Each agent for itself: terminated where it touches its leader, truncated where its record ends. All are truncated
-    after ``max_episode_steps``: 300, or for as long as the record of any agent goes on. A crash pays ``−crash_cost``
-    instead, by default 3001 (imitation) or 1501 (follow) times the number of agents, whose mean a single environment
-    pays, so that it is worse than any survival (``idm_env.tasks.crash``).
+    after ``max_episode_steps``: 300, or for as long as the record of any agent goes on.
 
     Args:
         data: A trajectory file; None is a made-up scene of the project's own.
@@ -55,7 +53,6 @@ class ReplayTask(Task):
             time, a fraction of these, or ids, as ``["vehicle"]`` or ``["run/vehicle"]``.
         model: Which vehicles the drivers' model takes over: ids as for ``controlled``, or ``"all"`` with a recorded
             leader.
-        reward_terms: ``"imitation"`` or ``"follow"``.
     """
 
     name: ClassVar[str] = "replay"
@@ -70,7 +67,6 @@ class ReplayTask(Task):
     data: str | None = None
     runs: Sequence[str] | None = None
     model: str | Sequence[str] = ()
-    reward_terms: str = "imitation"
 
     def __post_init__(self) -> None:
         in_ranges(self)
@@ -78,7 +74,6 @@ class ReplayTask(Task):
             raise ValueError(f"vehicles = {self.vehicles}, but the file of task 'replay' decides. Leave it out.")
         if self.warmup:
             raise ValueError(f"warmup = {self.warmup}, but a replay begins from its record. Leave it out.")
-        one_of("reward_terms", self.reward_terms, REWARDS)
         # The simulator needs no number of vehicles; everything that does comes after this line.
         object.__setattr__(self, "vehicles", len(self.scene.ids))
         self._check_episode()
@@ -128,9 +123,12 @@ class ReplayTask(Task):
         return SEEN
 
     @property
-    def own_reward_range(self) -> RewardRange:
-        """Distances are costs only; the terms of ``follow`` lie in −4 … 1."""
-        return RewardRange(_FARTHEST, 0.0) if self.reward_terms == "imitation" else RewardRange(LOWEST, HIGHEST)
+    def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
+        """``unit``; minus the distance; and the source's of ``follow``."""
+        record = RewardTerm("record", "1/(1 + |x − x_record|/10 m)", "", 0.0, 1.0, self._record)
+        imitation = RewardTerm("imitation", "−|x − x_record|/10 m", "", _FARTHEST, 0.0, self._imitation)
+        source = RewardTerm("source", "", "", LOWEST, HIGHEST, self._source)
+        return {"unit": {record: 1.0}, "imitation": {imitation: 1.0}, "source": {source: 1.0}}
 
     @property
     def shares(self) -> int:
@@ -259,16 +257,21 @@ class ReplayTask(Task):
         inputs["replay"] = Record(position, speed, accel, replayed | (state.present <= 0), present)
         return inputs
 
-    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
-        """Return minus the distance to the record (10 m), or the terms of ``follow``; 0 of those who are not there."""
-        state = after.state
-        if self.reward_terms == "imitation":
-            return floored(-0.1 * self.distance(after), 0.5 * _FARTHEST, _FARTHEST)
+    def _record(self, step: Transition) -> Tensor:
+        """Return ``1/(1 + |x − x_record|/10 m)``."""
+        return 1.0 / (1.0 + 0.1 * self.distance(step.after))
+
+    def _imitation(self, step: Transition) -> Tensor:
+        """Return minus the distance to the record (10 m), saturated from −5 towards −10."""
+        return floored(-0.1 * self.distance(step.after), 0.5 * _FARTHEST, _FARTHEST)
+
+    def _source(self, step: Transition) -> Tensor:
+        """Return ``1 − fuel/10 − 0.002 u² − 2 p`` with the agent's own fuel, saturated below −2."""
+        state, command = step.after.state, step.command
         speed, gap = self.pick(state.speed), self.pick(state.gap)
         fuel = 0.951 * metrics.fuel(speed, self.pick(state.accel))
         far = torch.where(gap < 1e3, headway_penalty(gap, speed), 0.0)
-        terms = 1.0 - 0.1 * fuel - 0.002 * command * command - 2.0 * far
-        return self.there(state, floored(terms, KNEE, LOWEST))
+        return floored(1.0 - 0.1 * fuel - 0.002 * command * command - 2.0 * far, KNEE, LOWEST)
 
     def distance(self, world: EnvState) -> Tensor:
         """Return how far the agents are from their records (m), 0 where these have ended, shape ``(…, agents)``."""

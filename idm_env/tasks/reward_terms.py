@@ -1,8 +1,9 @@
-"""What agents can be rewarded for: declared terms, in a catalogue that is open.
+"""Reward terms: a catalogue that is open, and rewards as weighted sums of them.
 
-A term is a function of a step; it says its unit and its bounds, from which follows what a crash must cost. Tasks have
-rewards of their own, and ``reward={"speed": 0.2, "effort": -4.0}`` is ``Σ weight · term`` in their place: names of
-``REWARD_TERMS``, or ``"my_file.py:my_term"``.
+A term is a function of a step of Δt, with its unit and bounds. A reward is ``Σ weight · term``, averaged over the time
+for which an action is held, so that its bounds do not depend on ``hold``. Every task declares rewards by name, of which
+``"unit"`` lies in [0, 1]; ``reward={"speed": 0.2, "effort": -4.0}`` is another one: names of ``REWARD_TERMS``, or
+``"my_file.py:my_term"``.
 
 Shapes: the value of a term is ``(..., agents)``, or ``(..., 1)`` where it is the same for all.
 """
@@ -20,7 +21,7 @@ from idm_env import metrics
 from idm_env.tasks import features
 from idm_env.tasks.features import AgentView
 from idm_env.tasks.types import Agents, EnvState, RewardRange
-from idm_env.validation import finite
+from idm_env.validation import finite, one_of
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class RewardTerm:
         low: Lowest value; lower ones are clipped, without a gradient.
         high: Highest value.
         of: Its value in a step, ``(…, agents)`` or ``(…, 1)`` where it is the same for all.
+        shared: Whether it is paid to agents that are not on the road, too.
     """
 
     name: str
@@ -57,6 +59,7 @@ class RewardTerm:
     low: float
     high: float
     of: Callable[[Transition], Tensor]
+    shared: bool = False
 
     def __post_init__(self) -> None:
         if not (self.low < self.high and callable(self.of)):
@@ -84,6 +87,29 @@ def effort(step: Transition) -> Tensor:
 def effort_squared(step: Transition) -> Tensor:
     """Return u² (m²/s⁴)."""
     return step.command * step.command
+
+
+def ease(step: Transition) -> Tensor:
+    """Return ``1 − (u/u_max)²``, u_max the hardest command: 1 without a command."""
+    low, high = step.task.command_limits
+    return 1.0 - (step.command / max(-low, high)).square()
+
+
+def headway(step: Transition) -> Tensor:
+    """Return 1 from 7 m and 1 s to 60 m, 0 below 6 m or 0.8 s and above 120 m, linear between."""
+    gap, speed = features.gap(step.view), features.speed(step.view)
+    near, short, far = gap - 6.0, (metrics.time_gap(gap, speed) - 0.8) / 0.2, (120.0 - gap) / 60.0
+    return torch.minimum(torch.minimum(near, short), far).clamp(0.0, 1.0)
+
+
+def headway_penalty(gap: Tensor, speed: Tensor) -> Tensor:
+    """Return 0 … 1, elementwise: how far a gap (m) is below 7 m, above 120 m, or a time gap below 1 s.
+
+    The source (Lichtlé et al. 2022) takes 1 at any violation. Here it rises over 1 m, 10 m and 0.2 s, so that it has a
+    gradient; a deeper violation counts 1 as in the source.
+    """
+    near, far, short = 7.0 - gap, (gap - 120.0) / 10.0, (1.0 - metrics.time_gap(gap, speed)) / 0.2
+    return torch.maximum(torch.maximum(near, far), short).clamp(0.0, 1.0)
 
 
 def jerk(step: Transition) -> Tensor:
@@ -120,6 +146,8 @@ REWARD_TERMS: dict[str, RewardTerm] = {
         RewardTerm("own_speed", "v", "m/s", 0.0, 40.0, own_speed),
         RewardTerm("effort", "|u|", "m/s²", 0.0, 10.0, effort),
         RewardTerm("effort_squared", "u²", "m²/s⁴", 0.0, 100.0, effort_squared),
+        RewardTerm("ease", "1 − (u/u_max)²", "", 0.0, 1.0, ease),
+        RewardTerm("headway", "h", "", 0.0, 1.0, headway),
         RewardTerm("jerk", "|ΔA|/Δt", "m/s³", 0.0, 100.0, jerk),
         RewardTerm("fuel", "⟨F⟩", "mL/s", 0.0, 10.0, fuel),
         RewardTerm("co2", "⟨CO₂⟩", "g/s", 0.0, 25.0, co2),
@@ -131,31 +159,49 @@ REWARD_TERMS: dict[str, RewardTerm] = {
 
 @dataclass(frozen=True)
 class Weighted:
-    """A reward of one's own: ``Σ weight · term``."""
+    """A reward: ``Σ weight · term``, each term within its bounds; a Δt pays ``1/held`` of it."""
 
     terms: tuple[tuple[RewardTerm, float], ...]
+    held: int = 1
 
     @property
     def reward_range(self) -> RewardRange:
-        """The lowest (at most 0) and the highest (at least 0) sum."""
+        """The lowest (at most 0) and the highest (at least 0) reward of a held step."""
         ends = [sorted((weight * term.low, weight * term.high)) for term, weight in self.terms]
-        return RewardRange(min(0.0, sum(low for low, _ in ends)), max(0.0, sum(high for _, high in ends)))
+        # Of weights that sum to 1 the floating-point sum need not.
+        low, high = (round(sum(x), 9) for x in zip(*ends, strict=True))
+        return RewardRange(min(0.0, low), max(0.0, high))
 
-    def __call__(self, step: Transition) -> Tensor:
-        """Return the reward of a step, ``(…, agents)``; 0 for agents that are not on the road."""
-        total = torch.zeros_like(step.command)
+    def parts(self, step: Transition) -> dict[str, Tensor]:
+        """Return what each term pays for a Δt, ``(…, agents)``; one that is not shared 0 to those off the road."""
+        none, parts = torch.zeros_like(step.command), {}
         for term, weight in self.terms:
-            total = total + weight * term.of(step).clamp(term.low, term.high)
-        return step.task.there(step.after.state, total)
+            value = none + weight / self.held * term.of(step).clamp(term.low, term.high)
+            parts[term.name] = value if term.shared else step.task.there(step.after.state, value)
+        return parts
 
 
-def weighted(reward: Any, read: Callable[[Any, str], Any]) -> Weighted | None:
-    """Return what ``reward`` asks for, None for the task's own; ``read`` returns the term of an entry.
+def weighted(
+    reward: Any, named: Mapping[str, Mapping[RewardTerm, float]], read: Callable[[Any, str], Any], held: int
+) -> Weighted:
+    """Return the reward that ``reward`` asks for: one of ``named``, of which None is the first, or weights of terms.
 
-    ValueError, in one line, for what is no mapping of terms to finite weights.
+    ``read`` returns the term of an entry.
+
+    Raises:
+        ValueError: In one line, for an unknown name, no terms, two of one name, and a weight that is not finite.
     """
-    if reward is None:
-        return None
+    if reward is None or isinstance(reward, str):
+        return Weighted(tuple(named[one_of("reward", reward or next(iter(named)), named)].items()), held)
     if not isinstance(reward, Mapping) or not reward:
-        raise ValueError('reward must give weights of terms, such as {"speed": 0.2, "effort": -4.0}.')
-    return Weighted(tuple((read(name, "reward"), finite(f"reward.{name}", w)) for name, w in reward.items()))
+        raise ValueError(
+            'reward must give weights of terms, such as {"speed": 0.2, "effort": -4.0}, or be one of '
+            f"{', '.join(named)}."
+        )
+    terms = tuple((read(name, "reward"), finite(f"reward.{name}", w)) for name, w in reward.items())
+    names = [term.name for term, _ in terms]
+    if len(set(names)) < len(names):
+        raise ValueError(f"reward names the terms {', '.join(names)}: give each once.")
+    if not any(weight for _, weight in terms):
+        raise ValueError(f"reward gives no term a weight: {', '.join(names)} are all 0. Give one a weight.")
+    return Weighted(terms, held)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
 from typing import ClassVar
@@ -15,11 +15,12 @@ from torch import Tensor
 from idm_env import metrics
 from idm_env.effects import IDM, Brakes, Effect
 from idm_env.roads import Ring, Road
-from idm_env.tasks.base import EnvState, RewardRange, Task
-from idm_env.tasks.checks import Range, at_least, span
+from idm_env.tasks.base import EnvState, Task
+from idm_env.tasks.checks import Range, at_least, only_with, span
 from idm_env.tasks.crash import floored
-from idm_env.tasks.features import Feature, feature
+from idm_env.tasks.features import Feature, feature, time_gap
 from idm_env.tasks.random import Draw
+from idm_env.tasks.reward_terms import REWARD_TERMS, RewardTerm, Transition
 from idm_env.types import Command, Inputs, Params, State
 from idm_env.validation import one_of, shown
 
@@ -44,19 +45,18 @@ class RingTask(Task):
     Observation, per agent: ``v/5, (v_lead − v)/1, headway/10`` (m/s, m/s, m), headway from front bumper to front
     bumper; raw: without the scales. Flow divides by 15, 15 and 270, so that its entries vary by 0.04, 0.004 and 0.002.
     Speeds are clipped to 40 m/s, their difference to ±20 m/s, headways to −10 m … the longest ring.
-    Reward, the same for all agents: ``4 mean(v)/20 − 4 mean|u|``, v of all vehicles after the step (at most 40 m/s), u
-    the commands (m/s²); less ``tailgating · max(0, 1 − time gap / tailgating_below)``, each agent's own, and ``fuel ·
-    mean fuel rate (mL/s)``, which saturates from 5 to 10 mL/s. At least ``−4 max|u|`` (less what has a weight) and
-    at most 8. Terminated where vehicles touch, which pays ``−crash_cost`` instead: 36 001 by default, so that a crash
-    is worse than any survival (``idm_env.tasks.crash``). Flow pays 0 there, which is more than a slow ring.
+    Reward, the same for all agents: ``0.9 ⟨min(v/v*, 1)⟩ + 0.1 (1 − (u/u_max)²)``, over all vehicles after the step,
+    ``v* = (mean gap − 2 m)/1 s`` the speed at which these drivers keep equal gaps. ``reward="flow"``: ``4 mean(v)/20 −
+    4 |u|`` (v at most 40 m/s, u in m/s²), less ``tailgating · max(0, 1 − time gap / tailgating_below)`` and ``fuel ·
+    mean fuel rate (mL/s)``, which saturates from 5 to 10 mL/s. Terminated where vehicles touch.
 
     Args:
         length: Circumference (m), or ``[lowest, highest]`` to be drawn for every episode.
         start: ``"uniform"``: equal gaps, standing. ``"wave"``: gaps and speeds in a wave, for a developed one with less
             warm-up.
-        tailgating: Weight of the tailgating term; 0 leaves it out.
+        tailgating: Weight of the tailgating term of ``reward="flow"``; 0 leaves it out.
         tailgating_below: Time gap below which it counts (s). An agent holds about that gap: leave a margin.
-        fuel: Weight of the fuel term (s/mL); 0 leaves it out.
+        fuel: Weight of the fuel term of ``reward="flow"`` (s/mL); 0 leaves it out.
         fuel_model: Whose fuel: ``"kamal"`` or ``"circles"`` (``idm_env.metrics.FUELS``).
         shock: Deceleration (m/s²) with which one human driver brakes in an episode, whatever is ahead: as hard as
             the brakes allow, by a command in place of the driver's acceleration; 0 is no shock.
@@ -115,6 +115,7 @@ class RingTask(Task):
             )
         if self.shock or self.shock_vehicle is not None:
             self._check_shocked()
+        only_with(self, "flow", ("tailgating", "fuel"))
 
     def _check_shocked(self) -> None:
         """Check that a human driver brakes."""
@@ -157,13 +158,25 @@ class RingTask(Task):
         )
 
     @property
-    def own_reward_range(self) -> RewardRange:
-        """From full commands and every weighted term at its worst to a ring at 40 m/s."""
-        return RewardRange(self._worst() - _FUEL * self.fuel, 0.2 * _FASTEST)
+    def own_rewards(self) -> Mapping[str, Mapping[RewardTerm, float]]:
+        """``unit``, and Flow's."""
+        low, high = self.command_limits
+        flow = {REWARD_TERMS["speed"]: 0.2, replace(REWARD_TERMS["effort"], high=max(-low, high)): -4.0}
+        if self.tailgating:
+            flow[RewardTerm("tailgating", "max(0, 1 − T/T_min)", "", 0.0, 1.0, self._tailgates)] = -self.tailgating
+        if self.fuel:
+            flow[RewardTerm("fuel", "⟨F⟩", "mL/s", 0.0, 10.0, self._fuel)] = -self.fuel
+        return {"unit": {EVEN: 0.9, REWARD_TERMS["ease"]: 0.1}, "flow": flow}
 
-    def _worst(self) -> float:
-        """Return the reward below which the fuel's term saturates; without its weight none lies below."""
-        return -4.0 * max(-self.command_limits[0], self.command_limits[1]) - self.tailgating - _FUEL * self.fuel
+    def _tailgates(self, step: Transition) -> Tensor:
+        """Return ``max(0, 1 − time gap / tailgating_below)``."""
+        return torch.relu(1.0 - time_gap(step.view) / self.tailgating_below)
+
+    def _fuel(self, step: Transition) -> Tensor:
+        """Return the mean fuel rate of all vehicles (mL/s), saturated from 5 towards 10."""
+        state = step.after.state
+        rate = metrics.fuel(state.speed, state.accel, self.fuel_model).mean(-1, keepdim=True)
+        return -floored(-rate, -_FUEL, -2.0 * _FUEL)
 
     def begin(self, draw: Draw, params: Params) -> EnvState:
         """Return rings of drawn lengths: standing at equal gaps, or in a wave."""
@@ -218,18 +231,12 @@ class RingTask(Task):
     def _is_shocked(self) -> list[bool]:
         return [i == self.shocked for i in range(self.vehicles)]
 
-    def own_reward(self, before: EnvState, command: Tensor, after: EnvState) -> Tensor:
-        """Return ``4 mean(v)/20 − 4 mean|u|``, less the terms that have a weight."""
-        state = after.state
-        effort = command.abs()
-        if len(self.agents) > 1:
-            effort = effort.mean(-1, keepdim=True)
-        reward = 0.2 * state.speed.mean(-1, keepdim=True).clamp_max(_FASTEST) - 4.0 * effort
-        if self.fuel:
-            reward = reward - self.fuel * metrics.fuel(state.speed, state.accel, self.fuel_model).mean(-1, keepdim=True)
-        if len(self.agents) > 1:
-            reward = reward.expand(-1, len(self.agents))
-        if self.tailgating:
-            time_gap = metrics.time_gap(self.pick(state.gap), self.pick(state.speed))
-            reward = reward - self.tailgating * torch.relu(1.0 - time_gap / self.tailgating_below)
-        return floored(reward, self._worst(), self.own_reward_range.low) if self.fuel else reward
+
+def even(step: Transition) -> Tensor:
+    """Return ``⟨min(v/v*, 1)⟩`` over all vehicles, ``v* = (mean gap − 2 m)/1 s``: 1 where all drive as one can."""
+    state = step.after.state
+    best = (state.gap.mean(-1, keepdim=True) - 2.0).clamp_min(0.5)
+    return (state.speed / best).clamp_max(1.0).mean(-1, keepdim=True)
+
+
+EVEN = RewardTerm("even", "⟨min(v/v*, 1)⟩", "", 0.0, 1.0, even)

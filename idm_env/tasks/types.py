@@ -42,6 +42,10 @@ class Agents(Protocol):
     def agents(self) -> tuple[int, ...]:
         """Indices of the controlled vehicles."""
 
+    @property
+    def command_limits(self) -> tuple[float, float]:
+        """The accelerations (m/s²) that actions of −1 and 1 command."""
+
     def pick(self, x: Tensor) -> Tensor:
         """Return what belongs to the controlled vehicles, ``(…, agents)``."""
 

@@ -21,8 +21,8 @@ ROADS: dict[str, dict[str, Any]] = {
     "waits at a ramp": {"task": "merge", "controlled": [60, 79], "failsafe": 3.0},
     "waits at a bottleneck": {"task": "bottleneck", "controlled": [60, 79], "lane_commands": True},
     "has left a record": {"task": "replay", "controlled": ["b", "c"]},
-    "has left another record": {"task": "replay", "controlled": ["b", "c"], "reward_terms": "follow"},
-    "has left recorded lanes": {"task": "replay_lanes", "controlled": ["b", "c"], "reward_terms": "follow"},
+    "has left another record": {"task": "replay", "controlled": ["b", "c"], "reward": "source"},
+    "has left recorded lanes": {"task": "replay_lanes", "controlled": ["b", "c"], "reward": "source"},
 }
 
 

@@ -25,7 +25,9 @@ def vector(mode="SameStep", limit=5, **keywords):
     return gym.make_vec("DiffIDM-v0", num_envs=3, autoreset_mode=mode, max_episode_steps=limit, **{**SMALL, **keywords})
 
 
-@pytest.mark.parametrize("keywords", [{}, {"controlled": 2, "tailgating": 1.0, "fuel": 0.1}, {"start": "wave"}])
+@pytest.mark.parametrize(
+    "keywords", [{}, {"controlled": 2, "reward": "flow", "tailgating": 1.0, "fuel": 0.1}, {"start": "wave"}]
+)
 def test_gradcheck_of_the_return_by_actions(keywords):
     def total(actions):
         env = single(**keywords)

@@ -13,7 +13,7 @@ from idm_env.tasks import TASKS, make_task
 
 @pytest.mark.parametrize("name", TASKS)
 def test_a_held_action_is_so_many_steps_under_it(name: str) -> None:
-    """Observations, ends and infos are those of the last of them, the reward is their sum."""
+    """Observations, ends and infos are those of the last of them, the reward and its parts are their means."""
     choices = {"task": name, "controlled": 1, "warmup": 10} if name == "ring" else {"task": name, "controlled": 1}
     once, held = (
         gym.make("DiffIDM-v0", **choices, hold=hold, max_episode_steps=n) for hold, n in ((0.1, 12), (0.3, 4))
@@ -21,14 +21,16 @@ def test_a_held_action_is_so_many_steps_under_it(name: str) -> None:
     np.testing.assert_array_equal(once.reset(seed=3)[0], held.reset(seed=3)[0])
     for k in range(4):
         action = held.action_space.sample() * 0 + np.float32(0.3 * (-1) ** k)
-        total = 0.0
+        total, parts = 0.0, []
         for _ in range(3):
             seen, reward, terminated, truncated, info = once.step(action)
-            total += reward
+            total += reward / 3
+            parts.append(info.pop("rewards"))
         found = held.step(action)
         np.testing.assert_array_equal(found[0], seen)
         assert found[1] == pytest.approx(total, rel=1e-5, abs=1e-6)
         assert found[2:4] == (terminated, truncated) == (False, k == 3)
+        np.testing.assert_allclose(found[4].pop("rewards"), np.mean(parts, 0), rtol=1e-5)
         assert all(np.array_equal(found[4][key], value) for key, value in info.items())
 
 
@@ -53,7 +55,7 @@ def test_rows_that_end_while_an_action_is_held_tell_of_their_end() -> None:
                 k += 1
             assert k <= 20 * (step + 1) < k + 20
             np.testing.assert_array_equal(info["final_obs"][row], seen)
-            assert reward[row] == pytest.approx(sum(paid[20 * step :]), rel=1e-5)
+            assert reward[row] == pytest.approx(sum(paid[20 * step :]) / 20, rel=1e-5)
             assert info["final_info"]["crash_reason"][row] == told["crash_reason"]
     assert len(ended) == 4
 

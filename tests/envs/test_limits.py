@@ -97,7 +97,7 @@ def test_what_is_no_number_of_steps_is_an_error(bad):
 
 
 def test_the_cost_of_a_crash_knows_the_episodes_length():
-    short, long = (gym.make("DiffIDM-v0", max_episode_steps=n).unwrapped.task for n in (10, 10000))
+    short, long = (gym.make("DiffIDM-v0", reward="flow", max_episode_steps=n).unwrapped.task for n in (10, 10000))
     assert (short.cost_of_crash, long.cost_of_crash) == (121.0, 120001.0)
 
 

@@ -129,7 +129,7 @@ def test_agents_of_trips_come_and_go():
         seen, reward, terminated, truncated, _ = many.step({a: np.zeros(1, np.float32) for a in many.agents})
         over = {a for a in terminated if terminated[a] or truncated[a]}
         assert not over & ended and not ended & set(many.agents)
-        assert all(seen[a][at] == 0.0 and reward[a] < 0.0 for a in terminated if terminated[a])
+        assert all(seen[a][at] == 0.0 and reward[a] > 0.0 for a in terminated if terminated[a])
         ended, began, last = ended | over, began | set(many.agents), truncated
     assert began == ended <= set(many.possible_agents) and len(began) >= 5
     assert {name.split("_trip_")[0] for name in began} == {"vehicle_2", "vehicle_9"}

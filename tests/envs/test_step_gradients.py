@@ -34,6 +34,7 @@ CASES = {
         {
             "warmup": 5,
             "fuel": 0.1,
+            "reward": "flow",
             "tailgating": 1.0,
             "controlled": 3,
             "failsafe": 3.0,
@@ -52,7 +53,7 @@ CASES = {
     "follow": ("follow", {"max_episode_steps": 25, "fuel_model": "circles"}),
     "platoon": ("platoon", {"controlled": 2, "noise": 0.1, "observation": DECLARED, "reward": WEIGHTS}),
     "replay": ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
-    "single": ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
+    "single": ("replay", {"reward": "source", "failsafe": 4.0}),
     # Several lanes: who enters and leaves, changes, is let in, is put on a lane by a record, begins anew.
     "highway": (
         "highway",

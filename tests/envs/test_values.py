@@ -28,13 +28,24 @@ def compiled_at_once(monkeypatch):
 
 CASES = [
     ("ring", {"start": "wave", "warmup": 20}),
-    ("ring", {"warmup": 5, "fuel": 0.1, "tailgating": 1.0, "controlled": 3, "failsafe": 3.0, "integration": "euler"}),
+    (
+        "ring",
+        {
+            "warmup": 5,
+            "reward": "flow",
+            "fuel": 0.1,
+            "tailgating": 1.0,
+            "controlled": 3,
+            "failsafe": 3.0,
+            "integration": "euler",
+        },
+    ),
     ("ring", {"warmup": 5, "controlled": 2, "shock": 4.0, "shock_after": [0.5, 3.0], "max_command": [-4.5, 2.6]}),
     ("ring", {"warmup": 5, "effects": ["delay", "memory"], "parameters": {"idm.time_gap": 1.3}}),
     ("follow", {"max_episode_steps": 25, "fuel_model": "circles"}),
     ("platoon", {"controlled": 2, "noise": 0.1, "observation": DECLARED, "reward": WEIGHTS}),
     ("replay", {"controlled": 2, "model": "all", "max_episode_steps": 20}),
-    ("replay", {"reward_terms": "follow", "failsafe": 4.0}),
+    ("replay", {"reward": "source", "failsafe": 4.0}),
     LANES["highway"],
     ("bottleneck", {"vehicles": 20, "integration": "euler", "max_episode_steps": 33, "added": True, "careful": False}),
     ("open_highway", {"vehicles": 12, "lanes_count": 2, "length": 150.0, "max_episode_steps": 33}),

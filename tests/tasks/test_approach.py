@@ -60,7 +60,7 @@ def test_vehicles_come_in_platoons(platoon: float) -> None:
 
 def test_fuel_has_its_price() -> None:
     """What a step pays is the delay of all, and each millilitre as many vehicle-seconds."""
-    (cheap, worlds), (dear, _) = rolled(20, fuel_weight=0.0), rolled(0, fuel_weight=2.0)
+    (cheap, worlds), (dear, _) = rolled(20, reward="delay", fuel_weight=0.0), rolled(0, reward="delay", fuel_weight=2.0)
     before, after = worlds[-2:]
     command = torch.zeros(ROWS, 60, dtype=torch.float64)
     less, more = (task.rewards(before, command, after)[:, 0] for task in (cheap, dear))

@@ -55,7 +55,7 @@ def test_follow_replays_its_leader_from_a_drawn_start():
 )
 def test_follow_rewards_what_is_written(weight, lag, accel):
     keywords = {**({} if weight == 0.1 else {"fuel_weight": weight}), **({"lag_weight": lag} if lag else {})}
-    task = make_task("follow", vehicles=3, **keywords)
+    task = make_task("follow", vehicles=3, reward="source", **keywords)
     world, params = start(task, 1)
     command = torch.tensor([[accel]], dtype=torch.float64)
     after = task.step(world, command, None, params)
@@ -105,7 +105,7 @@ def test_platoon_amplifies_towards_its_end_and_starts_at_rest_with_its_head():
 
 
 def test_replay_stays_on_the_record_but_for_those_handed_over():
-    task = make_task("replay", model=["3"])
+    task = make_task("replay", model=["3"], reward="imitation")
     worlds = roll(task, 40, count=1)
     record = torch.as_tensor(task.scene.motion)[int(worlds[0].episode["start"]) + 40]
     off = (worlds[-1].state.position[0] - record[:, 0]).abs()
@@ -190,7 +190,7 @@ def test_agents_end_one_by_one(recording):
         ({"controlled": 3}, "Control fewer"),
         ({"runs": ["q"]}, "run 'q' is not in"),
         ({"model": "some"}, "'all' or a list"),
-        ({"reward_terms": "imitations"}, "Did you mean 'imitation'"),
+        ({"reward": "imitations"}, "Did you mean 'imitation'"),
         ({"vehicles": 5}, "Leave it out"),
         ({"dt": 0.25}, "no multiple"),
     ],

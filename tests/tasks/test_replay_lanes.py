@@ -127,7 +127,7 @@ def test_whoever_drives_as_recorded_stays_on_the_record(road, vehicle):
 
 def test_the_leader_is_whoever_is_ahead_on_the_lane_now(road):
     """c stands still; d, who merges in front of it, is its leader from then on, at the gap that positions say."""
-    task = make_task("replay_lanes", data=road, controlled=["c"], max_command=9.0, reward_terms="follow")
+    task = make_task("replay_lanes", data=road, controlled=["c"], max_command=9.0, reward="source")
     world, params = started(task, at=0)
     ids, (own,) = task.scene.ids, task.agents
     for t in range(1, 61):
@@ -155,7 +155,7 @@ def test_a_collision_is_reported(road, vehicle, action, words):
         if terminated or truncated:
             break
     assert terminated
-    assert reward < -100
+    assert reward == 0.0
     assert pl.Series([info["crash_reason"]]).str.contains(words)[0], info["crash_reason"]
 
 
@@ -207,7 +207,7 @@ def test_faces_replay_the_same(road):
 
 def test_gradients_are_finite_differences(road):
     """Behind leaders who change lanes."""
-    task = make_task("replay_lanes", data=road, controlled=["c"], reward_terms="follow")
+    task = make_task("replay_lanes", data=road, controlled=["c"], reward="source")
     world, params = started(task, at=10)
 
     def total(push):

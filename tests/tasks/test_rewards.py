@@ -1,22 +1,53 @@
-"""A crash is worse than any survival, in every task: by bounds of what a step pays, and in wild rollouts."""
+"""Rewards lie in their bounds and a crash never pays, in every task: by bounds of terms, and in wild rollouts."""
 
+import re
+
+import gymnasium
+import numpy as np
 import pytest
 import torch
 
-from idm_env.tasks import TASKS, Draw, make_task
+import idm_env  # noqa: F401 (registers the environments)
+from idm_env.envs.pettingzoo import parallel_env
+from idm_env.tasks import REWARD_TERMS, TASKS, Draw, Transition, make_task
 from idm_env.tasks.crash import floored
 
 CASES = {
     "ring": {"task": "ring", "warmup": 60},
     "ring, wave": {"task": "ring", "warmup": 60, "start": "wave", "controlled": 3},
-    "ring, weights": {"task": "ring", "warmup": 60, "tailgating": 2.0, "fuel": 3.0, "max_command": 4.0},
+    "ring, weights": {
+        "task": "ring",
+        "warmup": 60,
+        "reward": "flow",
+        "tailgating": 2.0,
+        "fuel": 3.0,
+        "max_command": 4.0,
+    },
     "ring, real brakes": {"task": "ring", "warmup": 60, "max_command": [-4.5, 2.6], "shock": 4.0, "shock_after": 3.0},
-    "ring, the other fuel": {"task": "ring", "warmup": 60, "fuel": 3.0, "fuel_model": "circles"},
+    "ring, the other fuel": {"task": "ring", "warmup": 60, "reward": "flow", "fuel": 3.0, "fuel_model": "circles"},
     "follow": {"task": "follow"},
     "follow, hard": {"task": "follow", "max_command": 30.0, "controlled": 2},
-    "follow, thrifty": {"task": "follow", "fuel_weight": 2.0},
-    "follow, in time": {"task": "follow", "lag_weight": 2.0},
+    "follow, thrifty": {"task": "follow", "reward": "source", "fuel_weight": 2.0},
+    "follow, in time": {"task": "follow", "reward": "source", "lag_weight": 2.0},
     "platoon": {"task": "platoon", "controlled": 2},
+    "platoon, costs": {"task": "platoon", "controlled": 2, "reward": "quadratic"},
+    "replay, imitation": {"task": "replay", "reward": "imitation"},
+    "merge, delay": {
+        "task": "merge",
+        "vehicles": 40,
+        "max_command": 4.0,
+        "controlled": 3,
+        "careful": False,
+        "reward": "delay",
+    },
+    "approach, delay": {
+        "task": "approach",
+        "vehicles": 40,
+        "controlled": 8,
+        "careful": False,
+        "reward": "delay",
+        "max_command": 4.0,
+    },
     "replay": {"task": "replay"},
     "replay lanes": {"task": "replay_lanes", "controlled": 2, "lane_commands": True},
     "highway": {"task": "highway", "vehicles": 30, "length": 300.0, "max_command": 4.0, "controlled": 3},
@@ -24,7 +55,7 @@ CASES = {
     "merge": {"task": "merge", "vehicles": 40, "max_command": 4.0, "controlled": 3, "careful": False},
     "bottleneck": {"task": "bottleneck", "vehicles": 40, "max_command": 4.0, "controlled": 12, "careful": False},
     "approach": {"task": "approach", "vehicles": 40, "max_command": 4.0, "controlled": 8, "careful": False},
-    "replay, follow": {"task": "replay", "controlled": 3, "reward_terms": "follow"},
+    "replay, follow": {"task": "replay", "controlled": 3, "reward": "source"},
 }
 STEPS, COUNT = 150, 24
 
@@ -57,7 +88,8 @@ def returns(task, kind):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_every_crash_returns_less_than_every_survival(name):
+def test_no_crash_pays(name):
+    """In [0, 1] it ends what was in store; under a reward that can be negative it returns less than every survival."""
     crashed, survived = [], []
     with torch.no_grad():
         for failsafe in (0.0, 3.0):
@@ -68,15 +100,20 @@ def test_every_crash_returns_less_than_every_survival(name):
                 survived += total[~over].tolist()
     assert len(crashed) > 5
     assert len(survived) > 50
-    assert max(crashed) < min(survived)
+    if task.reward_range.low < 0.0:
+        assert max(crashed) < min(survived)
+    else:
+        assert task.cost_of_crash == 0.0 <= min(*crashed, *survived)
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_no_state_pays_beyond_the_bounds_that_the_cost_is_made_of(name):
+def test_no_state_pays_beyond_the_bounds(name):
     task = make_task(**CASES[name])
-    assert task.reward_range.low <= 0.0 <= task.reward_range.high
-    shared = task.cost_of_crash / task.shares
-    assert (task.steps - 1) * task.reward_range.high - shared < task.steps * task.reward_range.low
+    if "reward" not in CASES[name]:
+        assert task.reward_range == (0.0, 1.0)
+    steps, shared = task.steps // task.held, task.cost_of_crash / task.shares
+    if task.reward_range.low < 0.0:
+        assert (steps - 1) * task.reward_range.high - shared < steps * task.reward_range.low
     params = task.params(torch.float64, "cpu")
     draw = Draw.of(torch.arange(500), torch.zeros(500, dtype=torch.int64))
     world = task.begin(draw, params)
@@ -86,9 +123,31 @@ def test_no_state_pays_beyond_the_bounds_that_the_cost_is_made_of(name):
         position=world.state.position + 1e5 * u[:, 0], step=world.state.step + 9,
     )  # fmt: skip
     command = task.command(2.0 * u[:, 1, : len(task.agents)] - 1.0)
-    earned = task.own_reward(world, command, world._replace(state=state))
+    earned = task.held * sum(
+        task.weighted.parts(Transition(task, world, command, world._replace(state=state))).values()
+    )
     assert bool(torch.isfinite(earned).all())
-    assert task.reward_range.low <= float(earned.min()) < float(earned.max()) <= task.reward_range.high
+    assert task.reward_range.low <= float(earned.min()) < float(earned.max()) <= task.reward_range.high + 1e-9
+
+
+@pytest.mark.parametrize("keywords", [{"task": "highway", "hold": 0.5}, {"task": "merge", "reward": "delay"}])
+def test_infos_have_the_parts_of_a_held_step(keywords):
+    """On every face; their sum is the reward."""
+    env = gymnasium.make("DiffIDM-v0", **keywords)
+    env.reset(seed=0)
+    batch = gymnasium.make_vec("DiffIDM-v0", num_envs=2, **keywords)
+    batch.reset(seed=0)
+    agents = parallel_env(**keywords)
+    agents.reset(seed=0)
+    assert len(env.unwrapped.task.reward_names) == len(env.unwrapped.task.weighted.terms) + ("reward" in keywords)
+    for _ in range(2):
+        _, reward, _, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
+        assert float(info["rewards"].sum(-1).mean()) == pytest.approx(reward)
+        told = batch.step(np.zeros(batch.action_space.shape, np.float32))
+        np.testing.assert_allclose(told[4]["rewards"].sum(-1).mean(-1), told[1], rtol=1e-5)
+        _, rewards, _, _, infos = agents.step({a: np.zeros(1, np.float32) for a in agents.agents})
+        first = agents.agents[0]
+        assert first not in infos or infos[first]["rewards"].sum() == pytest.approx(rewards[first])
 
 
 def test_every_task_is_tried():
@@ -106,11 +165,27 @@ def test_the_floor_changes_nothing_above_its_knee_and_has_a_gradient_everywhere(
     assert float(kept[4].detach()) == pytest.approx(-4.8)
 
 
-def test_a_cost_of_ones_own_replaces_the_lawful_one():
-    task = make_task("follow", crash_cost=50.0)
-    params = task.params(torch.float64, "cpu")
-    world = task.begin(Draw.of(torch.tensor([0]), torch.tensor([0])), params)
-    gap = world.state.gap.clone()
-    gap[0, 3] = -0.1
-    touched = world._replace(state=world.state._replace(gap=gap))
-    assert float(task.rewards(world, torch.zeros(1, 1, dtype=torch.float64), touched)) == -50.0
+def test_a_crash_pays_its_price_and_nothing_else():
+    for keywords, price in (({}, 0.0), ({"crash_cost": 50.0}, 50.0), ({"reward": "source"}, 5001.0)):
+        task = make_task("follow", **keywords)
+        params = task.params(torch.float64, "cpu")
+        world = task.begin(Draw.of(torch.tensor([0]), torch.tensor([0])), params)
+        gap = world.state.gap.clone()
+        gap[0, 3] = -0.1
+        touched = world._replace(state=world.state._replace(gap=gap))
+        assert float(task.rewards(world, torch.zeros(1, 1, dtype=torch.float64), touched)) == -price
+
+
+@pytest.mark.parametrize(
+    ("keywords", "said"),
+    [
+        ({"reward": "flows"}, "reward = 'flows' is unknown. Did you mean 'flow'?"),
+        ({"reward": {"speed": 0.0}}, "reward gives no term a weight: speed"),
+        ({"reward": {REWARD_TERMS["speed"]: 1.0, "speed": 2.0}}, "give each once"),
+        ({"tailgating": 2.0}, "tailgating = 2.0 weighs a term of reward = 'flow'"),
+    ],
+)
+def test_a_reward_that_cannot_be_is_told_in_one_line(keywords, said):
+    with pytest.raises(ValueError, match=re.escape(said)) as told:
+        make_task("ring", **keywords)
+    assert "\n" not in str(told.value)

@@ -14,7 +14,7 @@ def start(task, count=1, seed=0, dtype=torch.float64):
 
 
 def test_the_observation_is_what_is_written_and_the_reward_flows():
-    task = make_task("ring", warmup=50)
+    task = make_task("ring", warmup=50, reward="flow")
     before, params = start(task)
     command = torch.tensor([[0.5]], dtype=torch.float64)
     after = task.step(before, command, {"noise": torch.zeros(1, 22, dtype=torch.float64)}, params)
@@ -164,8 +164,8 @@ def test_the_driver_opposite_is_no_agent_and_a_wrong_one_is_told():
 
 @pytest.mark.parametrize("below", [0.8, 1.1])
 def test_tailgating_and_fuel_cost(below):
-    plain = make_task("ring", warmup=30)
-    dear = make_task("ring", warmup=30, tailgating=3.0, tailgating_below=below, fuel=2.0)
+    plain = make_task("ring", warmup=30, reward="flow")
+    dear = make_task("ring", warmup=30, reward="flow", tailgating=3.0, tailgating_below=below, fuel=2.0)
     world, _ = start(plain)
     close = world._replace(state=world.state._replace(gap=torch.full_like(world.state.gap, 0.4)))
     none = torch.zeros(1, 1, dtype=torch.float64)
